@@ -1,0 +1,53 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+BOARD  ?= auto
+
+DEBIAN_PYTHON := python3-venv
+DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
+
+.PHONY: demo test setup board-tools lint types check nojit clean
+
+demo: setup
+	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
+
+test: setup
+	@$(BIN)/python -m pytest $(TEST_ARGS)
+
+setup: $(VENV)/.ready board-tools
+
+# Apt is used when root or when sudo asks for no password; else one line names what is missing.
+define apt_install
+if [ "$$(id -u)" = 0 ]; then APT=""; elif sudo -n true 2>/dev/null; then APT="sudo -n"; else APT=none; fi; \
+if [ "$$APT" = none ] || ! command -v apt-get >/dev/null; then echo "seldinger: missing Debian packages: $(1)" >&2; false; \
+else echo "seldinger: installing $(1)" >&2; \
+  { $$APT apt-get update -qq && $$APT env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(1); } >build/apt.log 2>&1 \
+  || { echo "seldinger: apt could not install: $(1) (see build/apt.log)" >&2; false; }; fi
+endef
+
+$(VENV)/.ready: pyproject.toml
+	@mkdir -p build
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "seldinger: found $$($(PYTHON) --version), wanted Python 3.11 or newer" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(call apt_install,$(DEBIAN_PYTHON)); }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "seldinger: installing the package into $(VENV)" >&2
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]" 2>build/pip.log || { cat build/pip.log >&2; exit 1; }
+	@touch $@
+
+# The simulated board needs a C compiler; the AVR tool chain is wanted, and its absence is said, not fatal.
+board-tools:
+	@mkdir -p build
+	@if [ "$(BOARD)" = native ] && command -v gcc >/dev/null; then :; \
+	elif command -v avr-gcc >/dev/null && command -v gcc >/dev/null && [ -e /usr/include/simavr/sim_avr.h ] && [ -e /usr/include/libelf.h ]; then :; \
+	else $(call apt_install,$(DEBIAN_BOARD)) || { command -v gcc >/dev/null && [ "$(BOARD)" != avr ] \
+	  && echo "seldinger: no AVR tool chain: the firmware runs compiled for this machine (BOARD=native)" >&2; }; fi
+
+lint: $(VENV)/.ready
+	@$(BIN)/ruff check .
+
+types: $(VENV)/.ready
+	@$(BIN)/mypy
+
+clean:
+	@rm -rf build runs

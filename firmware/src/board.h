@@ -1,0 +1,47 @@
+/* Pins and limits of the boards. One word a port: the port's letter; the simulated board reads the same words.
+ *
+ * Inputs have ports of their own: an input with a pull-up beside outputs is rewritten by simavr with every output.
+ * All switches are normally closed to ground with the pull-up on: an open line, hit or broken wire, reads 1.
+ *
+ *                 ATmega2560 (Arduino Mega)                 ATmega328P (Uno, Nano)
+ * STEP 0 1 2      PA0 PA1 PA2   D22 D23 D24                 PD2 PD3 PD4   D2 D3 D4
+ * DIR  0 1 2      PA3 PA4 PA5   D25 D26 D27  1: backwards   PD5 PD6 PD7   D5 D6 D7
+ * ENABLE          PA6           D28          1: powered     none: wire it to the emergency stop
+ * encoder A,B     PC0..PC5      D37..D32                    PC0..PC5      A0..A5
+ * limits min,max  PL0..PL5      D49..D44                    PB0 PB1 PB2   D8 D9 D10, both ends of an axis in series
+ * emergency stop  PL6           D43                         PB3           D11
+ */
+#ifndef BOARD_H
+#define BOARD_H
+
+#define ATMEGA2560_OUTPUTS A
+#define ATMEGA2560_OUTPUT_SHIFT 0
+#define ATMEGA2560_ENCODERS C
+#define ATMEGA2560_SWITCHES L
+#define ATMEGA2560_SHARED_LIMITS 0
+
+#define ATMEGA328P_OUTPUTS D
+#define ATMEGA328P_OUTPUT_SHIFT 2
+#define ATMEGA328P_ENCODERS C
+#define ATMEGA328P_SWITCHES B
+#define ATMEGA328P_SHARED_LIMITS 1
+
+#define BOARD_CPU_HZ 16000000UL
+#define BOARD_ENCODER_MASK 0x3F
+#define BOARD_BOOT_COUNT_ADDRESS 0 /* EEPROM, u16 */
+
+#if defined(__AVR_ATmega2560__)
+#define BOARD(word) ATMEGA2560_##word
+#define BOARD_MCU MCU_ATMEGA2560
+#define BOARD_SWITCH_MASK 0x7F
+#define BOARD_OUTPUT_MASK 0x7F
+#elif defined(__AVR_ATmega328P__)
+#define BOARD(word) ATMEGA328P_##word
+#define BOARD_MCU MCU_ATMEGA328P
+#define BOARD_SWITCH_MASK 0x0F
+#define BOARD_OUTPUT_MASK 0x3F
+#elif defined(__AVR__)
+#error "board.h has no pins for this processor: wanted ATmega2560 or ATmega328P"
+#endif
+
+#endif

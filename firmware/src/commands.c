@@ -1,0 +1,132 @@
+/* What the board does with each frame from the host, and what it tells of itself. */
+#include "commands.h"
+
+#include "clock.h"
+#include "frames.h"
+#include "interpolator.h"
+#include "link.h"
+#include "port.h"
+#include "quadrature.h"
+#include "safety.h"
+#include "setpoint_gate.h"
+
+boot_t boot;
+static bool identified; /* the host speaks this protocol */
+
+void commands_start(const boot_t *facts) {
+    boot = *facts;
+    identified = false;
+}
+
+bool command_fits(uint8_t id, uint8_t payload_bytes) {
+    switch (id) {
+        case FRAME_HELLO: return payload_bytes == FRAME_HELLO_BYTES;
+        case FRAME_CONFIGURE: return payload_bytes == FRAME_CONFIGURE_BYTES;
+        case FRAME_ARM: return payload_bytes == FRAME_ARM_BYTES;
+        case FRAME_DISARM: return payload_bytes == FRAME_DISARM_BYTES;
+        case FRAME_CLEAR_FAULT: return payload_bytes == FRAME_CLEAR_FAULT_BYTES;
+        case FRAME_SETPOINT: return payload_bytes == FRAME_SETPOINT_BYTES;
+        case FRAME_SET_POSITION: return payload_bytes == FRAME_SET_POSITION_BYTES;
+        case FRAME_PING: return payload_bytes == FRAME_PING_BYTES;
+        default: return false;
+    }
+}
+
+static void send_identity(void) {
+    frame_identity_t *identity = (frame_identity_t *)link_payload();
+    identity->protocol_hash = PROTOCOL_HASH;
+    identity->firmware_version = FIRMWARE_VERSION;
+    identity->boot_count = boot.boot_count;
+    identity->reset_cause = boot.reset_cause;
+    identity->mcu = boot.mcu;
+    identity->timer_hz = TIMER_HZ;
+    identity->axes = AXIS_COUNT;
+    identity->queue_capacity = QUEUE_CAPACITY;
+    identity->deadman_us = DEADMAN_US;
+    identity->horizon_us = HORIZON_US;
+    link_send(FRAME_IDENTITY, FRAME_IDENTITY_BYTES);
+}
+
+static void hello(uint8_t sequence, const frame_hello_t *frame) {
+    identified = frame->protocol_hash == PROTOCOL_HASH;
+    link_restart_sequence(sequence);
+    send_identity();
+}
+
+static uint8_t arm(const frame_arm_t *frame) {
+    if (frame->boot_count != boot.boot_count) return RESULT_BOOT_MISMATCH;
+    if (!gate_configured()) return RESULT_NOT_CONFIGURED;
+    gate_rearm();
+    return safety_arm();
+}
+
+static uint8_t set_position(const frame_set_position_t *frame) {
+    if (safety.state != STATE_DISARMED) return RESULT_BAD_STATE;
+    if (frame->axis >= AXIS_COUNT) return RESULT_BAD_VALUE;
+    port_lock_t lock = port_lock();
+    motion_rename_position(frame->axis, frame->position_steps);
+    quadrature_set(frame->axis, frame->position_steps);
+    port_unlock(lock);
+    return RESULT_OK;
+}
+
+static uint8_t execute(uint8_t id, const uint8_t *payload) {
+    if (id == FRAME_PING) return RESULT_OK;
+    if (id == FRAME_DISARM) return safety_disarm();
+    if (!identified) return RESULT_NOT_IDENTIFIED;
+    switch (id) {
+        case FRAME_CONFIGURE:
+            if (safety.state != STATE_DISARMED) return RESULT_BAD_STATE;
+            return gate_configure((const frame_configure_t *)payload);
+        case FRAME_ARM: return arm((const frame_arm_t *)payload);
+        case FRAME_CLEAR_FAULT: return safety_clear(((const frame_clear_fault_t *)payload)->fault);
+        default: return set_position((const frame_set_position_t *)payload);
+    }
+}
+
+void command_take(uint8_t id, uint8_t sequence, const uint8_t *payload) {
+    if (id == FRAME_HELLO) {
+        hello(sequence, (const frame_hello_t *)payload);
+        return;
+    }
+    if (id == FRAME_SETPOINT) {
+        if (identified) gate_take((const frame_setpoint_t *)payload);
+        return;
+    }
+    uint8_t result = execute(id, payload);
+    frame_ack_t *ack = (frame_ack_t *)link_payload();
+    ack->command = id;
+    ack->command_sequence = sequence;
+    ack->result = result;
+    ack->mcu_time_us = clock_now_us();
+    link_send(FRAME_ACK, FRAME_ACK_BYTES);
+}
+
+void send_status(void) {
+    frame_status_t *status = (frame_status_t *)link_payload();
+    port_lock_t lock = port_lock();
+    status->mcu_time_us = clock_locked_us();
+    for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) {
+        status->position_steps[axis] = motion_position(axis);
+        status->encoder_counts[axis] = quadrature_count(axis);
+    }
+    status->state = safety.state;
+    status->fault = safety.fault;
+    status->inputs = safety.inputs;
+    status->queue_depth = motion_waiting();
+    status->deadman_age_ms = safety.deadman_age_ms;
+    status->underruns = safety.underruns;
+    status->rx_overruns = serial.rx_overruns;
+    status->encoder_errors = quadrature.errors;
+    port_unlock(lock);
+    status->last_setpoint = gate.last_number;
+    status->last_reject = gate.last_reject;
+    status->boot_count = boot.boot_count;
+    status->crc_errors = serial.crc_errors;
+    status->sequence_errors = serial.sequence_errors;
+    status->rejected = gate.rejected;
+    status->expired = gate.expired;
+    status->overflows = gate.overflows;
+    status->late = gate.late;
+    link_send(FRAME_STATUS, FRAME_STATUS_BYTES);
+}

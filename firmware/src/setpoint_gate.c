@@ -1,0 +1,154 @@
+/* Which set-points may move the axes: order, time, speed, travel. */
+#include "setpoint_gate.h"
+
+#include "clock.h"
+#include "interpolator.h"
+#include "port.h"
+#include "safety.h"
+
+#define TRAVEL_MAX 1000000000L           /* keeps differences of positions within 32 bits */
+#define LATE_TICKS TICKS_PER_MS          /* a late set-point gets one control period */
+#define STOP_MS (STOP_US / 1000)
+
+gate_t gate;
+
+/* What the plan looks like at one instant. */
+typedef struct {
+    uint32_t time_us;
+    uint16_t tick, end_tick; /* now, and where the plan ends */
+    uint8_t waiting, state, inputs;
+} plan_t;
+
+void gate_start(void) { gate = (gate_t){0}; }
+
+bool gate_configured(void) {
+    for (uint8_t axis = 0; axis < AXIS_COUNT; axis++)
+        if (!gate.axis[axis].configured) return false;
+    return true;
+}
+
+static bool within_travel(int32_t steps) { return steps >= -TRAVEL_MAX && steps <= TRAVEL_MAX; }
+
+uint8_t gate_configure(const frame_configure_t *limits) {
+    uint32_t speed = limits->max_speed_steps_per_s, accel = limits->max_accel_steps_per_s2;
+    if (limits->axis >= AXIS_COUNT || speed < 1 || speed >= TIMER_HZ) return RESULT_BAD_VALUE;
+    if (!within_travel(limits->soft_min_steps) || !within_travel(limits->soft_max_steps)) return RESULT_BAD_VALUE;
+    if (limits->soft_min_steps > limits->soft_max_steps) return RESULT_BAD_VALUE;
+    /* Must be able to stop within STOP_US; 2 % of slack for limits that were rounded to whole steps. */
+    if (accel > 40000000UL || accel * 51 / 1000 * STOP_MS < speed * 50) return RESULT_BAD_VALUE;
+    uint32_t speed_q16 = (speed << 16) / TIMER_HZ;
+    uint32_t ramp_q16 = accel / 125 * 256 / 625 + 1; /* steps/s^2 to steps per tick and ms: 65536 / 20000 / 1000 */
+    uint32_t enough_q16 = speed_q16 / STOP_MS + 1;
+    if (ramp_q16 < enough_q16) ramp_q16 = enough_q16;
+    if (ramp_q16 > 0xFFFF) ramp_q16 = 0xFFFF;
+    axis_limits_t *axis = &gate.axis[limits->axis];
+    axis->speed_q16 = (uint16_t)speed_q16;
+    axis->soft_min = limits->soft_min_steps;
+    axis->soft_max = limits->soft_max_steps;
+    axis->configured = true;
+    motion_set_limits(limits->axis, (uint16_t)speed_q16, (uint16_t)ramp_q16);
+    return RESULT_OK;
+}
+
+void gate_rearm(void) { gate.have_number = false; }
+
+static void snapshot(plan_t *plan) {
+    port_lock_t lock = port_lock();
+    plan->time_us = clock_locked_us();
+    plan->tick = motion.tick;
+    plan->waiting = motion_waiting();
+    plan->state = safety.state;
+    plan->inputs = safety.inputs;
+    plan->end_tick = motion.planned_tick;
+    if (motion.mode != MOTION_SEGMENT && !plan->waiting) {
+        plan->end_tick = motion.tick;
+        for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) gate.planned[axis] = motion_position(axis);
+    }
+    port_unlock(lock);
+}
+
+/* Chooses the tick at which the set-point is reached; returns why it cannot be. */
+static uint8_t check_time(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
+    int32_t ahead_us = (int32_t)(setpoint->execute_us - plan->time_us);
+    if (ahead_us > (int32_t)HORIZON_US) return REJECT_HORIZON;
+    if (ahead_us + (int32_t)setpoint->expiry_us < 0) return REJECT_EXPIRED;
+    if (ahead_us > 0) {
+        segment->end_tick = (uint16_t)(plan->tick + (uint16_t)ahead_us / (uint16_t)TICK_US);
+        if ((int16_t)(segment->end_tick - plan->end_tick) > 0) return REJECT_NONE;
+        if ((uint16_t)ahead_us >= TICK_US) return REJECT_ORDER;
+    }
+    segment->end_tick = (uint16_t)(plan->end_tick + LATE_TICKS);
+    gate.late++;
+    return REJECT_NONE;
+}
+
+static uint8_t check_travel(const frame_setpoint_t *setpoint, uint8_t inputs, uint8_t index) {
+    const axis_limits_t *axis = &gate.axis[index];
+    int32_t wanted = setpoint->position_steps[index];
+    if (wanted < axis->soft_min || wanted > axis->soft_max) return REJECT_SOFT_LIMIT;
+    uint8_t low = (uint8_t)(1U << (2 * index));
+    if (wanted < gate.planned[index] && (inputs & low)) return REJECT_LIMIT_SWITCH;
+    if (wanted > gate.planned[index] && (inputs & (low << 1))) return REJECT_LIMIT_SWITCH;
+    return REJECT_NONE;
+}
+
+/* The step grid and the tick grid each allow for one count more than the limit. */
+static uint8_t check_axes(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
+    uint8_t ticks = (uint8_t)(segment->end_tick - plan->end_tick);
+    uint16_t per_step_q16 = (uint16_t)(0xFFFFU / ticks);
+    for (uint8_t i = 0; i < AXIS_COUNT; i++) {
+        uint8_t reject = check_travel(setpoint, plan->inputs, i);
+        if (reject) return reject;
+        int32_t wanted = setpoint->position_steps[i];
+        int32_t delta = wanted - gate.planned[i];
+        uint32_t distance = (uint32_t)(delta < 0 ? -delta : delta);
+        uint16_t most = (uint16_t)(((uint32_t)gate.axis[i].speed_q16 * (uint16_t)(ticks + 1)) >> 16) + 1;
+        if (distance > most) return REJECT_SPEED;
+        segment->rate_q16[i] = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
+        segment->target[i] = (uint16_t)wanted;
+    }
+    return REJECT_NONE;
+}
+
+/* The interrupt may have stopped the axes since the snapshot. */
+static uint8_t commit(const segment_t *segment) {
+    uint8_t reject = REJECT_STATE;
+    port_lock_t lock = port_lock();
+    if (safety.state == STATE_ARMED || safety.state == STATE_RUNNING) {
+        motion_append(segment);
+        safety_feed();
+        reject = REJECT_NONE;
+    }
+    port_unlock(lock);
+    return reject;
+}
+
+static uint8_t judge(const frame_setpoint_t *setpoint) {
+    plan_t plan;
+    segment_t segment;
+    snapshot(&plan);
+    if (plan.state != STATE_ARMED && plan.state != STATE_RUNNING) return REJECT_STATE;
+    if (gate.have_number && (int16_t)(setpoint->number - gate.last_number) <= 0) return REJECT_ORDER;
+    if (plan.waiting >= QUEUE_CAPACITY) return REJECT_OVERFLOW;
+    uint8_t reject = check_time(setpoint, &plan, &segment);
+    if (!reject) reject = check_axes(setpoint, &plan, &segment);
+    if (!reject) reject = commit(&segment);
+    return reject;
+}
+
+void gate_take(const frame_setpoint_t *setpoint) {
+    uint8_t reject = judge(setpoint);
+    if (!reject) {
+        gate.last_number = setpoint->number;
+        gate.have_number = true;
+        for (uint8_t i = 0; i < AXIS_COUNT; i++) gate.planned[i] = setpoint->position_steps[i];
+        return;
+    }
+    gate.last_reject = reject;
+    if (reject == REJECT_EXPIRED)
+        gate.expired++;
+    else if (reject == REJECT_OVERFLOW)
+        gate.overflows++;
+    else
+        gate.rejected++;
+}

@@ -1,0 +1,36 @@
+/* Which set-points may move the axes: order, time, speed, travel. */
+#ifndef SETPOINT_GATE_H
+#define SETPOINT_GATE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "frames.h"
+
+typedef struct {
+    bool configured;
+    uint16_t speed_q16; /* steps per tick */
+    int32_t soft_min, soft_max;
+} axis_limits_t;
+
+typedef struct {
+    axis_limits_t axis[AXIS_COUNT];
+    int32_t planned[AXIS_COUNT]; /* where the last accepted set-point ends */
+    uint16_t last_number;
+    bool have_number;
+    uint8_t last_reject;
+    uint16_t rejected, expired, overflows, late;
+} gate_t;
+
+extern gate_t gate;
+
+void gate_start(void);
+bool gate_configured(void);
+/* Sets the limits of one axis; returns a RESULT_.... */
+uint8_t gate_configure(const frame_configure_t *limits);
+/* Forgets the numbers seen: the next set-point starts a new count. */
+void gate_rearm(void);
+/* Queues the set-point, or refuses and counts it. */
+void gate_take(const frame_setpoint_t *setpoint);
+
+#endif

@@ -1,0 +1,185 @@
+"""Force in, motion out: m a + c v + k x = force + offset, simulated freely, from recorded force or under the recorded controller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.dataset import Recording
+from host.diagnosis.effect import Parameter, Port
+from host.diagnosis.force_kernel import run_axis, slot_array
+from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.nominal import NominalSpec
+from host.diagnosis.operators import fill, smooth_derivatives
+
+Array = npt.NDArray[np.float64]
+SMOOTHING_S = 0.02
+FOLLOWER_RAD_S = 20.0
+
+
+class Axis:
+    """Nominal model of kind `axis`.
+
+    With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and without a spring, the
+    axis would run away from any recording: then it is held to the recorded motion by a soft follower, and the force the follower needs
+    (zero if nothing is missing) is compared instead.
+    """
+
+    kind = "axis"
+
+    def __init__(self, spec: NominalSpec) -> None:
+        if spec.axis is None:
+            raise ValueError("axis: found nothing, wanted a section")
+        self.spec = spec.axis
+        self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
+        self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
+        outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
+        if self.spec.controller is not None or not self.free_run:
+            outputs.append(Output(self.spec.input, force, name))
+        self.outputs = tuple(outputs)
+        self.ports = (Port(name, "force", name, tuple(o.channel for o in outputs)), Port(f"{name}_drive", "timing+limit", name, (self.spec.output,)),
+                      Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)))
+        defaults = {"mass": (1.0, f"{force} s2/{motion}"), "damping": (1.0, f"{force} s/{motion}"), "stiffness": (1.0, f"{force}/{motion}"),
+                    "offset": (0.0, force)}
+        parameters = []
+        for term in self.spec.terms:
+            value, free = spec.start(term, defaults[term][0])
+            low, high = (value, value) if not free else (-np.inf, np.inf) if term == "offset" else (1e-12, 1e12)
+            parameters.append(Parameter(term, defaults[term][1], (value,), low, high, log=term != "offset" and free))
+        self.given = [term for term in self.spec.terms if term in spec.parameters]
+        self.parameters = tuple(parameters)
+        self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
+        if "stiffness" not in self.spec.terms:
+            self.taken |= {"softening:"}
+        self.quiet_inputs = (self.spec.input,)
+
+    def prepare(self, recording: Recording) -> Piece:
+        """Input up-sampled to half sub-steps; start taken from the measured motion."""
+        spec = self.spec
+        names = [spec.input]
+        if spec.controller is not None:
+            names += [name for name in (spec.controller.reference, spec.controller.added) if name in recording.channels]
+        y = stack(recording, [o.channel for o in self.outputs])
+        piece = Piece(recording, y, recording.fit, recording.heldout, filled(recording, names))
+        motion = fill(recording.channels[spec.output])
+        window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
+        x, v, a = smooth_derivatives(motion, recording.dt_s, window)
+        name = spec.subsystem
+        reads = {"position": (x, v), "velocity": (np.cumsum(x) * recording.dt_s, x), "acceleration": (np.zeros_like(x), np.zeros_like(x))}
+        piece.inputs[f"motion:{name}"] = reads[spec.reads][0]
+        begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
+        piece.extra.update(begin=np.array(begin), x=x, v=v, substeps=self._substeps(piece), tolerance=tolerance_of(motion, float(np.ptp(motion))))
+        piece.extra["units"] = {**self.units, name: self.units[spec.input], f"motion:{name}": self.units[spec.output],
+                                f"{name}_drive": self.units[spec.input], f"{name}_reading": self.units[spec.output]}
+        piece.extra["steps"] = upsample(piece.inputs[spec.input], 2 * piece.extra["substeps"], spec.hold)
+        if not self.free_run:
+            piece.y = np.zeros_like(y)
+            piece.y[:, ~np.isfinite(recording.channels[spec.output])] = np.nan
+        return piece
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """Equation-error estimate in the frequency domain where the TOML gives no value: U = (-w^2 m + i w c + k) X."""
+        given = np.array([p.grid[0] for p in self.parameters])
+        if len(self.given) == len(self.spec.terms):
+            return given
+        rows, sides = [], []
+        for piece in pieces:
+            if not piece.fit.any():
+                continue
+            u, y = piece.inputs[self.spec.input], fill(piece.recording.channels[self.spec.output])
+            window = np.hanning(u.size)
+            U, Y = np.fft.rfft(window * (u - u.mean())), np.fft.rfft(window * (y - y.mean()))
+            s = 2j * np.pi * np.fft.rfftfreq(u.size, piece.recording.dt_s)
+            keep = (np.abs(s) > 0) & (np.abs(U) > 0.02 * np.max(np.abs(U)))
+            X = Y[keep] / s[keep] ** ("position", "velocity", "acceleration").index(self.spec.reads)
+            columns = {"mass": s[keep] ** 2 * X, "damping": s[keep] * X, "stiffness": X, "offset": np.zeros_like(X)}
+            rows.append(np.array([columns[term] for term in self.spec.terms]).T)
+            sides.append(U[keep])
+        A, b = np.concatenate(rows), np.concatenate(sides)
+        size = np.linalg.norm(A, axis=0) + 1e-300
+        A, b = np.concatenate((A.real, A.imag)), np.concatenate((b.real, b.imag))
+        found = np.linalg.lstsq(A / size, b, rcond=1e-12)[0] / size
+        pick = [value if term in self.given or not np.isfinite(f) or (p.log and f <= 0) else f
+                for term, value, f, p in zip(self.spec.terms, given, found, self.parameters, strict=True)]
+        return np.array(pick)
+
+    def _substeps(self, piece: Piece) -> int:
+        return 2 if self.spec.controller is not None or "stiffness" not in self.spec.terms else 3
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Outputs in free run. Shape (outputs, n)."""
+        spec, extra = self.spec, piece.extra
+        linear = np.zeros(4)
+        for term, value in zip(spec.terms, theta, strict=True):
+            linear[("mass", "damping", "stiffness", "offset").index(term)] = value
+        if "mass" not in spec.terms:
+            linear[0] = 1.0
+        steps = extra["steps"]
+        drive = [act for act in acts if act[0].port.name == f"{spec.subsystem}_drive"]
+        if drive:
+            changed = apply_acts(piece.inputs[spec.input], drive, f"{spec.subsystem}_drive", piece, None)
+            steps = upsample(changed, 2 * extra["substeps"], spec.hold)
+        slots = [candidate.effect.slots(values, candidate.form) for candidate, values in acts if candidate.effect.slots is not None]
+        p = slot_array([*slots, {"stiffness": float(linear[2])}])
+        load = np.zeros(piece.n)
+        if spec.controller is not None:
+            c = spec.controller
+            control = np.array([c.position_gain_per_s, c.velocity_gain, c.force_gain, c.force_limit])
+            reference = np.vstack([piece.inputs[c.reference], piece.inputs.get(c.added, load)])
+        else:
+            control, reference = np.zeros(0), load[None, :]
+        if not self.free_run:
+            return self._follow(piece, linear, steps, p)
+        run = run_axis(steps, extra["substeps"], piece.recording.dt_s, linear, p, extra["begin"], load, control, reference,
+                       piece.start.get(spec.subsystem, 0.0))
+        motion = run[("position", "velocity", "acceleration").index(spec.reads)]
+        motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
+        return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
+
+    def _follow(self, piece: Piece, linear: Array, steps: Array, p: Array) -> Array:
+        """Force error along the measured motion: recorded input against what the equation of motion needs, both smoothed alike."""
+        from host.diagnosis.force_kernel import along
+
+        extra, dt = piece.extra, piece.recording.dt_s
+        window = max(7, round(SMOOTHING_S / dt) | 1)
+        x, v = extra["x"], extra["v"]
+        a = np.gradient(v, dt)
+        need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
+        need = need + along(x, v, a, np.zeros(piece.n), piece.recording.time_s, dt, extra["tolerance"], piece.start.get(self.spec.subsystem, 0.0), p)
+        force = smooth_derivatives(steps[:: 2 * extra["substeps"]][: piece.n], dt, window)[0]
+        return np.asarray(need - force)[None, :]
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """Motion at the force port, force at the drive, reading at the sensor."""
+        if port.name == f"{self.spec.subsystem}_drive":
+            return piece.inputs[self.spec.input]
+        return piece.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else piece.extra["x"]
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of size)."""
+        if len(self.outputs) == 2 or not self.free_run:
+            return np.asarray(residual[-1])
+        if port.name.endswith("_reading"):
+            return np.asarray(residual[0])
+        size = dict(zip(self.spec.terms, theta, strict=True)).get("stiffness", 1.0)
+        return np.asarray(residual[0] * size)
+
+
+def upsample(u: Array, factor: int, hold: str) -> Array:
+    """Input at `factor` points per sample, (n * factor + 1,). zero: held; linear; band_limited: sinc (whole record, by Fourier)."""
+    n = u.size
+    if hold == "zero":
+        return np.append(np.repeat(u, factor), u[-1])
+    if hold == "linear":
+        return np.append(np.interp(np.arange(n * factor) / factor, np.arange(n), u), u[-1])
+    from scipy.signal import resample
+
+    pad = min(n - 1, 400)
+    mirrored = np.concatenate((u[pad:0:-1], u, u[-2: -pad - 2: -1]))
+    size = 2 ** math.ceil(math.log2(mirrored.size))
+    mirrored = np.pad(mirrored, (0, size - mirrored.size), mode="linear_ramp", end_values=mirrored[0])
+    fine = resample(mirrored, size * factor)
+    return np.asarray(fine[pad * factor: (pad + n) * factor + 1])

@@ -1,0 +1,24 @@
+"""Backlash: the output follows only after a gap is taken up; it remembers the last reversal."""
+
+from __future__ import annotations
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.operators import play
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Width of the gap."""
+    low = max(s.tolerance, 1e-4 * s.span)
+    return (Parameter("width", s.unit, spread(max(low, 4e-3 * s.span), 0.6 * s.span, 10), low, 2.0 * s.span, log=True),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Play operator of half-width p[0] / 2."""
+    return play(signal, 0.5 * p[0], c.start)
+
+
+EFFECTS = (
+    Effect("backlash", "motion", 40, parameters, "After every reversal the output rests until a gap of {width} is taken up.",
+           "y = play(x, width/2)", apply),
+)

@@ -1,0 +1,25 @@
+"""Compliance: a deflection in proportion to load between two points, in phase with it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Deflection per load."""
+    return (Parameter("compliance", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), linear=True),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """The output gives way by p[0] load."""
+    return np.asarray(signal + p[0] * c.load)
+
+
+SAYS = "Between input and output there is a spring: {source} moves the output by {compliance} of its size."
+EFFECTS = (
+    Effect("compliance", "motion", 70, per_load, SAYS, "y = x + compliance*load", apply, side="output", source="load"),
+    Effect("compliance", "mix", 20, per_load, SAYS, "y = x + compliance*load", apply, source="load"),
+)

@@ -1,0 +1,25 @@
+"""Coupling: another channel moves this one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Gain from the other channel."""
+    return (Parameter("gain", f"{s.unit}/{s.source_unit}" if s.unit != s.source_unit else "", (s.need / s.source_rms,), linear=True),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Adds p[0] times the other channel."""
+    return np.asarray(signal + p[0] * c.load)
+
+
+EFFECTS = (
+    Effect("coupling", "motion", 73, parameters, "{source} moves this channel too: {gain} of its size.", "y = x + gain*other", apply,
+           side="output", source="other"),
+    Effect("coupling", "mix", 21, parameters, "{source} moves this reading too: {gain} of its size.", "y = x + gain*other", apply, source="other"),
+)

@@ -1,0 +1,54 @@
+"""Creep: deflection or force goes on changing while the input rests (standard linear solid)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.operators import lag
+
+
+
+def taus(s: Scale) -> Parameter:
+    """Time constant between a few samples and the whole recording."""
+    return Parameter("time_constant", "s", spread(max(10 * s.dt_s, 0.01 * s.duration_s), 0.3 * s.duration_s, 4), 3 * s.dt_s, 3 * s.duration_s, log=True)
+
+
+def of_motion(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Slow share of the motion and its time constant."""
+    return (Parameter("slow_share", "", (s.need / s.span,), -5.0, 5.0, linear=True), taus(s))
+
+
+def of_load(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Slow deflection per load and its time constant."""
+    return (Parameter("compliance", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), linear=True), taus(s))
+
+
+def force(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Stiffness of the branch that relaxes, and its time constant."""
+    return (Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, np.inf, linear=True), taus(s))
+
+
+def apply_motion(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Part p[0] of the motion arrives late, with time constant p[1]."""
+    return np.asarray(signal + p[0] * (lag(signal, c.dt_s, p[1]) - signal))
+
+
+def apply_load(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Slow deflection under load."""
+    return np.asarray(signal + p[0] * lag(c.load, c.dt_s, p[1]))
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """Maxwell branch beside the spring."""
+    return {"maxwell_stiffness": p[0], "maxwell_time": p[1]}
+
+
+EFFECTS = (
+    Effect("creep_relaxation", "motion", 55, of_motion, "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
+           "y = x + slow_share*(lag(x, time_constant) - x)", apply_motion, timed=True),
+    Effect("creep_relaxation", "motion", 72, of_load, "Under {source} the output goes on giving way over {time_constant}.",
+           "y = x + compliance*lag(load, time_constant)", apply_load, side="output", source="load", timed=True),
+    Effect("creep_relaxation", "force", 21, force, "Part of the force, {stiffness}, relaxes over {time_constant}.",
+           "F = stiffness*(x - lag(x, time_constant))", slots=slots, timed=True),
+)

@@ -1,0 +1,40 @@
+"""Periodic disturbance: beat, respiration (over time) or lead-screw period (over place)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Amplitudes of sine and cosine, and frequency or pitch."""
+    pair = (Parameter("sine", s.unit, (s.need,), linear=True), Parameter("cosine", s.unit, (s.need,), linear=True))
+    if form == "place":
+        return (*pair, Parameter("pitch", s.motion_unit or s.unit, spread(s.motion_span / 40.0, s.motion_span, 60), s.motion_span / 200.0,
+                                 2.0 * s.motion_span, log=True, step=3e-3))
+    top = min(0.2 / s.dt_s, 8.0)
+    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    return (*pair, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Adds a sine over time or over place."""
+    phase = 2.0 * np.pi * (c.motion / p[2] if form == "place" else c.time_s * p[2])
+    return np.asarray(signal + p[0] * np.sin(phase) + p[1] * np.cos(phase))
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """A sine over time or over place, as a force."""
+    return {"sine": p[0], "cosine": p[1], ("pitch" if form == "place" else "frequency"): p[2]}
+
+
+SAYS = "A periodic disturbance rides on the signal."
+EFFECTS = (
+    Effect("periodic_disturbance", "motion", 75, parameters, SAYS, "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, side="output", timed=True),
+    Effect("periodic_disturbance", "motion", 25, parameters, SAYS, "y = x + sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)", apply, forms=("place",)),
+    Effect("periodic_disturbance", "force", 30, parameters, SAYS, "F = sine*sin(2 pi f t) + cosine*cos(2 pi f t)", slots=slots, timed=True),
+    Effect("periodic_disturbance", "force", 31, parameters, SAYS, "F = sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)", slots=slots, forms=("place",)),
+    Effect("periodic_disturbance", "mix", 81, parameters, SAYS, "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, timed=True),
+)

@@ -1,0 +1,27 @@
+"""Plastic set: the rest shape shifts after an overload and stays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.operators import overload
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Yield level, and set per excess."""
+    size = max(abs(s.low), abs(s.high))
+    return (Parameter("set_per_excess", "", (s.need / size,), -1.0, 1.0, linear=True),
+            Parameter("yield", s.unit, tuple(f * size for f in (0.5, 0.7, 0.85, 0.95)), 0.2 * size, size, step=0.1 * size))
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Offset that grows with each excess beyond the yield level."""
+    return np.asarray(signal + p[0] * overload(signal, p[1]))
+
+
+EFFECTS = (
+    Effect("plastic_set", "motion", 57, parameters, "Beyond {yield} the rest position shifts, and stays shifted, by {set_per_excess} of the excess.",
+           "y = x + set_per_excess*max excess of |x| over yield so far", apply),
+)

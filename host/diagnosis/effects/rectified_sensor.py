@@ -1,0 +1,23 @@
+"""Rectified sensor: the reading has lost its sign."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Share of the sign that is lost (1: all of it)."""
+    return (Parameter("share", "", (1.0,), 0.0, 1.0, step=0.3),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Magnitude instead of value."""
+    return np.asarray(signal + p[0] * (np.abs(signal) - signal))
+
+
+EFFECTS = (
+    Effect("rectified_sensor", "drift", 90, parameters, "The sensor gives the magnitude only: its reading folds at zero.", "y = |x|", apply),
+)

@@ -1,0 +1,30 @@
+"""Softening: gain or stiffness changes with time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Relative change of gain per second."""
+    return (Parameter("rate", "1/s", (s.need / (s.span * s.duration_s),), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Gain that grows in proportion to time, about the middle of the motion."""
+    return np.asarray(signal + p[0] * c.time_s * signal)
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """Relative change of stiffness per second."""
+    return {"softening": p[0]}
+
+
+EFFECTS = (
+    Effect("softening", "motion", 20, parameters, "The gain changes by {rate} of itself as time goes on.", "y = x*(1 + rate*t)", apply, timed=True),
+    Effect("softening", "force", 22, parameters, "The stiffness changes by {rate} of itself as time goes on.", "F = stiffness*rate*t*x",
+           slots=slots, timed=True),
+)

@@ -1,0 +1,32 @@
+"""Static nonlinearity: any other memoryless curve, traced the same way up and down (cubic polynomial)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Quadratic and cubic bend, as displacement at the ends of the range."""
+    return (Parameter("quadratic", s.unit, (s.need,), linear=True), Parameter("cubic", s.unit, (s.need,), linear=True),
+            Parameter("middle", s.unit, (0.5 * (s.low + s.high),), 0.5 * (s.low + s.high), 0.5 * (s.low + s.high)),
+            Parameter("half_range", s.unit, (0.5 * s.span,), 0.5 * s.span, 0.5 * s.span))
+
+
+def force(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Force that depends on place: amplitudes of the square and the cube over the travel."""
+    return (Parameter("quadratic", s.unit, (s.need,), linear=True), Parameter("cubic", s.unit, (s.need,), linear=True))
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Polynomial of the place in the range; mean and slope stay with the nominal gain."""
+    u = (signal - p[2]) / p[3]
+    return np.asarray(signal + p[0] * (u * u - 1.0 / 3.0) + p[1] * (u**3 - 0.6 * u))
+
+
+EFFECTS = (
+    Effect("static_nonlinearity", "motion", 31, parameters, "The curve from input to output is bent, the same way up and down.",
+           "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5),  u = (x - middle)/half_range", apply),
+)

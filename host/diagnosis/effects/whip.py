@@ -1,0 +1,25 @@
+"""Whip: the roll output varies with roll angle, as of a pre-curved shaft in a curved vessel; jumps when strong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.operators import whip
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Amplitude and phase."""
+    return (Parameter("amplitude", "rad", (0.1, 0.4, 0.9, 1.5), 1e-3, 6.0, log=True),
+            Parameter("phase", "rad", tuple(np.arange(8) * np.pi / 4), -20.0, 20.0, step=0.3))
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Solution of y + A sin(y + phase) = x on the branch that is followed."""
+    return whip(signal, p[0], p[1])
+
+
+EFFECTS = (
+    Effect("whip", "turn", 42, parameters, "The output turns unevenly with roll angle: amplitude {amplitude}.", "y + amplitude*sin(y + phase) = x", apply),
+)

@@ -1,0 +1,186 @@
+"""Every force term of the vocabulary in one kernel: along a measured motion, or inside the equation of motion of an axis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Array = npt.NDArray[np.float64]
+SLOTS = (
+    "coulomb", "static_excess", "stribeck_speed", "presliding", "presliding_distance", "presliding_maxwell", "load_friction",
+    "load_friction_distance", "viscous", "drag", "viscous_asymmetry", "quadratic", "cubic", "maxwell_stiffness", "maxwell_time",
+    "softening", "sine", "cosine", "pitch", "frequency", "second_mass", "second_omega", "second_damping",
+    "contact_stiffness", "contact_place", "contact_exponent", "contact_damping", "stiffness", "gap", "backward_ratio",
+)
+PLACE = {name: index for index, name in enumerate(SLOTS)}
+(COULOMB, EXCESS, STRIBECK, PRESLIDING, PRE_DISTANCE, PRE_MAXWELL, LOAD, LOAD_DISTANCE, VISCOUS, DRAG, ASYMMETRY, QUADRATIC, CUBIC,
+ MAXWELL_K, MAXWELL_T, SOFTENING, SINE, COSINE, PITCH, FREQUENCY, MASS2, OMEGA2, DAMPING2, CONTACT_K, CONTACT_X, CONTACT_N, CONTACT_C,
+ STIFFNESS, GAP, BACKWARD) = range(len(SLOTS))
+TWO_PI = 2.0 * math.pi
+
+
+@njit(cache=True)
+def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
+    """Force without dry friction: against the motion, to be overcome by the input. `slow`: x after the lag of the Maxwell branch."""
+    force = p[VISCOUS] * v + p[DRAG] * v * abs(v) + p[ASYMMETRY] * abs(v) + p[QUADRATIC] * x * x + p[CUBIC] * x * x * x
+    force += p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x
+    force -= p[STIFFNESS] * min(max(x, -p[GAP]), p[GAP])
+    if p[PITCH] > 0.0:
+        force += p[SINE] * math.sin(TWO_PI * x / p[PITCH]) + p[COSINE] * math.cos(TWO_PI * x / p[PITCH])
+    if p[FREQUENCY] > 0.0:
+        force += p[SINE] * math.sin(TWO_PI * t * p[FREQUENCY]) + p[COSINE] * math.cos(TWO_PI * t * p[FREQUENCY])
+    depth = x - p[CONTACT_X]
+    if p[CONTACT_N] > 0.0 and depth > 0.0:
+        force += depth ** p[CONTACT_N] * (p[CONTACT_K] + p[CONTACT_C] * v)
+    return force
+
+
+@njit(cache=True)
+def hysteresis(z: Array, dx: float, load: float, p: Array) -> float:
+    """Presliding and load-dependent friction after a step dx; `z` (5,) is moved on: four Maxwell elements (or one of Dahl), and the load's."""
+    force = 0.0
+    side = 1.0 if dx > 0.0 else -1.0
+    if p[PRESLIDING] != 0.0:
+        if p[PRE_MAXWELL] > 0.5:
+            distance = 0.25 * p[PRE_DISTANCE]
+            for j in range(4):
+                z[j] = min(max(z[j] + dx / distance, -1.0), 1.0)
+                force += 0.25 * p[PRESLIDING] * z[j]
+                distance *= 2.0
+        else:
+            z[0] = side + (z[0] - side) * math.exp(-abs(dx) / p[PRE_DISTANCE])
+            force += p[PRESLIDING] * z[0]
+    if p[LOAD] != 0.0:
+        z[4] = side + (z[4] - side) * math.exp(-abs(dx) / p[LOAD_DISTANCE])
+        force += p[LOAD] * abs(load) * z[4]
+    return force * (1.0 + p[BACKWARD] * (1.0 if force < 0.0 else 0.0))
+
+
+@njit(cache=True)
+def start_state(z: Array, start: float, load: float, p: Array) -> float:
+    """Friction states such that together they hold `start` at the first sample, as far as they can; returns Coulomb's share."""
+    level = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD] * abs(load)
+    share = min(max(start / level, -1.0), 1.0) if level != 0.0 else 0.0
+    z[:] = share
+    return share
+
+
+@njit(cache=True)
+def along(x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tolerance: float, start: float, p: Array) -> Array:
+    """Force of all terms along a measured motion x, v, a (n,)."""
+    out = np.empty(x.size)
+    z = np.zeros(5)
+    dry = start_state(z, start, load[0], p)
+    slow = x[0]
+    decay = math.exp(-dt_s / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
+    x2, v2 = x[0], 0.0
+    steps = max(1, int(math.ceil(p[OMEGA2] * dt_s / 0.2)))
+    h = dt_s / steps
+    for i in range(x.size):
+        dx = x[i] - x[i - 1] if i > 0 else 0.0
+        slow = x[i] + (slow - x[i]) * decay
+        dry = min(max(dry + dx / tolerance, -1.0), 1.0)
+        level = p[COULOMB]
+        if p[STRIBECK] > 0.0:
+            level += p[EXCESS] * math.exp(-((v[i] / p[STRIBECK]) ** 2))
+        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + level * dry + hysteresis(z, dx, load[i], p)
+        if p[MASS2] > 0.0:
+            k2, c2 = p[OMEGA2] * p[OMEGA2], 2.0 * p[DAMPING2] * p[OMEGA2]
+            for _ in range(steps):
+                v2 += h * (k2 * (x[i] - x2) + c2 * (v[i] - v2))
+                x2 += h * v2
+            out[i] += p[MASS2] * (k2 * (x[i] - x2) + c2 * (v[i] - v2))
+    return out
+
+
+@njit(cache=True)
+def _rates(state: Array, u: float, t: float, slow: float, held: float, m: float, c: float, k: float, p: Array, rate: Array) -> None:
+    """Rates of (x, v, x2, v2)."""
+    x, v = state[0], state[1]
+    force = u - c * v - k * x - smooth_force(x, v, t, slow, p) - held
+    if p[MASS2] > 0.0:
+        pull = p[OMEGA2] * p[OMEGA2] * (x - state[2]) + 2.0 * p[DAMPING2] * p[OMEGA2] * (v - state[3])
+        force -= p[MASS2] * m * pull
+        rate[2], rate[3] = state[3], pull
+    rate[0], rate[1] = v, force / m
+
+
+@njit(cache=True)
+def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begin: Array, load: Array, control: Array, reference: Array,
+             start: float) -> Array:
+    """Motion of m a + c v + k x + (force terms) = u + offset from recorded or controlled input.
+
+    Arguments:
+        u: (n * 2 * substeps + 1,) input at half sub-steps. linear: m, c, k, offset. begin: x and v at the first sample.
+        control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is added. start: friction held at first.
+    Returns:
+        (4, n): position, velocity, acceleration, input used.
+    Runge-Kutta for the smooth forces; Coulomb friction as an impulse at the end of each sub-step, so that it can hold (Moreau 1988).
+    """
+    n = load.size
+    out = np.empty((4, n))
+    m, c, k, offset = linear[0], linear[1], linear[2], linear[3]
+    h = dt_s / substeps
+    state, rate = np.zeros(4), np.zeros((4, 4))
+    state[0], state[1], state[2], state[3] = begin[0], begin[1], begin[0], begin[1]
+    z = np.zeros(5)
+    start_state(z, start, load[0], p)
+    held = hysteresis(z, 0.0, load[0], p)
+    slow = begin[0]
+    decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
+    previous, drive = begin[0], 0.0
+    for i in range(n):
+        if control.size:
+            drive = control[2] * control[1] * (control[0] * (reference[0, i] - state[0]) - (state[0] - previous) / dt_s)
+            if reference.shape[0] > 1:
+                drive += reference[1, i]
+            drive = min(max(drive, -control[3]), control[3])
+            previous = state[0]
+        out[0, i], out[1, i] = state[0], state[1]
+        out[3, i] = drive if control.size else u[i * 2 * substeps]
+        for j in range(substeps):
+            place = (i * substeps + j) * 2
+            u0, u1, u2 = (drive, drive, drive) if control.size else (u[place], u[place + 1], u[place + 2])
+            t = i * dt_s + j * h
+            x_old, v_old = state[0], state[1]
+            dry = p[COULOMB]
+            if p[STRIBECK] > 0.0:
+                dry += p[EXCESS] * math.exp(-((v_old / p[STRIBECK]) ** 2))
+            _rates(state, u0 + offset, t, slow, held, m, c, k, p, rate[0])
+            if j == 0:
+                out[2, i] = rate[0, 1] - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(rate[0, 1], -dry / m), dry / m)))
+            stuck = dry > 0.0 and v_old == 0.0 and abs(rate[0, 1]) * m <= dry
+            _rates(state + 0.5 * h * rate[0], u1 + offset, t + 0.5 * h, slow, held, m, c, k, p, rate[1])
+            _rates(state + 0.5 * h * rate[1], u1 + offset, t + 0.5 * h, slow, held, m, c, k, p, rate[2])
+            _rates(state + h * rate[2], u2 + offset, t + h, slow, held, m, c, k, p, rate[3])
+            for s in range(4):
+                state[s] += h / 6.0 * (rate[0, s] + 2.0 * rate[1, s] + 2.0 * rate[2, s] + rate[3, s])
+            if stuck:
+                state[0], state[1] = x_old, 0.0
+            elif dry > 0.0:
+                side = v_old if v_old != 0.0 else state[1]
+                dv = dry * h / m
+                v_free = state[1]
+                if side > 0.0:
+                    state[1] = v_free - dv if v_free - dv > 0.0 else min(0.0, v_free + dv)
+                else:
+                    state[1] = v_free + dv if v_free + dv < 0.0 else max(0.0, v_free - dv)
+                state[0] += 0.5 * h * (state[1] - v_free)
+            slow = state[0] + (slow - state[0]) * decay
+            held = hysteresis(z, state[0] - x_old, load[i], p)
+            if not abs(state[0]) < 1e12:
+                out[:, i:] = 1e12
+                return out
+    return out
+
+
+def slot_array(filled: list[dict[str, float]]) -> Array:
+    """Parameter array of the kernel from the slots that the active effects fill."""
+    p = np.zeros(len(SLOTS))
+    for slots in filled:
+        for name, value in slots.items():
+            p[PLACE[name]] = value
+    return p

@@ -1,0 +1,124 @@
+"""Sensor noise from the quiescent parts of a recording: level, colour, wild samples. Never from the residual to be explained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.operators import fill, quantum
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+ORDER = 3
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one channel: `sigma` in its unit, `ar` (p,) coefficients of e[t] = sum ar[k] e[t-1-k] + w, and its source."""
+
+    sigma: float
+    ar: Array
+    source: str
+
+    @property
+    def correlation_samples(self) -> float:
+        """Integrated autocorrelation time in samples (1 for white noise)."""
+        gain = 1.0 - float(np.sum(self.ar))
+        flat = float(np.sum(autocovariance_of(self.ar)[:1]))
+        return float(np.clip(1.0 / (gain * gain * flat), 1.0, 1e4)) if gain > 0 and flat > 0 else 1.0
+
+    def whiten(self, residual: Array) -> Array:
+        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN beside missing samples."""
+        out = residual.copy()
+        for k, a in enumerate(self.ar):
+            out[k + 1:] -= a * residual[: -k - 1]
+        out[: self.ar.size] = np.nan
+        return out / (self.sigma / np.sqrt(autocovariance_of(self.ar)[0]))
+
+
+def autocovariance_of(ar: Array, length: int = 400) -> Array:
+    """Autocovariance at lag 0 of the process with unit innovations, by its impulse response. Shape (1,)."""
+    response = np.zeros(length)
+    response[0] = 1.0
+    for t in range(1, length):
+        for k in range(min(ar.size, t)):
+            response[t] += ar[k] * response[t - 1 - k]
+    return np.array([float(response @ response)])
+
+
+def quiescent(inputs: list[Array], dt_s: float, timed: bool) -> Mask:
+    """Samples at which no input has moved (beyond resolution and 0.2 % of range) for half a second around them."""
+    half = max(5, int(round(0.25 / dt_s))) if timed else 5
+    still = np.ones(inputs[0].size, dtype=bool)
+    for values in inputs:
+        line = fill(values)
+        span = np.ptp(line)
+        limit = max(2.1 * quantum(values), 0.002 * span)
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, half, mode="edge"), 2 * half + 1)
+        still &= (windows.max(axis=1) - windows.min(axis=1)) <= limit
+    return still
+
+
+def runs(mask: Mask, shortest: int) -> list[slice]:
+    """Stretches of True at least `shortest` long."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
+    return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= shortest]
+
+
+def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
+    """Noise of one channel from several recordings. `outputs[i]` (n_i,), `still[i]` its quiescent samples."""
+    pieces = []
+    for values, mask in zip(outputs, still, strict=True):
+        for part in runs(mask & np.isfinite(values), 30):
+            piece = values[part]
+            line = np.polynomial.polynomial.polyfit(np.arange(piece.size), piece, 1)
+            pieces.append(piece - np.polynomial.polynomial.polyval(np.arange(piece.size), line))
+    step = max((quantum(values) for values in outputs), default=0.0)
+    floor = step / np.sqrt(12.0)
+    if sum(piece.size for piece in pieces) < 100:
+        return Noise(max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)")
+    lags = np.zeros(ORDER + 1)
+    count = np.zeros(ORDER + 1)
+    for piece in pieces:
+        spread = 1.4826 * np.median(np.abs(piece - np.median(piece))) + 1e-300
+        tame = np.clip(piece, -5 * spread, 5 * spread) if spread > 1e-200 else piece
+        for k in range(ORDER + 1):
+            lags[k] += tame[: tame.size - k] @ tame[k:]
+            count[k] += tame.size - k
+    lags /= count
+    sigma = float(np.sqrt(max(lags[0], 0.0)))
+    if sigma <= floor:
+        return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
+    return Noise(sigma, _autoregression(lags), "quiescent parts")
+
+
+def _autoregression(lags: Array) -> Array:
+    from scipy.linalg import solve_toeplitz
+
+    damped = lags.copy()
+    damped[0] *= 1.0 + 1e-6
+    return np.asarray(solve_toeplitz(damped[:-1], damped[1:]))
+
+
+def _high_frequency(outputs: list[Array]) -> float:
+    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum."""
+    from scipy.signal import welch
+
+    spread = []
+    for values in outputs:
+        if np.count_nonzero(np.isfinite(values)) > 64:
+            line = fill(values)
+            _, power = welch(line, fs=1.0, nperseg=min(256, line.size), window="blackman")
+            spread.append(np.sqrt(0.5 * np.quantile(power[1:-1], 0.05)))
+    return float(np.median(spread)) if spread else 0.0
+
+
+def wild(values: Array, sigma: float) -> Mask:
+    """Samples that lie alone, far (12 sigma and 8 local spreads) from the median of their seven neighbours."""
+    line = fill(values)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, 3, mode="edge"), 7)
+    middle = np.median(windows, axis=1)
+    spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
+    return np.asarray((np.abs(line - middle) > 12.0 * sigma + 8.0 * spread) & np.isfinite(values))

@@ -1,0 +1,153 @@
+"""The nominal TOML: which columns are which channels, how recordings are split, and which law is taken for granted."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from host.cli.contract_io import BadInput, Request, validate
+
+
+class ChannelSpec(Request):
+    """One channel: SI value = sign * scale * column + offset."""
+
+    column: str
+    scale: float = 1.0
+    unit: str = ""
+    sign: Literal[-1, 1] = 1
+    offset: float = 0.0
+
+
+class PieceSpec(Request):
+    """One recording inside a file: `rows` first (inclusive) and last (exclusive)."""
+
+    name: str
+    rows: list[int] = Field(min_length=2, max_length=2)
+    file: str = "*"
+
+
+class DataSpec(Request):
+    """Where the recordings are, their time line, and the split."""
+
+    files: list[str] = []
+    time: str | None = None
+    rate_Hz: float | None = Field(default=None, gt=0)
+    heldout: list[str] | None = None
+    pieces: list[PieceSpec] = []
+    lead_rows: int = Field(default=0, ge=0)
+
+
+class ParameterSpec(Request):
+    """A nominal parameter: start value and whether it is refitted."""
+
+    value: float
+    free: bool = True
+
+
+class LinkSpec(Request):
+    """One motion-in, motion-out transmission."""
+
+    subsystem: str = "transmission"
+    input: str
+    output: str
+    load: list[str] = []
+    others: list[str] = []
+    lag_order: int = Field(default=0, ge=0, le=2)
+
+
+class ControllerSpec(Request):
+    """Cascade of position and velocity loops: force = gain * kv * (kp * (reference - x) - v) + added, limited.
+
+    `added`: channel of a known force on top of the controller's, zero in recordings without it.
+    """
+
+    reference: str
+    added: str = ""
+    position_gain_per_s: float
+    velocity_gain: float
+    force_gain: float = 1.0
+    force_limit: float = Field(default=1e300, gt=0)
+
+
+class AxisSpec(Request):
+    """Force in, motion out: mass * a + damping * v + stiffness * x = force + offset."""
+
+    subsystem: str = "axis"
+    input: str
+    output: str
+    terms: list[Literal["mass", "damping", "stiffness", "offset"]] = ["mass", "damping", "offset"]
+    reads: Literal["position", "velocity", "acceleration"] = "position"
+    hold: Literal["zero", "linear", "band_limited"] = "linear"
+    controller: ControllerSpec | None = None
+
+
+class ImpedanceSpec(Request):
+    """Motion in, force out."""
+
+    subsystem: str = "impedance"
+    input: str
+    output: str
+    load: list[str] = []
+    others: list[str] = []
+    terms: list[Literal["mass", "damping", "stiffness", "load", "offset"]] = ["stiffness", "offset"]
+
+
+class CallableSpec(Request):
+    """A Python function `name(inputs, parameters, time_s) -> outputs`, dictionaries of arrays (n,)."""
+
+    function: str
+    inputs: list[str]
+    outputs: list[str]
+    subsystem: str = "model"
+    load: list[str] = []
+
+
+class RigSpec(Request):
+    """Geometry of the catheter rig that is held; what may be refitted stands under `parameters`."""
+
+    distal_length_m: float = Field(default=0.110, gt=0)
+    shaft_sensor_offset_m: float = Field(default=0.030, gt=0)
+    torsion_to_bending: float = Field(default=0.77, gt=0)
+    wall_normal: list[float] = Field(default=[0.0, 0.0, 1.0], min_length=3, max_length=3)
+
+
+class NominalSpec(Request):
+    """A whole nominal TOML."""
+
+    name: str
+    kind: Literal["transmission", "axis", "impedance", "callable", "rig"]
+    data: DataSpec = DataSpec()
+    channels: dict[str, ChannelSpec] = {}
+    parameters: dict[str, float | ParameterSpec] = {}
+    link: list[LinkSpec] = []
+    axis: AxisSpec | None = None
+    impedance: ImpedanceSpec | None = None
+    callable: CallableSpec | None = None
+    rig: RigSpec | None = None
+
+    @model_validator(mode="after")
+    def _section_present(self) -> NominalSpec:
+        section = {"transmission": "link"}.get(self.kind, self.kind)
+        if not getattr(self, section):
+            raise ValueError(f"kind {self.kind} wants a section [{section}]")
+        return self
+
+    def start(self, name: str, default: float) -> tuple[float, bool]:
+        """Start value of nominal parameter `name`, and whether it may be refitted."""
+        given = self.parameters.get(name, default)
+        return (given.value, given.free) if isinstance(given, ParameterSpec) else (float(given), True)
+
+
+def read_nominal(path: Path | str) -> NominalSpec:
+    """The nominal model in TOML file `path`. Raises BadInput naming the key."""
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput("nominal", f"{path}: {error}", "a readable TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise BadInput("nominal", f"{path}: {error}", "valid TOML") from None
+    return validate(NominalSpec, content)

@@ -1,0 +1,208 @@
+"""Memory operators on sampled signals: play, hysteresis, lag, delay and friends. All `njit`, arrays (n,) in and out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Array = npt.NDArray[np.float64]
+
+
+@njit(cache=True)
+def play(x: Array, radius: float, start: float) -> Array:
+    """Backlash operator of half-width `radius`: the output rests until the input pushes it. `start`: first output minus input."""
+    out = np.empty(x.size)
+    z = x[0] + min(max(start, -radius), radius)
+    for i in range(x.size):
+        z = min(max(z, x[i] - radius), x[i] + radius)
+        out[i] = z
+    return out
+
+
+@njit(cache=True)
+def jenkins(x: Array, distance: float, start: float) -> Array:
+    """Elastic-plastic element in [-1, 1]: rises over `distance` after a reversal, then slides (Jenkin 1922)."""
+    out = np.empty(x.size)
+    z = min(max(start, -1.0), 1.0)
+    out[0] = z
+    for i in range(1, x.size):
+        z = min(max(z + (x[i] - x[i - 1]) / distance, -1.0), 1.0)
+        out[i] = z
+    return out
+
+
+@njit(cache=True)
+def dahl(x: Array, distance: float, start: float) -> Array:
+    """Dahl friction state in [-1, 1]: dz = (1 - z sgn dx) dx / distance, integrated exactly (Dahl 1968, exponent 1)."""
+    out = np.empty(x.size)
+    z = min(max(start, -1.0), 1.0)
+    out[0] = z
+    for i in range(1, x.size):
+        dx = x[i] - x[i - 1]
+        side = 1.0 if dx > 0.0 else -1.0
+        z = side + (z - side) * math.exp(-abs(dx) / distance)
+        out[i] = z
+    return out
+
+
+@njit(cache=True)
+def maxwell_slip(x: Array, distance: float, start: float) -> Array:
+    """Mean of four Jenkin elements whose slip distances are spread 1/4, 1/2, 1, 2 times `distance`: non-local memory."""
+    out = np.zeros(x.size)
+    step = 0.25 * distance
+    for _ in range(4):
+        out += 0.25 * jenkins(x, step, start)
+        step *= 2.0
+    return out
+
+
+@njit(cache=True)
+def lag(x: Array, dt_s: float, time_constant_s: float) -> Array:
+    """First-order low pass, exact for an input that is linear between samples; starts at rest."""
+    out = np.empty(x.size)
+    a = math.exp(-dt_s / time_constant_s)
+    slope = time_constant_s / dt_s * (1.0 - a)
+    y = x[0]
+    out[0] = y
+    for i in range(1, x.size):
+        y = a * y + (slope - a) * x[i - 1] + (1.0 - slope) * x[i]
+        out[i] = y
+    return out
+
+
+@njit(cache=True)
+def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float) -> Array:
+    """Unit-gain second-order low pass by Runge-Kutta sub-steps, input linear between samples; starts at rest."""
+    out = np.empty(x.size)
+    steps = max(1, int(math.ceil(omega_rad_s * dt_s / 0.3)))
+    h = dt_s / steps
+    w2, c = omega_rad_s * omega_rad_s, 2.0 * damping * omega_rad_s
+    y, v = x[0], 0.0
+    out[0] = y
+    for i in range(1, x.size):
+        for j in range(steps):
+            u0 = x[i - 1] + (x[i] - x[i - 1]) * j / steps
+            u1 = x[i - 1] + (x[i] - x[i - 1]) * (j + 0.5) / steps
+            u2 = x[i - 1] + (x[i] - x[i - 1]) * (j + 1.0) / steps
+            k1y, k1v = v, w2 * (u0 - y) - c * v
+            k2y, k2v = v + 0.5 * h * k1v, w2 * (u1 - y - 0.5 * h * k1y) - c * (v + 0.5 * h * k1v)
+            k3y, k3v = v + 0.5 * h * k2v, w2 * (u1 - y - 0.5 * h * k2y) - c * (v + 0.5 * h * k2v)
+            k4y, k4v = v + h * k3v, w2 * (u2 - y - h * k3y) - c * (v + h * k3v)
+            y += h * (k1y + 2.0 * k2y + 2.0 * k3y + k4y) / 6.0
+            v += h * (k1v + 2.0 * k2v + 2.0 * k3v + k4v) / 6.0
+        out[i] = y
+    return out
+
+
+@njit(cache=True)
+def shift(x: Array, dt_s: float, delay_s: Array) -> Array:
+    """`x` as it was `delay_s[i]` seconds earlier, by cubic interpolation (Catmull-Rom); held at the ends."""
+    n = x.size
+    out = np.empty(n)
+    for i in range(n):
+        place = min(max(i - delay_s[i] / dt_s, 0.0), n - 1.0)
+        k = min(int(place), n - 2)
+        f = place - k
+        x0, x1, x2, x3 = x[max(k - 1, 0)], x[k], x[k + 1], x[min(k + 2, n - 1)]
+        out[i] = x1 + 0.5 * f * (x2 - x0 + f * (2.0 * x0 - 5.0 * x1 + 4.0 * x2 - x3 + f * (3.0 * (x1 - x2) + x3 - x0)))
+    return out
+
+
+@njit(cache=True)
+def overload(x: Array, level: float) -> Array:
+    """Permanent set left by |x| beyond `level`: grows with each new extreme, in the direction of the load, and stays."""
+    out = np.empty(x.size)
+    high, low = level, -level
+    for i in range(x.size):
+        high, low = max(high, x[i]), min(low, x[i])
+        out[i] = (high - level) + (low + level)
+    return out
+
+
+@njit(cache=True)
+def whip(theta: Array, amplitude_rad: float, phase_rad: float) -> Array:
+    """Tip roll of a pre-curved shaft in a curved vessel: out + A sin(out + phase) = in, on the branch that is followed; jumps if A > 1."""
+    out = np.empty(theta.size)
+    y = theta[0]
+    for i in range(theta.size):
+        low, high = theta[i] - amplitude_rad - 1e-9, theta[i] + amplitude_rad + 1e-9
+        for _ in range(40):
+            residual = y + amplitude_rad * math.sin(y + phase_rad) - theta[i]
+            slope = 1.0 + amplitude_rad * math.cos(y + phase_rad)
+            if residual > 0.0:
+                high = y
+            else:
+                low = y
+            y_new = y - residual / slope if slope > 0.05 else 0.5 * (low + high)
+            if y_new <= low or y_new >= high:
+                y_new = 0.5 * (low + high)
+            if abs(y_new - y) < 1e-10:
+                y = y_new
+                break
+            y = y_new
+        out[i] = y
+    return out
+
+
+@njit(cache=True)
+def since_reversal(x: Array, tolerance: float) -> Array:
+    """Distance travelled since the last reversal larger than `tolerance`; before the first one, since the start."""
+    out = np.empty(x.size)
+    extreme, turn, side = x[0], x[0], 0.0
+    for i in range(x.size):
+        if side >= 0.0 and x[i] > extreme or side <= 0.0 and x[i] < extreme:
+            side = side if side != 0.0 else (1.0 if x[i] > extreme else -1.0)
+            extreme = x[i]
+        elif side != 0.0 and abs(x[i] - extreme) > tolerance:
+            turn, extreme, side = extreme, x[i], -side
+        out[i] = abs(x[i] - turn)
+    return out
+
+
+@njit(cache=True)
+def direction(x: Array, tolerance: float) -> Array:
+    """Sign of the last movement larger than `tolerance`, held while still; 0 before the first."""
+    out = np.zeros(x.size)
+    extreme, side = x[0], 0.0
+    for i in range(x.size):
+        if side * (x[i] - extreme) > 0.0:
+            extreme = x[i]
+        elif abs(x[i] - extreme) > tolerance:
+            side = 1.0 if x[i] > extreme else -1.0
+            extreme = x[i]
+        out[i] = side
+    return out
+
+
+def fill(values: Array) -> Array:
+    """`values` with missing samples bridged linearly (ends held); zeros if all are missing."""
+    good = np.isfinite(values)
+    if good.all():
+        return values
+    if not good.any():
+        return np.zeros_like(values)
+    index = np.arange(values.size)
+    return np.interp(index, index[good], values[good])
+
+
+def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array, Array]:
+    """Position, velocity, acceleration of a measured motion by a local cubic over `window` samples (odd), without phase."""
+    from scipy.signal import savgol_filter
+
+    window = max(5, min(window | 1, (x.size - 1) | 1))
+    smooth = [savgol_filter(x, window, 3, deriv=d, delta=dt_s, mode="interp") for d in (0, 1, 2)]
+    return smooth[0], smooth[1], smooth[2]
+
+
+def quantum(values: Array) -> float:
+    """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized."""
+    good = values[np.isfinite(values)]
+    levels = np.unique(good)
+    if levels.size < 3 or levels.size > 0.5 * good.size:
+        return 0.0
+    steps = np.diff(levels)
+    dust = 1e-9 * (levels[-1] - levels[0])
+    return float(np.min(steps[steps > dust])) if np.any(steps > dust) else 0.0

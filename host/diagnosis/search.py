@@ -1,0 +1,290 @@
+"""Which effects are missing: screening by projection, joint refits, forward, upgrade, swap and backward moves on held-out evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.effect import Candidate
+from host.diagnosis.evidence import Gain, compare, correlation_time
+from host.diagnosis.fit import Fit, Problem, Term, finish, grid_points, jacobian, minimize, reweigh, size_of, starts
+from host.diagnosis.model import scale_of
+
+Array = npt.NDArray[np.float64]
+Tell = Callable[[str, float], None]
+FULL_FITS = 8              # candidates refitted in full at each step
+MOST_EFFECTS = 5
+ENOUGH = 6.0               # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
+SURE = 2e-3                # p-value a new effect has to reach on held-out blocks
+SMALLEST_SHARE = 0.015     # of the weighted held-out error it has to take away
+GRID = 160
+
+
+@dataclass
+class Trial:
+    """A candidate fitted in full, with its gains over the structure it was added to."""
+
+    candidate: Candidate
+    fit: Fit
+    heldout: Gain
+    trained: Gain
+    score: float
+
+
+@dataclass
+class Step:
+    """One move of the search, for the report."""
+
+    move: str
+    key: str
+    gain: Gain
+    trials: list[Trial] = field(default_factory=list)
+
+
+@dataclass
+class Found:
+    """Nominal fit, best fit, the moves between, and all trials that were fitted beside the best structure."""
+
+    nominal: Fit
+    best: Fit
+    steps: list[Step]
+    rivals: dict[str, list[Trial]] = field(default_factory=dict)
+
+
+def fit_nominal(problem: Problem) -> Fit:
+    """Nominal parameters refitted on all samples to fit; sets the weights of outputs and the start of memories."""
+    start = problem.model.guess(problem.pieces)
+    fit = Fit((), start)
+    for _ in range(3):
+        reweigh(problem, fit)
+        fit = minimize(problem, (), fit.values)
+    reweigh(problem, fit)
+    finish(problem, fit)
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        first = slice(0, max(5, int(round(0.3 / piece.recording.dt_s))) if piece.recording.timed else 5)
+        for port in problem.model.ports:
+            need = problem.model.needs(piece, port, fit.values, residual)[first]
+            piece.start[port.name] = float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0
+    return fit
+
+
+def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
+    """`candidate` with bounds and start values for these recordings."""
+    needs = [problem.model.needs(piece, candidate.port, fit.values, residual)[piece.fit]
+             for piece, residual in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()]
+    together = np.concatenate(needs)
+    rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
+    scale = scale_of(problem.model, problem.pieces, candidate.port, candidate, rms)
+    parameters = candidate.effect.parameters(scale, candidate.form)
+    if problem.model.kind == "impedance":
+        parameters = tuple(replace(p, low=-np.inf) if p.linear and p.low == 0.0 else p for p in parameters)
+    return Term(candidate, parameters)
+
+
+def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Term, ...], Array]:
+    """Terms and values of `fit` but for the candidates named in `drop`."""
+    n = len(problem.model.parameters)
+    terms, values, at = [], list(fit.values[:n]), n
+    for term in fit.terms:
+        part = fit.values[at: at + len(term.parameters)]
+        at += len(term.parameters)
+        if term.candidate.key not in drop:
+            terms.append(term)
+            values += list(part)
+    return tuple(terms), np.array(values)
+
+
+def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
+    """Active candidates that `candidate` would replace (it contains them), or None if it may not join."""
+    drop = []
+    for term in fit.terms:
+        other = term.candidate
+        if other.port.name != candidate.port.name:
+            continue
+        if other.effect.id == candidate.effect.id and other.source == candidate.source:
+            if other.form == candidate.form and other.effect.order == candidate.effect.order:
+                return None
+            if other.effect.id not in ("creep_relaxation", "periodic_disturbance"):
+                drop.append(other.key)
+        elif other.effect.id in candidate.effect.contains:
+            drop.append(other.key)
+        elif candidate.effect.id in other.effect.contains:
+            return None
+    return tuple(drop)
+
+
+@dataclass
+class Screened:
+    """A candidate with its promise by projection and the start values that earned it."""
+
+    candidate: Candidate
+    term: Term
+    drop: tuple[str, ...]
+    promise: float
+    begin: list[Array]
+
+
+def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
+    """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid search)."""
+    r = problem.stacked(fit.terms, fit.values)
+    found = []
+    bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
+    n_eff = _independent(problem, fit)
+    for count, candidate in enumerate(pool):
+        tell("screening", count / len(pool))
+        drop = replaced_by(fit, candidate)
+        if drop is None:
+            continue
+        if drop not in bases:
+            terms, values = without(fit, problem, drop)
+            base = problem.stacked(terms, values) if drop else r
+            parameters = problem.parameters(terms)
+            J = jacobian(problem, terms, values, base, [size_of(p, v) for p, v in zip(parameters, values, strict=True)])
+            Q = np.linalg.qr(J)[0] if J.shape[1] else J
+            bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
+        terms, values, base, Q, rest = bases[drop]
+        term = term_of(problem, candidate, fit)
+        points = _scan(problem, (*terms, term), values, term, base, Q, rest)
+        if not points:
+            continue
+        points.sort(key=lambda point: point[0], reverse=True)
+        reference = float(r @ r)
+        left = max(float(rest @ rest) - points[0][0], 1e-300)
+        promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters)
+        found.append(Screened(candidate, term, drop, float(promise), [begin for _, begin in points[:3]]))
+    return sorted(found, key=lambda item: item.promise, reverse=True)
+
+
+def _independent(problem: Problem, fit: Fit) -> float:
+    total = 0.0
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        if piece.fit.any():
+            for row in residual:
+                n = int(np.sum(piece.fit & np.isfinite(row)))
+                total += n / correlation_time(np.where(piece.fit, row, np.nan))
+    return total
+
+
+def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array,
+          rest: Array) -> list[tuple[float, Array]]:
+    """(energy taken, start values of the term) at each grid point."""
+    points = []
+    linear = [p for p in term.parameters if p.linear]
+    for point in grid_points(term.parameters, GRID):
+        columns = []
+        for p in linear or [None]:
+            amplitude = {q.name: 0.0 for q in linear}
+            if p is not None:
+                amplitude[p.name] = size_of(p, 0.0)
+            trial = np.concatenate((values, starts(term, amplitude, point)))
+            columns.append(base - problem.stacked(terms, trial))
+        D = np.array(columns).T
+        D = D - Q @ (Q.T @ D)
+        if not np.all(np.isfinite(D)) or float(np.max(np.sum(D * D, axis=0))) < 1e-9 * float(rest @ rest) * 1e-6:
+            continue
+        a = np.linalg.lstsq(D, rest, rcond=1e-8)[0]
+        if linear:
+            a = np.array([min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)])
+        elif not 0.2 < a[0] < 5.0:
+            continue
+        taken = float(rest @ rest) - float(np.sum((rest - D @ a) ** 2))
+        amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
+        points.append((taken, starts(term, amplitude, point)))
+    return points
+
+
+def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
+    """Full joint refit of one candidate from its best starts."""
+    terms, values = without(base, problem, item.drop)
+    fits = []
+    for begin in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]:
+        fits.append(minimize(problem, (*terms, item.term), np.concatenate((values, begin)), rounds=12, tolerance=1e-4))
+    fit = finish(problem, min(fits, key=lambda f: f.cost))
+    heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
+    trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
+    more = len(fit.values) - len(base.values)
+    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more)
+
+
+def rank(trials: list[Trial], base: Fit) -> None:
+    """Sorts trials by held-out likelihood, with one effective sample size for all: a rival must not profit from whiter rubbish."""
+    if not trials:
+        return
+    common = np.median([trial.heldout.independent for trial in trials], axis=0)
+    for trial in trials:
+        more = max(len(trial.fit.values) - len(base.values), 0)
+        trial.score = 0.5 * float(common @ trial.heldout.log_ratio) - more
+    trials.sort(key=lambda trial: trial.score, reverse=True)
+    top = trials[0]
+    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > top.score - ENOUGH]
+    if simpler:
+        best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
+        trials.remove(best)
+        trials.insert(0, best)
+
+
+def good_enough(trial: Trial, base: Fit) -> bool:
+    """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts."""
+    more = max(len(trial.fit.values) - len(base.values), 0)
+    gain = trial.heldout
+    return (gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > SMALLEST_SHARE
+            and trial.trained.log_likelihood > ENOUGH + 2.0 * more)
+
+
+def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
+    """Nominal refit, then moves until none is earned."""
+    tell("refitting the nominal model", 0.0)
+    nominal = fit_nominal(problem)
+    floor = np.array([noise.sigma for noise in problem.noise])
+    best, steps = nominal, []
+    rivals: dict[str, list[Trial]] = {}
+    for _ in range(MOST_EFFECTS):
+        ranked = screen(problem, best, pool, tell)
+        trials = []
+        promising = _varied([item for item in ranked if item.promise > 3.0])
+        for count, item in enumerate(promising):
+            tell(f"fitting {item.candidate.key}", count / len(promising))
+            trials.append(try_fit(problem, best, item, floor))
+        rank(trials, best)
+        winner = next((trial for trial in trials if good_enough(trial, best)), None)
+        if winner is None:
+            steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
+            break
+        move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
+        steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
+        rivals[winner.candidate.key] = [trial for trial in trials if trial is not winner]
+        best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
+        reweigh(problem, best)
+        best = _prune(problem, best, floor, steps)
+    return Found(nominal, best, steps, rivals)
+
+
+def _varied(items: list[Screened]) -> list[Screened]:
+    """The most promising, at most two of one effect so that rivals of other kinds get their chance."""
+    kept: list[Screened] = []
+    for item in items:
+        same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
+        if same < 3:
+            kept.append(item)
+        if len(kept) == FULL_FITS:
+            break
+    return kept
+
+
+def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+    """Backward: drop what no longer earns its place."""
+    dropped = True
+    while dropped and len(best.terms) > 1:
+        dropped = False
+        for term in best.terms:
+            terms, values = without(best, problem, (term.candidate.key,))
+            less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
+            gain = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
+            if gain.log_likelihood < 0.5 * ENOUGH + len(term.parameters) or gain.share < 0.5 * SMALLEST_SHARE:
+                best, dropped = less, True
+                steps.append(Step("backward", term.candidate.key, gain))
+                break
+    return best

@@ -1,0 +1,1 @@
+"""Force estimation from measured poses."""

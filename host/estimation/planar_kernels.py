@@ -1,0 +1,256 @@
+"""Force from the tip's planar pose, compiled: least-energy curvatures, force by statics, then maximum likelihood."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from host.mechanics import pcar_kernels as kernels
+
+Array = NDArray[np.float64]
+
+# Columns of a result row
+FORCE_X, FORCE_Y, INFO_XX, INFO_XY, INFO_YY, CHI_SQUARE, ERROR_X, ERROR_Y, ERROR_ANGLE, ENDED, EVALUATIONS = range(11)
+COLUMNS = 11
+
+STEP_LIMIT_rad = 0.8
+CURVATURE_TOLERANCE_rad = 1e-3    # the maximum-likelihood stage takes over from here
+EXACT_TOLERANCE_rad = 1e-10
+END_rad = 1e-9                    # turning of the last step
+END_N = 1e-9                      # force of the last step
+CURVATURE_STEPS, LIKELIHOOD_STEPS = 30, 40
+# Keeps fewer than three arcs solvable: the pose is met up to this share of its covariance, 1e-4 m/N at 0.3 mm
+SOFTNESS_per_N_m = 1e-4
+
+
+@njit(cache=True, nogil=True)
+def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, float]:
+    """Solution of the symmetric positive 3 x 3 system (a: xx, xy, xz, yy, yz, zz) by Cholesky; NaN where singular."""
+    d0 = a[0]
+    l1, l2 = a[1] / d0, a[2] / d0
+    d1 = a[3] - l1 * a[1]
+    m = a[4] - l1 * a[2]
+    l3 = m / d1
+    d2 = a[5] - l2 * a[2] - l3 * m
+    if not (d0 > 0.0 and d1 > 0.0 and d2 > 0.0):
+        return math.nan, math.nan, math.nan
+    y1 = b1 - l1 * b0
+    z = (b2 - l2 * b0 - l3 * y1) / d2
+    y = y1 / d1 - l3 * z
+    return b0 / d0 - l1 * y - l2 * z, y, z
+
+
+@njit(cache=True, nogil=True)
+def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array, covariance: Array,
+                            tolerance: float, kappa: Array, work: Array) -> tuple[bool, int]:
+    """Curvatures that reach the tip pose with the least bending energy, from the unloaded shape. Writes `kappa`.
+
+    Arguments: `pose` (3,) x, y, angle; `covariance` (3, 3) of the pose, which decides how it is missed where fewer
+    than three arcs cannot meet it. Result: converged, evaluations. Source: (4.3); with three arcs the energy has no
+    say and this is Newton's method on (2.12)-(2.14).
+    """
+    n = length.size
+    none = np.zeros((0, 2))
+    normal = np.empty(6)
+    for i in range(n):
+        kappa[i] = kappa0[i]
+    for count in range(1, CURVATURE_STEPS + 1):
+        x, y, angle = kernels.evaluate(length, kappa, 0.0, 0.0, none, 0.0, work)
+        kernels.arms(work)
+        e0, e1, e2 = pose[0] - x, pose[1] - y, pose[2] - angle
+        normal[0], normal[1], normal[2] = covariance[0, 0], covariance[0, 1], covariance[0, 2]
+        normal[3], normal[4], normal[5] = covariance[1, 1], covariance[1, 2], covariance[2, 2]
+        for k in range(6):
+            normal[k] *= SOFTNESS_per_N_m
+        for i in range(n):
+            j0, j1 = -work[kernels.ARM_Y, i], work[kernels.ARM_X, i]
+            weight = length[i] / EI[i]
+            normal[0] += weight * j0 * j0
+            normal[1] += weight * j0 * j1
+            normal[2] += weight * j0
+            normal[3] += weight * j1 * j1
+            normal[4] += weight * j1
+            normal[5] += weight
+            back = length[i] * (kappa[i] - kappa0[i])
+            e0 += j0 * back
+            e1 += j1 * back
+            e2 += back
+        w0, w1, w2 = solve3(normal, e0, e1, e2)
+        turning = 0.0
+        for i in range(n):
+            target = kappa0[i] + (w2 - work[kernels.ARM_Y, i] * w0 + work[kernels.ARM_X, i] * w1) / EI[i]
+            work[kernels.STEP, i] = target - kappa[i]
+            turning += abs(length[i] * work[kernels.STEP, i])
+        if not turning < math.inf:
+            return False, count
+        scale = 1.0 if turning <= STEP_LIMIT_rad else STEP_LIMIT_rad / turning
+        for i in range(n):
+            kappa[i] += scale * work[kernels.STEP, i]
+        if turning < tolerance:
+            return True, count
+    return False, CURVATURE_STEPS
+
+
+@njit(cache=True, nogil=True)
+def force_by_statics(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array,
+                     work: Array) -> tuple[float, float]:
+    """Force that best explains `kappa`, each arc's moment weighted by its compliance (least energy of the misfit).
+
+    Result: Fx, Fy (N). Source: (4.4), linear least squares of (2.8).
+    """
+    kernels.evaluate(length, kappa, 0.0, 0.0, np.zeros((0, 2)), 0.0, work)
+    kernels.arms(work)
+    xx = xy = yy = bx = by = 0.0
+    for i in range(length.size):
+        weight = length[i] / EI[i]
+        delta = kappa[i] - kappa0[i]
+        moment = EI[i] * delta * (1.0 + cubic[i] * delta * delta)
+        j0, j1 = -work[kernels.ARM_Y, i], work[kernels.ARM_X, i]
+        xx += weight * j0 * j0
+        xy += weight * j0 * j1
+        yy += weight * j1 * j1
+        bx += weight * j0 * moment
+        by += weight * j1 * moment
+    determinant = xx * yy - xy * xy
+    if not determinant > 1e-14 * (xx + yy) ** 2:
+        # one lever only (a single arc, or a straight one): the shortest force
+        trace = xx + yy
+        return (bx / trace, by / trace) if trace > 0.0 else (0.0, 0.0)
+    return (yy * bx - xy * by) / determinant, (xx * by - xy * bx) / determinant
+
+
+@njit(cache=True, nogil=True)
+def two_stage(length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array, covariance: Array, kappa: Array,
+              work: Array) -> tuple[bool, float, float]:
+    """The thesis' estimate: curvatures from the pose (4.3), then force from the curvatures (4.4).
+
+    Result: converged, Fx, Fy (N); writes `kappa`.
+    """
+    converged, _ = least_energy_curvatures(length, EI, kappa0, pose, covariance, EXACT_TOLERANCE_rad, kappa, work)
+    fx, fy = force_by_statics(length, EI, cubic, kappa0, kappa, work)
+    return converged, fx, fy
+
+
+@njit(cache=True, nogil=True)
+def sensitivities(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, fx: float, fy: float,
+                  drag: Array, pose: Array, work: Array, out: Array) -> None:
+    """Linearization at (`kappa`, force), in equilibrium or not: `out` gets 6 of d(pose)/d(force) row by row, then the
+    pose's error after the shape has been corrected to equilibrium (3). Leaves the steps in work[STEP, ARM_X, ARM_Y].
+    """
+    x, y, angle = kernels.evaluate(length, kappa, fx, fy, drag, 1.0, work)
+    kernels.newton_step(length, EI, cubic, kappa0, kappa, work)
+    kernels.arms(work)
+    for i in range(length.size):
+        j0, j1 = -work[kernels.ARM_Y, i], work[kernels.ARM_X, i]
+        work[kernels.TRIAL, i], work[kernels.TANGENT, i] = j0, j1
+        work[kernels.ARM_X, i], work[kernels.ARM_Y, i] = j0, j1
+    kernels.back_substitute(length, work, kernels.ARM_X)
+    kernels.back_substitute(length, work, kernels.ARM_Y)
+    for k in range(6):
+        out[k] = 0.0
+    out[6], out[7], out[8] = pose[0] - x, pose[1] - y, pose[2] - angle
+    for i in range(length.size):
+        j0, j1 = length[i] * work[kernels.TRIAL, i], length[i] * work[kernels.TANGENT, i]
+        step, by_x, by_y = work[kernels.STEP, i], work[kernels.ARM_X, i], work[kernels.ARM_Y, i]
+        out[0] += j0 * by_x
+        out[1] += j0 * by_y
+        out[2] += j1 * by_x
+        out[3] += j1 * by_y
+        out[4] += length[i] * by_x
+        out[5] += length[i] * by_y
+        out[6] -= j0 * step
+        out[7] -= j1 * step
+        out[8] -= length[i] * step
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: float,
+                     row: Array) -> tuple[float, float]:
+    """Information of the force into `row`, chi square too. Result: gradient. `prior`: force (2), information (3)."""
+    gx = gy = xx = xy = yy = chi = 0.0
+    for k in range(3):
+        wx = wy = we = 0.0
+        for m in range(3):
+            wx += weight[k, m] * out[2 * m]
+            wy += weight[k, m] * out[2 * m + 1]
+            we += weight[k, m] * out[6 + m]
+        xx += out[2 * k] * wx
+        xy += out[2 * k] * wy
+        yy += out[2 * k + 1] * wy
+        gx += out[2 * k] * we
+        gy += out[2 * k + 1] * we
+        chi += out[6 + k] * we
+    px, py = prior[0] - fx, prior[1] - fy
+    row[INFO_XX], row[INFO_XY], row[INFO_YY] = xx + prior[2], xy + prior[3], yy + prior[4]
+    row[CHI_SQUARE] = chi + prior[2] * px * px + 2.0 * prior[3] * px * py + prior[4] * py * py
+    return gx + prior[2] * px + prior[3] * py, gy + prior[3] * px + prior[4] * py
+
+
+@njit(cache=True, nogil=True)
+def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array, weight: Array,
+               prior: Array, damping: float, kappa: Array, fx: float, fy: float, work: Array, row: Array) -> None:
+    """Maximum-likelihood force from start (`kappa`, fx, fy): Gauss-Newton on shape and force together.
+
+    Arguments: `weight` (3, 3), inverse covariance of the pose; `prior` (5,): force, then its information xx, xy, yy;
+    `damping`, Levenberg's, relative, halved at each step. Writes `kappa` and `row` (COLUMNS,).
+    """
+    out = np.empty(9)
+    row[ENDED] = 0.0
+    for count in range(1, LIKELIHOOD_STEPS + 1):
+        sensitivities(length, EI, cubic, kappa0, kappa, fx, fy, drag, pose, work, out)
+        gx, gy = normal_equations(out, weight, prior, fx, fy, row)
+        # the floor belongs to a force of 1 kN: it only keeps a direction that the pose cannot see from dividing by 0
+        xx = row[INFO_XX] * (1.0 + damping) + 1e-6
+        yy = row[INFO_YY] * (1.0 + damping) + 1e-6
+        determinant = xx * yy - row[INFO_XY] ** 2
+        dx = (yy * gx - row[INFO_XY] * gy) / determinant
+        dy = (xx * gy - row[INFO_XY] * gx) / determinant
+        turning = 0.0
+        for i in range(length.size):
+            step = work[kernels.STEP, i] + dx * work[kernels.ARM_X, i] + dy * work[kernels.ARM_Y, i]
+            work[kernels.STEP, i] = step
+            turning += abs(length[i] * step)
+        row[EVALUATIONS] = count
+        if not turning < math.inf:
+            break
+        scale = 1.0 if turning <= STEP_LIMIT_rad else STEP_LIMIT_rad / turning
+        for i in range(length.size):
+            kappa[i] += scale * work[kernels.STEP, i]
+        fx += scale * dx
+        fy += scale * dy
+        damping *= 0.5 if damping > 1e-9 else 0.0
+        if turning < END_rad and abs(dx) + abs(dy) < END_N:
+            row[ENDED] = 1.0
+            break
+    row[FORCE_X], row[FORCE_Y] = fx, fy
+    row[ERROR_X], row[ERROR_Y], row[ERROR_ANGLE] = out[6], out[7], out[8]
+
+
+@njit(cache=True, nogil=True)
+def estimate_cold(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
+                  covariance: Array, weight: Array, prior: Array, kappa: Array, work: Array, row: Array) -> None:
+    """Both stages from the unloaded shape; a damped second start where the first does not end. Writes `row`."""
+    least_energy_curvatures(length, EI, kappa0, pose, covariance, CURVATURE_TOLERANCE_rad, kappa, work)
+    fx, fy = force_by_statics(length, EI, cubic, kappa0, kappa, work)
+    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, 0.0, kappa, fx, fy, work, row)
+    if row[ENDED] != 1.0 or not row[CHI_SQUARE] < 1e4:
+        other, second = kappa0.copy(), np.empty(COLUMNS)
+        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, 10.0, other, 0.0, 0.0, work, second)
+        better = second[CHI_SQUARE] < row[CHI_SQUARE] or row[ENDED] != 1.0
+        if second[ENDED] == 1.0 and better:
+            row[:] = second
+            kappa[:] = other
+
+
+@njit(cache=True, nogil=True)
+def estimate_many(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
+                  covariance: Array, weight: Array, prior: Array, kappa: Array, rows: Array) -> None:
+    """`estimate_cold` for N independent samples: `length`, `kappa0`, `kappa` (N, n), `pose` (N, 3), `prior` (N, 5),
+    `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording."""
+    work = np.empty((kernels.ROWS, length.shape[1]))
+    for i in range(length.shape[0]):
+        estimate_cold(length[i], EI, cubic, kappa0[i], drag, pose[i], covariance, weight, prior[i], kappa[i], work,
+                      rows[i])

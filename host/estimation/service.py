@@ -1,0 +1,130 @@
+"""The estimator among messages: pairs poses with the actuation of their time, asks, checks the answer."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from host.estimation.interface import Actuation, Estimator, PoseReading
+from protocol.topics import ForceEstimate, Message, Pose, Stage
+from realtime.rig_file import Rig
+
+DEFAULT_ESTIMATOR = "host.estimation.planar:make_estimator"
+HISTORY_NS = 500_000_000
+PAIRED_WITHIN_NS = 5_000_000
+
+
+def load_estimator(name: str, rig: Rig) -> Estimator:
+    """The estimator that `module:function` makes for `rig`. Raises ValueError where there is no such function."""
+    module, _, function = name.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"estimator: found {name!r} ({error}), wanted module:function") from None
+    return make(rig)
+
+
+def _reading(pose: Pose) -> PoseReading:
+    return PoseReading(np.array(pose.position_m, dtype=float), np.array(pose.quaternion_wxyz, dtype=float), pose.stamp_ns)
+
+
+def _actuation(stage: Stage) -> Actuation | None:
+    joints = (stage.joint_insertion_m, stage.joint_roll_rad, stage.joint_curvature_per_m)
+    if joints[0] is None or joints[1] is None or joints[2] is None:
+        return None
+    return Actuation(joints[0], joints[1], joints[2], stage.stamp_ns)
+
+
+class EstimationService:
+    """Answers poses with force messages; no clock and no transport of its own.
+
+    estimator: asked once per tip pose. timer_ns: measures how long it took; never anything else.
+    """
+
+    def __init__(self, estimator: Estimator, timer_ns: Callable[[], int] = time.perf_counter_ns) -> None:
+        self._estimator, self._timer_ns = estimator, timer_ns
+        self._stages: deque[Stage] = deque()
+        self._shaft: Pose | None = None
+        self._waiting: Pose | None = None
+        self.answered = 0
+        self.unanswered = 0
+        self.last_failure = ""
+
+    def hear(self, topic: str, message: Message) -> None:
+        """Take in a message; topics of no concern are ignored. A newer tip pose takes the place of one not answered."""
+        if isinstance(message, Stage):
+            self._stages.append(message)
+            while message.stamp_ns - self._stages[0].stamp_ns > HISTORY_NS or message.stamp_ns < self._stages[0].stamp_ns:
+                self._stages.popleft()
+        elif isinstance(message, Pose) and topic == "pose/shaft":
+            self._shaft = message
+        elif isinstance(message, Pose) and topic == "pose/tip" and not message.missing:
+            self._waiting = message
+
+    def answer(self, now_ns: int) -> ForceEstimate | None:
+        """The estimate for the newest tip pose, None where there is none that was not answered before.
+
+        now_ns: the rig's clock, for `published_ns`.
+        """
+        tip, self._waiting = self._waiting, None
+        if tip is None:
+            return None
+        actuation = self._actuation_at(tip.stamp_ns)
+        if actuation is None:
+            self.unanswered += 1
+            self.last_failure = "no stage message from the time of the pose"
+            return None
+        return self._ask(tip, self._shaft_of(tip), actuation, now_ns)
+
+    def __call__(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
+        """One pose answered at once, for lock step; `published_ns` is then the caller's to set."""
+        for topic, message in (("stage", stage), ("pose/shaft", shaft), ("pose/tip", tip)):
+            if message is not None:
+                self.hear(topic, message)
+        return self.answer(tip.stamp_ns)
+
+    def _actuation_at(self, stamp_ns: int) -> Actuation | None:
+        if not self._stages:
+            return None
+        nearest = min(self._stages, key=lambda stage: abs(stage.stamp_ns - stamp_ns))
+        return _actuation(nearest) if abs(nearest.stamp_ns - stamp_ns) <= HISTORY_NS else None
+
+    def _shaft_of(self, tip: Pose) -> PoseReading | None:
+        shaft = self._shaft
+        if shaft is None or shaft.missing or abs(shaft.stamp_ns - tip.stamp_ns) > PAIRED_WITHIN_NS:
+            return None
+        return _reading(shaft)
+
+    def _ask(self, tip: Pose, shaft: PoseReading | None, actuation: Actuation, now_ns: int) -> ForceEstimate:
+        begin_ns = self._timer_ns()
+        try:
+            answer = self._estimator.estimate(_reading(tip), shaft, actuation)
+        except (ValueError, ArithmeticError) as error:
+            self.last_failure = f"{type(error).__name__}: {error}"
+            answer = None
+        compute_us = (self._timer_ns() - begin_ns) * 1e-3
+        good = answer is not None and answer.converged and _believable(answer.force_N, answer.covariance_N2)
+        self.answered += good
+        self.unanswered += not good
+        if answer is None or not good:
+            return ForceEstimate(stamp_ns=tip.stamp_ns, frame="base", converged=False, published_ns=now_ns,
+                                 residual=None if answer is None else answer.residual, compute_us=compute_us)
+        return ForceEstimate(stamp_ns=tip.stamp_ns, frame="base", converged=True, published_ns=now_ns,
+                             force_N=np.asarray(answer.force_N), covariance_N2=np.asarray(answer.covariance_N2),
+                             residual=answer.residual, compute_us=compute_us)
+
+
+def _believable(force_N: np.ndarray, covariance_N2: np.ndarray) -> bool:
+    """Right shapes, finite, and a covariance that is one: symmetric, no negative variance along any direction."""
+    force_N, covariance_N2 = np.asarray(force_N), np.asarray(covariance_N2)
+    if force_N.shape != (3,) or covariance_N2.shape != (3, 3):
+        return False
+    if not (np.isfinite(force_N).all() and np.isfinite(covariance_N2).all()):
+        return False
+    scale = float(np.abs(covariance_N2).max())
+    symmetric = float(np.abs(covariance_N2 - covariance_N2.T).max()) <= 1e-9 * scale
+    return symmetric and float(np.linalg.eigvalsh(covariance_N2).min()) >= -1e-9 * scale

@@ -1,0 +1,140 @@
+"""The model process: hears the rig over zenoh, estimates the tip force, publishes it, and records everything."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+from host.estimation.interface import Estimator
+from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
+from host.mechanics.catheter import load_catheter
+from host.recording import Header, RecordingWriter
+from protocol.topics import Log
+from protocol.zenoh_session import Session
+from realtime.rig_file import Rig, load_rig
+
+POLL_S = 0.002
+QUIET_NS = 1_000_000_000
+
+
+def header_of(rig: Rig, clock: str, seed: int | None = None, notes: dict[str, str] | None = None) -> Header:
+    """The recording's header for `rig`. clock: `virtual` or `wall`."""
+    return Header(rig=rig.name, clock=clock, configuration=rig.effective(),
+                  catheter=dataclasses.asdict(load_catheter(rig.catheter.name)), seed=seed, notes=notes or {})
+
+
+class EstimatorProcess:
+    """Everything of the process between its start and its end; `run` until `stop` is set.
+
+    recording: where to write, None to record nothing. now_ns: the rig's clock.
+    """
+
+    def __init__(self, rig: Rig, session: Session, estimator: Estimator, recording: RecordingWriter | None,
+                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self.service = EstimationService(estimator)
+        self._recording, self._now_ns = recording, now_ns
+        self._everything = session.everything()
+        self._forces = session.publisher("force/estimate")
+        self._logs = session.publisher("log")
+        self._heard_ns = now_ns()
+        self._told = ""
+
+    def step(self) -> bool:
+        """Take in what has come, record it, answer the newest pose. True if there was anything."""
+        taken = self._everything.take()
+        now_ns = self._now_ns()
+        for topic, message, payload in taken:
+            self.service.hear(topic, message)
+            if self._recording is not None:
+                self._recording.write_encoded(topic, payload, message.stamp_ns, message.sequence, now_ns)
+        estimate = self.service.answer(self._now_ns())
+        if estimate is not None:
+            self._forces.put(estimate)
+        self._tell_once(self._everything.complaint or self.service.last_failure)
+        if taken:
+            self._heard_ns = now_ns
+        elif self._recording is not None and now_ns - self._heard_ns > QUIET_NS:
+            self._recording.flush()
+            self._heard_ns = now_ns
+        return bool(taken)
+
+    def log(self, level: str, text: str) -> None:
+        """Say `text` on the log topic and on standard error."""
+        print(f"seldinger estimator: {text}", file=sys.stderr, flush=True)
+        self._logs.put(Log(stamp_ns=max(self._now_ns(), 0), level=level, source="estimator", text=text))
+
+    def _tell_once(self, text: str) -> None:
+        if text and text != self._told:
+            self._told = text
+            self.log("warning", text)
+
+    def run(self, stop: threading.Event) -> None:
+        """Steps until `stop`, then takes in what is left."""
+        while not stop.is_set():
+            if not self.step():
+                stop.wait(POLL_S)
+        self.step()
+
+
+def _stop_on_signals() -> threading.Event:
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    return stop
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """`python -m host.estimator_process RIG.toml`. Exit status 0 after SIGTERM or SIGINT, 1 where it cannot start."""
+    parser = argparse.ArgumentParser(prog="seldinger estimator", description=__doc__)
+    parser.add_argument("rig", type=Path, help="rig file")
+    parser.add_argument("--record", type=Path, help="recording to write (a file that does not exist yet)")
+    parser.add_argument("--estimator", default=DEFAULT_ESTIMATOR, help="module:function that makes the estimator of a rig")
+    parser.add_argument("--clock", choices=("wall", "virtual"), default="wall")
+    parser.add_argument("--seed", type=int)
+    options = parser.parse_args(arguments)
+    stop = _stop_on_signals()
+    try:
+        rig = load_rig(options.rig)
+        estimator = load_estimator(options.estimator, rig)
+        session = Session(rig.name, rig.zenoh.listen, [])
+    except (ValueError, OSError) as error:
+        print(f"seldinger estimator: {error}", file=sys.stderr)
+        return 1
+    with session:
+        recording = None
+        process: EstimatorProcess | None = None
+
+        def on_failure(text: str) -> None:
+            if process is not None:
+                process.log("error", text)
+
+        try:
+            if options.record is not None:
+                header = header_of(rig, options.clock, options.seed, {"estimator": options.estimator})
+                recording = RecordingWriter(options.record, header, on_failure)
+            process = EstimatorProcess(rig, session, estimator, recording)
+            print(json.dumps({"ready": True, "recording": str(options.record or "")}), flush=True)
+            process.run(stop)
+        except OSError as error:
+            print(f"seldinger estimator: {error}", file=sys.stderr)
+            return 1
+        finally:
+            if recording is not None:
+                recording.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

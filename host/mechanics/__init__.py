@@ -1,0 +1,1 @@
+"""Static models of the catheter: planar arcs, spatial rod, and the parameters they share."""

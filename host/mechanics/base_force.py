@@ -1,0 +1,138 @@
+"""Compiled answer to a tip force in the base frame: cold along the branch from the unloaded shape, or warm from a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from host.mechanics import multiple_shooting as ms
+from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, follow, newton
+from host.mechanics.cosserat_kernels import BODY_LENGTH, COARSE, POSE, ROW, SHAFT_LENGTH, sweep
+from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix
+from host.mechanics.segments import cut, lay_loads
+from host.mechanics.stability import unstable_modes
+from host.mechanics.tip_shooting import (
+    NO_STATIONS,
+    QUICK_BELOW,
+    UNIQUE_BELOW,
+    correct_once,
+    length3,
+    load_number,
+    polish,
+    quick_branch,
+    unloaded_direction,
+)
+
+Array = NDArray[np.float64]
+
+GOAL = 1e-6  # share of the force by which n(base) may miss at the end: about 1e-8 m at the tip
+WARM_TRUST = 0.3
+NO_FORCES = np.zeros((0, 3))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def solve_cold(rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array,
+               work: Array) -> tuple[int, float, int, int, int]:
+    """Equilibrium on the branch from the unloaded shape. Returns (status, load reached, sweeps, load steps, unstable).
+
+    Arguments: rod (9,); force (3,) N, base frame; stations (n,) m back from the tip, ascending, exposed; bend: FINE
+    or EXACT. Written: x (3,) force in the tip frame; out (n + 1, 48) pose rows at the stations and the base.
+    Status: `branch.CONVERGED`, or `FOLD` or `ITERATIONS` with the share of the load at which the branch ends.
+    """
+    size = length3(force)
+    if size == 0.0:
+        x[:] = 0.0
+        sweep(rod, x, stations, bend, POSE, out, work)
+        return CONVERGED, 1.0, 1, 0, 0
+    used = 0
+    if load_number(rod, size) <= QUICK_BELOW:
+        Gi = np.empty((3, 3))
+        found, used, steps = quick_branch(rod, force, x, Gi, out[:1], work)
+        if found:
+            miss, more = polish(rod, force, stations, bend, POSE, x, Gi, GOAL, out, work)
+            used += more
+            if miss < GOAL and unstable_modes(rod, x, work) == 0:
+                return CONVERGED, 1.0, used, steps, 0
+    status, load, passes, steps, unstable = robust_branch(rod, force, stations, bend, x, out)
+    return status, load, used + passes, steps, unstable
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def solve_warm(rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array,
+               work: Array) -> tuple[bool, int]:
+    """Equilibrium next to the guess x (3,), the force as the tip saw it before; refined in place. (converged, sweeps).
+
+    Arguments as `solve_cold`. Not converged where the guess is too far off to be sure of the branch: solve cold then.
+    """
+    size = length3(force)
+    if size == 0.0:
+        x[:] = 0.0
+        sweep(rod, x, stations, bend, POSE, out, work)
+        return True, 1
+    if length3(x) == 0.0:
+        unloaded_direction(rod, force, x)
+    Gi, scratch = np.empty((3, 3)), np.empty((2, 3))
+    miss, determinant = correct_once(rod, force, COARSE, x, Gi, scratch, out[:1], work)
+    if not (miss < WARM_TRUST and determinant > 0.0):
+        return False, 1
+    miss, sweeps = polish(rod, force, stations, bend, POSE, x, Gi, GOAL, out, work)
+    return miss < GOAL, sweeps + 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def robust_branch(rod: Array, force: Array, stations: Array, bend: float, x: Array,
+                  out: Array) -> tuple[int, float, int, int, int]:
+    """`solve_cold` by multiple shooting, for any load number: slower, with a wider and better watched path."""
+    size = length3(force)
+    total = rod[SHAFT_LENGTH] + rod[BODY_LENGTH]
+    count = stations.shape[0]
+    marks = np.empty(count + 3)
+    marks[0], marks[1], marks[2] = 0.0, rod[BODY_LENGTH], total
+    marks[3:] = total - stations
+    segments = cut(rod, np.sort(marks), size)
+    lay_loads(segments, force, np.zeros(3), NO_STATIONS, NO_FORCES, ms.N_START)
+    lay_loads(segments, force, np.zeros(3), NO_STATIONS, NO_FORCES, ms.DN_START)
+    n = segments.shape[0]
+    Q, M, slope = np.empty((n + 1, 4)), np.empty((n + 1, 3)), np.empty((n + 1, 6))
+    first = min(1.0, UNIQUE_BELOW / load_number(rod, size))
+    status, load, passes, steps, unstable = follow(segments, Q, M, first, COARSE, LARGEST_GUESS_ERROR)
+    if status != CONVERGED:
+        return status, load, passes, steps, unstable
+    work = np.zeros(ms.WORK)
+    ok, _, more, unstable = newton(segments, 1.0, Q, M, bend, 1e-9, LARGEST_GUESS_ERROR, slope, work)
+    if not ok:
+        return FOLD, load, passes + more, steps, unstable
+    positions = np.empty((n + 1, 3))
+    lay_out(segments, 1.0, Q, M, bend, positions, work)
+    x[:] = rotation_matrix(Q[n]).T @ force
+    where = total - np.append(stations, total)
+    rows_from_nodes(segments, Q, positions, force, where, out)
+    return CONVERGED, 1.0, passes + more, steps, unstable
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def lay_out(segments: Array, load: float, Q: Array, M: Array, bend: float, positions: Array, work: Array) -> None:
+    """positions (n + 1, 3) of the nodes in the base frame, m."""
+    work[7:10] = 0.0
+    positions[0] = 0.0
+    for i in range(segments.shape[0]):
+        ms.cross_segment(segments[i], load, Q[i], M[i], bend, ms.STATE, work)
+        positions[i + 1] = work[7:10]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def rows_from_nodes(segments: Array, Q: Array, positions: Array, force: Array, where: Array, out: Array) -> None:
+    """out (k, 48): pose rows, as a tip sweep would leave them, of the nodes nearest to the arc lengths where (k,)."""
+    n = segments.shape[0]
+    for j in range(where.shape[0]):
+        node, here, best, at = 0, 0.0, abs(where[j]), 0.0
+        for i in range(n):
+            here += segments[i, ms.LENGTH]
+            if abs(where[j] - here) < best:
+                node, best, at = i + 1, abs(where[j] - here), here
+        R = rotation_matrix(Q[node])
+        out[j, :ROW] = 0.0
+        out[j, 0:3] = R.T @ (positions[node] - positions[n])
+        out[j, 3:6] = R.T @ force
+        out[j, 6:10] = quaternion_product(conjugate(Q[n]), Q[node])

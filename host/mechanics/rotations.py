@@ -1,0 +1,101 @@
+"""Unit quaternions (scalar first, tip -> base) and rotation vectors, compiled, for the spatial models."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def quaternion_product(p: Array, q: Array) -> Array:
+    """Hamilton product p q of quaternions (4,): first turn by q, then by p."""
+    return np.array([
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    ])
+
+
+@njit(cache=True, nogil=True)
+def conjugate(q: Array) -> Array:
+    """Inverse of the unit quaternion q (4,)."""
+    return np.array([q[0], -q[1], -q[2], -q[3]])
+
+
+@njit(cache=True, nogil=True)
+def rotation_matrix(q: Array) -> Array:
+    """Rotation matrix (3, 3) of the unit quaternion q (4,); (3.15) with the element (1, 3) put right."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ])
+
+
+@njit(cache=True, nogil=True)
+def quaternion_of_matrix(R: Array) -> Array:
+    """Unit quaternion (4,) of the rotation matrix R (3, 3), scalar part not negative. Shepperd's choice of pivot."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    q = np.empty(4)
+    if trace >= max(R[0, 0], R[1, 1], R[2, 2]):
+        q[0], q[1], q[2], q[3] = 1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    elif R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2]:
+        q[0], q[1] = R[2, 1] - R[1, 2], 1.0 + 2.0 * R[0, 0] - trace
+        q[2], q[3] = R[1, 0] + R[0, 1], R[2, 0] + R[0, 2]
+    elif R[1, 1] >= R[2, 2]:
+        q[0], q[1] = R[0, 2] - R[2, 0], R[1, 0] + R[0, 1]
+        q[2], q[3] = 1.0 + 2.0 * R[1, 1] - trace, R[2, 1] + R[1, 2]
+    else:
+        q[0], q[1] = R[1, 0] - R[0, 1], R[2, 0] + R[0, 2]
+        q[2], q[3] = R[2, 1] + R[1, 2], 1.0 + 2.0 * R[2, 2] - trace
+    q /= math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return -q if q[0] < 0.0 else q
+
+
+@njit(cache=True, nogil=True)
+def quaternion_of_vector(v: Array) -> Array:
+    """Unit quaternion (4,) of the rotation vector v (3,) in rad; smooth through zero."""
+    angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    half = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
+    return np.array([math.cos(0.5 * angle), half * v[0], half * v[1], half * v[2]])
+
+
+@njit(cache=True, nogil=True)
+def vector_of_quaternion(q: Array) -> Array:
+    """Rotation vector (3,) in rad of the unit quaternion q (4,), length at most pi; smooth through zero."""
+    sign = -1.0 if q[0] < 0.0 else 1.0
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    scale = 2.0 * sign if sine < 1e-9 else 2.0 * sign * math.atan2(sine, sign * q[0]) / sine
+    return np.array([scale * q[1], scale * q[2], scale * q[3]])
+
+
+@njit(cache=True, nogil=True)
+def rotate(q: Array, v: Array) -> Array:
+    """Vector v (3,) turned by the unit quaternion q (4,)."""
+    return rotation_matrix(q) @ v
+
+
+@njit(cache=True, nogil=True)
+def angle_between(p: Array, q: Array) -> float:
+    """Angle in rad of the turn from the unit quaternion p (4,) to q (4,)."""
+    v = vector_of_quaternion(quaternion_product(conjugate(p), q))
+    return float(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
+
+
+@njit(cache=True, nogil=True)
+def cross(a: Array, b: Array) -> Array:
+    """Vector product (3,) of a (3,) and b (3,)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True, nogil=True)
+def skew(a: Array) -> Array:
+    """Matrix (3, 3) with skew(a) b = a x b."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])

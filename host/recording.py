@@ -1,0 +1,355 @@
+"""Recordings: MCAP files of the topics' messages, self-describing, readable up to the last chunk after a power cut."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import struct
+import subprocess
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import Writer
+
+from protocol.topics import TOPICS, Message, encode, json_schema
+
+PROFILE = "seldinger"
+CHUNK_BYTES = 256 * 1024
+CHUNK_NS = 1_000_000_000
+_MAX_RECORD_BYTES = 64 * 1024 * 1024
+_DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, OverflowError, MemoryError)
+
+
+def software_version() -> str:
+    """The installed version of this software, `unknown` when it is not installed."""
+    try:
+        return version("seldinger")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def git_revision() -> str:
+    """The revision that this code stands at, with `+changes` where files differ from it; `unknown` outside git."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return "unknown"
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty=+changes", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return "unknown"
+    return done.stdout.strip() or "unknown"
+
+
+class Header(NamedTuple):
+    """What must be known to understand a recording, besides its messages."""
+
+    rig: str
+    clock: str
+    configuration: dict[str, Any]
+    catheter: dict[str, Any]
+    seed: int | None = None
+    notes: dict[str, str] = {}  # noqa: RUF012 - a NamedTuple's default, never written to
+
+    def sections(self) -> dict[str, dict[str, str]]:
+        """The MCAP metadata records: name -> texts."""
+        run = {
+            "rig": self.rig, "clock": self.clock, "seed": "" if self.seed is None else str(self.seed),
+            "software_version": software_version(), "git_revision": git_revision(),
+            "started_utc": datetime.now(UTC).isoformat(timespec="seconds"), **self.notes,
+        }
+        return {"run": run, "configuration": {"json": json.dumps(self.configuration)},
+                "catheter": {"json": json.dumps(self.catheter)}}
+
+
+class _GuardedFile:
+    """The file under the MCAP writer: the first failed write cuts the file back to its last whole chunk and ends it."""
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._position = 0
+        self._whole = 0
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        view = memoryview(data)
+        try:
+            while self.error is None and len(view):
+                view = view[os.write(self._fd, view):]
+        except OSError as error:
+            self._fail(error)
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Everything written so far is whole: bring it to the disk."""
+        if self.error is not None:
+            return
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+                self._fail(error)
+                return
+        self._whole = self._position
+
+    def _fail(self, error: OSError) -> None:
+        self.error = error
+        os.ftruncate(self._fd, self._whole)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+class RecordingWriter:
+    """Writes one recording. Not thread-safe: one thread records.
+
+    path: a file that does not exist yet (FileExistsError otherwise). on_failure: called once, with one sentence,
+    when the disk is full or gone; writing then goes on doing nothing, so that nothing else has to stop.
+    """
+
+    def __init__(self, path: str | Path, header: Header, on_failure: Callable[[str], None] | None = None) -> None:
+        self.path = Path(path)
+        self.failure = ""
+        self._on_failure = on_failure
+        self._file = _GuardedFile(self.path)
+        # The library never ends a chunk by itself: `_due` does, by size and by time, so that each chunk is also synced.
+        self._writer = Writer(self._file, chunk_size=1 << 40)  # type: ignore[arg-type]
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[type[Message], int] = {}
+        self._sequence: dict[str, int] = {}
+        self._chunk_bytes, self._chunk_start_ns = 0, 0
+        self._closed = False
+        self._writer.start(profile=PROFILE, library=f"seldinger {software_version()}")
+        for name, texts in header.sections().items():
+            self._writer.add_metadata(name, texts)
+        self._sync()
+
+    def _channel(self, topic: str) -> int:
+        known = self._channels.get(topic)
+        if known is not None:
+            return known
+        row = TOPICS[topic]
+        if row.message not in self._schemas:
+            self._schemas[row.message] = self._writer.register_schema(
+                row.message.__name__, "jsonschema", json_schema(row.message).encode())
+        metadata = {"rate_hz": f"{row.rate_hz:g}", "direction": row.direction, "description": row.doc}
+        self._channels[topic] = self._writer.register_channel(topic, "msgpack", self._schemas[row.message], metadata)
+        return self._channels[topic]
+
+    def write(self, topic: str, message: Message, recorded_ns: int | None = None) -> None:
+        """Append `message` of `topic`, numbered here. recorded_ns: the rig's clock now, else the message's own stamp.
+
+        Raises ValueError for a message of another topic or with a field that is not what its class declares.
+        """
+        if type(message) is not TOPICS[topic].message:
+            raise ValueError(f"{topic}: found {type(message).__name__}, wanted {TOPICS[topic].message.__name__}")
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        self.write_encoded(topic, encode(message, sequence), message.stamp_ns, sequence, recorded_ns)
+
+    def write_encoded(self, topic: str, payload: bytes, stamp_ns: int, sequence: int,
+                      recorded_ns: int | None = None) -> None:
+        """Append a payload that has already been decoded (and so checked) as a message of `topic`."""
+        if self._closed or self.failure:
+            return
+        now_ns = stamp_ns if recorded_ns is None else recorded_ns
+        self._writer.add_message(self._channel(topic), log_time=now_ns, publish_time=stamp_ns, data=payload,
+                                 sequence=sequence & 0xFFFFFFFF)
+        if self._chunk_bytes == 0:
+            self._chunk_start_ns = now_ns
+        self._chunk_bytes += len(payload) + 31
+        if self._chunk_bytes >= CHUNK_BYTES or abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
+            self._sync()
+
+    def _sync(self) -> None:
+        self._writer.flush()
+        self._chunk_bytes = 0
+        self._report()
+
+    def flush(self) -> None:
+        """End the chunk in progress and bring it to the disk; for quiet times, when no message ends it."""
+        if not self._closed and not self.failure and self._chunk_bytes:
+            self._sync()
+
+    def _report(self) -> None:
+        error = self._file.error
+        if error is None or self.failure:
+            return
+        cause = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error.strerror or error)
+        self.failure = f"recording {self.path} ended early: {cause}; what was written before is readable"
+        if self._on_failure is not None:
+            self._on_failure(self.failure)
+
+    def close(self) -> None:
+        """Finish the file with its index. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        if not self.failure:
+            self._writer.finish()
+            self._file.flush()
+            self._report()
+        self._file.close()
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()
+
+
+class _Row(NamedTuple):
+    recorded_ns: int
+    data: bytes
+
+
+class Recording:
+    """A recording, read whole. A file cut short, or with damaged chunks, gives every message that is intact.
+
+    path: the MCAP file. Raises ValueError where it cannot be read at all or is no recording.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.truncated = False
+        self.damaged_chunks = 0
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._rows: dict[str, list[_Row]] = {}
+        self._of_channel: dict[int, list[_Row]] = {}
+        self._tables: dict[str, dict[str, np.ndarray]] = {}
+        try:
+            with self.path.open("rb") as stream:
+                self._read(stream)
+        except OSError as error:
+            raise ValueError(f"{path}: found {error.strerror or error}, wanted a readable recording") from None
+        for number, rows in self._of_channel.items():
+            if number in self._channels:
+                self._rows.setdefault(self._channels[number].topic, []).extend(rows)
+
+    def _read(self, stream: Any) -> None:
+        magic = stream.read(8)
+        if magic != b"\x89MCAP0\r\n":
+            raise ValueError(f"{self.path}: found {magic!r} at its start, wanted an MCAP recording")
+        records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
+        self.truncated = True
+        try:
+            for record in records:
+                self._take(record)
+            self.truncated = False
+        except _DAMAGE:
+            return
+
+    def _take(self, record: Any) -> None:
+        if isinstance(record, Chunk):
+            try:
+                inside = breakup_chunk(record, validate_crc=True)
+            except _DAMAGE:
+                self.damaged_chunks += 1
+                return
+            for item in inside:
+                self._take(item)
+        elif isinstance(record, McapMessage):
+            self._of_channel.setdefault(record.channel_id, []).append(_Row(record.log_time, record.data))
+        elif isinstance(record, Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self._channels.setdefault(record.id, record)
+        elif isinstance(record, Metadata):
+            self._metadata[record.name] = record.metadata
+
+    @property
+    def run(self) -> dict[str, str]:
+        """Rig, clock, seed, software version, git revision, start and notes, as texts."""
+        return self._metadata.get("run", {})
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The effective configuration of the rig."""
+        return json.loads(self._metadata.get("configuration", {}).get("json", "{}"))
+
+    @property
+    def catheter(self) -> dict[str, Any]:
+        """The catheter's parameters."""
+        return json.loads(self._metadata.get("catheter", {}).get("json", "{}"))
+
+    @property
+    def topics(self) -> dict[str, int]:
+        """Topic -> number of messages, for topics that have any."""
+        return {topic: len(rows) for topic, rows in self._rows.items()}
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Earliest and latest time of recording, (0, 0) for an empty one."""
+        times = [row.recorded_ns for rows in self._rows.values() for row in (rows[0], rows[-1])]
+        return (min(times), max(times)) if times else (0, 0)
+
+    def schema(self, topic: str) -> dict[str, Any]:
+        """The JSON Schema of `topic` as this file carries it. Raises ValueError for a topic that is not in it."""
+        for channel in self._channels.values():
+            if channel.topic == topic and channel.schema_id in self._schemas:
+                return json.loads(self._schemas[channel.schema_id].data)
+        known = ", ".join(sorted(self._rows)) or "none, the recording is empty"
+        raise ValueError(f"topic: found {topic!r}, wanted one of {known}")
+
+    def units(self, topic: str) -> dict[str, str]:
+        """Column -> unit of `topic`'s table, empty text where it has none."""
+        units = {}
+        for name, item in self.schema(topic)["properties"].items():
+            if name != "schema_version":
+                for column in item.get("columns", [name]):
+                    units[column] = item.get("unit", "")
+        return {**units, "recorded_ns": "ns"}
+
+    def messages(self, topic: str) -> Iterator[dict[str, Any]]:
+        """The messages of `topic` as dicts, in the order of recording; none for a topic that is not there."""
+        for row in self._rows.get(topic, []):
+            yield msgpack.unpackb(row.data)
+
+    def table(self, topic: str) -> dict[str, np.ndarray]:
+        """The messages of `topic` as columns, one array of shape (n,) each; vectors are spread over named columns.
+
+        nil becomes NaN. `recorded_ns` is when it was recorded. Raises ValueError for a topic that is not in the file.
+        """
+        if topic not in self._tables:
+            bodies = list(self.messages(topic))
+            table = {}
+            for name, item in self.schema(topic)["properties"].items():
+                if name != "schema_version":
+                    table.update(_columns(name, item, [body.get(name) for body in bodies]))
+            table["recorded_ns"] = np.array([row.recorded_ns for row in self._rows.get(topic, [])], dtype=np.int64)
+            self._tables[topic] = table
+        return self._tables[topic]
+
+
+_DTYPES: dict[str, Any] = {"number": np.float64, "integer": np.int64, "boolean": np.bool_, "string": np.str_}
+
+
+def _columns(name: str, item: dict[str, Any], values: list[Any]) -> dict[str, np.ndarray]:
+    """The columns that one property of a schema makes out of its values."""
+    names = item.get("columns")
+    if names is None:
+        kind = item["type"][0] if isinstance(item["type"], list) else item["type"]
+        return {name: np.array(values, dtype=_DTYPES[kind])}
+    hole = [None] * len(names)
+    dtype = _DTYPES[item["items"]["type"]]
+    rows = np.array([hole if value is None else value for value in values], dtype=dtype).reshape(-1, len(names))
+    return {column: np.ascontiguousarray(rows[:, index]) for index, column in enumerate(names)}

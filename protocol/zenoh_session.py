@@ -1,0 +1,221 @@
+"""Zenoh, opened safely: this machine only, no scouting, newest value wins, a frozen reader never blocks a writer."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, topic_of
+
+RECORDER_DEPTH = 4096
+LONGEST_LIFE_NS = 10_000_000_000
+_TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
+
+
+def check_endpoint(endpoint: str) -> str:
+    """`endpoint` if it stays on this machine: tcp on a loopback address, or a unix socket. Raises ValueError."""
+    wanted = f"endpoint: found {endpoint!r}, wanted tcp/127.0.0.1:PORT, tcp/[::1]:PORT or unixsock-stream/PATH"
+    if endpoint.startswith("unixsock-stream/") and not re.search(r"[#?;\s]", endpoint) and len(endpoint) > 16:
+        return endpoint
+    match = _TCP.fullmatch(endpoint)
+    if not match or not 0 < int(match[2]) < 65536:
+        raise ValueError(wanted)
+    try:
+        loopback = ipaddress.ip_address(match[1].strip("[]")).is_loopback
+    except ValueError:
+        raise ValueError(wanted) from None
+    if not loopback:
+        raise ValueError(wanted)
+    return endpoint
+
+
+def configuration(listen: list[str], connect: list[str]) -> zenoh.Config:
+    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints."""
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
+        # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
+        "mode": "router",
+        "listen/endpoints": [check_endpoint(endpoint) for endpoint in listen],
+        "listen/exit_on_failure": True,
+        "connect/endpoints": [check_endpoint(endpoint) for endpoint in connect],
+        # -1: keep trying for ever, so that either side may start later or restart; and do not wait for it to open.
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "adminspace/enabled": False,
+        "transport/shared_memory/enabled": False,
+        # Zenoh would let each put wait 1 ms for a reader that has stopped: at 1 kHz that is all the time there is.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        # With 16 batches (and messages sharing them) a burst of thousands to a live reader loses none; with 2, half.
+        "transport/link/tx/queue/size/data": 16,
+        "transport/link/tx/lease": 2000,
+        "transport/link/tx/keep_alive": 4,
+    }
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+class Publisher:
+    """Publishes one topic, numbered. `put` never blocks: what a reader cannot take in time is dropped."""
+
+    def __init__(self, session: zenoh.Session, rig: str, topic: str) -> None:
+        self.topic = TOPICS[topic]
+        self.sequence = 0
+        self._publisher = session.declare_publisher(
+            key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False)
+
+    def put(self, message: Message) -> None:
+        """Publish `message`. Raises ValueError where it is not what the topic declares."""
+        if type(message) is not self.topic.message:
+            raise ValueError(f"{self.topic.name}: found {type(message).__name__}, wanted {self.topic.message.__name__}")
+        self._publisher.put(encode(message, self.sequence))
+        self.sequence += 1
+
+
+class Latest:
+    """The newest value of one topic. Older ones are gone; malformed ones are counted, never returned."""
+
+    def __init__(self, session: zenoh.Session, rig: str, topic: str) -> None:
+        self.topic = TOPICS[topic]
+        self.malformed = 0
+        self.complaint = ""
+        self._subscriber = session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(1))
+
+    def take(self) -> Message | None:
+        """The newest message since the last call, None where there is none or it is malformed."""
+        sample = self._subscriber.try_recv()
+        if sample is None:
+            return None
+        try:
+            return decode(self.topic.message, bytes(sample.payload))
+        except ValueError as error:
+            self.malformed += 1
+            self.complaint = str(error)
+            return None
+
+
+class Everything:
+    """All topics of a rig, in order, for a recorder: deep rings that lose their oldest when it does not keep up."""
+
+    def __init__(self, session: zenoh.Session, rig: str, depth: int = RECORDER_DEPTH) -> None:
+        self.malformed = 0
+        self.complaint = ""
+        names = [name for name, topic in TOPICS.items() if topic.kind != "query"]
+        self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth))
+                             for name in names]
+
+    def take(self) -> list[tuple[str, Message, bytes]]:
+        """(topic, message, payload) of all that came since the last call, topic by topic."""
+        taken = []
+        for subscriber in self._subscribers:
+            while (sample := subscriber.try_recv()) is not None:
+                payload = bytes(sample.payload)
+                try:
+                    _, topic = topic_of(str(sample.key_expr))
+                    taken.append((topic.name, decode(topic.message, payload), payload))
+                except ValueError as error:
+                    self.malformed += 1
+                    self.complaint = str(error)
+        return taken
+
+
+class CommandServer:
+    """Answers commands. Malformed, expired and repeated ones never reach `decide`, but a late stop still stops.
+
+    decide(command) -> Reply is called on a thread of zenoh's, one command at a time; now_ns is the rig's clock.
+    """
+
+    def __init__(self, session: zenoh.Session, rig: str, now_ns: Callable[[], int],
+                 decide: Callable[[Command], Reply]) -> None:
+        self._now_ns, self._decide = now_ns, decide
+        self._seen: dict[str, int] = {}
+        self._queryable = session.declare_queryable(key(rig, "command"), self._answer, complete=True)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            payload = bytes(query.payload) if query.payload is not None else b""
+            query.reply(query.key_expr, encode(self.judge(payload)))
+
+    def judge(self, payload: bytes) -> Reply:
+        """The reply to the command in `payload`: refused here, or what `decide` says of it."""
+        now_ns = self._now_ns()
+        try:
+            command = decode(Command, payload)
+        except ValueError as error:
+            return Reply(stamp_ns=now_ns, id="", result="malformed", text=str(error))
+        if command.action == "stop":
+            return self._decide(command)
+        if now_ns > command.expires_ns:
+            late_s = (now_ns - command.expires_ns) * 1e-9
+            return Reply(stamp_ns=now_ns, id=command.id, result="expired", text=f"came {late_s:.3f} s after its expiry")
+        if max(command.stamp_ns, command.expires_ns) > now_ns + LONGEST_LIFE_NS:
+            return Reply(stamp_ns=now_ns, id=command.id, result="refused",
+                         text=f"issued or valid more than {LONGEST_LIFE_NS * 1e-9:g} s ahead of the rig's clock")
+        self._seen = {name: expires_ns for name, expires_ns in self._seen.items() if expires_ns >= now_ns}
+        if command.id in self._seen:
+            return Reply(stamp_ns=now_ns, id=command.id, result="replayed", text="this id was answered before")
+        self._seen[command.id] = command.expires_ns
+        return self._decide(command)
+
+
+class Session:
+    """One open session of a rig. Use as a context, or `close` it.
+
+    listen, connect: endpoints, as in `check_endpoint`. Normally one process listens and the others connect to it; those
+    also reach each other through it. Who starts first does not matter.
+    Raises ValueError for an endpoint that leaves this machine, OSError where it cannot listen.
+    """
+
+    def __init__(self, rig: str, listen: list[str], connect: list[str]) -> None:
+        key(rig, "state")
+        self.rig = rig
+        config = configuration(listen, connect)
+        try:
+            self.zenoh = zenoh.open(config)
+        except zenoh.ZError as error:
+            where = ", ".join(listen) or "nothing"
+            found = str(error).split(" at /")[0]
+            raise OSError(f"zenoh: found {found}, wanted to listen on {where}") from None
+
+    def publisher(self, topic: str) -> Publisher:
+        """A publisher of `topic`."""
+        return Publisher(self.zenoh, self.rig, topic)
+
+    def latest(self, topic: str) -> Latest:
+        """The newest value of `topic`, for who steers by it."""
+        return Latest(self.zenoh, self.rig, topic)
+
+    def everything(self) -> Everything:
+        """All topics, for who records."""
+        return Everything(self.zenoh, self.rig)
+
+    def serve_commands(self, now_ns: Callable[[], int], decide: Callable[[Command], Reply]) -> CommandServer:
+        """Answer commands with `decide`; see CommandServer."""
+        return CommandServer(self.zenoh, self.rig, now_ns, decide)
+
+    def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
+        """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
+        for reply in self.zenoh.get(key(self.rig, "command"), payload=encode(command), timeout=timeout_s,
+                                    congestion_control=zenoh.CongestionControl.DROP):
+            if reply.ok is not None:
+                return decode(Reply, bytes(reply.ok.payload))
+        return None
+
+    def close(self) -> None:
+        """Undeclare everything and close the links."""
+        self.zenoh.close()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,1 @@
+"""The fixed-rate process: one pure tick out of small modules, the native loop, the clock and the device drivers."""

@@ -1,0 +1,133 @@
+"""How an Aurora is brought up: reset, speed, ports, tools, start; a script that waits for one reply at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from realtime.drivers import ndi_protocol as ndi
+from realtime.drivers.device_events import EventKind
+
+if TYPE_CHECKING:
+    from realtime.drivers.aurora import AuroraClient
+
+POWER_UP_BAUD = 9600
+BREAK_S = 0.25
+ATTEMPTS = 3
+# The device changes its speed this long after it has answered COMM.
+COMM_SETTLE_S = 0.1
+_INFO = ndi.PHINF_BASIC | ndi.PHINF_PART_NUMBER | ndi.PHINF_LOCATION
+
+
+@dataclass(frozen=True, slots=True)
+class LineAction:
+    """Set the line to `baud`, then, with `break_s` above 0, hold a break that long."""
+
+    baud: int
+    break_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Send these bytes and wait for a text reply at most `wait_s`; or, with `pause`, wait that long for nothing."""
+
+    phase: str
+    send: bytes
+    wait_s: float
+    pause: bool = False
+
+
+class SessionFailed(Exception):
+    """Bringing up went wrong; the text says at which command and why."""
+
+
+Script = Generator[Step, str | None, dict[str, ndi.ToolInfo]]
+_Part = Generator[Step, str | None, str]
+
+
+def set_up(client: AuroraClient) -> Script:
+    """From an unknown state to tracking. Returns the enabled tools by handle. Raises SessionFailed."""
+    yield from _reset(client)
+    yield from _command(client, "initialising", "INIT")
+    client.firmware = (yield from _command(client, "initialising", "VER", "0")).split("\n")[0].strip()
+    if client.config.baud != POWER_UP_BAUD:
+        yield from _command(client, "initialising", "COMM", f"{ndi.BAUD_CODES[client.config.baud]}0000", attempts=1)
+        yield Step("initialising", b"", COMM_SETTLE_S, pause=True)
+        client.line(LineAction(client.config.baud))
+    if client.config.beeps:
+        yield from _command(client, "initialising", "BEEP", str(client.config.beeps))
+    return (yield from enumerate_and_start(client, stop_first=False))
+
+
+def enumerate_and_start(client: AuroraClient, stop_first: bool) -> Script:
+    """Free what was pulled, initialise what is new, enable what is wanted, start tracking. Raises SessionFailed."""
+    if stop_first:
+        yield from _command(client, "reading ports", "TSTOP")
+    for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "01"))):
+        yield from _command(client, "reading ports", "PHF", handle)
+    yield from _initialise_tools(client)
+    tools: dict[str, ndi.ToolInfo] = {}
+    for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "00"))):
+        if client.config.tools and handle not in client.config.tools:
+            continue
+        text = yield from _command(client, "reading ports", "PHINF", f"{handle}{_INFO:04X}")
+        info = ndi.parse_phinf(text)
+        if not info.status & ndi.PortStatus.INITIALISED:
+            continue
+        if not info.status & ndi.PortStatus.ENABLED:
+            yield from _command(client, "enabling tools", "PENA", f"{handle}D")
+        tools[handle] = info
+    absent = [handle for handle in client.config.tools if handle not in tools]
+    if absent:
+        client.event(EventKind.ERROR, f"wanted tools not plugged in: {', '.join(absent)}")
+    if not tools:
+        raise SessionFailed("no tool to track")
+    yield from _command(client, "starting", "TSTART")
+    return tools
+
+
+def _reset(client: AuroraClient) -> Generator[Step, str | None, None]:
+    """A serial break resets the device whatever its speed and mode; where the adapter swallows breaks, ask in words."""
+    client.line(LineAction(POWER_UP_BAUD, BREAK_S))
+    if (yield Step("resetting", b"", client.config.reset_timeout_s)) == "RESET":
+        return
+    for baud in dict.fromkeys((client.config.baud, POWER_UP_BAUD)):
+        client.line(LineAction(baud))
+        if (yield Step("resetting", ndi.command("RESET", "0"), client.config.reply_timeout_s)) == "RESET":
+            if baud != POWER_UP_BAUD:
+                client.line(LineAction(POWER_UP_BAUD))
+            return
+    raise SessionFailed("no answer to a reset: is the Aurora switched on, and is this its port?")
+
+
+def _initialise_tools(client: AuroraClient) -> Generator[Step, str | None, None]:
+    """PINIT until no handle waits: initialising a tool with two sensors brings up a second handle."""
+    refused: set[str] = set()
+    while True:
+        waiting = [handle for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "02")))
+                   if handle not in refused]
+        if not waiting:
+            return
+        for handle in waiting:
+            refused.add(handle)
+            try:
+                yield from _command(client, "initialising tools", "PINIT", handle)
+            except SessionFailed as failed:
+                client.event(EventKind.ERROR, str(failed))
+
+
+def _command(client: AuroraClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
+    """One command and its reply. Silence (a damaged command or reply) is answered by asking again."""
+    for _ in range(attempts):
+        reply = yield Step(phase, ndi.command(name, parameters), client.config.reply_timeout_s)
+        if reply is None:
+            continue
+        if reply.startswith("ERROR"):
+            if reply[5:7] == "04":
+                continue
+            raise SessionFailed(f"{name} {parameters}: {ndi.words(reply)}")
+        if reply.startswith("WARNING"):
+            client.event(EventKind.WARNING, f"{name} {parameters}: {ndi.words(reply)}")
+        return reply
+    raise SessionFailed(f"{name} {parameters}: no answer in {attempts} attempts of {client.config.reply_timeout_s} s")

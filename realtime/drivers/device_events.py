@@ -1,0 +1,26 @@
+"""What a sensor's driver tells besides samples: events in words, and counters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class EventKind(Enum):
+    """TRACKING: samples flow for the first time. RECONNECTED: they flow again; hold, and come back disarmed."""
+
+    TRACKING = "tracking"
+    LOST = "lost"
+    RECONNECTED = "reconnected"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEvent:
+    """One thing worth a line in the log, with the driver's time of it."""
+
+    stamp_ns: int
+    device: str
+    kind: EventKind
+    text: str

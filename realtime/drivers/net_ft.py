@@ -1,0 +1,259 @@
+"""ATI Net F/T client without I/O: RDT requests out, UDP records in, forces in newtons with gaps and faults told."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.frame_clock import FrameClock
+from realtime.drivers.net_ft_calibration import NetFtCalibration
+
+RDT_PORT = 49152
+RECORD = struct.Struct(">IIIiiiiii")
+REQUEST = struct.Struct(">HHI")
+HEADER = 0x1234
+_MODULUS = 1 << 32
+# Error bits of a record's status; a latched monitor condition (bit 16) with the summary bit alone is no fault.
+ERROR_SUMMARY, MONITOR_CONDITION = 0x80000000, 0x00010000
+STATUS_WORDS = {
+    0x40000000: "CPU or RAM error", 0x20000000: "digital board error", 0x10000000: "analog board error",
+    0x08000000: "serial link communication error", 0x04000000: "program memory error",
+    0x02000000: "halted by configuration errors", 0x01000000: "settings not valid",
+    0x00800000: "configuration does not fit the calibration", 0x00400000: "network failure",
+    0x00200000: "CAN failure", 0x00100000: "RDT failure", 0x00080000: "EtherNet/IP failure",
+    0x00040000: "DeviceNet failure", 0x00020000: "transducer saturated or A/D error",
+    0x00010000: "monitor condition latched", 0x00004000: "watchdog timeout", 0x00002000: "stack error",
+    0x00001000: "EEPROM failure", 0x00000800: "flash failure", 0x00000400: "analog board watchdog timeout",
+    0x00000200: "excitation current too high", 0x00000100: "excitation current too low",
+    0x00000080: "analog ground out of range", 0x00000040: "analog supply too high",
+    0x00000020: "analog supply too low", 0x00000010: "no data on the serial link",
+    0x00000008: "reference voltage error", 0x00000004: "temperature error", 0x00000002: "HTTP failure",
+}
+
+
+class Command(IntEnum):
+    """RDT commands."""
+
+    STOP = 0x0000
+    START_REALTIME = 0x0002
+    START_BUFFERED = 0x0003
+    RESET_LATCH = 0x0041
+    SET_BIAS = 0x0042
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceSample:
+    """One record. stamp_ns: when the gauges were read, host clock; force_N, torque_Nm: (3,) in the sensor's frame;
+    status: the record's status word; lost: records missing between this one and the sample before."""
+
+    stamp_ns: int
+    arrival_ns: int
+    force_N: np.ndarray
+    torque_Nm: np.ndarray
+    rdt_sequence: int
+    status: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class NetFtConfig:
+    """ft_rate_hz: the box's internal rate, at which ft_sequence counts; latency_s: from gauge to UDP at no waiting;
+    wild_ratio: readings beyond this multiple of the rated range are not believed."""
+
+    calibration: NetFtCalibration
+    ft_rate_hz: float = 7000.0
+    latency_s: float = 0.0003
+    silent_after_s: float = 0.1
+    retry_s: float = 0.25
+    max_gap: int = 10_000
+    resync_after: int = 3
+    wild_ratio: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not (self.ft_rate_hz > 0 and self.latency_s >= 0 and self.max_gap > 0 and self.resync_after > 0):
+            raise ValueError("net_ft: found ft_rate_hz, latency_s, max_gap or resync_after out of range, "
+                             "wanted more than 0 (latency_s: 0 or more)")
+
+
+@dataclass
+class NetFtCounters:
+    """All since the client was made. `lost`: gaps in the sequence; `old`: reordered; `strays`: not of this stream."""
+
+    requests: int = 0
+    records: int = 0
+    samples: int = 0
+    malformed: int = 0
+    duplicates: int = 0
+    old: int = 0
+    strays: int = 0
+    lost: int = 0
+    status_errors: int = 0
+    wild: int = 0
+    resyncs: int = 0
+    silences: int = 0
+
+
+def request(command: Command, count: int = 0) -> bytes:
+    """An 8-byte RDT request; `count` records, 0 for without end."""
+    return REQUEST.pack(HEADER, command, count)
+
+
+def status_words(status: int) -> str:
+    """A status word in words; "good" when no bit of it is set."""
+    return ", ".join(text for bit, text in STATUS_WORDS.items() if status & bit) or (
+        "error" if status & ERROR_SUMMARY else "good")
+
+
+def is_fault(status: int) -> bool:
+    """True when a record of this status must not be used."""
+    return bool(status & ~(ERROR_SUMMARY | MONITOR_CONDITION)) or status == ERROR_SUMMARY
+
+
+class NetFtClient:
+    """The driver's core: send what `outgoing`, `start`, `bias` or `stop` return, give every datagram to `feed`.
+
+    Asks for the stream by itself and asks again when it falls silent. Never raises on what arrives.
+    """
+
+    def __init__(self, config: NetFtConfig) -> None:
+        self.config = config
+        self.clock = FrameClock(1.0 / config.ft_rate_hz, window_s=20.0, block_s=0.5, early_s=0.002, late_s=0.5,
+                                strange_in_row=200)
+        c = config.calibration
+        self._newton = np.array([1.0 / c.counts_per_N] * 3)
+        self._newton_metre = np.array([1.0 / c.counts_per_Nm] * 3)
+        self._wild = np.array(c.range_N + c.range_Nm) * config.wild_ratio
+        self._counters = NetFtCounters()
+        self._events: list[DeviceEvent] = []
+        self._streamed = False
+        self._streaming = False
+        self._wanted = True
+        self._heard_ns: int | None = None
+        self._asked_ns: int | None = None
+        self._status = 0
+        self._restart()
+
+    @property
+    def streaming(self) -> bool:
+        """True while records arrive."""
+        return self._streaming
+
+    @property
+    def counters(self) -> NetFtCounters:
+        """A copy of the counters."""
+        return NetFtCounters(**asdict(self._counters))
+
+    def take_events(self) -> list[DeviceEvent]:
+        """Events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def start(self) -> bytes:
+        """The request that starts the stream; the box counts records from 1 again."""
+        self._counters.requests += 1
+        self._wanted = True
+        return request(Command.START_REALTIME)
+
+    def stop(self) -> bytes:
+        """The request that ends the stream."""
+        self._wanted = self._streaming = False
+        return request(Command.STOP)
+
+    def bias(self) -> bytes:
+        """The request that makes the present load the new zero (software bias); only while nothing touches."""
+        return request(Command.SET_BIAS)
+
+    def outgoing(self, now_ns: int) -> bytes:
+        """A request to send now, or nothing. Also where silence is noticed."""
+        if self._streaming and now_ns - (self._heard_ns or 0) > self.config.silent_after_s * 1e9:
+            self._counters.silences += 1
+            self.lost(now_ns, f"no record for {self.config.silent_after_s} s")
+        if self._streaming or not self._wanted:
+            return b""
+        if self._asked_ns is not None and now_ns - self._asked_ns < self.config.retry_s * 1e9:
+            return b""
+        self._asked_ns = now_ns
+        return self.start()
+
+    def lost(self, now_ns: int, why: str) -> None:
+        """The stream has ended, or its socket has gone."""
+        if self._streaming:
+            self._event(EventKind.LOST, why, now_ns)
+        self._streaming, self._asked_ns = False, None
+        self._restart()
+
+    def feed(self, datagram: bytes, now_ns: int) -> ForceSample | None:
+        """The sample in one datagram that arrived at `now_ns`, or None when it must not be used (see `counters`)."""
+        if len(datagram) != RECORD.size:
+            self._counters.malformed += 1
+            return None
+        sequence, ft_sequence, status, *counts = RECORD.unpack(datagram)
+        self._counters.records += 1
+        lost = self._follow(sequence)
+        if lost is None:
+            return None
+        self._heard_ns = now_ns
+        stamp_ns = self._stamp(ft_sequence, now_ns)
+        if status != self._status:
+            self._status = status
+            self._event(EventKind.WARNING, f"status {status:08X}: {status_words(status)}", now_ns)
+        if is_fault(status):
+            self._counters.status_errors += 1
+            return None
+        force_N = np.array(counts[:3]) * self._newton
+        torque_Nm = np.array(counts[3:]) * self._newton_metre
+        if np.any(np.abs(np.concatenate((force_N, torque_Nm))) > self._wild):
+            self._counters.wild += 1
+            return None
+        if not self._streaming:
+            self._streaming = True
+            self._event(EventKind.RECONNECTED if self._streamed else EventKind.TRACKING, "records arrive", now_ns)
+            self._streamed = True
+        self._counters.samples += 1
+        return ForceSample(stamp_ns, now_ns, force_N, torque_Nm, sequence, status, lost)
+
+    def _restart(self) -> None:
+        self._last: int | None = None
+        self._stray: int | None = None
+        self._stray_run = 0
+        self._ft: int | None = None
+        self.clock.reset()
+
+    def _follow(self, sequence: int) -> int | None:
+        """Records lost before this one; None when it is a duplicate, late, or of another stream."""
+        if self._last is None:
+            self._last = sequence
+            return 0
+        step = (sequence - self._last) % _MODULUS
+        if 0 < step <= self.config.max_gap:
+            self._last, self._stray = sequence, None
+            self._counters.lost += step - 1
+            return step - 1
+        if step == 0:
+            self._counters.duplicates += 1
+            return None
+        if step >= _MODULUS - self.config.max_gap:
+            self._counters.old += 1
+        else:
+            self._counters.strays += 1
+        # A stream that was started anew counts from 1: believed once it has counted on for a few records.
+        self._stray_run = self._stray_run + 1 if self._stray is not None and sequence == self._stray + 1 else 1
+        self._stray = sequence
+        if self._stray_run < self.config.resync_after:
+            return None
+        self._counters.resyncs += 1
+        self._restart()
+        self._last = sequence
+        return 0
+
+    def _stamp(self, ft_sequence: int, now_ns: int) -> int:
+        near = self._ft if self._ft is not None else ft_sequence
+        self._ft = near + (ft_sequence - near + _MODULUS // 2) % _MODULUS - _MODULUS // 2
+        return self.clock.observe(self._ft, now_ns) - round(self.config.latency_s * 1e9)
+
+    def _event(self, kind: EventKind, text: str, now_ns: int) -> None:
+        self._events.append(DeviceEvent(now_ns, "net_ft", kind, text))

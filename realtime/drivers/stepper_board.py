@@ -1,0 +1,295 @@
+"""The link to the stepper board without I/O: bytes in, events out; commands as bytes to send."""
+
+import enum
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from protocol.serial_codec import Message, StreamDecoder, encode
+from protocol.serial_frames import (
+    AXES,
+    BAUD,
+    BITS_PER_BYTE,
+    FIRMWARE_VERSION,
+    FRAME_BY_ID,
+    FRAME_BY_NAME,
+    PROTOCOL_HASH,
+    Fault,
+    Mcu,
+    ResetCause,
+    Result,
+    State,
+    wire_bytes,
+)
+from realtime.drivers.mcu_clock import McuClock
+
+RETRY_NS = 100_000_000  # a command without an answer is sent again after this time
+_STATUS_LINE_NS = wire_bytes(FRAME_BY_NAME["STATUS"]) * BITS_PER_BYTE * 1_000_000_000 // BAUD
+
+FAULT_ADVICE = {
+    Fault.NONE: "no fault",
+    Fault.DEADMAN: "no valid set-point for 30 ms: look for a stall of the host or a broken cable, then clear it",
+    Fault.ESTOP: "the emergency stop is open: release it, then clear it",
+    Fault.LIMIT: "a limit switch opened: clear it, then move away from that end",
+    Fault.WATCHDOG: "the firmware hung and was reset by its watchdog: home the axes again, and report it",
+    Fault.BROWNOUT: "the board's supply dipped: check the supply, home the axes again",
+}
+
+
+class LinkPhase(enum.Enum):
+    """How far the bring-up has come."""
+
+    HELLO = "hello"  # waits for IDENTITY
+    CONFIGURE = "configure"  # waits for the limits to be accepted
+    READY = "ready"  # may be armed
+    MISMATCH = "mismatch"  # another protocol or firmware: nothing is sent any more
+    RESET = "reset"  # the processor started anew: restart() once the operator knows
+
+
+class EventKind(enum.Enum):
+    """What happened on the link."""
+
+    IDENTIFIED = "identified"
+    READY = "ready"
+    STATUS = "status"
+    ACK = "ack"  # a command was accepted
+    REFUSED = "refused"  # a command was refused
+    FAULT = "fault"  # the board latched a fault
+    RESET = "reset"  # the processor started anew; positions are lost
+    MISMATCH = "mismatch"  # another protocol or firmware version
+
+
+class BoardIdentity(NamedTuple):
+    """IDENTITY as the board sent it."""
+
+    protocol_hash: int
+    firmware_version: int
+    boot_count: int
+    reset_cause: int
+    mcu: int
+    timer_hz: int
+    axes: int
+    queue_capacity: int
+    deadman_us: int
+    horizon_us: int
+
+
+class BoardStatus(NamedTuple):
+    """STATUS as the board sent it, and the host time at which it had arrived whole."""
+
+    arrival_ns: int
+    mcu_time_us: int
+    last_setpoint: int
+    position_steps: tuple[int, int, int]
+    encoder_counts: tuple[int, int, int]
+    state: int
+    fault: int
+    inputs: int
+    queue_depth: int
+    deadman_age_ms: int
+    last_reject: int
+    boot_count: int
+    crc_errors: int
+    sequence_errors: int
+    underruns: int
+    rejected: int
+    expired: int
+    overflows: int
+    late: int
+    rx_overruns: int
+    encoder_errors: int
+
+
+class LinkEvent(NamedTuple):
+    """One event: its kind, host time of arrival, a line for people, the command it answers ("" for none)."""
+
+    kind: EventKind
+    stamp_ns: int
+    message: str
+    command: str = ""
+
+
+class AxisLimits(NamedTuple):
+    """Limits of one axis, as CONFIGURE sends them. The axis must be able to stop from full speed within 50 ms."""
+
+    max_speed_steps_per_s: int
+    max_accel_steps_per_s2: int
+    soft_min_steps: int
+    soft_max_steps: int
+
+
+class _Pending(NamedTuple):
+    command: str
+    axis: int
+
+
+class StepperBoardLink:
+    """State of the link to one board.
+
+    axes: limits in the order of protocol.serial_frames.AXES. Call feed() with whatever arrives, send what
+    advance() and the commands return. The bring-up is: advance() until phase is READY, then arm().
+    Set-points have their own sequence count, so a compiled loop may send them beside the commands from here.
+    """
+
+    def __init__(self, axes: Sequence[AxisLimits]) -> None:
+        if len(axes) != len(AXES):
+            raise ValueError(f"axes: found {len(axes)}, wanted {len(AXES)} ({', '.join(AXES)})")
+        self.axes = tuple(axes)
+        self.phase = LinkPhase.HELLO
+        self.identity: BoardIdentity | None = None
+        self.status: BoardStatus | None = None
+        self.decoder = StreamDecoder()
+        self.clock = McuClock()
+        self._sequence = 0
+        self._setpoint_sequence = 0
+        self._pending: dict[int, _Pending] = {}
+        self._configured: set[int] = set()
+        self._sent_ns: int | None = None
+        self._fault = Fault.NONE
+
+    # --- to the board ---------------------------------------------------------------------------------------------
+
+    def advance(self, now_ns: int) -> bytes:
+        """Bytes that bring the link further: HELLO, then the limits; again every 100 ms until they are answered."""
+        if self.phase not in (LinkPhase.HELLO, LinkPhase.CONFIGURE):
+            return b""
+        if self._sent_ns is not None and now_ns - self._sent_ns < RETRY_NS:
+            return b""
+        self._sent_ns = now_ns
+        if self.phase is LinkPhase.HELLO:
+            return self.hello()
+        return b"".join(self.configure(axis) for axis in range(len(AXES)) if axis not in self._configured)
+
+    def restart(self) -> None:
+        """Starts the bring-up anew, after RESET or MISMATCH or when another board was plugged in."""
+        self.phase = LinkPhase.HELLO
+        self.identity = None
+        self.status = None
+        self._configured.clear()
+        self._pending.clear()
+        self._sent_ns = None
+        self._fault = Fault.NONE
+        self.clock.restart()
+
+    def hello(self) -> bytes:
+        """HELLO, after a delimiter that ends whatever was on the line before."""
+        return b"\0" + self._command("HELLO", protocol_hash=PROTOCOL_HASH)
+
+    def configure(self, axis: int) -> bytes:
+        """CONFIGURE with the limits of `axis`."""
+        return self._command("CONFIGURE", axis=axis, **self.axes[axis]._asdict())
+
+    def set_position(self, axis: int, position_steps: int) -> bytes:
+        """SET_POSITION: the present position of `axis` is `position_steps` from now on."""
+        return self._command("SET_POSITION", axis=axis, position_steps=position_steps)
+
+    def arm(self) -> bytes:
+        """ARM, on the boot count of the last IDENTITY. Raises ValueError unless phase is READY."""
+        if self.phase is not LinkPhase.READY or self.identity is None:
+            raise ValueError(f"board link: found phase {self.phase.value}, wanted ready before arm")
+        return self._command("ARM", boot_count=self.identity.boot_count)
+
+    def disarm(self) -> bytes:
+        """DISARM: decelerate and refuse set-points."""
+        return self._command("DISARM")
+
+    def clear_fault(self, fault: int) -> bytes:
+        """CLEAR_FAULT for an operator who has seen `fault`; a program never calls it by itself."""
+        return self._command("CLEAR_FAULT", fault=fault)
+
+    def ping(self) -> bytes:
+        """PING, answered by an ACK event."""
+        return self._command("PING")
+
+    def setpoint(self, number: int, execute_us: int, expiry_us: int, position_steps: Sequence[int]) -> bytes:
+        """SETPOINT for callers that do not use protocol.setpoint_encoder; number and times are wrapped to the wire."""
+        self._setpoint_sequence = self._setpoint_sequence + 1 & 0xFF
+        return encode("SETPOINT", self._setpoint_sequence, number=number & 0xFFFF, execute_us=execute_us & 0xFFFFFFFF,
+                      expiry_us=expiry_us, position_steps=[int(s) for s in position_steps])
+
+    def _command(self, name: str, **fields: int) -> bytes:
+        self._sequence = self._sequence + 1 & 0xFF
+        self._pending[self._sequence] = _Pending(name, fields.get("axis", -1))
+        return encode(name, self._sequence, **fields)
+
+    # --- from the board -------------------------------------------------------------------------------------------
+
+    def feed(self, data: bytes, now_ns: int) -> list[LinkEvent]:
+        """Events in what arrived. data: any portion of the stream. now_ns: host time at which it was read."""
+        events: list[LinkEvent] = []
+        for message in self.decoder.feed(data):
+            if message.name == "STATUS":
+                events += self._on_status(message, now_ns)
+            elif message.name == "IDENTITY":
+                events += self._on_identity(message, now_ns)
+            elif message.name == "ACK":
+                events += self._on_ack(message, now_ns)
+        return events
+
+    def mcu_offset_ns(self, now_ns: int) -> int:
+        """Host time minus board time. Raises ValueError before the first STATUS."""
+        return self.clock.offset_ns(now_ns)
+
+    @property
+    def armed(self) -> bool:
+        """Whether the board takes set-points, by its last STATUS."""
+        return self.status is not None and self.status.state in (State.ARMED, State.RUNNING)
+
+    def _on_identity(self, message: Message, now_ns: int) -> list[LinkEvent]:
+        identity = BoardIdentity(**message.fields)
+        major, minor = divmod(identity.firmware_version, 256)
+        if identity.protocol_hash != PROTOCOL_HASH or major != FIRMWARE_VERSION[0]:
+            self.phase = LinkPhase.MISMATCH
+            return [LinkEvent(EventKind.MISMATCH, now_ns, (
+                f"board: found protocol {identity.protocol_hash:#010x}, firmware {major}.{minor}; wanted "
+                f"{PROTOCOL_HASH:#010x}, {FIRMWARE_VERSION[0]}.x: build and flash this version's firmware"))]
+        events = self._check_boot(identity.boot_count, now_ns)
+        if self.phase is LinkPhase.HELLO:
+            self.identity = identity
+            self.phase = LinkPhase.CONFIGURE
+            self._sent_ns = None
+            events.append(LinkEvent(EventKind.IDENTIFIED, now_ns, (
+                f"board: {Mcu(identity.mcu).name.lower()}, firmware {major}.{minor}, "
+                f"start {identity.boot_count} by {ResetCause(identity.reset_cause).name.lower()}")))
+        return events
+
+    def _on_status(self, message: Message, now_ns: int) -> list[LinkEvent]:
+        status = BoardStatus(arrival_ns=now_ns, **message.fields)
+        events = self._check_boot(status.boot_count, now_ns)
+        if self.status is None and self.phase is LinkPhase.HELLO:
+            self._sent_ns = None  # the board has only now started to speak: a HELLO before was lost
+        self.clock.update(status.mcu_time_us, now_ns - _STATUS_LINE_NS)
+        self.status = status
+        fault = Fault(status.fault)
+        if fault != self._fault and fault != Fault.NONE:
+            events.append(LinkEvent(EventKind.FAULT, now_ns, f"board fault {fault.name}: {FAULT_ADVICE[fault]}"))
+        self._fault = fault
+        events.append(LinkEvent(EventKind.STATUS, now_ns, ""))
+        return events
+
+    def _check_boot(self, boot_count: int, now_ns: int) -> list[LinkEvent]:
+        if self.identity is None or boot_count == self.identity.boot_count or self.phase is LinkPhase.RESET:
+            return []
+        known = self.identity.boot_count
+        self.phase = LinkPhase.RESET
+        self.clock.restart()
+        return [LinkEvent(EventKind.RESET, now_ns, (
+            f"board was reset: found start {boot_count}, wanted {known}; its positions are lost, home the axes again"))]
+
+    def _on_ack(self, message: Message, now_ns: int) -> list[LinkEvent]:
+        result = Result(message.fields["result"])
+        frame = FRAME_BY_ID.get(message.fields["command"])
+        pending = self._pending.pop(message.fields["command_sequence"], None)
+        if frame is None or pending is None or pending.command != frame.name:
+            return []
+        if result != Result.OK:
+            message_text = f"board refused {frame.name}: {result.name}"
+            if self.status is not None:
+                message_text += f" (it is {State(self.status.state).name}, fault {Fault(self.status.fault).name})"
+            return [LinkEvent(EventKind.REFUSED, now_ns, message_text, frame.name)]
+        events = [LinkEvent(EventKind.ACK, now_ns, f"board accepted {frame.name}", frame.name)]
+        if frame.name == "CONFIGURE":
+            self._configured.add(pending.axis)
+            if self.phase is LinkPhase.CONFIGURE and len(self._configured) == len(AXES):
+                self.phase = LinkPhase.READY
+                events.append(LinkEvent(EventKind.READY, now_ns, "board ready"))
+        return events

@@ -1,0 +1,98 @@
+"""Where a driver's bytes go: a serial port, or a pair of queues in one process for lock step."""
+
+import os
+from collections import deque
+from typing import Protocol
+
+import serial
+
+
+class Transport(Protocol):
+    """A byte stream that never blocks."""
+
+    def read(self) -> bytes:
+        """What has arrived since the last call; empty when nothing has. Raises OSError when the device is gone."""
+
+    def write(self, data: bytes) -> None:
+        """Hands over all of `data`. Raises OSError when the device is gone or does not take it."""
+
+    def fileno(self) -> int:
+        """Descriptor to wait on, or -1 where there is none."""
+
+    def close(self) -> None:
+        """Releases the device; a second call does nothing."""
+
+
+class SerialTransport:
+    """A serial port (or pty) in raw mode, 8N1, held by this process alone.
+
+    path: device, as /dev/ttyACM0. baud: bits per second. Raises OSError with the path when it cannot be opened.
+    """
+
+    def __init__(self, path: str, baud: int) -> None:
+        self.path = path
+        try:
+            self._port = serial.Serial(path, baud, timeout=0, write_timeout=0.5, exclusive=True)
+        except serial.SerialException as error:
+            raise OSError(f"serial port: found {path} that does not open ({error}), wanted a free device") from error
+
+    def read(self) -> bytes:
+        """Bytes that have arrived, at most 4096."""
+        try:
+            return os.read(self._port.fileno(), 4096)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Hands over all of `data`; waits at most 0.5 s for a full output buffer."""
+        try:
+            self._port.write(data)
+        except serial.SerialException as error:
+            raise OSError(f"{self.path}: did not take {len(data)} bytes ({error})") from error
+
+    def fileno(self) -> int:
+        """Descriptor of the port."""
+        return int(self._port.fileno())
+
+    def close(self) -> None:
+        """Closes the port."""
+        self._port.close()
+
+
+class PipeTransport:
+    """One end of a pair in memory, for lock step in one process: what one end writes the other reads."""
+
+    def __init__(self, incoming: deque[bytes], outgoing: deque[bytes]) -> None:
+        self._incoming = incoming
+        self._outgoing = outgoing
+
+    @classmethod
+    def pair(cls) -> "tuple[PipeTransport, PipeTransport]":
+        """Two ends that are connected."""
+        a: deque[bytes] = deque()
+        b: deque[bytes] = deque()
+        return cls(a, b), cls(b, a)
+
+    def read(self) -> bytes:
+        """All that the other end has written since the last call."""
+        data = b"".join(self._incoming)
+        self._incoming.clear()
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Hands `data` to the other end."""
+        if data:
+            self._outgoing.append(bytes(data))
+
+    def fileno(self) -> int:
+        """There is nothing to wait on: -1."""
+        return -1
+
+    def close(self) -> None:
+        """Drops what was not read."""
+        self._incoming.clear()
+
+
+def open_serial(path: str, baud: int) -> SerialTransport:
+    """Opens the serial port at `path`. Raises OSError with the path when it cannot."""
+    return SerialTransport(path, baud)

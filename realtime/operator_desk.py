@@ -1,0 +1,103 @@
+"""Commands in, replies out: arms the board and the loop, sets targets, stops, clears. Nothing arms by itself.
+
+Expiry and repetition of commands are judged where they arrive (`protocol.zenoh_session.CommandServer`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocol.serial_frames import Fault
+from protocol.messages import Vector
+from protocol.topics import Command, Reply
+from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
+from realtime.records import (
+    COMMAND_CONTACT,
+    COMMAND_HOLD,
+    COMMAND_POSITION,
+    COMMAND_RETRACT,
+    COMMAND_STOP,
+)
+from realtime.rig_file import Rig
+
+_KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND_CONTACT, "retract": COMMAND_RETRACT}
+
+
+class OperatorDesk:
+    """Turns commands into the tick's COMMAND record and into frames for the board (`take_frames`)."""
+
+    def __init__(self, rig: Rig, record: np.record, link: StepperBoardLink) -> None:
+        self._rig, self._record, self._link = rig, record, link
+        self._frames: list[bytes] = []
+        record.normal[:] = (0.0, 0.0, -1.0)
+
+    def take_frames(self) -> list[bytes]:
+        """Frames to send to the board, in order."""
+        frames, self._frames = self._frames, []
+        return frames
+
+    def obey(self, command: Command, now_ns: int) -> Reply:
+        """Carry out `command` at `now_ns` or refuse it; a refused command changes nothing."""
+        actions = {"arm": self._arm, "disarm": self._disarm, "stop": self._stop, "clear_fault": self._clear_fault,
+                   "target": self._target}
+        problem = actions[command.action](command)
+        return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
+
+    def _set(self, kind: int) -> None:
+        self._record.kind = kind
+        self._record.count += 1
+
+    def _arm(self, command: Command) -> str:
+        if self._link.phase is not LinkPhase.READY:
+            return f"arm: found the board link in phase {self._link.phase.value}, wanted ready"
+        if self._link.status is not None and self._link.status.fault != Fault.NONE:
+            return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
+        self._frames.append(self._link.arm())
+        self._record.armed = 1
+        self._set(COMMAND_HOLD)
+        return ""
+
+    def _disarm(self, command: Command) -> str:
+        self._record.armed = 0
+        self._set(COMMAND_HOLD)
+        self._frames.append(self._link.disarm())
+        return ""
+
+    def _stop(self, command: Command) -> str:
+        self._set(COMMAND_STOP)
+        return ""
+
+    def _clear_fault(self, command: Command) -> str:
+        """Clears the loop's latched causes and the board's fault, and leaves both disarmed."""
+        self._disarm(command)
+        self._record.clear += 1
+        if self._link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH):
+            self._link.restart()
+        elif self._link.status is not None and self._link.status.fault != Fault.NONE:
+            self._frames.append(self._link.clear_fault(command.fault or self._link.status.fault))
+        return ""
+
+    def _target(self, command: Command) -> str:
+        if not self._record.armed:
+            return "target: found the rig disarmed, wanted armed"
+        if command.target_m is not None:
+            problem = self._outside(command.target_m)
+            if problem:
+                return problem
+        if command.force_N is not None and command.force_N >= self._rig.safety.over_force_N:
+            return f"force_N: found {command.force_N}, wanted below safety.over_force_N {self._rig.safety.over_force_N}"
+        if command.target_m is not None:
+            self._record.target_m[:] = command.target_m
+        if command.normal is not None:
+            self._record.normal[:] = -np.asarray(command.normal)
+        if command.force_N is not None:
+            self._record.force_N = command.force_N
+        self._set(_KINDS[command.target])
+        return ""
+
+    def _outside(self, target_m: Vector) -> str:
+        low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
+        for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
+            if not least <= value <= most:
+                return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
+        return ""

@@ -1,0 +1,246 @@
+"""The realtime process on the wall clock: device threads fill mailboxes, the compiled loop ticks, zenoh hears of it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from protocol.topics import HISTOGRAM_BUCKETS, Log, LoopTiming, Message, histogram_bucket
+from protocol.zenoh_session import Session
+from realtime import telemetry
+from realtime.board_intake import axis_limits, board_message, take_status
+from realtime.clock import Clock
+from realtime.configure import tick_parameters
+from realtime.drivers.aurora import AuroraConfig, PoseSample
+from realtime.drivers.device_events import DeviceEvent
+from realtime.drivers.device_events import EventKind as DeviceEventKind
+from realtime.drivers.net_ft import ForceSample, NetFtConfig
+from realtime.drivers.net_ft_calibration import NetFtCalibration
+from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
+from realtime.drivers.stepper_board import EventKind, StepperBoardLink
+from realtime.drivers.transport import open_serial
+from realtime.intake import Intake
+from realtime.latency import percentiles_us
+from realtime.loop_thread import NativeLoop, input_mailboxes
+from realtime.native_loop import GAP_PLACES, WORK_BIN_NS
+from realtime.operator_desk import OperatorDesk
+from realtime.records import INPUTS, OUTPUTS, STATE, new
+from realtime.rig_file import Rig
+from realtime.scheduling import RealtimeSettings
+from realtime.tick import tick
+
+_POLL_S = 0.005
+_OPEN_RETRY_S = 0.2
+logger = logging.getLogger("seldinger.realtime")
+
+
+class RealtimeProcess:
+    """Everything of the process, from `start` to `stop`. Ports as in the rig file, or given here.
+
+    Raises OSError where the board's port does not open within `open_timeout_s`, or zenoh cannot connect as asked.
+    """
+
+    def __init__(self, rig: Rig, *, board_port: str | None = None, tracker_port: str | None = None,
+                 force_port: int = 49152, force_source: str = "sensor", open_timeout_s: float = 10.0) -> None:
+        self.rig, self.clock = rig, Clock.monotonic()
+        self._stopping = threading.Event()
+        self._mailboxes = input_mailboxes(INPUTS)
+        self._intake = Intake(rig)
+        self._link = StepperBoardLink(axis_limits(rig))
+        self._link_lock = threading.Lock()
+        self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link)
+        self._params = tick_parameters(rig, force_source)
+        self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
+        os.set_blocking(self._port.fileno(), False)
+        self._session = Session(rig.name, [], rig.zenoh.connect)
+        self._publishers = {name: self._session.publisher(name) for name in (
+            "stage", "pose/tip", "pose/shaft", "force/sensor", "state", "board", "loop", "log")}
+        self._publish_lock = threading.Lock()
+        self._estimates = self._session.latest("force/estimate")
+        self.loop = NativeLoop(
+            tick, self._params, new(STATE), INPUTS, OUTPUTS, self._mailboxes, clock=self.clock,
+            period_ns=round(1e9 / rig.control.loop_hz), fd=self._port.fileno(), realtime=RealtimeSettings())
+        tracker, sensor = rig.tracker, rig.force_sensor
+        self._tracker = AuroraThread(
+            lambda: open_serial(tracker_port or tracker.port, 9600), self._on_pose,
+            AuroraConfig(tools=(tracker.tip_handle, tracker.shaft_handle), rate_hz=tracker.rate_hz,
+                         latency_s=tracker.latency_s), self._on_device)
+        calibration = NetFtCalibration(counts_per_N=sensor.counts_per_newton,
+                                       counts_per_Nm=sensor.counts_per_newton_metre, rdt_rate_hz=sensor.rate_hz)
+        self._force = NetFtThread(sensor.address, self._on_force, NetFtConfig(calibration), self._on_device, force_port)
+        self._threads = [threading.Thread(target=self._guard, args=(work,), name=work.__name__, daemon=True)
+                         for work in (self._serve_board, self._serve_telemetry)]
+        self.failure: BaseException | None = None
+
+    def start(self) -> None:
+        """Compile, start the loop and all threads, begin to answer commands."""
+        self.loop.prepare()
+        self.loop.start()
+        if self.loop.granted.warning:
+            self._log("warning", "realtime", self.loop.granted.warning)
+        for thread in self._threads:
+            thread.start()
+        self._tracker.start()
+        self._force.start()
+        self._commands = self._session.serve_commands(self.clock.now_ns, self._obey)
+        self._log("info", "realtime", f"loop at {self.rig.control.loop_hz} Hz, disarmed")
+
+    def stop(self) -> None:
+        """Disarm, let the stages come to rest, end the loop and the threads, close the ports."""
+        with self._link_lock:
+            self._mailboxes["command"].record[0].armed = 0
+            self._mailboxes["command"].publish()
+            if self._link.status is not None:
+                self.loop.send(self._link.disarm())
+        time.sleep(0.1)
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join(1.0)
+        self._tracker.stop()
+        self._force.stop()
+        self.loop.stop()
+        self.loop.join(1.0)
+        self._session.close()
+        self._port.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the loop runs and no thread has failed."""
+        return self.loop.alive and self.failure is None
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as failure:  # the thread's last words; `alive` turns false and the process ends
+            self.failure = failure
+            logger.exception("%s failed", work.__name__)
+
+    # Devices.
+
+    def _on_pose(self, sample: PoseSample) -> None:
+        tracker = self.rig.tracker
+        name = {tracker.tip_handle: "tip", tracker.shaft_handle: "shaft"}.get(sample.tool)
+        if sample.missing or name is None:
+            return
+        box = self._mailboxes[name]
+        self._intake.pose(box.record[0], sample.stamp_ns, sample.arrival_ns, sample.position_m, sample.quaternion_wxyz)
+        box.publish()
+        self._publish(f"pose/{name}", telemetry.pose_message(box.record[0], sample.frame, sample.quality_m))
+
+    def _on_force(self, sample: ForceSample) -> None:
+        box = self._mailboxes["sensor"]
+        self._intake.force(box.record[0], sample.stamp_ns, sample.arrival_ns, sample.force_N)
+        if box.publish() % telemetry.FORCE_EVERY == 0:
+            self._publish("force/sensor", telemetry.force_message(box.record[0], sample.status))
+
+    def _on_device(self, event: DeviceEvent) -> None:
+        bad = event.kind in (DeviceEventKind.LOST, DeviceEventKind.WARNING, DeviceEventKind.ERROR)
+        self._log("warning" if bad else "info", event.device, event.text)
+
+    def _serve_board(self) -> None:
+        """Read the board; keep the link's bring-up going; all that is sent goes through the loop's one writer."""
+        last_status_ns = 0
+        while not self._stopping.is_set():
+            ready = select.select([self._port.fileno()], [], [], _POLL_S)[0]
+            now_ns = self.clock.now_ns()
+            with self._link_lock:
+                for event in self._link.feed(self._port.read(), now_ns) if ready else []:
+                    if event.kind is EventKind.STATUS:
+                        take_status(self._mailboxes["board"].record[0], self._link, now_ns)
+                        self._mailboxes["board"].publish()
+                    else:
+                        bad = event.kind in (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
+                        self._log("error" if bad else "info", "board", event.message)
+                self._send([self._link.advance(now_ns)])
+                if self._link.status is not None and now_ns - last_status_ns > 50_000_000:
+                    last_status_ns = now_ns
+                    self._publish("board", board_message(self._link, now_ns))
+            self._take_estimate(now_ns)
+
+    def _send(self, frames: list[bytes]) -> None:
+        for frame in b"".join(frames).split(b"\0"):
+            if frame:
+                self.loop.send(frame + b"\0")
+
+    def _take_estimate(self, now_ns: int) -> None:
+        estimate: Any = self._estimates.take()
+        if estimate is None or not estimate.converged:
+            return
+        box = self._mailboxes["estimate"]
+        self._intake.estimate(box.record[0], estimate.stamp_ns, now_ns, np.array(estimate.force_N),
+                              np.array(estimate.covariance_N2).reshape(3, 3))
+        box.publish()
+
+    def _obey(self, command: Any) -> Any:
+        with self._link_lock:
+            reply = self._desk.obey(command, self.clock.now_ns())
+            self._mailboxes["command"].publish()
+            self._send(self._desk.take_frames())
+        self._log("info" if reply.result == "accepted" else "warning", "operator",
+                  f"{command.action} {command.target}: {reply.result} {reply.text}".strip())
+        return reply
+
+    # Telling.
+
+    def _publish(self, topic: str, message: Message) -> None:
+        with self._publish_lock:
+            self._publishers[topic].put(message)
+
+    def _log(self, level: str, source: str, text: str) -> None:
+        logger.log(getattr(logging, level.upper()), "%s: %s", source, text)
+        self._publish("log", Log(stamp_ns=self.clock.now_ns(), level=level, source=source, text=text[:500]))
+
+    def _serve_telemetry(self) -> None:
+        due_ns, inputs, last_cause = 0, new(INPUTS), ""
+        while not self._stopping.wait(0.02):
+            records = self.loop.telemetry.drain()
+            for box in ("board", "command", "sensor"):
+                self._mailboxes[box].read(inputs[box])
+            for record in records:
+                outputs, number = record["outputs"], int(record["loop"]["tick"])
+                view = outputs.reshape(1).view(np.recarray)[0]
+                if number % telemetry.STAGE_EVERY == 0:
+                    self._publish("stage", telemetry.stage_message(self._params[0], inputs[0], view))
+                if number % telemetry.STATE_EVERY == 0:
+                    state = telemetry.state_message(inputs[0], view)
+                    self._publish("state", state)
+                    if state.cause != last_cause and state.safety_action not in ("none", "warn"):
+                        self._log("warning", "safety", f"{state.safety_action}: {state.cause}")
+                    last_cause = state.cause
+            if self.clock.now_ns() > due_ns:
+                due_ns = self.clock.now_ns() + 500_000_000
+                self._publish("loop", self.timing())
+
+    def timing(self) -> LoopTiming:
+        """Tick time, lateness, missed ticks and the longest gap since the start."""
+        loop, gap = self.loop.snapshot(), self.loop
+        work = percentiles_us(gap.work, WORK_BIN_NS)
+        late = percentiles_us(gap.lateness, 1000)
+        buckets = np.zeros(HISTOGRAM_BUCKETS, int)
+        for index in np.flatnonzero(gap.work[:-2]):
+            buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(gap.work[index])
+        return LoopTiming(
+            stamp_ns=self.clock.now_ns(), loop_hz=float(self.rig.control.loop_hz), ticks=loop["tick"],
+            missed_ticks=loop["missed"], tick_p50_us=work["p50"], tick_p99_us=work["p99"], tick_p999_us=work["p999"],
+            tick_max_us=work["max"], lateness_p50_us=late["p50"], lateness_p99_us=late["p99"],
+            lateness_p999_us=late["p999"], lateness_max_us=late["max"], longest_gap_ns=loop["longest_gap_ns"],
+            longest_gap_where=GAP_PLACES[loop["longest_gap_place"]], tick_histogram=tuple(map(int, buckets)))
+
+
+def _opened(path: str, baud: int, timeout_s: float) -> Any:
+    """The board's port, waited for. Raises OSError."""
+    give_up = time.monotonic() + timeout_s
+    while True:
+        try:
+            return open_serial(path, baud)
+        except OSError:
+            if time.monotonic() > give_up:
+                raise
+            time.sleep(_OPEN_RETRY_S)

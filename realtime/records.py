@@ -1,0 +1,101 @@
+"""The records that cross the tick: parameters, state, inputs, outputs. One declaration, read by kernels and people."""
+
+from __future__ import annotations
+
+import numpy as np
+
+N_AXES = 3
+CURVE_POINTS = 129
+
+# What the operator wants of the loop.
+COMMAND_NONE, COMMAND_HOLD, COMMAND_POSITION, COMMAND_CONTACT, COMMAND_RETRACT, COMMAND_STOP = range(6)
+# Where the loop is.
+PHASE_DISARMED, PHASE_HOLD, PHASE_POSITION, PHASE_APPROACH, PHASE_CONTACT, PHASE_RETRACT, PHASE_STOPPED = range(7)
+PHASE_NAMES = ("disarmed", "hold", "position", "approach", "contact", "retract", "stopped")
+
+POSE = np.dtype([
+    ("count", "i8"), ("stamp_ns", "i8"), ("arrival_ns", "i8"), ("position_m", "f8", 3), ("quaternion_wxyz", "f8", 4),
+], align=True)
+FORCE = np.dtype([
+    ("count", "i8"), ("stamp_ns", "i8"), ("arrival_ns", "i8"), ("force_N", "f8", 3), ("covariance_N2", "f8", (3, 3)),
+], align=True)
+BOARD = np.dtype([
+    ("count", "i8"), ("arrival_ns", "i8"), ("mcu_offset_ns", "i8"), ("position_steps", "i8", N_AXES),
+    ("encoder_counts", "i8", N_AXES), ("state", "i8"), ("fault", "i8"), ("ready", "i8"),
+], align=True)
+COMMAND = np.dtype([
+    ("count", "i8"), ("kind", "i8"), ("armed", "i8"), ("target_m", "f8", 3), ("normal", "f8", 3),
+    ("force_N", "f8"), ("clear", "i8"),
+], align=True)
+
+INPUTS = np.dtype([
+    ("now_ns", "i8"), ("tip", POSE), ("shaft", POSE), ("sensor", FORCE), ("estimate", FORCE), ("board", BOARD),
+    ("command", COMMAND),
+], align=True)
+
+PREDICTOR_PARAMS = np.dtype([
+    ("acceleration_noise_m_per_s2", "f8"), ("position_noise_m", "f8"), ("max_speed_m_per_s", "f8"),
+    ("gate_sigma", "f8"), ("workspace_min_m", "f8", 3), ("workspace_max_m", "f8", 3),
+], align=True)
+PREDICTOR_STATE = np.dtype([
+    ("started", "i8"), ("seen", "i8"), ("stamp_ns", "i8"), ("accepted_ns", "i8"), ("position_m", "f8", 3),
+    ("velocity_m_per_s", "f8", 3), ("quaternion_wxyz", "f8", 4), ("p00", "f8"), ("p01", "f8"), ("p11", "f8"),
+    ("rejected", "i8"), ("rejected_in_row", "i8"),
+], align=True)
+
+STAGE_PARAMS = np.dtype([
+    ("steps_per_unit", "f8", N_AXES), ("max_speed", "f8", N_AXES), ("max_accel", "f8", N_AXES),
+    ("min_unit", "f8", N_AXES), ("max_unit", "f8", N_AXES),
+], align=True)
+STAGE_STATE = np.dtype([("position", "f8", N_AXES), ("speed", "f8", N_AXES)], align=True)
+
+BACKLASH_PARAMS = np.dtype([
+    ("width_m", "f8"), ("slope", "f8"), ("threshold_m", "f8"), ("roll_slope", "f8"),
+], align=True)
+BACKLASH_STATE = np.dtype([("direction", "f8"), ("extreme_m", "f8")], align=True)
+
+KINEMATICS_PARAMS = np.dtype([
+    ("distal_length_m", "f8"), ("insertion_at_home_m", "f8"), ("max_curvature_per_m", "f8"), ("axis_radius_m", "f8"),
+    ("knob_of_curvature_rad", "f8", CURVE_POINTS),
+], align=True)
+
+HYBRID_PARAMS = np.dtype([
+    ("position_gain_per_s", "f8"), ("position_integral_per_s2", "f8"), ("force_gain_m_per_N", "f8"),
+    ("force_integral_m_per_N_s", "f8"), ("approach_speed_m_per_s", "f8"), ("contact_force_N", "f8"),
+], align=True)
+HYBRID_STATE = np.dtype([
+    ("joint", "f8", N_AXES), ("integral", "f8", N_AXES), ("force_integral_N_s", "f8"), ("goal_m", "f8", 3),
+    ("above_ns", "i8"),
+], align=True)
+
+SAFETY_PARAMS = np.dtype([
+    ("over_force_N", "f8"), ("hold_after_ns", "i8"), ("stop_after_ns", "i8"), ("force_timeout_ns", "i8"),
+    ("board_timeout_ns", "i8"), ("retract_speed_m_per_s", "f8"), ("retract_distance_m", "f8"),
+], align=True)
+
+PARAMS = np.dtype([
+    ("period_s", "f8"), ("setpoint_lead_ns", "i8"), ("setpoint_expiry_us", "i8"), ("stage", STAGE_PARAMS),
+    ("backlash", BACKLASH_PARAMS), ("kinematics", KINEMATICS_PARAMS), ("hybrid", HYBRID_PARAMS),
+    ("predictor", PREDICTOR_PARAMS), ("safety", SAFETY_PARAMS), ("force_source", "i8"),
+], align=True)
+
+STATE = np.dtype([
+    ("ticks", "i8"), ("phase", "i8"), ("action", "i8"), ("cause", "i8"), ("latched", "i8"), ("latch_clear", "i8"),
+    ("retract_from_m", "f8"), ("setpoint_number", "i8"), ("predictor", PREDICTOR_STATE), ("stage", STAGE_STATE),
+    ("backlash", BACKLASH_STATE), ("hybrid", HYBRID_STATE), ("force_N", "f8", 3), ("force_seen", "i8"),
+    ("force_arrival_ns", "i8"), ("force_rejected", "i8"), ("command_seen", "i8"), ("cleared", "i8"),
+    ("contact_since_ns", "i8"), ("work", "f8", (4, 3)),
+], align=True)
+
+OUTPUTS = np.dtype([
+    ("now_ns", "i8"), ("valid", "i8"), ("number", "i8"), ("execute_us", "i8"), ("expiry_us", "i8"),
+    ("position_steps", "i8", N_AXES), ("stage_unit", "f8", N_AXES), ("joint", "f8", N_AXES),
+    ("tip_m", "f8", 3), ("tip_velocity_m_per_s", "f8", 3), ("goal_m", "f8", 3), ("force_N", "f8", 3),
+    ("normal_force_N", "f8"), ("wanted_force_N", "f8"), ("phase", "i8"), ("action", "i8"), ("cause", "i8"),
+    ("poses_rejected", "i8"), ("forces_rejected", "i8"), ("pose_age_ns", "i8"),
+], align=True)
+
+
+def new(dtype: np.dtype) -> np.recarray:
+    """A zeroed record array of length 1 and `dtype`, for `record[0]` in kernels and in plain Python alike."""
+    return np.zeros(1, dtype).view(np.recarray)

@@ -1,0 +1,234 @@
+"""The one rig file: what the rig is, its limits and gains. Unknown keys and values out of bounds are refused."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+AXES = ("insertion", "roll", "knob")
+
+# Bounds that no rig file can widen (a safety limit cannot be configured away).
+HARD_MAX_FORCE_N = 0.5
+HARD_STOP_AFTER_S = 0.150
+
+
+class RigFileError(ValueError):
+    """A rig file that must not start anything: the message names file, key, what was found and what is wanted."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=False, allow_inf_nan=False, frozen=True)
+
+
+Positive = Annotated[float, Field(gt=0)]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Stage(_Section):
+    """One stepper axis. `unit` is m for insertion and rad for roll and knob."""
+
+    steps_per_unit: Annotated[float, Field(gt=0, le=1e7)]
+    encoder_counts_per_step: Positive = 1.0
+    max_speed_unit_per_s: Positive
+    max_accel_unit_per_s2: Positive
+    min_unit: float
+    max_unit: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Stage:
+        if self.min_unit >= self.max_unit:
+            raise ValueError("min_unit below max_unit")
+        if self.max_speed_unit_per_s * self.steps_per_unit > 20_000:
+            raise ValueError("at most 20000 steps/s (max_speed_unit_per_s * steps_per_unit), the board's step timer")
+        if self.max_speed_unit_per_s / self.max_accel_unit_per_s2 > 0.045:
+            raise ValueError("a stop from full speed within 0.045 s (max_speed_unit_per_s / max_accel_unit_per_s2)")
+        return self
+
+
+class Stages(_Section):
+    insertion: Stage
+    roll: Stage
+    knob: Stage
+
+
+class Catheter(_Section):
+    name: str
+    distal_length_m: Annotated[float, Field(gt=0.01, le=0.3)]
+    max_curvature_per_m: Annotated[float, Field(gt=0, le=100)]
+
+
+class Transmission(_Section):
+    """Handle to distal end, as characterized on this rig (thesis 6.2)."""
+
+    catheter: str
+    insertion_at_home_m: float
+    insertion_backlash_m: Annotated[float, Field(ge=0, le=0.02)]
+    insertion_slope: Annotated[float, Field(gt=0.2, le=2)]
+    roll_slope: Annotated[float, Field(gt=0.05, le=2)]
+    knob_rad: list[float]
+    curvature_per_m: list[float]
+
+    @model_validator(mode="after")
+    def _monotone_curve(self) -> Transmission:
+        if len(self.knob_rad) != len(self.curvature_per_m) or len(self.knob_rad) < 3:
+            raise ValueError("knob_rad and curvature_per_m of one length, at least 3")
+        if any(b <= a for a, b in zip(self.knob_rad, self.knob_rad[1:], strict=False)):
+            raise ValueError("knob_rad strictly increasing")
+        if any(b < a for a, b in zip(self.curvature_per_m, self.curvature_per_m[1:], strict=False)):
+            raise ValueError("curvature_per_m never decreasing along knob_rad")
+        return self
+
+
+class Tracker(_Section):
+    """NDI Aurora. `base_from_tracker_*` registers the tracker's frame to the base frame at the sheath's exit."""
+
+    port: str
+    rate_hz: Annotated[float, Field(gt=1, le=200)]
+    latency_s: Annotated[float, Field(ge=0, le=0.2)]
+    tip_handle: str = "0A"
+    shaft_handle: str = "0B"
+    shaft_sensor_offset_m: Annotated[float, Field(gt=0, le=0.2)]
+    position_noise_m: Positive
+    orientation_noise_rad: Positive
+    base_from_tracker_m: Vector3
+    base_from_tracker_wxyz: Quaternion
+
+    @model_validator(mode="after")
+    def _unit(self) -> Tracker:
+        if abs(math.hypot(*self.base_from_tracker_wxyz) - 1) > 1e-3:
+            raise ValueError("base_from_tracker_wxyz of unit length")
+        return self
+
+
+class ForceSensor(_Section):
+    """ATI Nano17 behind a Net F/T box; `base_from_sensor_wxyz` turns its reading into the force on the tissue."""
+
+    address: str
+    counts_per_newton: Positive
+    counts_per_newton_metre: Positive
+    rate_hz: Annotated[float, Field(gt=1, le=7000)]
+    noise_N: Positive
+    range_N: Positive
+    base_from_sensor_wxyz: Quaternion
+
+    @model_validator(mode="after")
+    def _unit(self) -> ForceSensor:
+        if abs(math.hypot(*self.base_from_sensor_wxyz) - 1) > 1e-3:
+            raise ValueError("base_from_sensor_wxyz of unit length")
+        return self
+
+
+class Board(_Section):
+    port: str
+    baud: Annotated[int, Field(gt=9600, le=1_000_000)]
+    setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
+    setpoint_expiry_s: Annotated[float, Field(ge=0.001, le=0.02)]
+
+
+class Control(_Section):
+    """Gains in physical units per second: they hold at any loop rate."""
+
+    loop_hz: Annotated[int, Field(ge=100, le=4000)]
+    position_gain_per_s: Annotated[float, Field(ge=0, le=50)]
+    position_integral_per_s2: Annotated[float, Field(ge=0, le=200)]
+    force_gain_m_per_N: Annotated[float, Field(ge=0, le=0.1)]
+    force_integral_m_per_N_s: Annotated[float, Field(ge=0, le=0.5)]
+    approach_speed_m_per_s: Annotated[float, Field(gt=0, le=0.02)]
+    contact_force_N: Annotated[float, Field(gt=0.005, le=0.1)]
+    reversal_threshold_m: Annotated[float, Field(ge=0, le=0.002)]
+    acceleration_noise_m_per_s2: Positive
+
+    @model_validator(mode="after")
+    def _stable(self) -> Control:
+        if self.position_gain_per_s / self.loop_hz > 0.5:
+            raise ValueError("position_gain_per_s at most half of loop_hz, beyond it the loop is unstable")
+        return self
+
+
+class Safety(_Section):
+    over_force_N: Annotated[float, Field(gt=0, le=HARD_MAX_FORCE_N)]
+    hold_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    stop_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    force_timeout_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    retract_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)]
+    retract_distance_m: Annotated[float, Field(gt=0, le=0.05)]
+    max_tip_speed_m_per_s: Annotated[float, Field(gt=0, le=1)]
+    workspace_min_m: Vector3
+    workspace_max_m: Vector3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Safety:
+        if self.hold_after_s > self.stop_after_s:
+            raise ValueError("hold_after_s at most stop_after_s")
+        if any(a >= b for a, b in zip(self.workspace_min_m, self.workspace_max_m, strict=True)):
+            raise ValueError("workspace_min_m below workspace_max_m")
+        return self
+
+
+class Zenoh(_Section):
+    listen: list[str]
+    connect: list[str]
+
+
+class Rig(_Section):
+    """All of it. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    catheter: Catheter
+    stages: Stages
+    transmission: Transmission
+    tracker: Tracker
+    force_sensor: ForceSensor
+    board: Board
+    control: Control
+    safety: Safety
+    zenoh: Zenoh
+
+    @model_validator(mode="after")
+    def _calibration_fits(self) -> Rig:
+        if self.transmission.catheter != self.catheter.name:
+            raise ValueError(f"transmission.catheter equal to catheter.name ({self.catheter.name}), "
+                             f"found {self.transmission.catheter}: calibrated with another catheter")
+        return self
+
+    def stage(self, axis: int) -> Stage:
+        """The stage of axis 0 insertion, 1 roll or 2 knob."""
+        return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
+
+    def effective(self) -> dict[str, Any]:
+        """The whole effective configuration, for the recording's header."""
+        return self.model_dump(mode="json")
+
+
+def _bounds(error: Any) -> str:
+    context = error.get("ctx") or {}
+    limits = [f"{word} {context[key]}" for key, word in
+              (("gt", "above"), ("ge", "at least"), ("lt", "below"), ("le", "at most")) if key in context]
+    return " and ".join(limits) or error["msg"].removeprefix("Value error, ")
+
+
+def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
+    """`data` as a checked `Rig`. Raises RigFileError with the first offending key."""
+    try:
+        return Rig.model_validate(data)
+    except ValidationError as problem:
+        error: Any = problem.errors()[0]
+        key = ".".join(str(part) for part in error["loc"]) or "rig"
+        if error["type"] == "extra_forbidden":
+            raise RigFileError(f"{name}: {key}: found an unknown key, wanted one that the rig file knows") from None
+        found = "nothing" if error["type"] == "missing" else repr(error["input"])[:80]
+        raise RigFileError(f"{name}: {key}: found {found}, wanted {_bounds(error)}") from None
+
+
+def load_rig(path: str | Path) -> Rig:
+    """The rig in TOML file `path`. Raises RigFileError (unreadable file, unknown key, value out of its bounds)."""
+    try:
+        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RigFileError(f"{path}: found {error}, wanted a readable TOML file") from None
+    return parse_rig(data, str(path))

@@ -1,0 +1,1 @@
+"""The rig that stands in for steel. Its physics is written apart from the models in `host` that are judged on it."""

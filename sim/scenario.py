@@ -1,0 +1,199 @@
+"""The main job in lock step: from rest to a beating wall, hold a force on it; computer and world in turn."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from protocol.topics import Command, ForceEstimate, Message, SimulatedTruth
+from realtime.drivers.stepper_board import LinkPhase
+from realtime.lockstep import Arriving, LockstepLoop, Publish
+from realtime.records import PHASE_CONTACT, PHASE_STOPPED
+from realtime.rig_file import Rig
+from sim.world import World
+
+Estimator = Callable[[Message, Message | None, Message], ForceEstimate | None]
+
+SETTLE_S = 3.0
+START_TIMEOUT_S = 10.0
+TRUTH_EVERY = 10
+COMMAND_LIFE_NS = 100_000_000
+
+
+@dataclass
+class ContactJob:
+    """What to do: press with `force_N` along `into` (unit, into the tissue) at `target_m`, `hold_s` after contact."""
+
+    target_m: tuple[float, float, float]
+    into: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    clearance_m: float = 0.004
+    force_N: float = 0.2
+    hold_s: float = 20.0
+    approach_s: float = 15.0
+
+
+@dataclass
+class Outcome:
+    """How it went, as far as the scenario itself can see."""
+
+    contact: bool = False
+    stopped: bool = False
+    virtual_s: float = 0.0
+    digest: str = ""
+    notes: list[str] = field(default_factory=list)
+
+
+class Scenario:
+    """Runs `LockstepLoop` against `World`. `estimator` answers each tip pose after `estimator_delay_s`, if given.
+
+    pace: 1.0 is real time, 0 is as fast as it goes.
+    """
+
+    def __init__(self, rig: Rig, world: World, publish: Publish, *, estimator: Estimator | None = None,
+                 estimator_delay_s: float = 0.005, force_source: str = "sensor", pace: float = 0.0) -> None:
+        self.world, self.pace = world, pace
+        self._estimator, self._delay_ns = estimator, round(estimator_delay_s * 1e9)
+        self._publish = publish
+        self.loop = LockstepLoop(rig, force_source, self._heard)
+        self._leaving = self.loop.step(0, Arriving())
+        self._latest: dict[str, Message] = {}
+        self._commands = 0
+        self._started = time.monotonic()
+        self._stop = False
+
+    @property
+    def now_ns(self) -> int:
+        """Virtual time."""
+        return self.world.now_ns
+
+    def stop(self) -> None:
+        """Ends the run after the present period; for signal handlers."""
+        self._stop = True
+
+    def _heard(self, topic: str, message: Message) -> None:
+        """All that the loop publishes goes out, and the estimator hears the poses."""
+        self._publish(topic, message)
+        self._latest[topic] = message
+        if topic != "pose/tip" or self._estimator is None or "stage" not in self._latest:
+            return
+        estimate = self._estimator(message, self._latest.get("pose/shaft"), self._latest["stage"])
+        if estimate is not None:
+            arrival_ns = self.loop.inputs[0].tip.arrival_ns + self._delay_ns
+            self.loop.estimate_at(_published_at(estimate, int(arrival_ns)))
+
+    def step(self) -> None:
+        """One period of the loop."""
+        now_ns = self.world.now_ns + self.loop.period_ns
+        arriving = self.world.exchange(now_ns, self._leaving)
+        self._leaving = self.loop.step(now_ns, arriving)
+        if self.loop.state[0].ticks % TRUTH_EVERY == 0:
+            self._publish("sim/truth", _truth(self.world))
+        if self.pace > 0:
+            ahead_s = now_ns * 1e-9 / self.pace - (time.monotonic() - self._started)
+            if ahead_s > 0.002:
+                time.sleep(ahead_s)
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Steps for `seconds` of virtual time, or until `until()`; True if that ended it."""
+        end_ns = self.world.now_ns + round(seconds * 1e9)
+        while self.world.now_ns < end_ns and not self._stop:
+            self.step()
+            if until():
+                return True
+        return False
+
+    def command(self, action: str, target: str = "none", **fields: object) -> None:
+        """An operator's command, now."""
+        self._commands += 1
+        now_ns = self.world.now_ns
+        self.loop.command(Command(
+            stamp_ns=now_ns, id=f"scenario-{self._commands}", expires_ns=now_ns + COMMAND_LIFE_NS, action=action,
+            target=target, **fields), now_ns)  # type: ignore[arg-type]
+
+    @property
+    def phase(self) -> int:
+        """The loop's phase (`realtime.records`)."""
+        return int(self.loop.outputs[0].phase)
+
+    def ready(self) -> bool:
+        """Board configured, poses and forces arriving."""
+        state = self.loop.state[0]
+        return self.loop.link.phase is LinkPhase.READY and bool(state.predictor.started) and bool(state.force_seen)
+
+    def arm(self) -> bool:
+        """Wait for all devices, arm, and let the loop hold for a moment; False if that fails in START_TIMEOUT_S."""
+        if not self.run(START_TIMEOUT_S, self.ready):
+            return False
+        self.command("arm")
+        return self.run(1.0, lambda: bool(self.loop.outputs[0].valid))
+
+    def press(self, job: ContactJob, progress: Callable[[str, float], None] = lambda phase, share: None) -> Outcome:
+        """The whole job: arm, approach, hold, retract, disarm."""
+        outcome = Outcome()
+        if not self.arm():
+            outcome.notes.append(f"devices not ready after {START_TIMEOUT_S} s of virtual time")
+            return self._closed(outcome)
+        self._shape(job)
+        self.command("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+        start_ns = self.world.now_ns
+
+        def reporting(phase: str, seconds: float, done: Callable[[], bool]) -> bool:
+            begin_ns = self.world.now_ns
+
+            def watch() -> bool:
+                if self.loop.state[0].ticks % 100 == 0:
+                    progress(phase, (self.world.now_ns - begin_ns) / (seconds * 1e9))
+                return done() or self.phase == PHASE_STOPPED
+
+            return self.run(seconds, watch) and done()
+
+        outcome.contact = reporting("approach", job.approach_s, lambda: self.phase == PHASE_CONTACT)
+        if outcome.contact:
+            reporting("hold", job.hold_s, lambda: False)
+        else:
+            outcome.notes.append(f"no contact within {(self.world.now_ns - start_ns) * 1e-9:.1f} s")
+        outcome.stopped = self.phase == PHASE_STOPPED
+        self.command("target", "retract")
+        reporting("retract", 2.0, lambda: self.phase == PHASE_STOPPED)
+        return self._closed(outcome)
+
+    def _shape(self, job: ContactJob) -> bool:
+        """Bend the catheter before the wall: a point `clearance_m` in front of the target, reached to 1 mm."""
+        point = np.array(job.target_m) - job.clearance_m * np.array(job.into)
+        self.command("target", "position", target_m=tuple(map(float, point)))
+        inside_ns = 0
+
+        def there() -> bool:
+            nonlocal inside_ns
+            off_m = np.linalg.norm(np.asarray(self.loop.outputs[0].tip_m) - point)
+            inside_ns = inside_ns + self.loop.period_ns if off_m < 1e-3 else 0
+            return inside_ns > 300_000_000
+
+        return self.run(job.approach_s, there)
+
+    def _closed(self, outcome: Outcome) -> Outcome:
+        self.command("disarm")
+        self.run(0.1)
+        outcome.virtual_s = self.world.now_ns * 1e-9
+        outcome.digest = self.world.digest
+        return outcome
+
+
+def _published_at(estimate: ForceEstimate, published_ns: int) -> ForceEstimate:
+    return dataclasses.replace(estimate, published_ns=published_ns)
+
+
+def _truth(world: World) -> SimulatedTruth:
+    truth = world.plant.truth()
+    tissue = world.plant.config.tissue
+    wall_m = np.array(tissue.point_m) + truth["heart_m"] * np.array(tissue.normal)
+    return SimulatedTruth(
+        stamp_ns=world.now_ns, tip_m=tuple(map(float, truth["tip_m"])), wall_m=tuple(map(float, wall_m)),
+        contact_force_N=tuple(map(float, truth["contact_force_N"])),
+        distal_insertion_m=float(truth["insertion_m"]), distal_roll_rad=float(truth["roll_rad"]),
+        distal_curvature_per_m=float(truth["curvature_per_m"]))
+

@@ -1,0 +1,107 @@
+"""The simulated rig: board, stages, catheter, wall and sensor boxes, advanced together to a given virtual time."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from realtime.intake import quaternion_product, rotation
+from realtime.lockstep import Arriving, Leaving
+from realtime.rig_file import Rig
+from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
+from sim.board import Board, BoardSlice
+from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
+from sim.plant import Plant
+
+# Tools of the plant, in the order of its tool_offsets_m.
+TIP, SHAFT = 0, 1
+
+
+class World:
+    """Everything outside the computer. Time in ns from 0; the same seed and bytes give the same world.
+
+    `digest` is a hash of all step edges and all true poses so far.
+    """
+
+    def __init__(self, rig: Rig, plant: Plant, board: Board, seed: int) -> None:
+        self.rig, self.plant, self.board = rig, plant, board
+        self.now_ns = 0
+        self.steps = np.zeros(3, np.int64)
+        self.edges = np.zeros(3, np.int64)
+        self.slice: BoardSlice | None = None
+        self.limit_bits, self.estop = 0, False
+        tracker, sensor = rig.tracker, rig.force_sensor
+        self.tracker = AuroraEmulator(AuroraEmulatorConfig(
+            handles=(tracker.tip_handle, tracker.shaft_handle), rate_hz=tracker.rate_hz, latency_s=tracker.latency_s,
+            position_noise_m=tracker.position_noise_m, orientation_noise_rad=tracker.orientation_noise_rad,
+        ), seed=2 * seed + 1)
+        self.force_box = NetFtEmulator(NetFtEmulatorConfig(
+            rate_hz=sensor.rate_hz, counts_per_N=sensor.counts_per_newton,
+            counts_per_Nm=sensor.counts_per_newton_metre, force_noise_N=sensor.noise_N,
+        ), seed=2 * seed + 2)
+        self._digest = hashlib.sha256()
+        self._per_unit = np.array([rig.stage(axis).steps_per_unit for axis in range(3)])
+        self._counts_per_step = np.array([rig.stage(axis).encoder_counts_per_step for axis in range(3)])
+        turn = np.array(tracker.base_from_tracker_wxyz)
+        self._tracker_from_base = rotation(turn).T
+        self._tracker_turn = turn * (1.0, -1.0, -1.0, -1.0)
+        self._tracker_shift_m = np.array(tracker.base_from_tracker_m)
+        self._sensor_from_base = rotation(sensor.base_from_sensor_wxyz).T
+
+    @property
+    def digest(self) -> str:
+        """Hash of all step edges (cycle, axis, sign) and true tip poses since the start."""
+        return self._digest.hexdigest()
+
+    @property
+    def stage_unit(self) -> np.ndarray:
+        """Positions (3,) of the stages (m, rad, rad) by the step edges seen on the pins."""
+        return self.steps / self._per_unit
+
+    def exchange(self, until_ns: int, leaving: Leaving) -> Arriving:
+        """Take what the computer sent, let time run to `until_ns` in slices of 1 ms, return what arrives by then."""
+        for action in leaving.tracker_line:
+            self.tracker.set_line(action.baud)
+            if action.break_s > 0:
+                self.tracker.serial_break(self.now_ns)
+        self.tracker.feed(leaving.tracker, self.now_ns)
+        for datagram in leaving.force:
+            self.force_box.feed(datagram, self.now_ns)
+        to_board, from_board = leaving.board, b""
+        while self.now_ns < until_ns:
+            next_ns = min(self.now_ns + 1_000_000, until_ns)
+            from_board += self._advance(next_ns, to_board)
+            to_board = b""
+        return Arriving(from_board, self.tracker.read(until_ns), self.force_box.read(until_ns))
+
+    def _advance(self, until_ns: int, to_board: bytes) -> bytes:
+        counts = np.round(self.steps * self._counts_per_step).astype(np.int64)
+        part = self.board.exchange(until_ns // 1000, to_board, self.limit_bits, self.estop, counts)
+        self.slice = part
+        np.add.at(self.steps, part.edge_axis, part.edge_sign)
+        np.add.at(self.edges, part.edge_axis, 1)
+        self.plant.step((until_ns - self.now_ns) * 1e-9, self.stage_unit)
+        self._sample(until_ns)
+        self.now_ns = until_ns
+        for column in (part.edge_cycle, part.edge_axis, part.edge_sign):
+            self._digest.update(np.ascontiguousarray(column).tobytes())
+        self._digest.update(np.ascontiguousarray(self.plant.sensor_pose(0.0)[0]).tobytes())
+        return part.uart_out
+
+    def _sample(self, until_ns: int) -> None:
+        """Let the sensors measure what falls due. Their sampling is placed at the end of the 1 ms slice it is in."""
+        while self.force_box.next_sample_ns <= until_ns:
+            force_N, torque_Nm = self.plant.measured_wrench()
+            self.force_box.sample(self.force_box.next_sample_ns, self._sensor_from_base @ force_N,
+                                  self._sensor_from_base @ torque_Nm)
+        while self.tracker.next_frame_ns <= until_ns:
+            poses = [self._in_tracker_frame(tool) for tool in (TIP, SHAFT)]
+            self.tracker.sample(self.tracker.next_frame_ns, poses)
+
+    def _in_tracker_frame(self, tool: int) -> Pose | None:
+        measured = self.plant.measured_pose(tool)
+        if measured.missing:
+            return None
+        return (self._tracker_from_base @ (measured.position_m - self._tracker_shift_m),
+                quaternion_product(self._tracker_turn, measured.quaternion_wxyz))

@@ -1,0 +1,265 @@
+"""Two real processes over zenoh: late start, restart, a frozen reader, commands; and what a session refuses."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.topics import Command, ForceSensor, Reply, encode, key
+from protocol.zenoh_session import LONGEST_LIFE_NS, CommandServer, Session, check_endpoint, configuration
+
+PATIENCE_S = 30.0
+
+READER = """
+import sys, time
+from protocol.zenoh_session import Session
+with Session("simulated", [], [sys.argv[1]]) as session:
+    latest = session.latest("force/sensor")
+    print("up", flush=True)
+    while True:
+        message = latest.take()
+        if message is not None:
+            print(message.sequence, flush=True)
+        time.sleep(0.01)
+"""
+
+LISTENER = """
+import sys, time
+from protocol.topics import ForceSensor
+from protocol.zenoh_session import Session
+with Session("simulated", [sys.argv[1]], []) as session:
+    publisher = session.publisher("force/sensor")
+    print("up", flush=True)
+    while True:
+        publisher.put(ForceSensor(stamp_ns=int(sys.argv[2]), arrival_ns=0, force_N=(0.0, 0.0, 0.2)))
+        time.sleep(0.01)
+"""
+
+
+@contextmanager
+def running(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    child = subprocess.Popen([sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True,
+                             cwd=Path(__file__).parents[2])
+    try:
+        assert child.stdout is not None and child.stdout.readline() == "up\n"
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        assert child.stdout is not None
+        child.stdout.close()
+
+
+@pytest.fixture(params=["tcp", "unix"])
+def endpoint(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "unix":
+        return f"unixsock-stream/{tmp_path}/rig.sock"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def reading(force_N: float = 0.2) -> ForceSensor:
+    return ForceSensor(stamp_ns=0, arrival_ns=0, force_N=(0.0, 0.0, force_N))
+
+
+def until(happened: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        if happened():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_a_reader_that_starts_first_gets_what_comes_later_and_after_a_restart(endpoint: str) -> None:
+    with Session("simulated", [], [endpoint]) as session:
+        latest = session.latest("force/sensor")
+        assert latest.take() is None
+        for life in (1, 2):
+            with running(LISTENER, endpoint, str(life)):
+                assert until(lambda life=life: (m := latest.take()) is not None and m.stamp_ns == life)
+
+
+def test_a_frozen_reader_never_blocks_the_writer_and_wakes_to_the_newest(endpoint: str) -> None:
+    with Session("simulated", [endpoint], []) as session, running(READER, endpoint) as reader:
+        publisher = session.publisher("force/sensor")
+        seen: list[int] = []
+        assert reader.stdout is not None
+        threading.Thread(target=lambda: seen.extend(int(line) for line in reader.stdout), daemon=True).start()
+        assert until(lambda: publisher.put(reading()) is None and bool(seen))
+        os.kill(reader.pid, signal.SIGSTOP)
+        flood = threading.Thread(target=lambda: [publisher.put(reading()) for _ in range(40_000)], daemon=True)
+        flood.start()
+        flood.join(PATIENCE_S)
+        assert not flood.is_alive()
+        os.kill(reader.pid, signal.SIGCONT)
+        after = publisher.sequence
+        assert until(lambda: publisher.put(reading()) is None and bool(seen) and seen[-1] >= after)
+        assert seen == sorted(seen) and len(seen) < 40_000
+
+
+def test_the_newest_value_is_the_one_taken(endpoint: str) -> None:
+    with Session("simulated", [endpoint], []) as one, Session("simulated", [], [endpoint]) as other:
+        latest, publisher = other.latest("force/sensor"), one.publisher("force/sensor")
+        assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
+        last = [publisher.put(reading()) or publisher.sequence - 1 for _ in range(50)][-1]
+        assert until(lambda: (m := latest.take()) is not None and m.sequence == last)
+        assert latest.take() is None
+
+
+def test_what_is_malformed_is_counted_and_never_taken(endpoint: str) -> None:
+    with Session("simulated", [endpoint], []) as session:
+        latest = session.latest("force/sensor")
+        recorder = session.everything()
+        good = encode(reading())
+        bad = [b"", b"junk", good[:-1], good + b"\x00", b"\x00" * 100_000, msgpack.packb({"schema_version": 1})]
+        for count, payload in enumerate(bad, start=1):
+            session.zenoh.put(key("simulated", "force/sensor"), payload)
+            assert until(lambda count=count: latest.take() is None and latest.malformed == count)
+        assert latest.complaint and recorder.take() == [] and recorder.malformed == len(bad)
+
+
+def test_those_that_connect_to_one_listener_reach_each_other(endpoint: str) -> None:
+    with Session("simulated", [endpoint], []), Session("simulated", [], [endpoint]) as one, \
+            Session("simulated", [], [endpoint]) as other:
+        publisher, latest = one.publisher("force/sensor"), other.latest("force/sensor")
+        assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
+
+
+def arm(now_ns: int, name: str = "c1", life_ns: int = 1_000_000_000) -> Command:
+    return Command(stamp_ns=now_ns, id=name, expires_ns=now_ns + life_ns, action="arm", target="none")
+
+
+def test_a_command_is_answered_once_and_its_replay_refused(endpoint: str) -> None:
+    done: list[str] = []
+
+    def decide(command: Command) -> Reply:
+        done.append(command.id)
+        return Reply(stamp_ns=5, id=command.id, result="accepted")
+
+    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as operator:
+        server = rig.serve_commands(lambda: 5, decide)
+        replies: list[Reply] = []
+        assert until(lambda: (reply := operator.ask(arm(5))) is not None and (replies.append(reply) is None))
+        again = operator.ask(arm(5))
+        assert replies[0].result == "accepted" and again is not None and again.result == "replayed"
+        assert done == ["c1"] and server is not None
+
+
+def test_nobody_to_answer_is_no_answer(endpoint: str) -> None:
+    with Session("simulated", [], [endpoint]) as operator:
+        assert operator.ask(arm(5), timeout_s=0.2) is None
+
+
+class Judged:
+    """A command server without zenoh under it, and what it let through."""
+
+    def __init__(self, now_ns: int = 10_000_000_000) -> None:
+        self.now_ns = now_ns
+        self.done: list[Command] = []
+        self.server = CommandServer.__new__(CommandServer)
+        self.server._now_ns, self.server._seen = lambda: self.now_ns, {}
+        self.server._decide = self.decide
+
+    def decide(self, command: Command) -> Reply:
+        self.done.append(command)
+        return Reply(stamp_ns=self.now_ns, id=command.id, result="accepted")
+
+
+def test_stale_and_far_future_commands_do_nothing() -> None:
+    judged = Judged()
+    now_ns = judged.now_ns
+    assert judged.server.judge(encode(arm(now_ns - 2_000_000_000))).result == "expired"
+    assert judged.server.judge(encode(arm(now_ns, "c2", LONGEST_LIFE_NS + 1))).result == "refused"
+    assert judged.server.judge(encode(arm(now_ns + LONGEST_LIFE_NS + 1, "c3"))).result == "refused"
+    assert judged.done == []
+    assert judged.server.judge(encode(arm(now_ns, "c4"))).result == "accepted"
+
+
+def test_a_late_stop_still_stops() -> None:
+    judged = Judged()
+    stop = Command(stamp_ns=0, id="s", expires_ns=1, action="stop", target="none")
+    assert judged.server.judge(encode(stop)).result == "accepted"
+    assert judged.server.judge(encode(stop)).result == "accepted"
+
+
+def test_ids_are_forgotten_when_they_could_not_be_replayed_anyway() -> None:
+    judged = Judged()
+    for number in range(100):
+        judged.server.judge(encode(arm(judged.now_ns, f"c{number}")))
+        judged.now_ns += 500_000_000
+    assert len(judged.done) == 100 and len(judged.server._seen) < 5
+
+
+@given(st.binary(max_size=5000))
+def test_noise_is_never_a_command(payload: bytes) -> None:
+    judged = Judged()
+    assert judged.server.judge(payload).result == "malformed" and judged.done == []
+
+
+@pytest.mark.parametrize("bad", [
+    "tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "tcp/localhost:7447", "tcp/127.0.0.1:0", "tcp/127.0.0.1:99999",
+    "tcp/127.0.0.1", "udp/127.0.0.1:7447", "tls/127.0.0.1:7447", "quic/127.0.0.1:7447", "tcp/127.0.0.1:7447#iface=eth0",
+    "tcp/[::]:7447", "unixsock-stream/", "unixsock-stream//tmp/a b", "", "tcp/127.0.0.1:7447\n",
+])
+def test_endpoints_that_leave_this_machine_are_refused(bad: str) -> None:
+    with pytest.raises(ValueError, match="endpoint: found"):
+        Session("simulated", [bad], [])
+    with pytest.raises(ValueError, match="endpoint: found"):
+        Session("simulated", [], [bad])
+
+
+@pytest.mark.parametrize("good", ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "unixsock-stream//run/seldinger/rig.sock"])
+def test_endpoints_on_this_machine_are_taken(good: str) -> None:
+    assert check_endpoint(good) == good
+
+
+def test_scouting_is_off_and_reconnecting_never_ends() -> None:
+    config = configuration(["tcp/127.0.0.1:7447"], [])
+    assert config.get_json("scouting/multicast/enabled") == "false"
+    assert config.get_json("scouting/gossip/enabled") == "false"
+    assert config.get_json("connect/timeout_ms") == "-1"
+
+
+def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
+    if endpoint.startswith("unix"):
+        return
+    with Session("simulated", [endpoint], []), pytest.raises(OSError, match="wanted to listen on tcp"):
+        Session("simulated", [endpoint], [])
+
+
+def listening_sockets() -> set[str]:
+    """Local addresses (hexadecimal, as in /proc/net) of this process' listening TCP sockets and of all its UDP ones."""
+    mine = {os.readlink(link) for link in Path("/proc/self/fd").iterdir()
+            if os.path.lexists(link)}
+    found = set()
+    for table, states in (("tcp", {"0A"}), ("tcp6", {"0A"}), ("udp", {"07", "01"}), ("udp6", {"07", "01"})):
+        for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[3] in states and f"socket:[{words[9]}]" in mine:
+                found.add(f"{table} {words[1]}")
+    return found
+
+
+def test_a_session_opens_no_other_socket_than_it_was_told(endpoint: str) -> None:
+    before = listening_sockets()
+    with Session("simulated", [], [endpoint]):
+        assert listening_sockets() == before
+    with Session("simulated", [endpoint], []):
+        opened = listening_sockets() - before
+        assert len(opened) == (1 if endpoint.startswith("tcp") else 0)
+        assert all(address.startswith("tcp 0100007F:") for address in opened)

@@ -1,0 +1,53 @@
+"""The rig file: what ships is good; each kind of mistake is refused in one line that names the key."""
+
+import tomllib
+
+import pytest
+
+from realtime.rig_file import RigFileError, load_rig, parse_rig
+from tests.realtime.conftest import RIG_FILE
+
+
+def changed(key: str, value: object) -> dict:
+    data = tomllib.loads(RIG_FILE.read_text())
+    *path, last = key.split(".")
+    section = data
+    for part in path:
+        section = section[part]
+    if value is None:
+        del section[last]
+    else:
+        section[last] = value
+    return data
+
+
+def test_the_shipped_rig_is_good() -> None:
+    assert load_rig(RIG_FILE).name == "simulated"
+
+
+@pytest.mark.parametrize(("key", "value", "names"), [
+    ("safety.over_force_N", 5.0, ["safety.over_force_N", "5.0", "at most 0.5"]),
+    ("safety.stop_after_s", 10.0, ["safety.stop_after_s", "at most 0.15"]),
+    ("safety.over_force_N", float("nan"), ["safety.over_force_N", "nan"]),
+    ("stages.insertion.max_speed_unit_per_s", -1.0, ["stages.insertion.max_speed_unit_per_s", "-1.0", "above 0"]),
+    ("stages.insertion.max_speed_unit_per_s", 1.0, ["stages.insertion", "20000 steps/s"]),
+    ("control.position_gian_per_s", 1.0, ["control.position_gian_per_s", "unknown key"]),
+    ("control.loop_hz", None, ["control.loop_hz", "nothing"]),
+    ("transmission.catheter", "livewire", ["transmission.catheter", "livewire", "another catheter"]),
+    ("tracker.base_from_tracker_wxyz", [1.0, 1.0, 0.0, 0.0], ["tracker", "unit length"]),
+])
+def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, names: list[str]) -> None:
+    with pytest.raises(RigFileError) as refused:
+        parse_rig(changed(key, value))
+    message = str(refused.value)
+    assert "\n" not in message
+    for name in names:
+        assert name in message, message
+
+
+def test_an_unreadable_file_is_one_line(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "rig.toml"
+    path.write_text("name = ")
+    with pytest.raises(RigFileError) as refused:
+        load_rig(path)
+    assert "\n" not in str(refused.value) and "TOML" in str(refused.value)
