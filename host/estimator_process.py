@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -22,7 +21,7 @@ from protocol.zenoh_session import Session
 from realtime.rig_file import Rig, load_rig
 
 POLL_S = 0.002
-QUIET_NS = 1_000_000_000
+QUIET_S = 1.0
 
 
 def header_of(rig: Rig, clock: str, seed: int | None = None, notes: dict[str, str] | None = None) -> Header:
@@ -34,22 +33,26 @@ def header_of(rig: Rig, clock: str, seed: int | None = None, notes: dict[str, st
 class EstimatorProcess:
     """Everything of the process between its start and its end; `run` until `stop` is set.
 
-    recording: where to write, None to record nothing. now_ns: the rig's clock.
+    recording: where to write, None to record nothing. clock: `wall` is CLOCK_MONOTONIC, as in all processes of a rig;
+    `virtual` is handed out by the simulated rig, and known here as the newest stamp heard.
     """
 
-    def __init__(self, rig: Rig, session: Session, estimator: Estimator, recording: RecordingWriter | None,
-                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, session: Session, estimator: Estimator, recording: RecordingWriter | None,
+                 clock: str = "wall") -> None:
         self.service = EstimationService(estimator)
-        self._recording, self._now_ns = recording, now_ns
+        self._recording = recording
+        self._newest_ns = 0
+        self._now_ns = time.monotonic_ns if clock == "wall" else lambda: self._newest_ns
         self._everything = session.everything()
         self._forces = session.publisher("force/estimate")
         self._logs = session.publisher("log")
-        self._heard_ns = now_ns()
+        self._heard_s = self._told_s = time.monotonic()
         self._told = ""
 
     def step(self) -> bool:
         """Take in what has come, record it, answer the newest pose. True if there was anything."""
         taken = self._everything.take()
+        self._newest_ns = max([self._newest_ns, *(message.stamp_ns for _, message, _ in taken)])
         now_ns = self._now_ns()
         for topic, message, payload in taken:
             self.service.hear(topic, message)
@@ -58,22 +61,27 @@ class EstimatorProcess:
         estimate = self.service.answer(self._now_ns())
         if estimate is not None:
             self._forces.put(estimate)
-        self._tell_once(self._everything.complaint or self.service.last_failure)
-        if taken:
-            self._heard_ns = now_ns
-        elif self._recording is not None and now_ns - self._heard_ns > QUIET_NS:
-            self._recording.flush()
-            self._heard_ns = now_ns
+        self._tell(self._everything.complaint or self.service.last_failure)
+        self._flush_when_quiet(bool(taken))
         return bool(taken)
+
+    def _flush_when_quiet(self, heard: bool) -> None:
+        now_s = time.monotonic()
+        if not heard and self._recording is not None and now_s - self._heard_s > QUIET_S:
+            self._recording.flush()
+        if heard or now_s - self._heard_s > QUIET_S:
+            self._heard_s = now_s
 
     def log(self, level: str, text: str) -> None:
         """Say `text` on the log topic and on standard error."""
         print(f"seldinger estimator: {text}", file=sys.stderr, flush=True)
         self._logs.put(Log(stamp_ns=max(self._now_ns(), 0), level=level, source="estimator", text=text))
 
-    def _tell_once(self, text: str) -> None:
-        if text and text != self._told:
-            self._told = text
+    def _tell(self, text: str) -> None:
+        """Log `text` when it is new, at most once in QUIET_S: a flood of bad messages must not become one of logs."""
+        now_s = time.monotonic()
+        if text and text != self._told and now_s - self._told_s > QUIET_S:
+            self._told, self._told_s = text, now_s
             self.log("warning", text)
 
     def run(self, stop: threading.Event) -> None:
@@ -124,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
             if options.record is not None:
                 header = header_of(rig, options.clock, options.seed, {"estimator": options.estimator})
                 recording = RecordingWriter(options.record, header, on_failure)
-            process = EstimatorProcess(rig, session, estimator, recording)
+            process = EstimatorProcess(session, estimator, recording, options.clock)
             print(json.dumps({"ready": True, "recording": str(options.record or "")}), flush=True)
             process.run(stop)
         except OSError as error:

@@ -95,12 +95,12 @@ def encode(frame_name: str, sequence: int, **fields: Any) -> bytes:
     except struct.error as error:
         raise ValueError(f"{frame_name}: found {fields}, wanted values that fit the wire types ({error})") from None
     body = bytes((frame.id, sequence & 0xFF)) + payload
-    return cobs_encode(body + struct.pack("<H", crc16(body))) + DELIMITER
+    return cobs_encode(body + struct.pack(">H", crc16(body))) + DELIMITER
 
 
 def decode_body(body: bytes) -> Message:
     """Message of one frame without its COBS coding. Raises ValueError when anything about it is wrong."""
-    if len(body) < 4 or struct.unpack_from("<H", body, len(body) - 2)[0] != crc16(body[:-2]):
+    if len(body) < 4 or crc16(body) != 0:  # with its check sum, high byte first, a body leaves no remainder
         raise ValueError(f"frame: found {len(body)} bytes with a wrong check sum")
     frame = FRAME_BY_ID.get(body[0])
     if frame is None or frame.payload_bytes != len(body) - 4:

@@ -62,6 +62,8 @@ def encode_setpoint(buffer: np.ndarray, sequence: int, number: int, execute_us: 
     at = _put(buffer, at, min(max(expiry_us, 0), 65535), 2)
     for axis in range(AXIS_COUNT):
         at = _put(buffer, at, steps[axis], 4)
-    at = _put(buffer, at, _crc16(buffer, 1, at), 2)
+    crc = _crc16(buffer, 1, at)
+    at = _put(buffer, at, crc >> 8, 1)
+    at = _put(buffer, at, crc, 1)
     _stuff(buffer, at)
     return at + 1

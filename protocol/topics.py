@@ -173,6 +173,7 @@ class BoardCounters(Message):
     host_crc_errors: int = integer("", "damaged frames that the host saw", bits=32, default=0)
     underruns: int = integer("", "times the queue ran dry while moving", bits=32)
     rejected: int = integer("", "setpoints refused", bits=32)
+    last_reject: str = text("why the last one was refused, empty when none was", default="")
     boot_count: int = integer("", "resets of the board", bits=32)
     deadman_age_ms: float = number("ms", "time since the newest valid setpoint", minimum=0)
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocol.serial_frames import Fault
+from protocol.serial_frames import Fault, Reject
 from protocol.topics import BoardCounters
 from realtime.drivers.stepper_board import AxisLimits, StepperBoardLink
 from realtime.rig_file import Rig
+
+# A better offset comes in by this much a STATUS (5 ms), so that execution times always rise; a larger error at once.
+OFFSET_SLEW_NS = 200_000
+OFFSET_JUMP_NS = 50_000_000
 
 
 def axis_limits(rig: Rig) -> tuple[AxisLimits, ...]:
@@ -29,9 +33,13 @@ def take_status(record: np.record, link: StepperBoardLink, now_ns: int) -> None:
     status = link.status
     if status is None:
         return
+    offset_ns = link.mcu_offset_ns(now_ns)
+    change_ns = offset_ns - int(record.mcu_offset_ns)
+    if record.count > 0 and abs(change_ns) < OFFSET_JUMP_NS:
+        offset_ns -= change_ns - min(max(change_ns, -OFFSET_SLEW_NS), OFFSET_SLEW_NS)
     record.count += 1
     record.arrival_ns = status.arrival_ns
-    record.mcu_offset_ns = link.mcu_offset_ns(now_ns)
+    record.mcu_offset_ns = offset_ns
     record.position_steps[:] = status.position_steps
     record.encoder_counts[:] = status.encoder_counts
     record.state, record.fault = status.state, status.fault
@@ -49,5 +57,6 @@ def board_message(link: StepperBoardLink, now_ns: int) -> BoardCounters:
         queue_depth=status.queue_depth, last_setpoint=status.last_setpoint, position_steps=status.position_steps,
         encoder_counts=status.encoder_counts, crc_errors=status.crc_errors,
         host_crc_errors=link.decoder.counters.crc_errors, underruns=status.underruns,
-        rejected=status.rejected + status.expired + status.overflows, boot_count=status.boot_count,
+        rejected=status.rejected + status.expired + status.overflows,
+        last_reject=Reject(status.last_reject).name.lower() if status.last_reject else "", boot_count=status.boot_count,
         deadman_age_ms=float(status.deadman_age_ms))

@@ -6,30 +6,27 @@ import math
 
 import numpy as np
 from numba import njit
-from scipy.interpolate import PchipInterpolator
 
 from realtime.records import CURVE_POINTS, KINEMATICS_PARAMS
 
 Config = KINEMATICS_PARAMS
 
+_FLAT_SLOPE = 1e-5
+
 
 def fitted_knob_curve(knob_rad: list[float], curvature_per_m: list[float], max_curvature_per_m: float) -> np.ndarray:
     """Knob angle (rad) on a uniform grid of CURVE_POINTS curvatures in +-max_curvature_per_m.
 
-    Monotone (PCHIP) inverse of a recorded sweep. Flat parts (dead zones) of the sweep become steep parts here:
-    their two ends are kept and the points between them dropped. Beyond the sweep the last slope goes on.
+    Piecewise linear inverse of a recorded sweep. Flat parts (dead zones) of the sweep become steep parts here, by
+    a slope too small to matter that is added to them. Beyond the sweep its mean slope goes on.
     """
     knob, curvature = np.asarray(knob_rad, float), np.asarray(curvature_per_m, float)
     span = curvature[-1] - curvature[0]
-    keep = [0]
-    for i in range(1, len(knob)):
-        if curvature[i] - curvature[keep[-1]] > 1e-6 * span:
-            keep.append(i)
-    curve = PchipInterpolator(curvature[keep], knob[keep], extrapolate=False)
+    rising = curvature + _FLAT_SLOPE * span * (knob - knob[0]) / (knob[-1] - knob[0])
     grid = np.linspace(-max_curvature_per_m, max_curvature_per_m, CURVE_POINTS)
-    inside = np.clip(grid, curvature[keep[0]], curvature[keep[-1]])
+    inside = np.clip(grid, rising[0], rising[-1])
     gain = (knob[-1] - knob[0]) / span
-    return np.asarray(curve(inside) + gain * (grid - inside))
+    return np.asarray(np.interp(inside, rising, knob) + gain * (grid - inside))
 
 
 @njit(cache=True)

@@ -75,6 +75,7 @@ class LockstepLoop:
         self.faults: list[str] = []
         self._buffer = np.zeros(BUFFER_BYTES, np.uint8)
         self._estimates: deque[ForceEstimate] = deque()
+        tick(self.params, self.state.copy(), self.inputs.copy(), self.outputs.copy())  # compiles; changes nothing
 
     def command(self, command: Command, now_ns: int) -> None:
         """An operator's command; its reply is published."""

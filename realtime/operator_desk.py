@@ -5,10 +5,12 @@ Expiry and repetition of commands are judged where they arrive (`protocol.zenoh_
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from protocol.serial_frames import Fault
 from protocol.messages import Vector
+from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 from realtime.records import (
@@ -26,8 +28,10 @@ _KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND
 class OperatorDesk:
     """Turns commands into the tick's COMMAND record and into frames for the board (`take_frames`)."""
 
-    def __init__(self, rig: Rig, record: np.record, link: StepperBoardLink) -> None:
-        self._rig, self._record, self._link = rig, record, link
+    def __init__(self, rig: Rig, record: np.record, link: StepperBoardLink,
+                 missing: Callable[[], str] = lambda: "") -> None:
+        """missing: names the devices that are not there yet, empty when all are; asked before arming."""
+        self._rig, self._record, self._link, self._missing = rig, record, link, missing
         self._frames: list[bytes] = []
         record.normal[:] = (0.0, 0.0, -1.0)
 
@@ -52,6 +56,11 @@ class OperatorDesk:
             return f"arm: found the board link in phase {self._link.phase.value}, wanted ready"
         if self._link.status is not None and self._link.status.fault != Fault.NONE:
             return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
+        if self._record.armed:
+            return "arm: found the rig armed, wanted disarmed"
+        missing = self._missing()
+        if missing:
+            return f"arm: found nothing from {missing}, wanted fresh readings"
         self._frames.append(self._link.arm())
         self._record.armed = 1
         self._set(COMMAND_HOLD)

@@ -55,7 +55,7 @@ class RealtimeProcess:
         self._intake = Intake(rig)
         self._link = StepperBoardLink(axis_limits(rig))
         self._link_lock = threading.Lock()
-        self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link)
+        self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
         self._params = tick_parameters(rig, force_source)
         self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
         os.set_blocking(self._port.fileno(), False)
@@ -123,6 +123,13 @@ class RealtimeProcess:
             logger.exception("%s failed", work.__name__)
 
     # Devices.
+
+    def _missing(self) -> str:
+        """Sensors that have been silent for longer than the failsafe allows."""
+        now_ns, limit_ns = self.clock.now_ns(), self.rig.safety.stop_after_s * 1e9
+        ages = {"the tracker (tip)": now_ns - self._mailboxes["tip"].record[0].arrival_ns,
+                "the force sensor": now_ns - self._mailboxes["sensor"].record[0].arrival_ns}
+        return ", ".join(name for name, age_ns in ages.items() if age_ns > limit_ns)
 
     def _on_pose(self, sample: PoseSample) -> None:
         tracker = self.rig.tracker

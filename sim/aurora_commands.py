@@ -35,7 +35,7 @@ class Refused(Exception):
 
 @dataclass
 class Port:
-    """A port handle and the tool behind it."""
+    """A port handle and the tool behind it; `defect`: error code with which PINIT fails (an unreadable SROM: 1E)."""
 
     handle: str
     serial: str
@@ -44,6 +44,7 @@ class Port:
     enabled: bool = False
     stale: bool = False
     allocated: bool = True
+    defect: str = ""
 
     def unplug(self) -> None:
         """The tool is pulled; its handle stays, stale, until it is freed."""
@@ -158,6 +159,8 @@ class Console:
         port = self._port(parameters)
         if not port.occupied:
             raise Refused(NO_TOOL)
+        if port.defect:
+            raise Refused(port.defect)
         port.initialised = True
         return "OKAY"
 

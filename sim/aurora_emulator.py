@@ -12,6 +12,7 @@ import numpy as np
 from realtime.drivers.ndi_protocol import crc16
 from sim.aurora_commands import Console, Port
 from sim.rotation import quaternion_of_vector, quaternion_product
+from sim.sensor_faults import Fault, active, checked, strongest
 from sim.sensor_noise import MarkovNoise, generators
 
 if TYPE_CHECKING:
@@ -20,29 +21,10 @@ if TYPE_CHECKING:
 Pose = tuple[np.ndarray, np.ndarray]
 FRAMES_KEPT = 64
 _MAX_COMMAND = 4096
-FAULT_KINDS = ("missing", "out_of_volume", "partly", "wild", "frozen", "broken", "silent", "bit_errors", "late",
-               "stuck")
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong from start_ns to stop_ns, of one tool (`handle`) or of all.
-
-    missing, out_of_volume, partly (partially out of volume), broken (sensor coil); wild: the pose jumps about by
-    `value` (m, standard deviation per axis); frozen: last pose repeated under new frame numbers; stuck: the frame
-    counter and poses stand still; late: `value` (s) more latency; silent: no replies; bit_errors: `value` is the
-    error rate per bit of what the device sends.
-    """
-
-    kind: str
-    start_ns: int
-    stop_ns: int
-    handle: str | None = None
-    value: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.kind not in FAULT_KINDS:
-            raise ValueError(f"fault kind: found {self.kind!r}, wanted one of {', '.join(FAULT_KINDS)}")
+# missing, out_of_volume, partly (partially out of volume), broken (sensor coil); wild: the pose jumps about by `value`
+# (m, standard deviation per axis); frozen: last pose repeated under new frame numbers; stuck: frame counter and poses
+# stand still; late: `value` (s) more latency; silent: no replies; bit_errors: `value` is the error rate per bit sent.
+FAULT_KINDS = ("missing", "out_of_volume", "partly", "wild", "frozen", "broken", "silent", "bit_errors", "late", "stuck")
 
 
 @dataclass(frozen=True)
@@ -100,7 +82,7 @@ class AuroraEmulator:
     def __init__(self, config: AuroraEmulatorConfig | None = None, seed: int = 0,
                  faults: Sequence[Fault] = ()) -> None:
         self.config = config or AuroraEmulatorConfig()
-        self.faults = list(faults)
+        self.faults = checked(faults, FAULT_KINDS)
         self.ports = {handle: Port(handle, serial=f"{0x34801000 + i:08X}")
                       for i, handle in enumerate(self.config.handles)}
         self.frame_number = 0
@@ -185,14 +167,14 @@ class AuroraEmulator:
         jumps = self._fault_rng.standard_normal((len(handles), 3))
         jitter_s = self._delay_rng.exponential(c.frame_jitter_s) if c.frame_jitter_s > 0 else 0.0
         self._samples += 1
-        if self._faults("stuck", frame_time_ns):
+        if active(self.faults, frame_time_ns, "stuck"):
             return
         tools = {}
         for i, handle in enumerate(handles):
             measured = _measured(poses[i], shift[i], turn[i], quality[i])
             tools[handle] = self._spoilt(handle, measured, frame_time_ns, draws[i], jumps[i])
         self.frame_number = (self.frame_number + 1) & 0xFFFFFFFF
-        late_s = sum(fault.value for fault in self._faults("late", frame_time_ns))
+        late_s = sum(fault.value for fault in active(self.faults, frame_time_ns, "late"))
         available_ns = frame_time_ns + round((c.latency_s + jitter_s + late_s) * 1e9)
         if self._frames:
             available_ns = max(available_ns, self._frames[-1].available_ns)
@@ -201,22 +183,18 @@ class AuroraEmulator:
 
     def _spoilt(self, handle: str, pose: tuple[float, ...] | None, time_ns: int, draws: np.ndarray,
                 jump: np.ndarray) -> Tracked:
-        active = {fault.kind: fault for fault in self.faults
-                  if fault.start_ns <= time_ns < fault.stop_ns and fault.handle in (None, handle)}
-        if "frozen" in active and handle in self._last:
+        now = {fault.kind: fault for fault in active(self.faults, time_ns) if fault.handle in (None, handle)}
+        if "frozen" in now and handle in self._last:
             return self._last[handle]
-        flags = {kind for kind in ("out_of_volume", "partly", "broken") if kind in active}
-        if pose is None or "missing" in active or "broken" in active or draws[0] < self.config.dropout:
+        flags = {kind for kind in ("out_of_volume", "partly", "broken") if kind in now}
+        if pose is None or "missing" in now or "broken" in now or draws[0] < self.config.dropout:
             return Tracked(frozenset(flags), None)
-        jump_m = active["wild"].value if "wild" in active else 0.0
+        jump_m = now["wild"].value if "wild" in now else 0.0
         if draws[1] < self.config.wild:
             jump_m = self.config.wild_m
         if jump_m:
             pose = (*pose[:4], *(np.array(pose[4:7]) + 1e3 * jump_m * jump).tolist(), pose[7])
         return Tracked(frozenset(flags), pose)
-
-    def _faults(self, kind: str, time_ns: int) -> list[Fault]:
-        return [fault for fault in self.faults if fault.kind == kind and fault.start_ns <= time_ns < fault.stop_ns]
 
     # Talking.
 
@@ -257,7 +235,7 @@ class AuroraEmulator:
         """Carry out the commands that are due by now, in order."""
         while self._due and self._due[0][0] <= now_ns:
             due_ns, command = self._due.popleft()
-            if due_ns < self._dead_until_ns or self._faults("silent", due_ns):
+            if due_ns < self._dead_until_ns or active(self.faults, due_ns, "silent"):
                 continue
             answer = self._console.execute(command, self._frame_at(due_ns))
             if answer.power_cycle:
@@ -282,7 +260,7 @@ class AuroraEmulator:
         self._wire.append((start_ns, reply, self._console.baud))
 
     def _garbled(self, data: bytes, time_ns: int) -> bytes:
-        rate = max((fault.value for fault in self._faults("bit_errors", time_ns)), default=0.0)
+        rate = strongest(self.faults, time_ns, "bit_errors")
         if rate <= 0:
             return data
         flips = np.packbits(self._bit_rng.random((len(data), 8)) < rate, axis=1)[:, 0]

@@ -71,7 +71,7 @@ def _elastic(e, x: float, load: float, stage: Array, time_s: float, dt_s: float)
     if e.code == code.SOFTENING:
         return x / (1.0 + e.p[0] * (time_s - e.start_s))
     if e.code == code.ASYMMETRY:
-        return x + 0.5 * (e.p[0] - 1.0) * (x - abs(x))
+        return x + 0.5 * (e.p[0] - 1.0) * (x - e.p[1] - abs(x - e.p[1]))
     if e.code == code.STATIC_NONLINEARITY:
         return x + e.p[1] * x * math.sin(x / e.p[0])
     if e.code == code.SATURATION:
@@ -152,7 +152,7 @@ def _yielding(e, x: float, load: float, dt_s: float) -> float:  # type: ignore[n
 
 @njit(cache=True)
 def _whip(e, x: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """A pre-curved shaft in a curved vessel: the angle at rest between windup and the vessel's hold, which jumps if strong."""
+    """A pre-curved shaft in a curved vessel: the angle where windup and the vessel's hold balance; it may jump."""
     hold = math.sin(-e.p[1])
     if not e.began:
         e.s[0] = x

@@ -55,7 +55,7 @@ CHAIN_STATE = np.dtype([
     # results of the step
     ("free", "f8", (CELLS, 3)), ("compliance", "f8", (3, 3)), ("shift", "f8", (3,)),
     ("base_force", "f8", (3,)), ("base_moment", "f8", (3,)), ("residual", "f8"),
-    ("turn", "f8", (3, 3)), ("frame", "f8", (3, 3))], align=True)
+    ("turn", "f8", (3, 3))], align=True)
 
 
 def parameters(config: CatheterConfig) -> np.record:
@@ -164,7 +164,10 @@ def predict(p, s, curvature_per_m: float, dt_s: float) -> None:  # type: ignore[
 
 @njit(cache=True)
 def settle(p, s, contact: Array, dt_s: float) -> None:  # type: ignore[no-untyped-def]
-    """Strains after the step with the force `contact` (3,) on the tip, and the base reaction; s.residual: fastest du/dt (1/m/s)."""
+    """Strains after the step with the force `contact` (3,) on the tip; s.base_*: loads on the sheath's exit.
+
+    s.residual: fastest du/dt (1/m/s), zero in equilibrium.
+    """
     ratio = p.retardation_s * s.retardation / dt_s
     s.residual = 0.0
     for j in range(s.cells):

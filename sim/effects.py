@@ -51,6 +51,7 @@ def _axis_parameters(port: str) -> dict[str, tuple[Parameter, ...]]:
     """Effects that act on a motion: on a stage's way to the catheter, or on the curvature the wires ask for."""
     unit, load, size = _UNIT[port], _LOAD[port], _SIZE[port]
     stiffness_unit, k = _STIFFNESS[port]
+    gain, source = {"insertion": (1e-3, 1.0), "roll": (20.0, 0.0), "knob": (15.0, 0.0), "shape": (300.0, 0.0)}[port]
     stiffness = Parameter(f"stiffness_{stiffness_unit}", k, 1e-6, _BIG)
     force = Parameter(load, k * size, 0.0, _BIG)
     time_constant = Parameter("time_constant_s", 0.05, 1e-4, 1e3)
@@ -63,7 +64,8 @@ def _axis_parameters(port: str) -> dict[str, tuple[Parameter, ...]]:
         "dead_zone": (length("centre", 0.0, -_BIG), length("half_width", 0.7)),
         "coulomb_friction": (force, stiffness),
         "presliding_friction": (force, length("distance", 1.0, 1e-9), stiffness),
-        "load_dependent_friction": (Parameter("coefficient", 0.3, 0.0, 5.0), stiffness),
+        "load_dependent_friction": (Parameter("coefficient", 0.03, 0.0, 2.0),) if port == "knob" else (
+            Parameter("coefficient", 0.5, 0.0, 5.0), stiffness),
         "stribeck_friction": (Parameter(f"static_{load}", k * size, 0.0, _BIG),
                               Parameter(f"kinetic_{load}", 0.5 * k * size, 0.0, _BIG),
                               Parameter(f"speed_{unit}_per_s", 3.0 * size, 1e-9, _BIG), stiffness),
@@ -71,17 +73,20 @@ def _axis_parameters(port: str) -> dict[str, tuple[Parameter, ...]]:
         "rate_lag": (time_constant,),
         "latency": (Parameter("delay_s", 0.03, 0.0, 1.0),),
         "clock_drift": (Parameter("rate", 0.001, 0.0, 0.1),),
-        "compliance": (Parameter(f"{unit}_per_{load.rpartition('_')[2]}", size / (0.2 if port != "roll" else 1e-3), 0.0, _BIG),),
+        "compliance": (Parameter(f"compliance_{unit}_per_{load.rpartition('_')[2]}",
+                                 size / {"insertion": 0.2, "roll": 1e-3, "knob": 5.0, "shape": 0.2}[port], 0.0, _BIG),),
         "nonlinear_stiffness": (stiffness, Parameter("cubic_per_square", 1.0 / size**2, 0.0, _BIG)),
         "creep_relaxation": (Parameter("share", 0.1, 0.0, 0.95), Parameter("time_constant_s", 1.0, 1e-3, 1e4)),
         "plastic_set": (length("yield", 4.0), Parameter("share", 0.2, 0.0, 1.0)),
         "softening": (Parameter("rate_per_s", 0.003, 0.0, 1.0),),
-        "asymmetry": (Parameter("ratio", 0.85, 0.0, 5.0),),
+        "asymmetry": (Parameter("ratio", 0.85, 0.0, 5.0),
+                      length("centre", {"insertion": 6.0, "knob": 8.0}.get(port, 0.0), -_BIG)),
         "static_nonlinearity": (length("scale", 8.0, 1e-9), Parameter("share", 0.15, -0.5, 0.5)),
-        "saturation": (length("limit", 7.0, 1e-9),),
-        "coupling": (Parameter("gain", 0.05, -_BIG, _BIG), Parameter("source", 1.0 if port != "roll" else 0.0, 0.0, 2.0)),
+        "saturation": (length("limit", 9.0, 1e-9),),
+        "coupling": (Parameter("gain", gain, -_BIG, _BIG), Parameter("source", source, 0.0, 2.0)),
         "periodic_disturbance": (length("amplitude", 0.3), Parameter("frequency_Hz", 1.3, 0.0, 200.0),
-                                 Parameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG), Parameter("phase_rad", 0.0, -_BIG, _BIG)),
+                                 Parameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG),
+                                 Parameter("phase_rad", 0.0, -_BIG, _BIG)),
         "resonance": (Parameter("frequency_Hz", 6.0, 0.1, 200.0), Parameter("damping_ratio", 0.15, 0.001, 2.0)),
     }
 
@@ -91,7 +96,7 @@ _ON_SHAPE = {
     "coulomb_friction": (Parameter("moment_Nm", 2e-4, 0.0, 1.0),),
     "presliding_friction": (Parameter("moment_Nm", 3e-4, 0.0, 1.0), Parameter("curvature_per_m", 3.0, 1e-6, 1e3)),
     "viscous_friction": (Parameter("time_constant_s", 0.05, 0.0, 10.0),),
-    "nonlinear_stiffness": (Parameter("cubic_m2", 0.01, 0.0, 10.0),),
+    "nonlinear_stiffness": (Parameter("cubic_m2", 0.002, 0.0, 10.0),),
     "creep_relaxation": (Parameter("share", 0.15, 0.0, 5.0), Parameter("time_constant_s", 2.0, 1e-3, 1e4)),
     "plastic_set": (Parameter("yield_per_m", 8.0, 0.0, 1e3), Parameter("share", 0.3, 0.0, 1.0)),
     "softening": (Parameter("rate_per_s", 0.005, 0.0, 1.0), Parameter("floor", 0.5, 0.05, 1.0)),
@@ -99,8 +104,8 @@ _ON_SHAPE = {
     "gravity_load": (Parameter("weight_N_per_m", 0.05, 0.0, 100.0), Parameter("tip_weight_N", 0.01, 0.0, 10.0), *_DIRECTION),
     "flow_drag": (Parameter("speed_m_per_s", 0.4, 0.0, 5.0), Parameter("pulsatility", 0.6, 0.0, 2.0),
                   Parameter("frequency_Hz", 1.2, 0.0, 20.0), *_DIRECTION),
-    "second_contact": (Parameter("place_m", 0.012, 0.0, 0.3), Parameter("clearance_m", 0.001, -_BIG, _BIG),
-                       Parameter("stiffness_N_per_m", 400.0, 0.0, 1e5), *_DIRECTION),
+    "second_contact": (Parameter("place_m", 0.012, 0.0, 0.3), Parameter("clearance_m", 0.0008, -_BIG, _BIG),
+                       Parameter("stiffness_N_per_m", 100.0, 0.0, 1e5), *_DIRECTION),
 }
 _ON_CONTACT = {
     "contact_nonlinear": (Parameter("exponent", 1.5, 1.0, 4.0), Parameter("exponential_depth_m", 0.0, 0.0, 1.0)),

@@ -11,30 +11,60 @@ from sim import effect_codes as code
 
 Array = np.ndarray
 _SLIP_TIME_S = 0.008
+_BENT_M = 0.1   # shaft that the wire runs along
 
 
 @njit(cache=True)
 def on_axis(e, x: float, load: float, curvature: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """x less the stretch that friction leaves in the spring before it. State 0 is the last x, 1 the friction's share of full."""
+    """Motion behind a spring that x drags against friction. State 0: that motion; 1: the friction's share of full; 2: x."""
     if not e.began:
-        e.s[0], e.s[1], e.s[2] = x, 0.0, x
-    moved = x - e.s[0]
-    e.s[0] = x
+        e.s[0], e.s[1], e.s[2], e.s[3] = x, 0.0, x, load
     if e.code == code.COULOMB_FRICTION:
         full = e.p[0] / e.p[1]
-        e.s[1] = lugre(e.s[1], moved / (0.02 * full + 1e-12))
-        return x - full * e.s[1]
+        return _drag(e, x, full, 0.02 * full + 1e-12)
     if e.code == code.PRESLIDING_FRICTION:
-        e.s[1] = bouc_wen(e.s[1], moved / e.p[1])
-        return x - e.p[0] / e.p[2] * e.s[1]
+        return _drag(e, x, e.p[0] / e.p[2], e.p[1])
     if e.code == code.LOAD_DEPENDENT_FRICTION:
-        return x - _capstan(e, x, moved, load, curvature, dt_s)
+        return _held_by_load(e, x, load, curvature, dt_s)
     if e.code == code.STRIBECK_FRICTION:
         return _stick_slip(e, x, dt_s)
     if e.code == code.VISCOUS_FRICTION:
-        e.s[1] += (moved / dt_s - e.s[1]) * (1.0 - math.exp(-dt_s / 0.002))
+        e.s[1] += ((x - e.s[2]) / dt_s - e.s[1]) * (1.0 - math.exp(-dt_s / 0.002))
+        e.s[2] = x
         return x - e.p[0] / e.p[1] * e.s[1]
     return x
+
+
+@njit(cache=True)
+def _share(e, moved: float) -> float:  # type: ignore[no-untyped-def]
+    """Friction's share of full after `moved` distances: Bouc-Wen for presliding, LuGre for Coulomb's."""
+    return bouc_wen(e.s[1], moved) if e.code == code.PRESLIDING_FRICTION else lugre(e.s[1], moved)
+
+
+@njit(cache=True)
+def _drag(e, x: float, full: float, distance: float) -> float:  # type: ignore[no-untyped-def]
+    """Spring and friction in balance, x - y = full * share(y): y lies between its last value and where no friction
+    would add up, found by regula falsi (Illinois)."""
+    start = x - e.s[0] - full * e.s[1]
+    near, far = 0.0, start
+    at_near, at_far = start, start - far - full * (_share(e, far / distance) - e.s[1])
+    moved = far
+    for _ in range(60):
+        if abs(at_near - at_far) < 1e-300:
+            break
+        moved = (near * at_far - far * at_near) / (at_far - at_near)
+        value = start - moved - full * (_share(e, moved / distance) - e.s[1])
+        if abs(value) <= 1e-12 * (abs(start) + full):
+            break
+        if value * start > 0.0:
+            near, at_near = moved, value
+            at_far *= 0.5
+        else:
+            far, at_far = moved, value
+            at_near *= 0.5
+    e.s[1] = _share(e, moved / distance)
+    e.s[0] += moved
+    return e.s[0]
 
 
 @njit(cache=True)
@@ -57,20 +87,22 @@ def bouc_wen(share: float, moved: float) -> float:
 
 
 @njit(cache=True)
-def _capstan(e, x: float, moved: float, load: float, curvature: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """Stretch by friction that the load brings about. A wire wrapped over the bend loses exp(mu * angle); other axes rub."""
+def _held_by_load(e, x: float, load: float, curvature: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
+    """Motion that friction holds as far as the load presses: a wire over a bend keeps its far end between exp(-mu * angle)
+    and exp(mu * angle) of the near one (capstan); other axes rub with mu times the load."""
     e.s[3] += (load - e.s[3]) * (1.0 - math.exp(-dt_s / 0.01))
     if e.port == code.KNOB:
-        e.s[1] = lugre(e.s[1], moved / 0.01)
-        wrap = abs(curvature) * 0.1
-        return (1.0 - math.exp(-e.p[0] * wrap)) * abs(e.s[3]) / e.p[1] * e.s[1]
-    e.s[1] = lugre(e.s[1], moved / (2e-4 if e.port == code.INSERTION else 0.02))
-    return e.p[0] * abs(e.s[3]) / e.p[1] * e.s[1]
+        keep = math.exp(-e.p[0] * abs(curvature) * _BENT_M)
+        low, high = min(x * keep, x / keep), max(x * keep, x / keep)
+    else:
+        low, high = x - e.p[0] * abs(e.s[3]) / e.p[1], x + e.p[0] * abs(e.s[3]) / e.p[1]
+    e.s[0] = min(max(e.s[0], low), high)
+    return e.s[0]
 
 
 @njit(cache=True)
 def _stick_slip(e, x: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """A slider behind the spring: sticks until the static force, slips at the kinetic one, sticks again below the Stribeck speed."""
+    """A slider behind the spring: sticks up to the static force, slips at the kinetic one, sticks again when slow."""
     stretch = x - e.s[2]
     static, kinetic = e.p[0] / e.p[3], e.p[1] / e.p[3]
     if e.s[4] == 0.0 and abs(stretch) > static:

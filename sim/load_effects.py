@@ -164,7 +164,7 @@ def _material(e, p, chain, curvature: float, dt_s: float) -> None:  # type: igno
 
 @njit(cache=True)
 def _beside(e, chain) -> tuple[int, float]:  # type: ignore[no-untyped-def]
-    """The joint beyond the obstacle's place along e3 and the share of the touch on it (the rest on the next towards the base)."""
+    """The joint beyond the obstacle's place along e3 and its share of the touch (the rest is on the next joint back)."""
     for j in range(chain.cells - 1, 0, -1):
         here, beyond = chain.joint[j, 2], chain.joint[j - 1, 2]
         if here <= e.p[0] < beyond:

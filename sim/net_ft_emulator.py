@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sim.sensor_faults import Fault, active, checked, strongest
 from sim.sensor_noise import MarkovNoise, generators
 
 if TYPE_CHECKING:
@@ -17,26 +18,10 @@ if TYPE_CHECKING:
 
 INTERNAL_RATE_HZ = 7000
 _SATURATED, _ERROR, _BRIDGE = 0x00020000, 0x80000000, 0x00000100
+# drop, duplicate, reorder: `value` is the chance per record; silent: nothing leaves (unplugged); saturated: load beyond
+# the gauges; broken: gauge excitation failed; drift: `value` N/s on every force axis; frozen: the same counts under new
+# sequence numbers; bit_errors: `value` is the rate per bit (as if the UDP checksum were off).
 FAULT_KINDS = ("drop", "duplicate", "reorder", "silent", "saturated", "broken", "drift", "frozen", "bit_errors")
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong from start_ns to stop_ns.
-
-    drop, duplicate, reorder: `value` is the chance per record; silent: nothing leaves (unplugged); saturated: load
-    beyond the gauges, status says so; broken: gauge excitation failed, status says so; drift: `value` N/s on every
-    force axis; frozen: the same counts under new sequence numbers; bit_errors: rate per bit (UDP checksum off).
-    """
-
-    kind: str
-    start_ns: int
-    stop_ns: int
-    value: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.kind not in FAULT_KINDS:
-            raise ValueError(f"fault kind: found {self.kind!r}, wanted one of {', '.join(FAULT_KINDS)}")
 
 
 @dataclass(frozen=True)
@@ -74,7 +59,7 @@ class NetFtEmulator:
 
     def __init__(self, config: NetFtEmulatorConfig | None = None, seed: int = 0, faults: Sequence[Fault] = ()) -> None:
         self.config = c = config or NetFtEmulatorConfig()
-        self.faults = list(faults)
+        self.faults = checked(faults, FAULT_KINDS)
         self.streaming = False
         self.malformed_requests = 0
         noise_rng, self._delay_rng, self._fault_rng, self._bit_rng = generators(seed, 4)
@@ -118,7 +103,7 @@ class NetFtEmulator:
         if header != 0x1234 or command not in (0x0000, 0x0002, 0x0003, 0x0041, 0x0042):
             self.malformed_requests += 1
             return
-        if self._faults("silent", now_ns):
+        if active(self.faults, now_ns, "silent"):
             return
         if command == 0x0042:
             self._bias = self._load.copy()
@@ -138,11 +123,11 @@ class NetFtEmulator:
         self._samples += 1
         self._ft_sequence = (self._ft_sequence + self._ft_step) & 0xFFFFFFFF
         self._load = np.concatenate((np.asarray(force_N, float) + c.zero_offset_N, np.asarray(torque_Nm, float)))
-        for fault in self._faults("drift", time_ns):
+        for fault in active(self.faults, time_ns, "drift"):
             self._load[:3] += fault.value * (time_ns - fault.start_ns) * 1e-9
         self._load += noise
         status = self._status(time_ns)
-        if not self._faults("frozen", time_ns):
+        if not active(self.faults, time_ns, "frozen"):
             shown = np.clip(self._load, -self._limit, self._limit) - self._bias
             self._counts = np.clip(np.rint(shown * self._scale), -2**31, 2**31 - 1).astype(np.int64).tolist()
         if not self.streaming:
@@ -156,37 +141,31 @@ class NetFtEmulator:
 
     def _status(self, time_ns: int) -> int:
         status = 0
-        if self._faults("saturated", time_ns):
+        if active(self.faults, time_ns, "saturated"):
             self._load[:3] = 4.0 * self._limit[:3]
         if np.any(np.abs(self._load) >= self._limit):
             status |= _ERROR | _SATURATED
-        if self._faults("broken", time_ns):
+        if active(self.faults, time_ns, "broken"):
             status |= _ERROR | _BRIDGE
         return status
 
     def _send(self, record: bytes, time_ns: int, delay_s: float, draws: np.ndarray) -> None:
-        if self._faults("silent", time_ns) or draws[0] < self._chance("drop", time_ns):
+        if active(self.faults, time_ns, "silent") or draws[0] < strongest(self.faults, time_ns, "drop"):
             return
         arrival_ns = max(time_ns + round(delay_s * 1e9), self._last_arrival_ns)
         self._last_arrival_ns = arrival_ns
-        if draws[1] < self._chance("reorder", time_ns):
+        if draws[1] < strongest(self.faults, time_ns, "reorder"):
             arrival_ns += round(2.5e9 / self.config.rate_hz)
-        for _ in range(2 if draws[2] < self._chance("duplicate", time_ns) else 1):
+        for _ in range(2 if draws[2] < strongest(self.faults, time_ns, "duplicate") else 1):
             self._order += 1
             heapq.heappush(self._queue, (arrival_ns, self._order, self._damaged(record, time_ns)))
 
     def _damaged(self, record: bytes, time_ns: int) -> bytes:
-        rate = self._chance("bit_errors", time_ns)
+        rate = strongest(self.faults, time_ns, "bit_errors")
         if rate <= 0:
             return record
         flips = np.packbits(self._bit_rng.random((len(record), 8)) < rate, axis=1)[:, 0]
         return bytes(np.bitwise_xor(np.frombuffer(record, np.uint8), flips))
-
-    def _faults(self, kind: str, time_ns: int) -> list[Fault]:
-        return [fault for fault in self.faults if fault.kind == kind and fault.start_ns <= time_ns < fault.stop_ns]
-
-    def _chance(self, kind: str, time_ns: int) -> float:
-        return max((fault.value for fault in self._faults(kind, time_ns)), default=0.0)
 
     def read(self, now_ns: int) -> list[bytes]:
         """Datagrams that have reached the host by `now_ns`, in order of arrival."""

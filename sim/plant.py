@@ -23,7 +23,7 @@ TRAVEL = np.array([0.3, 60.0, 10.0])   # end stops of the stages: m, rad, rad ei
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """The demo's plant: about 23 mm of a blazer_prime_xp before a wall normal to e3, 21.2 mm out.
+    """The demo's plant: about 27 mm of a blazer_prime_xp before a wall normal to e3, 25 mm out.
 
     `tool_offsets_m`: sensors along the catheter, back from the tip. `start_stage`: m, rad, rad at time zero.
     """
@@ -89,7 +89,7 @@ class Plant:
         plant_step.advance(self._arrays, self._stage, dt_s)
 
     def sensor_pose(self, offset_m: float) -> tuple[Array, Array]:
-        """True (position (3,) m, quaternion (4,) scalar first, tip->base) at `offset_m` behind the tip, in the base frame."""
+        """True (position (3,) m, quaternion (4,) scalar first, tip->base) at `offset_m` behind the tip, base frame."""
         plant_step.pose(self._arrays, offset_m, self._position, self._frame, self._quaternion)
         return self._position.copy(), self._quaternion.copy()
 

@@ -21,7 +21,8 @@ RIG_STATE = np.dtype([
     ("time_s", "f8"), ("step", "i8"), ("handle", "f8", (3,)), ("last_handle", "f8", (3,)), ("stage", "f8", (3,)),
     ("load", "f8", (4,)), ("curvature", "f8"), ("last_curvature", "f8"), ("exit", "f8", (3,)), ("exit_frame", "f8", (3, 3)),
     ("offset", "f8", (TOOLS,)), ("tools", "i8"), ("random", "i8", (1,)), ("history_s", "f8", (HISTORY,)),
-    ("history", "f8", (HISTORY, TOOLS, 7)), ("wrench", "f8", (HISTORY, 6)), ("frame", "f8", (3, 3)), ("free_tip", "f8", (3,)), ("lever", "f8", (3,)),
+    ("history", "f8", (HISTORY, TOOLS, 7)), ("wrench", "f8", (HISTORY, 6)),
+    ("frame", "f8", (3, 3)), ("free_tip", "f8", (3,)), ("lever", "f8", (3,)),
     ("last_pose", "f8", (TOOLS, 7)), ("last_wrench", "f8", (6,))], align=True)
 
 
@@ -44,8 +45,8 @@ class Parts(NamedTuple):
 
 def hold(parts: Parts) -> tuple[Parts, Parts]:
     """(arrays of one record each, for kernels; records that look into them) from freshly made records."""
-    arrays = Parts(*[np.array([part], part.dtype) for part in parts[:-1]], parts.effects)
-    return arrays, Parts(*[array[0] for array in arrays[:-1]], parts.effects)
+    arrays = Parts._make([np.array([part], part.dtype) for part in parts[:-1]] + [parts.effects])
+    return arrays, Parts._make([array[0] for array in arrays[:-1]] + [parts.effects])
 
 
 def start(stage: tuple[float, float, float], offsets_m: tuple[float, ...], seed: int) -> np.record:
@@ -100,7 +101,7 @@ def _substep(parts: Parts, share: float, time_s: float, dt_s: float) -> None:
     handle = rig.last_handle[0] + share * (rig.handle[0] - rig.last_handle[0])
     turn = rig.last_handle[1] + share * (rig.handle[1] - rig.last_handle[1])
     curvature = rig.last_curvature + share * (rig.curvature - rig.last_curvature)
-    vessel.push(parts.vessel[0], body, handle, rig.load[0], 0.0, dt_s)
+    vessel.push(parts.vessel[0], body, handle, rig.load[0], dt_s)
     catheter_chain.expose(parts.chain[0], chain, body.body_m)
     catheter_chain.place(chain, body.roll_rad, rig.exit, rig.exit_frame)
     load_effects.load_shape(parts.effects, parts.chain[0], chain, curvature, time_s, dt_s)

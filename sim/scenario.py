@@ -38,12 +38,15 @@ class ContactJob:
 
 @dataclass
 class Outcome:
-    """How it went, as far as the scenario itself can see."""
+    """How it went, as far as the scenario itself can see. The steps (three axes) are taken at rest, before disarming."""
 
     contact: bool = False
     stopped: bool = False
     virtual_s: float = 0.0
     digest: str = ""
+    steps_commanded: list[int] = field(default_factory=list)
+    steps_on_pins: list[int] = field(default_factory=list)
+    steps_reported: list[int] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -176,6 +179,12 @@ class Scenario:
         return self.run(job.approach_s, there)
 
     def _closed(self, outcome: Outcome) -> Outcome:
+        self._stop = False
+        self.run(0.3)
+        outcome.steps_commanded = [int(steps) for steps in self.loop.outputs[0].position_steps]
+        outcome.steps_on_pins = self.world.steps.tolist()
+        status = self.loop.link.status
+        outcome.steps_reported = [] if status is None else [int(steps) for steps in status.position_steps]
         self.command("disarm")
         self.run(0.1)
         outcome.virtual_s = self.world.now_ns * 1e-9

@@ -21,7 +21,7 @@ _REFERENCE_DEPTH_M = 2.0e-4  # a power law has the linear wall's force at this d
 class TissueConfig:
     """Wall at `point_m` with `normal` out of the tissue towards the catheter (base frame)."""
 
-    point_m: tuple[float, float, float] = (0.0, 0.0, 0.0212)
+    point_m: tuple[float, float, float] = (0.0, 0.0, 0.025)
     normal: tuple[float, float, float] = (0.0, 0.0, -1.0)
     stiffness_N_per_m: float = 1000.0
     exponent: float = 1.0                      # of depth; 1.5 is Hertz'

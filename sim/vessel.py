@@ -19,7 +19,7 @@ from numba import njit
 class VesselConfig:
     """The way from the handle to the sheath's exit (thesis 6.2.1, 6.2.2)."""
 
-    home_insertion_m: float = -0.0940        # body insertion d when the insertion stage reads 0
+    home_insertion_m: float = -0.0890        # body insertion d when the insertion stage reads 0
     play_width_m: float = 0.0031
     insertion_slope: float = 1.0
     link_stiffness_N_per_m: float = 20000.0  # shaft stretched, or bowed against its guide
@@ -34,8 +34,9 @@ class VesselConfig:
 
 VESSEL_PARAMETERS = np.dtype([
     ("home_m", "f8"), ("gap_m", "f8"), ("slope", "f8"), ("link_stiffness", "f8"), ("slack_stiffness", "f8"),
-    ("friction_N", "f8"), ("damping", "f8"), ("rigid", "i8"), ("windup", "f8"), ("bed", "f8"), ("roll_damping", "f8")], align=True)
-VESSEL_STATE = np.dtype([("body_m", "f8"), ("roll_rad", "f8"), ("link_force_N", "f8"), ("friction_N", "f8")], align=True)
+    ("friction_N", "f8"), ("damping", "f8"), ("rigid", "i8"), ("windup", "f8"), ("bed", "f8"),
+    ("roll_damping", "f8")], align=True)
+VESSEL_STATE = np.dtype([("body_m", "f8"), ("roll_rad", "f8"), ("link_force_N", "f8")], align=True)
 
 
 def parameters(config: VesselConfig) -> np.record:
@@ -74,21 +75,19 @@ def _link_shortening(load_N: float, drag: float, p) -> float:  # type: ignore[no
 
 
 @njit(cache=True)
-def push(p, s, handle_m: float, exit_force_N: float, extra_friction_N: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def push(p, s, handle_m: float, exit_force_N: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
     """Move the body with the handle. Backward Euler of drag * v = link(handle - body) + exit force - Coulomb friction.
 
-    handle_m: stage reading (m); exit_force_N: axial force of the exposed catheter on the body (negative pushes it back);
-    extra_friction_N: planted friction on top of the vessel's own. Changes s.body_m, s.link_force_N.
+    handle_m: stage reading (m); exit_force_N: axial force of the exposed catheter on the body (negative pushes it back).
     """
     wanted = p.home_m + p.slope * handle_m
-    if p.rigid and extra_friction_N <= 0.0:
+    if p.rigid:
         s.body_m = wanted
         return
     drag = p.damping / dt_s
-    friction = p.friction_N + extra_friction_N
     free = drag * (wanted - s.body_m) - exit_force_N
-    forward = wanted - _link_shortening(free + friction, drag, p)
-    backward = wanted - _link_shortening(free - friction, drag, p)
+    forward = wanted - _link_shortening(free + p.friction_N, drag, p)
+    backward = wanted - _link_shortening(free - p.friction_N, drag, p)
     if forward > s.body_m:
         s.body_m = forward
     elif backward < s.body_m:

@@ -13,6 +13,7 @@ from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
 from sim.board import Board, BoardSlice
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
 from sim.plant import Plant
+from sim.stages import Stages, StagesConfig
 
 # Tools of the plant, in the order of its tool_offsets_m.
 TIP, SHAFT = 0, 1
@@ -27,9 +28,9 @@ class World:
     def __init__(self, rig: Rig, plant: Plant, board: Board, seed: int) -> None:
         self.rig, self.plant, self.board = rig, plant, board
         self.now_ns = 0
-        self.steps = np.zeros(3, np.int64)
         self.edges = np.zeros(3, np.int64)
         self.slice: BoardSlice | None = None
+        self.peak_force_N = 0.0
         self.limit_bits, self.estop = 0, False
         tracker, sensor = rig.tracker, rig.force_sensor
         self.tracker = AuroraEmulator(AuroraEmulatorConfig(
@@ -41,8 +42,11 @@ class World:
             counts_per_Nm=sensor.counts_per_newton_metre, force_noise_N=sensor.noise_N,
         ), seed=2 * seed + 2)
         self._digest = hashlib.sha256()
-        self._per_unit = np.array([rig.stage(axis).steps_per_unit for axis in range(3)])
-        self._counts_per_step = np.array([rig.stage(axis).encoder_counts_per_step for axis in range(3)])
+        self.stages = Stages(StagesConfig(
+            steps_per_unit=tuple(rig.stage(axis).steps_per_unit for axis in range(3)),  # type: ignore[arg-type]
+            encoder_counts_per_step=tuple(  # type: ignore[arg-type]
+                rig.stage(axis).encoder_counts_per_step for axis in range(3)),
+        ), plant.config.effects)
         turn = np.array(tracker.base_from_tracker_wxyz)
         self._tracker_from_base = rotation(turn).T
         self._tracker_turn = turn * (1.0, -1.0, -1.0, -1.0)
@@ -55,9 +59,9 @@ class World:
         return self._digest.hexdigest()
 
     @property
-    def stage_unit(self) -> np.ndarray:
-        """Positions (3,) of the stages (m, rad, rad) by the step edges seen on the pins."""
-        return self.steps / self._per_unit
+    def steps(self) -> np.ndarray:
+        """Steps (3,) counted on the pins since the start."""
+        return self.stages.step_counts
 
     def exchange(self, until_ns: int, leaving: Leaving) -> Arriving:
         """Take what the computer sent, let time run to `until_ns` in slices of 1 ms, return what arrives by then."""
@@ -71,19 +75,20 @@ class World:
         to_board, from_board = leaving.board, b""
         while self.now_ns < until_ns:
             next_ns = min(self.now_ns + 1_000_000, until_ns)
-            from_board += self._advance(next_ns, to_board)
+            from_board += self.advance(next_ns, to_board)
             to_board = b""
         return Arriving(from_board, self.tracker.read(until_ns), self.force_box.read(until_ns))
 
-    def _advance(self, until_ns: int, to_board: bytes) -> bytes:
-        counts = np.round(self.steps * self._counts_per_step).astype(np.int64)
-        part = self.board.exchange(until_ns // 1000, to_board, self.limit_bits, self.estop, counts)
+    def advance(self, until_ns: int, to_board: bytes) -> bytes:
+        """Let time run to `until_ns` (at most a few ms on) with bytes for the board; returns what the board sent."""
+        part = self.board.exchange(until_ns // 1000, to_board, self.limit_bits, self.estop, self.stages.encoder_counts)
         self.slice = part
-        np.add.at(self.steps, part.edge_axis, part.edge_sign)
         np.add.at(self.edges, part.edge_axis, 1)
-        self.plant.step((until_ns - self.now_ns) * 1e-9, self.stage_unit)
+        dt_s = (until_ns - self.now_ns) * 1e-9
+        self.plant.step(dt_s, self.stages.advance(dt_s, part.edge_axis, part.edge_sign))
         self._sample(until_ns)
         self.now_ns = until_ns
+        self.peak_force_N = max(self.peak_force_N, float(np.linalg.norm(self.plant.contact_force_N)))
         for column in (part.edge_cycle, part.edge_axis, part.edge_sign):
             self._digest.update(np.ascontiguousarray(column).tobytes())
         self._digest.update(np.ascontiguousarray(self.plant.sensor_pose(0.0)[0]).tobytes())

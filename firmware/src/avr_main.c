@@ -105,8 +105,7 @@ void firmware_loop(void) {
     uint8_t tick = (uint8_t)motion.tick;
     if (tick != seen_tick) wdt_reset(); /* both the main loop and the step timer must live */
     seen_tick = tick;
-    controller_poll();
-    sleep_mode(); /* until the next interrupt, at most one tick */
+    if (!controller_poll()) sleep_mode(); /* until the next interrupt, at most one tick */
 }
 
 uint8_t port_read_switches(void) {

@@ -13,9 +13,25 @@
 boot_t boot;
 static bool identified; /* the host speaks this protocol */
 
+/* Answers wait here while a frame out is being made: a set-point behind the command must not. */
+#define ANSWERS 8 /* power of two */
+typedef struct {
+    uint8_t command, sequence, result;
+} answer_t;
+static answer_t answers[ANSWERS];
+static uint8_t answers_head, answers_tail;
+
 void commands_start(const boot_t *facts) {
     boot = *facts;
     identified = false;
+    answers_head = answers_tail = 0;
+}
+
+/* Of more answers than there is room for the oldest is lost; the host asks again. */
+static void answer(uint8_t command, uint8_t sequence, uint8_t result) {
+    uint8_t slot = answers_head++ % ANSWERS;
+    answers[slot] = (answer_t){command, sequence, result};
+    if ((uint8_t)(answers_head - answers_tail) > ANSWERS) answers_tail++;
 }
 
 bool command_fits(uint8_t id, uint8_t payload_bytes) {
@@ -50,7 +66,7 @@ static void send_identity(void) {
 static void hello(uint8_t sequence, const frame_hello_t *frame) {
     identified = frame->protocol_hash == PROTOCOL_HASH;
     link_restart_sequence(sequence);
-    send_identity();
+    answer(FRAME_HELLO, sequence, RESULT_OK);
 }
 
 static uint8_t arm(const frame_arm_t *frame) {
@@ -93,23 +109,44 @@ void command_take(uint8_t id, uint8_t sequence, const uint8_t *payload) {
         if (identified) gate_take((const frame_setpoint_t *)payload);
         return;
     }
-    uint8_t result = execute(id, payload);
-    frame_ack_t *ack = (frame_ack_t *)link_payload();
-    ack->command = id;
-    ack->command_sequence = sequence;
-    ack->result = result;
-    ack->mcu_time_us = clock_now_us();
-    link_send(FRAME_ACK, FRAME_ACK_BYTES);
+    answer(id, sequence, execute(id, payload));
 }
 
-void send_status(void) {
-    frame_status_t *status = (frame_status_t *)link_payload();
-    port_lock_t lock = port_lock();
-    status->mcu_time_us = clock_locked_us();
-    for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) {
-        status->position_steps[axis] = motion_position(axis);
-        status->encoder_counts[axis] = quadrature_count(axis);
+bool send_answer(void) {
+    if (answers_head == answers_tail) return false;
+    answer_t next = answers[answers_tail++ % ANSWERS];
+    if (next.command == FRAME_HELLO) {
+        send_identity();
+        return true;
     }
+    frame_ack_t *ack = (frame_ack_t *)link_payload();
+    ack->command = next.command;
+    ack->command_sequence = next.sequence;
+    ack->result = next.result;
+    ack->mcu_time_us = clock_now_us();
+    link_send(FRAME_ACK, FRAME_ACK_BYTES);
+    return true;
+}
+
+/* In short critical sections, with constant indices: the step timer must not wait, or encoders lose counts. */
+static void read_motion(frame_status_t *status) {
+    port_lock_t lock = port_lock();
+    uint32_t ms_us = board_clock.ms_us;
+    uint8_t slot = board_clock.slot;
+    status->position_steps[0] = motion_position(0);
+    status->position_steps[1] = motion_position(1);
+    status->position_steps[2] = motion_position(2);
+    port_unlock(lock);
+    status->mcu_time_us = ms_us + (uint16_t)(slot * TICK_US);
+    lock = port_lock();
+    status->encoder_counts[0] = quadrature_count(0);
+    status->encoder_counts[1] = quadrature_count(1);
+    status->encoder_counts[2] = quadrature_count(2);
+    port_unlock(lock);
+}
+
+static void read_safety(frame_status_t *status) {
+    port_lock_t lock = port_lock();
     status->state = safety.state;
     status->fault = safety.fault;
     status->inputs = safety.inputs;
@@ -119,6 +156,12 @@ void send_status(void) {
     status->rx_overruns = serial.rx_overruns;
     status->encoder_errors = quadrature.errors;
     port_unlock(lock);
+}
+
+void send_status(void) {
+    frame_status_t *status = (frame_status_t *)link_payload();
+    read_motion(status);
+    read_safety(status);
     status->last_setpoint = gate.last_number;
     status->last_reject = gate.last_reject;
     status->boot_count = boot.boot_count;

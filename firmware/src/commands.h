@@ -19,9 +19,11 @@ void commands_start(const boot_t *facts);
 /* Whether `id` is a frame to the board and has this many bytes of payload. */
 bool command_fits(uint8_t id, uint8_t payload_bytes);
 
-/* Executes one whole frame and answers it. */
+/* Executes one whole frame; its answer waits for send_answer(). */
 void command_take(uint8_t id, uint8_t sequence, const uint8_t *payload);
 
+/* With no frame out in the making: begins the oldest answer; false when none waits. */
+bool send_answer(void);
 void send_status(void);
 
 #endif

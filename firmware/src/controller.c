@@ -8,6 +8,8 @@
 #include "safety.h"
 #include "setpoint_gate.h"
 
+#define PORTION_BYTES 12 /* of a frame out between two looks at what came in */
+
 board_clock_t board_clock;
 static uint32_t status_due_us;
 
@@ -56,10 +58,12 @@ uint8_t controller_tick(uint8_t encoder_bits) {
     return safety.state == STATE_DISARMED ? outputs : (uint8_t)(outputs | OUTPUT_ENABLE);
 }
 
-void controller_poll(void) {
+bool controller_poll(void) {
     link_poll();
+    if (link_pump(PORTION_BYTES) || send_answer()) return true;
     uint32_t now_us = clock_now_us();
-    if ((int32_t)(now_us - status_due_us) < 0) return;
+    if ((int32_t)(now_us - status_due_us) < 0) return false;
     status_due_us += STATUS_PERIOD_US;
     send_status();
+    return true;
 }

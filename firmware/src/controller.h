@@ -19,7 +19,7 @@ void controller_start(const boot_t *facts, bool shared_limits, uint8_t encoder_b
  * Returns the outputs for the next tick, so that edges leave at the interrupt's entry without jitter. */
 uint8_t controller_tick(uint8_t encoder_bits);
 
-/* Main loop: reads what came in, answers, sends the status when it is due. */
-void controller_poll(void);
+/* Main loop: reads what came in, answers, sends the status when it is due. True while there is more to do at once. */
+bool controller_poll(void);
 
 #endif

@@ -15,12 +15,6 @@ void motion_rename_position(uint8_t axis, int32_t position) {
     motion.axis[axis].fresh = 0;
 }
 
-void motion_append(const segment_t *segment) {
-    motion.queue[motion.head] = *segment;
-    motion.planned_tick = segment->end_tick;
-    motion.head = (uint8_t)(motion.head + 1) & (QUEUE_SLOTS - 1);
-}
-
 static inline void load_axis(uint8_t index, const segment_t *segment, uint8_t ticks) {
     axis_motion_t *axis = &motion.axis[index];
     uint16_t distance = (uint16_t)(segment->target[index] - ((uint16_t)axis->position + (uint16_t)axis->fresh));

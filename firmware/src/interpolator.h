@@ -60,8 +60,14 @@ static inline uint8_t motion_waiting(void) { return (uint8_t)(motion.head - moti
 static inline int32_t motion_position(uint8_t axis) { return motion.axis[axis].position + motion.axis[axis].fresh; }
 void motion_rename_position(uint8_t axis, int32_t position);
 
-/* With the interrupts locked: appends a segment; the caller has seen that motion_waiting() < QUEUE_CAPACITY. */
-void motion_append(const segment_t *segment);
+/* Where the next segment is to be written; nothing reads it before motion_append(). */
+static inline segment_t *motion_free_slot(void) { return &motion.queue[motion.head]; }
+
+/* With the interrupts locked: queues the segment in the free slot. The caller has seen that there is room. */
+static inline void motion_append(void) {
+    motion.planned_tick = motion.queue[motion.head].end_tick;
+    motion.head = (uint8_t)(motion.head + 1) & (QUEUE_SLOTS - 1);
+}
 
 /* With the interrupts locked: forgets the queue and decelerates every axis to rest. */
 void motion_stop(void);

@@ -9,6 +9,9 @@ serial_t serial;
 
 static frame_parser_t parser;
 static uint8_t outgoing[FRAME_MAX_WIRE_BYTES];
+static frame_writer_t writer;
+static bool writing;   /* the frame in `outgoing` is not yet all in the ring */
+static uint8_t pushed; /* bytes of it that are: it leaves while the rest is made */
 static uint8_t outgoing_sequence;
 
 /* Commands and set-points come from two writers, so each kind has its own count. */
@@ -22,6 +25,7 @@ void link_start(void) {
     serial = (serial_t){0};
     parser = (frame_parser_t){0};
     outgoing_sequence = 0;
+    writing = false;
     sequence[STREAM_COMMANDS].known = sequence[STREAM_SETPOINTS].known = false;
 }
 
@@ -66,12 +70,23 @@ void link_poll(void) {
     }
 }
 
+bool link_pump(uint8_t budget) {
+    if (!writing) return false;
+    bool done;
+    uint8_t n = frame_work(&writer, budget, &done), head = serial.sending.head;
+    while (pushed != n) serial.sending.bytes[head++] = outgoing[pushed++];
+    serial.sending.head = head;
+    port_start_transmitter();
+    writing = !done;
+    return writing;
+}
+
 uint8_t *link_payload(void) { return outgoing + 3; }
 
 bool link_send(uint8_t id, uint8_t payload_bytes) {
     if (ring_room(&serial.sending) < payload_bytes + FRAME_OVERHEAD_BYTES + 2) return false;
-    uint8_t n = frame_finish(outgoing, id, outgoing_sequence++, payload_bytes);
-    for (uint8_t i = 0; i < n; i++) ring_put(&serial.sending, outgoing[i]);
-    port_start_transmitter();
+    frame_begin(&writer, outgoing, id, outgoing_sequence++, payload_bytes);
+    writing = true;
+    pushed = 0;
     return true;
 }

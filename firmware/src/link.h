@@ -29,11 +29,14 @@ static inline bool link_next_byte(uint8_t *byte) { return ring_get(&serial.sendi
 /* Works through the bytes received; calls command_take() for every whole frame. */
 void link_poll(void);
 
-/* Where the payload of the next frame out is to be written. */
+/* Where the payload of the next frame out is to be written, once link_pump() has finished the one before. */
 uint8_t *link_payload(void);
 
-/* Sends the payload as frame `id`. Without room in the ring the frame is dropped and false returned. */
+/* Sends the payload as frame `id`; link_pump() does the work. Without room in the ring it is dropped: false. */
 bool link_send(uint8_t id, uint8_t payload_bytes);
+
+/* Works on the frame out, at most `budget` bytes of it; true while there is more to do. */
+bool link_pump(uint8_t budget);
 
 /* Takes the number of this HELLO as the start of the commands' sequence; set-points start anew. */
 void link_restart_sequence(uint8_t sequence);

@@ -3,23 +3,19 @@
 
 quadrature_t quadrature;
 
-/* Index: old BA in bits 2..3, new BA in bits 0..1. A leads B when counting up; 2 marks an impossible transition. */
-static const int8_t TRANSITION[16] = {0, 1, -1, 2, -1, 0, 2, 1, 1, 2, 0, -1, 2, -1, 1, 0};
+#define A_BITS 0x15U
 
 void quadrature_start(uint8_t bits) { quadrature.last_bits = bits; }
 
-static inline void update_axis(uint8_t axis, uint8_t old, uint8_t bits) {
-    int8_t move = TRANSITION[(uint8_t)((old & 3) << 2) | (bits & 3)];
-    if (move == 2)
-        quadrature.errors++;
-    else
-        quadrature.fresh[axis] = (int8_t)(quadrature.fresh[axis] + move);
-}
-
+/* All axes at once, on the A bits: up where the new A differs from the old B (A leads B). */
 void quadrature_update_changed(uint8_t bits) {
     uint8_t old = quadrature.last_bits;
+    uint8_t changed = bits ^ old;
+    uint8_t moved = (changed ^ (uint8_t)(changed >> 1)) & A_BITS;
+    uint8_t up = bits ^ (uint8_t)(old >> 1);
     quadrature.last_bits = bits;
-    update_axis(0, old, bits);
-    update_axis(1, old >> 2, bits >> 2);
-    update_axis(2, old >> 4, bits >> 4);
+    if (moved & 0x01U) quadrature.fresh[0] = (int8_t)(quadrature.fresh[0] + (up & 0x01U ? 1 : -1));
+    if (moved & 0x04U) quadrature.fresh[1] = (int8_t)(quadrature.fresh[1] + (up & 0x04U ? 1 : -1));
+    if (moved & 0x10U) quadrature.fresh[2] = (int8_t)(quadrature.fresh[2] + (up & 0x10U ? 1 : -1));
+    if (changed & (uint8_t)(changed >> 1) & A_BITS) quadrature.errors++;
 }

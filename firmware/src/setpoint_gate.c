@@ -67,13 +67,16 @@ static void snapshot(plan_t *plan) {
     port_unlock(lock);
 }
 
+/* us / TICK_US without a division, exact up to HORIZON_US. */
+static inline uint16_t to_ticks(uint16_t us) { return (uint16_t)((uint32_t)us * 5243U >> 18); }
+
 /* Chooses the tick at which the set-point is reached; returns why it cannot be. */
 static uint8_t check_time(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
     int32_t ahead_us = (int32_t)(setpoint->execute_us - plan->time_us);
     if (ahead_us > (int32_t)HORIZON_US) return REJECT_HORIZON;
     if (ahead_us + (int32_t)setpoint->expiry_us < 0) return REJECT_EXPIRED;
     if (ahead_us > 0) {
-        segment->end_tick = (uint16_t)(plan->tick + (uint16_t)ahead_us / (uint16_t)TICK_US);
+        segment->end_tick = (uint16_t)(plan->tick + to_ticks((uint16_t)ahead_us));
         if ((int16_t)(segment->end_tick - plan->end_tick) > 0) return REJECT_NONE;
         if ((uint16_t)ahead_us >= TICK_US) return REJECT_ORDER;
     }
@@ -95,7 +98,7 @@ static uint8_t check_travel(const frame_setpoint_t *setpoint, uint8_t inputs, ui
 /* The step grid and the tick grid each allow for one count more than the limit. */
 static uint8_t check_axes(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
     uint8_t ticks = (uint8_t)(segment->end_tick - plan->end_tick);
-    uint16_t per_step_q16 = (uint16_t)(0xFFFFU / ticks);
+    uint16_t per_step_q16 = ticks == TICKS_PER_MS ? 0xFFFFU / TICKS_PER_MS : (uint16_t)(0xFFFFU / ticks);
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
         uint8_t reject = check_travel(setpoint, plan->inputs, i);
         if (reject) return reject;
@@ -111,11 +114,11 @@ static uint8_t check_axes(const frame_setpoint_t *setpoint, const plan_t *plan, 
 }
 
 /* The interrupt may have stopped the axes since the snapshot. */
-static uint8_t commit(const segment_t *segment) {
+static uint8_t commit(void) {
     uint8_t reject = REJECT_STATE;
     port_lock_t lock = port_lock();
     if (safety.state == STATE_ARMED || safety.state == STATE_RUNNING) {
-        motion_append(segment);
+        motion_append();
         safety_feed();
         reject = REJECT_NONE;
     }
@@ -125,14 +128,14 @@ static uint8_t commit(const segment_t *segment) {
 
 static uint8_t judge(const frame_setpoint_t *setpoint) {
     plan_t plan;
-    segment_t segment;
+    segment_t *segment = motion_free_slot();
     snapshot(&plan);
     if (plan.state != STATE_ARMED && plan.state != STATE_RUNNING) return REJECT_STATE;
     if (gate.have_number && (int16_t)(setpoint->number - gate.last_number) <= 0) return REJECT_ORDER;
     if (plan.waiting >= QUEUE_CAPACITY) return REJECT_OVERFLOW;
-    uint8_t reject = check_time(setpoint, &plan, &segment);
-    if (!reject) reject = check_axes(setpoint, &plan, &segment);
-    if (!reject) reject = commit(&segment);
+    uint8_t reject = check_time(setpoint, &plan, segment);
+    if (!reject) reject = check_axes(setpoint, &plan, segment);
+    if (!reject) reject = commit();
     return reject;
 }
 

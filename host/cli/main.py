@@ -11,6 +11,14 @@ from host.cli.contract_io import BadInput
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
+    "demo": ("host.cli.demo", "demo", "Bring the tip of the simulated rig to a beating wall and hold a force on it."),
+    "solve": ("host.cli.solve", "solve", "Shape of a catheter under a force, from a JSON request."),
+    "estimate": ("host.cli.estimate", "estimate", "Force at the tip from measured poses, from a JSON request."),
+    "calibrate": ("host.cli.calibrate", "calibrate", "Stiffness of a catheter from shapes under known loads."),
+    "bench": ("host.cli.bench", "bench", "Times of the kernels, each beside a peer in the same run."),
+    "diagnose": ("host.cli.diagnose", "diagnose", "Where recordings and simulation part, and what physics is missing."),
+    "export": ("host.cli.export", "export", "Tables of a recording as parquet or csv."),
+    "latency-check": ("host.cli.latency_check", "latency_check", "How punctual the loop is here, beside cyclictest."),
 }
 
 

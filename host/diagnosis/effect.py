@@ -116,6 +116,7 @@ class Effect:
     timed: bool = False
     forms: tuple[str, ...] = ("",)
     contains: tuple[str, ...] = ()
+    family: str = ""           # of one family only one acts at a port: the second takes the place of the first
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,15 @@ FEWEST_BLOCKS = 6
 
 @dataclass(frozen=True)
 class Gain:
-    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the weighted error that went.
+    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output that gained most.
 
-    `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
+    `excess`: share of that output's error before that is above noise. `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
     """
 
     log_likelihood: float
     p_value: float
     share: float
+    excess: float = 1.0
     independent: Array = field(default_factory=lambda: np.zeros(0))
     log_ratio: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -53,13 +54,13 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
     return float(np.clip(total, 1.0, n / 4.0))
 
 
-def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array, ratio: float = 1.0) -> Gain:
+def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array) -> Gain:
     """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit` or `heldout`).
 
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it is divided by
     the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is gained.
     """
-    independent, log_ratio = np.zeros(floor.size), np.zeros(floor.size)
+    independent, log_ratio, excess = np.zeros(floor.size), np.zeros(floor.size), np.zeros(floor.size)
     blocks: list[float] = []
     for row in range(floor.size):
         b2, a2, n_eff, times = _pooled(pieces, which, before, after, row)
@@ -67,10 +68,12 @@ def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
             continue
         level_b, level_a = b2 + 1e-6 * floor[row] ** 2, a2 + 1e-6 * floor[row] ** 2
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
+        excess[row] = max(0.0, 1.0 - floor[row] ** 2 / level_b)
         blocks += _blocks(pieces, which, before, after, row, times, level_a)
     gain = 0.5 * float(independent @ log_ratio)
-    share = 1.0 - np.exp(-2.0 * gain / independent.sum()) if independent.any() else 0.0
-    return Gain(gain, _sign_of_mean(np.array(blocks)), float(share), independent, log_ratio)
+    top = int(np.argmax(independent * log_ratio))
+    share = float(1.0 - np.exp(-log_ratio[top]))
+    return Gain(gain, _sign_of_mean(np.array(blocks)), share, float(excess[top]), independent, log_ratio)
 
 
 def _pooled(pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int) -> tuple[float, float, float, list[float]]:

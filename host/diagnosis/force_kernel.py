@@ -97,15 +97,42 @@ def along(x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tole
 
 
 @njit(cache=True)
-def _rates(state: Array, u: float, t: float, slow: float, held: float, m: float, c: float, k: float, p: Array, rate: Array) -> None:
-    """Rates of (x, v, x2, v2)."""
-    x, v = state[0], state[1]
-    force = u - c * v - k * x - smooth_force(x, v, t, slow, p) - held
+def _accelerations(x: float, v: float, x2: float, v2: float, u: float, t: float, slow: float, linear: Array, p: Array) -> tuple[float, float]:
+    """Accelerations of the axis and of the second mass; `u` with offset and held friction."""
+    force = u - linear[1] * v - linear[2] * x - smooth_force(x, v, t, slow, p)
+    pull = 0.0
     if p[MASS2] > 0.0:
-        pull = p[OMEGA2] * p[OMEGA2] * (x - state[2]) + 2.0 * p[DAMPING2] * p[OMEGA2] * (v - state[3])
-        force -= p[MASS2] * m * pull
-        rate[2], rate[3] = state[3], pull
-    rate[0], rate[1] = v, force / m
+        pull = p[OMEGA2] * p[OMEGA2] * (x - x2) + 2.0 * p[DAMPING2] * p[OMEGA2] * (v - v2)
+        force -= p[MASS2] * linear[0] * pull
+    return force / linear[0], pull
+
+
+@njit(cache=True)
+def _runge_kutta(s: tuple[float, float, float, float], u: tuple[float, float, float], t: float, h: float, slow: float, linear: Array,
+                 p: Array) -> tuple[float, float, float, float, float]:
+    """One step of (x, v, x2, v2); the last item is the acceleration at its start."""
+    x, v, y, w = s
+    a1, b1 = _accelerations(x, v, y, w, u[0], t, slow, linear, p)
+    v2, w2 = v + 0.5 * h * a1, w + 0.5 * h * b1
+    a2, b2 = _accelerations(x + 0.5 * h * v, v2, y + 0.5 * h * w, w2, u[1], t + 0.5 * h, slow, linear, p)
+    v3, w3 = v + 0.5 * h * a2, w + 0.5 * h * b2
+    a3, b3 = _accelerations(x + 0.5 * h * v2, v3, y + 0.5 * h * w2, w3, u[1], t + 0.5 * h, slow, linear, p)
+    v4, w4 = v + h * a3, w + h * b3
+    a4, b4 = _accelerations(x + h * v3, v4, y + h * w3, w4, u[2], t + h, slow, linear, p)
+    return (x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4),
+            y + h / 6.0 * (w + 2.0 * w2 + 2.0 * w3 + w4), w + h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4), a1)
+
+
+@njit(cache=True)
+def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: float) -> tuple[float, bool]:
+    """Speed after Coulomb friction `dry` has acted over a step, and whether the axis holds."""
+    if v_old == 0.0 and abs(a_free) * m <= dry:
+        return 0.0, True
+    dv = dry * h / m
+    side = v_old if v_old != 0.0 else v_free
+    if side > 0.0:
+        return (v_free - dv if v_free > dv else min(0.0, v_free + dv)), False
+    return (v_free + dv if v_free < -dv else max(0.0, v_free - dv)), False
 
 
 @njit(cache=True)
@@ -115,63 +142,47 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
 
     Arguments:
         u: (n * 2 * substeps + 1,) input at half sub-steps. linear: m, c, k, offset. begin: x and v at the first sample.
-        control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is added. start: friction held at first.
+        control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is
+            added to its force. start: friction held at first.
     Returns:
         (4, n): position, velocity, acceleration, input used.
     Runge-Kutta for the smooth forces; Coulomb friction as an impulse at the end of each sub-step, so that it can hold (Moreau 1988).
     """
     n = load.size
     out = np.empty((4, n))
-    m, c, k, offset = linear[0], linear[1], linear[2], linear[3]
-    h = dt_s / substeps
-    state, rate = np.zeros(4), np.zeros((4, 4))
-    state[0], state[1], state[2], state[3] = begin[0], begin[1], begin[0], begin[1]
+    m, offset, h = linear[0], linear[3], dt_s / substeps
+    s = (begin[0], begin[1], begin[0], begin[1])
     z = np.zeros(5)
     start_state(z, start, load[0], p)
-    held = hysteresis(z, 0.0, load[0], p)
-    slow = begin[0]
+    held, slow = hysteresis(z, 0.0, load[0], p), begin[0]
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
     for i in range(n):
         if control.size:
-            drive = control[2] * control[1] * (control[0] * (reference[0, i] - state[0]) - (state[0] - previous) / dt_s)
-            if reference.shape[0] > 1:
-                drive += reference[1, i]
+            drive = control[2] * control[1] * (control[0] * (reference[0, i] - s[0]) - (s[0] - previous) / dt_s) + reference[1, i]
             drive = min(max(drive, -control[3]), control[3])
-            previous = state[0]
-        out[0, i], out[1, i] = state[0], state[1]
+            previous = s[0]
+        out[0, i], out[1, i] = s[0], s[1]
         out[3, i] = drive if control.size else u[i * 2 * substeps]
         for j in range(substeps):
             place = (i * substeps + j) * 2
-            u0, u1, u2 = (drive, drive, drive) if control.size else (u[place], u[place + 1], u[place + 2])
-            t = i * dt_s + j * h
-            x_old, v_old = state[0], state[1]
+            more = offset - held
+            push = (drive + more, drive + more, drive + more) if control.size else (u[place] + more, u[place + 1] + more, u[place + 2] + more)
+            x_old, v_old = s[0], s[1]
             dry = p[COULOMB]
             if p[STRIBECK] > 0.0:
                 dry += p[EXCESS] * math.exp(-((v_old / p[STRIBECK]) ** 2))
-            _rates(state, u0 + offset, t, slow, held, m, c, k, p, rate[0])
+            x, v, x2, v2, a = _runge_kutta(s, push, i * dt_s + j * h, h, slow, linear, p)
             if j == 0:
-                out[2, i] = rate[0, 1] - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(rate[0, 1], -dry / m), dry / m)))
-            stuck = dry > 0.0 and v_old == 0.0 and abs(rate[0, 1]) * m <= dry
-            _rates(state + 0.5 * h * rate[0], u1 + offset, t + 0.5 * h, slow, held, m, c, k, p, rate[1])
-            _rates(state + 0.5 * h * rate[1], u1 + offset, t + 0.5 * h, slow, held, m, c, k, p, rate[2])
-            _rates(state + h * rate[2], u2 + offset, t + h, slow, held, m, c, k, p, rate[3])
-            for s in range(4):
-                state[s] += h / 6.0 * (rate[0, s] + 2.0 * rate[1, s] + 2.0 * rate[2, s] + rate[3, s])
-            if stuck:
-                state[0], state[1] = x_old, 0.0
-            elif dry > 0.0:
-                side = v_old if v_old != 0.0 else state[1]
-                dv = dry * h / m
-                v_free = state[1]
-                if side > 0.0:
-                    state[1] = v_free - dv if v_free - dv > 0.0 else min(0.0, v_free + dv)
-                else:
-                    state[1] = v_free + dv if v_free + dv < 0.0 else max(0.0, v_free - dv)
-                state[0] += 0.5 * h * (state[1] - v_free)
-            slow = state[0] + (slow - state[0]) * decay
-            held = hysteresis(z, state[0] - x_old, load[i], p)
-            if not abs(state[0]) < 1e12:
+                out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
+            if dry > 0.0:
+                v_dry, stuck = _dry(v_old, v, a, dry, h, m)
+                x = x_old if stuck else x + 0.5 * h * (v_dry - v)
+                v = v_dry
+            s = (x, v, x2, v2)
+            slow = x + (slow - x) * decay
+            held = hysteresis(z, x - x_old, load[i], p)
+            if not abs(x) < 1e12:
                 out[:, i:] = 1e12
                 return out
     return out

@@ -52,6 +52,9 @@ class Model(Protocol):
     ports: tuple[Port, ...]
     parameters: tuple[Parameter, ...]
     quiet_inputs: tuple[str, ...]
+    screen_samples: int                # about so many samples are enough to screen by
+    fit_samples: int                   # and so many to fit; beyond, samples are averaged
+    coarsest_s: float                  # period beyond which they must not be averaged
     taken: frozenset[str]              # effects (id, or id:form) that the nominal model has already
 
     def prepare(self, recording: Recording) -> Piece:

@@ -197,6 +197,30 @@ def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array
     return smooth[0], smooth[1], smooth[2]
 
 
+@njit(cache=True)
+def calm(x: Array, sigma: float) -> Array:
+    """`x` (n,) without white noise `sigma`: at every sample the longest centred mean that agrees with all shorter ones (Lepski 1991)."""
+    n = x.size
+    total = np.zeros(n + 1)
+    for i in range(n):
+        total[i + 1] = total[i] + x[i]
+    out = np.empty(n)
+    for i in range(n):
+        low, high, best = -1e300, 1e300, x[i]
+        half = 0
+        while i - half >= 0 and i + half < n:
+            count = 2 * half + 1
+            mean = (total[i + half + 1] - total[i - half]) / count
+            spread = 2.0 * sigma / math.sqrt(count)
+            if mean < low - spread or mean > high + spread:
+                break
+            best = mean
+            low, high = max(low, mean - spread), min(high, mean + spread)
+            half = half + 1 if half < 4 else int(half * 1.3) + 1
+        out[i] = best
+    return out
+
+
 def quantum(values: Array) -> float:
     """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized."""
     good = values[np.isfinite(values)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +19,12 @@ Tell = Callable[[str, float], None]
 FULL_FITS = 8              # candidates refitted in full at each step
 MOST_EFFECTS = 5
 ENOUGH = 6.0               # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
-SURE = 2e-3                # p-value a new effect has to reach on held-out blocks
-SMALLEST_SHARE = 0.015     # of the weighted held-out error it has to take away
-GRID = 160
+SURE = 1e-2                # p-value a new effect has to reach on held-out blocks
+SMALLEST_SHARE = 0.015     # of the held-out error of some output it has to take away,
+SMALLEST_EXCESS = 0.05     # and this much of what is above noise
+SCREEN_ROWS = 24000        # residuals to screen by, about
+GRID = 160                 # grid points of one candidate at most
+SCAN_SECONDS = 0.4         # time to screen one candidate, about
 
 
 @dataclass
@@ -52,6 +56,8 @@ class Found:
     best: Fit
     steps: list[Step]
     rivals: dict[str, list[Trial]] = field(default_factory=dict)
+    nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
+    best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 
 
 def fit_nominal(problem: Problem) -> Fit:
@@ -109,7 +115,7 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
                 return None
             if other.effect.id not in ("creep_relaxation", "periodic_disturbance"):
                 drop.append(other.key)
-        elif other.effect.id in candidate.effect.contains:
+        elif other.effect.id in candidate.effect.contains or (candidate.effect.family and candidate.effect.family == other.effect.family):
             drop.append(other.key)
         elif candidate.effect.id in other.effect.contains:
             return None
@@ -129,10 +135,15 @@ class Screened:
 
 def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid search)."""
+    problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
     found = []
     bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
     n_eff = _independent(problem, fit)
+    slopes = _slopes(problem, fit)
+    began = perf_counter()
+    problem.stacked(fit.terms, fit.values)
+    most = int(np.clip(SCAN_SECONDS / max(perf_counter() - began, 1e-5), 12, GRID))
     for count, candidate in enumerate(pool):
         tell("screening", count / len(pool))
         drop = replaced_by(fit, candidate)
@@ -147,7 +158,8 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
         term = term_of(problem, candidate, fit)
-        points = _scan(problem, (*terms, term), values, term, base, Q, rest)
+        quick = slopes is not None and candidate.port.name in slopes[0]
+        points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes)
         if not points:
             continue
         points.sort(key=lambda point: point[0], reverse=True)
@@ -156,6 +168,46 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
         promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters)
         found.append(Screened(candidate, term, drop, float(promise), [begin for _, begin in points[:3]]))
     return sorted(found, key=lambda item: item.promise, reverse=True)
+
+
+Slopes = list[dict[str, Array]]
+
+
+def _slopes(problem: Problem, fit: Fit) -> Slopes | None:
+    """Sensitivity of the outputs to each axis, per piece, where the model offers it."""
+    sensitivity = getattr(problem.model, "sensitivity", None)
+    if sensitivity is None:
+        return None
+    n = len(problem.model.parameters)
+    acts, at = [], n
+    for term in fit.terms:
+        acts.append((term.candidate, fit.values[at: at + len(term.parameters)]))
+        at += len(term.parameters)
+    axes = [port.name for port in problem.model.ports if port.kind.startswith("motion")]
+    return [{axis: sensitivity(piece, fit.values[:n], axis, acts) for axis in axes} if piece.fit.any() else {axis: piece.y for axis in axes}
+            for piece in problem.pieces]
+
+
+def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slopes) -> Array:
+    """Weighted change of the outputs by the last term, linearized at its axis."""
+    term = terms[-1]
+    n = len(problem.model.parameters)
+    rows = []
+    for piece, S in zip(problem.pieces, slopes, strict=True):
+        if piece.fit.any():
+            change = problem.model.change(piece, trial[:n], S, term.candidate, trial[-len(term.parameters):])  # type: ignore[attr-defined]
+            rows.append(np.where(np.isfinite(piece.y), change, 0.0)[:, piece.fit] / problem.scale[:, None])
+    return np.concatenate([row.ravel() for row in rows])
+
+
+def _smaller(problem: Problem) -> Problem:
+    """The problem with enough recordings, spread over all, to screen by."""
+    used = [index for index, piece in enumerate(problem.pieces) if piece.fit.any()]
+    count = max(1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used)))))
+    chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
+    stride = max(1, int(sum(problem.pieces[index].fit.sum() for index in chosen) * len(problem.noise) / SCREEN_ROWS))
+    pieces = [replace(piece, fit=piece.fit & (index in chosen) & (np.arange(piece.n) % stride == 0)) for index, piece in enumerate(problem.pieces)]
+    return Problem(problem.model, pieces, problem.noise, problem.scale)
 
 
 def _independent(problem: Problem, fit: Fit) -> float:
@@ -169,28 +221,31 @@ def _independent(problem: Problem, fit: Fit) -> float:
 
 
 def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array,
-          rest: Array) -> list[tuple[float, Array]]:
-    """(energy taken, start values of the term) at each grid point."""
+          rest: Array, most: int, slopes: Slopes | None) -> list[tuple[float, Array]]:
+    """(energy taken, start values of the term) at each grid point; `rest` is orthogonal to the columns of `Q`."""
     points = []
     linear = [p for p in term.parameters if p.linear]
-    for point in grid_points(term.parameters, GRID):
+    for point in grid_points(term.parameters, most // max(len(linear), 1)):
         columns = []
         for p in linear or [None]:
             amplitude = {q.name: 0.0 for q in linear}
             if p is not None:
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
-            columns.append(base - problem.stacked(terms, trial))
-        D = np.array(columns).T
-        D = D - Q @ (Q.T @ D)
-        if not np.all(np.isfinite(D)) or float(np.max(np.sum(D * D, axis=0))) < 1e-9 * float(rest @ rest) * 1e-6:
+            fast = slopes is not None and term.candidate.port.name in slopes[0]
+            columns.append(_fast(problem, terms, trial, slopes) if fast and slopes is not None else base - problem.stacked(terms, trial))
+        D = np.array(columns)
+        B = D @ Q
+        G, g = D @ D.T - B @ B.T, D @ rest
+        size = np.sqrt(np.maximum(np.diag(G), 1e-300))
+        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < 1e-10:
             continue
-        a = np.linalg.lstsq(D, rest, rcond=1e-8)[0]
+        a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
         if linear:
             a = np.array([min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)])
         elif not 0.2 < a[0] < 5.0:
             continue
-        taken = float(rest @ rest) - float(np.sum((rest - D @ a) ** 2))
+        taken = float(2.0 * a @ g - a @ G @ a)
         amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
         points.append((taken, starts(term, amplitude, point)))
     return points
@@ -230,7 +285,8 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts."""
     more = max(len(trial.fit.values) - len(base.values), 0)
     gain = trial.heldout
-    return (gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > SMALLEST_SHARE
+    least = max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
+    return (gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
             and trial.trained.log_likelihood > ENOUGH + 2.0 * more)
 
 
@@ -283,7 +339,8 @@ def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
             terms, values = without(best, problem, (term.candidate.key,))
             less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
             gain = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
-            if gain.log_likelihood < 0.5 * ENOUGH + len(term.parameters) or gain.share < 0.5 * SMALLEST_SHARE:
+            least = 0.5 * max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
+            if gain.log_likelihood < 0.5 * ENOUGH + len(term.parameters) or gain.share < least:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break

@@ -21,12 +21,18 @@ CURVATURE_TOLERANCE_rad = 1e-3    # the maximum-likelihood stage takes over from
 EXACT_TOLERANCE_rad = 1e-10
 END_rad = 1e-9                    # turning of the last step
 END_N = 1e-9                      # force of the last step
+FORCE_LIMIT_N = 10.0              # a pose that asks for more is one that no force explains
 CURVATURE_STEPS, LIKELIHOOD_STEPS = 30, 40
 # Keeps fewer than three arcs solvable: the pose is met up to this share of its covariance, 1e-4 m/N at 0.3 mm
 SOFTNESS_per_N_m = 1e-4
+# The first steps may miss the pose as freely as they bend: without that, three arcs fall into other solutions of
+# (2.12)-(2.14) in one case of ten
+FIRST_SOFTNESS_per_N_m, SOFTENING = 1e7, 0.1
+SECOND_START_CHI_SQUARE = 6.0     # of one degree of freedom
+SCAN_DIRECTIONS, SCAN_FORCES_N, SCAN_BEST = 12, (0.08, 0.25), 3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, float]:
     """Solution of the symmetric positive 3 x 3 system (a: xx, xy, xz, yy, yz, zz) by Cholesky; NaN where singular."""
     d0 = a[0]
@@ -43,7 +49,7 @@ def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, flo
     return b0 / d0 - l1 * y - l2 * z, y, z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array, covariance: Array,
                             tolerance: float, kappa: Array, work: Array) -> tuple[bool, int]:
     """Curvatures that reach the tip pose with the least bending energy, from the unloaded shape. Writes `kappa`.
@@ -63,8 +69,9 @@ def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array
         e0, e1, e2 = pose[0] - x, pose[1] - y, pose[2] - angle
         normal[0], normal[1], normal[2] = covariance[0, 0], covariance[0, 1], covariance[0, 2]
         normal[3], normal[4], normal[5] = covariance[1, 1], covariance[1, 2], covariance[2, 2]
+        softness = max(SOFTNESS_per_N_m, FIRST_SOFTNESS_per_N_m * SOFTENING ** (count - 1))
         for k in range(6):
-            normal[k] *= SOFTNESS_per_N_m
+            normal[k] *= softness
         for i in range(n):
             j0, j1 = -work[kernels.ARM_Y, i], work[kernels.ARM_X, i]
             weight = length[i] / EI[i]
@@ -94,7 +101,7 @@ def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array
     return False, CURVATURE_STEPS
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def force_by_statics(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array,
                      work: Array) -> tuple[float, float]:
     """Force that best explains `kappa`, each arc's moment weighted by its compliance (least energy of the misfit).
@@ -122,7 +129,7 @@ def force_by_statics(length: Array, EI: Array, cubic: Array, kappa0: Array, kapp
     return (yy * bx - xy * by) / determinant, (xx * by - xy * bx) / determinant
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def two_stage(length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array, covariance: Array, kappa: Array,
               work: Array) -> tuple[bool, float, float]:
     """The thesis' estimate: curvatures from the pose (4.3), then force from the curvatures (4.4).
@@ -134,7 +141,7 @@ def two_stage(length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array
     return converged, fx, fy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sensitivities(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, fx: float, fy: float,
                   drag: Array, pose: Array, work: Array, out: Array) -> None:
     """Linearization at (`kappa`, force), in equilibrium or not: `out` gets 6 of d(pose)/d(force) row by row, then the
@@ -166,7 +173,7 @@ def sensitivities(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: 
         out[8] -= length[i] * step
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: float,
                      row: Array) -> tuple[float, float]:
     """Information of the force into `row`, chi square too. Result: gradient. `prior`: force (2), information (3)."""
@@ -189,13 +196,13 @@ def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: flo
     return gx + prior[2] * px + prior[3] * py, gy + prior[3] * px + prior[4] * py
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array, weight: Array,
-               prior: Array, damping: float, kappa: Array, fx: float, fy: float, work: Array, row: Array) -> None:
+               prior: Array, kappa: Array, fx: float, fy: float, work: Array, row: Array) -> None:
     """Maximum-likelihood force from start (`kappa`, fx, fy): Gauss-Newton on shape and force together.
 
-    Arguments: `weight` (3, 3), inverse covariance of the pose; `prior` (5,): force, then its information xx, xy, yy;
-    `damping`, Levenberg's, relative, halved at each step. Writes `kappa` and `row` (COLUMNS,).
+    Arguments: `weight` (3, 3), inverse covariance of the pose; `prior` (5,): force, then its information xx, xy, yy.
+    Writes `kappa` and `row` (COLUMNS,).
     """
     out = np.empty(9)
     row[ENDED] = 0.0
@@ -203,8 +210,7 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
         sensitivities(length, EI, cubic, kappa0, kappa, fx, fy, drag, pose, work, out)
         gx, gy = normal_equations(out, weight, prior, fx, fy, row)
         # the floor belongs to a force of 1 kN: it only keeps a direction that the pose cannot see from dividing by 0
-        xx = row[INFO_XX] * (1.0 + damping) + 1e-6
-        yy = row[INFO_YY] * (1.0 + damping) + 1e-6
+        xx, yy = row[INFO_XX] + 1e-6, row[INFO_YY] + 1e-6
         determinant = xx * yy - row[INFO_XY] ** 2
         dx = (yy * gx - row[INFO_XY] * gy) / determinant
         dy = (xx * gy - row[INFO_XY] * gx) / determinant
@@ -221,7 +227,8 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
             kappa[i] += scale * work[kernels.STEP, i]
         fx += scale * dx
         fy += scale * dy
-        damping *= 0.5 if damping > 1e-9 else 0.0
+        if not math.hypot(fx, fy) < FORCE_LIMIT_N:
+            break
         if turning < END_rad and abs(dx) + abs(dy) < END_N:
             row[ENDED] = 1.0
             break
@@ -229,28 +236,74 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
     row[ERROR_X], row[ERROR_Y], row[ERROR_ANGLE] = out[6], out[7], out[8]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def estimate_cold(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
-                  covariance: Array, weight: Array, prior: Array, kappa: Array, work: Array, row: Array) -> None:
-    """Both stages from the unloaded shape; a damped second start where the first does not end. Writes `row`."""
-    least_energy_curvatures(length, EI, kappa0, pose, covariance, CURVATURE_TOLERANCE_rad, kappa, work)
-    fx, fy = force_by_statics(length, EI, cubic, kappa0, kappa, work)
-    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, 0.0, kappa, fx, fy, work, row)
-    if row[ENDED] != 1.0 or not row[CHI_SQUARE] < 1e4:
-        other, second = kappa0.copy(), np.empty(COLUMNS)
-        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, 10.0, other, 0.0, 0.0, work, second)
-        better = second[CHI_SQUARE] < row[CHI_SQUARE] or row[ENDED] != 1.0
-        if second[ENDED] == 1.0 and better:
-            row[:] = second
-            kappa[:] = other
+                  covariance: Array, weight: Array, prior: Array, enough: float, kappa: Array, work: Array,
+                  row: Array) -> None:
+    """Maximum likelihood from the unloaded shape; other starts where that does not end or does not explain the pose.
+
+    Arguments as in `likelihood`, `covariance` (3, 3) of the pose, and `enough`, the chi square below which no other
+    start is tried. Writes `kappa` and `row` of the best.
+    """
+    kappa[:] = kappa0
+    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, kappa, 0.0, 0.0, work, row)
+    if row[ENDED] == 1.0 and row[CHI_SQUARE] < enough:
+        return
+    other, second = np.empty(kappa.size), np.empty(COLUMNS)
+    least_energy_curvatures(length, EI, kappa0, pose, covariance, CURVATURE_TOLERANCE_rad, other, work)
+    fx, fy = force_by_statics(length, EI, cubic, kappa0, other, work)
+    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, fx, fy, work, second)
+    keep_better(other, second, kappa, row)
+    if row[ENDED] == 1.0 and row[CHI_SQUARE] < enough:
+        return
+    scan(length, EI, cubic, kappa0, drag, pose, weight, prior, other, work, second, kappa, row)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def keep_better(other: Array, second: Array, kappa: Array, row: Array) -> None:
+    """Takes over the second result where it ended and explains the pose better."""
+    if second[ENDED] == 1.0 and (row[ENDED] != 1.0 or second[CHI_SQUARE] < row[CHI_SQUARE]):
+        row[:] = second
+        kappa[:] = other
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def scan(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array, weight: Array,
+         prior: Array, other: Array, work: Array, second: Array, kappa: Array, row: Array) -> None:
+    """The last resort: solves the statics for forces all around, and starts from those nearest to the pose."""
+    count = SCAN_DIRECTIONS * len(SCAN_FORCES_N)
+    miss, shapes = np.full(count, np.inf), np.empty((count, kappa.size))
+    forces = np.empty((count, 2))
+    for k in range(count):
+        angle = 2.0 * math.pi * (k % SCAN_DIRECTIONS) / SCAN_DIRECTIONS
+        size = SCAN_FORCES_N[k // SCAN_DIRECTIONS]
+        forces[k, 0], forces[k, 1] = size * math.cos(angle), size * math.sin(angle)
+        status, _, _ = kernels.load_path(length, EI, cubic, kappa0, forces[k, 0], forces[k, 1], drag, shapes[k],
+                                         work)
+        if status == kernels.CONVERGED:
+            x, y, turn = kernels.evaluate(length, shapes[k], 0.0, 0.0, drag, 0.0, work)
+            error = pose - np.array([x, y, turn])
+            miss[k] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    miss[k] += error[i] * weight[i, j] * error[j]
+    order = np.argsort(miss)
+    for k in order[:SCAN_BEST]:
+        other[:] = shapes[k]
+        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, forces[k, 0], forces[k, 1], work,
+                   second)
+        keep_better(other, second, kappa, row)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def estimate_many(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
                   covariance: Array, weight: Array, prior: Array, kappa: Array, rows: Array) -> None:
-    """`estimate_cold` for N independent samples: `length`, `kappa0`, `kappa` (N, n), `pose` (N, 3), `prior` (N, 5),
-    `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording."""
+    """`estimate_cold` for N independent samples: `length`, `kappa0`, `kappa` (N, n), `pose` (N, 3), `prior` (N, 5) or
+    (1, 5) for all, `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording."""
     work = np.empty((kernels.ROWS, length.shape[1]))
     for i in range(length.shape[0]):
-        estimate_cold(length[i], EI, cubic, kappa0[i], drag, pose[i], covariance, weight, prior[i], kappa[i], work,
-                      rows[i])
+        if not math.isfinite(pose[i, 0] + pose[i, 1] + pose[i, 2]):
+            rows[i] = math.nan
+            continue
+        estimate_cold(length[i], EI, cubic, kappa0[i], drag, pose[i], covariance, weight,
+                      prior[i % prior.shape[0]], SECOND_START_CHI_SQUARE, kappa[i], work, rows[i])

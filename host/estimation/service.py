@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from host.cli.contract_io import BadInput
 from host.estimation.interface import Actuation, Estimator, PoseReading
 from protocol.topics import ForceEstimate, Message, Pose, Stage
 from realtime.rig_file import Rig
@@ -103,7 +104,7 @@ class EstimationService:
         begin_ns = self._timer_ns()
         try:
             answer = self._estimator.estimate(_reading(tip), shaft, actuation)
-        except (ValueError, ArithmeticError) as error:
+        except (ValueError, ArithmeticError, BadInput) as error:
             self.last_failure = f"{type(error).__name__}: {error}"
             answer = None
         compute_us = (self._timer_ns() - begin_ns) * 1e-3

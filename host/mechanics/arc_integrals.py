@@ -15,7 +15,7 @@ REAL = tuple((-1) ** k / (math.factorial(2 * k) * (2 * k + 3)) for k in reversed
 IMAGINARY = tuple((-1) ** k / (math.factorial(2 * k + 1) * (2 * k + 4)) for k in reversed(range(TERMS)))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def phi2_series(u: float) -> tuple[float, float]:
     """Integral of t^2 exp(iut) for |u| <= 1 as (real, imaginary): the sum of (iu)^m / (m! (m + 3)), by Horner."""
     w = u * u
@@ -26,7 +26,7 @@ def phi2_series(u: float) -> tuple[float, float]:
     return real, u * imaginary
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def phi(u: float) -> tuple[float, float, float, float, float, float, float, float]:
     """phi_k(u) = integral of t^k exp(iut) dt over 0..1 for k = 0, 1, 2, and exp(iu).
 
@@ -49,7 +49,7 @@ def phi(u: float) -> tuple[float, float, float, float, float, float, float, floa
     return re0, im0, re1, im1, re2, im2, cosine, sine
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def phi3(u: float, re2: float, im2: float, cosine: float, sine: float) -> tuple[float, float]:
     """phi_3(u) from phi_2(u) and exp(iu); needed only under distributed loads."""
     if abs(u) >= SERIES_LIMIT_rad:

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from host.mechanics import multiple_shooting as ms
 from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, follow, newton
-from host.mechanics.cosserat_kernels import BODY_LENGTH, COARSE, POSE, ROW, SHAFT_LENGTH, sweep
-from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix
+from host.mechanics.cosserat_kernels import BODY_LENGTH, COARSE, FINE, POSE, ROW, SHAFT_LENGTH, sweep
+from host.mechanics.rotations import conjugate, quaternion_product, turn_back
 from host.mechanics.segments import cut, lay_loads
 from host.mechanics.stability import unstable_modes
 from host.mechanics.tip_shooting import (
+    LANDED,
     NO_STATIONS,
     QUICK_BELOW,
     UNIQUE_BELOW,
@@ -26,8 +27,8 @@ from host.mechanics.tip_shooting import (
 
 Array = NDArray[np.float64]
 
-GOAL = 1e-6  # share of the force by which n(base) may miss at the end: about 1e-8 m at the tip
-WARM_TRUST = 0.3
+GOAL_FINE, GOAL_EXACT = 1e-6, 1e-9  # share of the force by which n(base) may miss at the end
+WARM_TRUST, WARM_BELOW = 0.3, 25.0  # a warm start further off, or under a higher load number, is solved cold
 NO_FORCES = np.zeros((0, 3))
 
 
@@ -40,7 +41,7 @@ def solve_cold(rod: Array, force: Array, stations: Array, bend: float, x: Array,
     or EXACT. Written: x (3,) force in the tip frame; out (n + 1, 48) pose rows at the stations and the base.
     Status: `branch.CONVERGED`, or `FOLD` or `ITERATIONS` with the share of the load at which the branch ends.
     """
-    size = length3(force)
+    size, goal = length3(force), GOAL_EXACT if bend < FINE else GOAL_FINE
     if size == 0.0:
         x[:] = 0.0
         sweep(rod, x, stations, bend, POSE, out, work)
@@ -50,9 +51,9 @@ def solve_cold(rod: Array, force: Array, stations: Array, bend: float, x: Array,
         Gi = np.empty((3, 3))
         found, used, steps = quick_branch(rod, force, x, Gi, out[:1], work)
         if found:
-            miss, more = polish(rod, force, stations, bend, POSE, x, Gi, GOAL, out, work)
+            miss, more = polish(rod, force, stations, bend, x, Gi, 10.0 * LANDED, goal, np.empty((4, 3)), out, work)
             used += more
-            if miss < GOAL and unstable_modes(rod, x, work) == 0:
+            if miss < goal and unstable_modes(rod, x, work) == 0:
                 return CONVERGED, 1.0, used, steps, 0
     status, load, passes, steps, unstable = robust_branch(rod, force, stations, bend, x, out)
     return status, load, used + passes, steps, unstable
@@ -65,19 +66,21 @@ def solve_warm(rod: Array, force: Array, stations: Array, bend: float, x: Array,
 
     Arguments as `solve_cold`. Not converged where the guess is too far off to be sure of the branch: solve cold then.
     """
-    size = length3(force)
+    size, goal = length3(force), GOAL_EXACT if bend < FINE else GOAL_FINE
     if size == 0.0:
         x[:] = 0.0
         sweep(rod, x, stations, bend, POSE, out, work)
         return True, 1
     if length3(x) == 0.0:
         unloaded_direction(rod, force, x)
-    Gi, scratch = np.empty((3, 3)), np.empty((2, 3))
+    if load_number(rod, size) > WARM_BELOW:
+        return False, 0
+    Gi, scratch = np.empty((3, 3)), np.empty((4, 3))
     miss, determinant = correct_once(rod, force, COARSE, x, Gi, scratch, out[:1], work)
     if not (miss < WARM_TRUST and determinant > 0.0):
         return False, 1
-    miss, sweeps = polish(rod, force, stations, bend, POSE, x, Gi, GOAL, out, work)
-    return miss < GOAL, sweeps + 1
+    miss, sweeps = polish(rod, force, stations, bend, x, Gi, max(0.2 * miss, LANDED), goal, scratch, out, work)
+    return miss < goal, sweeps + 1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -105,7 +108,7 @@ def robust_branch(rod: Array, force: Array, stations: Array, bend: float, x: Arr
         return FOLD, load, passes + more, steps, unstable
     positions = np.empty((n + 1, 3))
     lay_out(segments, 1.0, Q, M, bend, positions, work)
-    x[:] = rotation_matrix(Q[n]).T @ force
+    turn_back(Q[n], force, x)
     where = total - np.append(stations, total)
     rows_from_nodes(segments, Q, positions, force, where, out)
     return CONVERGED, 1.0, passes + more, steps, unstable
@@ -126,13 +129,12 @@ def rows_from_nodes(segments: Array, Q: Array, positions: Array, force: Array, w
     """out (k, 48): pose rows, as a tip sweep would leave them, of the nodes nearest to the arc lengths where (k,)."""
     n = segments.shape[0]
     for j in range(where.shape[0]):
-        node, here, best, at = 0, 0.0, abs(where[j]), 0.0
+        node, here, best = 0, 0.0, abs(where[j])
         for i in range(n):
             here += segments[i, ms.LENGTH]
             if abs(where[j] - here) < best:
-                node, best, at = i + 1, abs(where[j] - here), here
-        R = rotation_matrix(Q[node])
+                node, best = i + 1, abs(where[j] - here)
         out[j, :ROW] = 0.0
-        out[j, 0:3] = R.T @ (positions[node] - positions[n])
-        out[j, 3:6] = R.T @ force
+        turn_back(Q[node], positions[node] - positions[n], out[j, 0:3])
+        turn_back(Q[node], force, out[j, 3:6])
         out[j, 6:10] = quaternion_product(conjugate(Q[n]), Q[node])

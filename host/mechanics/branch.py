@@ -78,10 +78,12 @@ def newton(segments: Array, load: float, Q: Array, M: Array, bend: float, tolera
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow(segments: Array, Q: Array, M: Array, first_step: float, bend: float, trust: float) -> tuple[int, float, int, int, int]:
+def follow(segments: Array, Q: Array, M: Array, first_step: float, bend: float,
+           trust: float) -> tuple[int, float, int, int, int]:
     """Nodes carried along the branch from no load to full load. Returns (status, load, passes, load steps, unstable).
 
-    Arguments: segments (n, 18) with lane 6 = the full load; Q (n + 1, 4), M (n + 1, 3), written.
+    Arguments: segments (n, 18) with lane 6 = the full load; Q (n + 1, 4), M (n + 1, 3), written; first_step: share
+    of the load to begin with; bend: see `cosserat_kernels`; trust: LARGEST_GUESS_ERROR, or less for a closer watch.
     Where the number of unstable modes changes, the step must be small and the prediction good before it is accepted:
     there another branch crosses, and a long step could end on it.
     """

@@ -7,7 +7,7 @@ behind this face are in `pcar_kernels`; `solve_many` is the array form.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -131,7 +131,7 @@ def solve(arcs: Arcs, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None)
     return Equilibrium(kappa, np.array([x, y]), angle, Status(status), negative == 0, evaluations, share)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve_many(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array,
                kappa: Array, pose: Array, status: Array) -> None:
     """Array form of `solve`: N cases of n arcs, all arguments plain arrays, nothing is checked.
@@ -147,12 +147,17 @@ def solve_many(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Arr
                                                               share, work)
 
 
-def point_at(arcs: Arcs, curvature_per_m: ArrayLike, station_m: float) -> tuple[Array, float]:
-    """Position (2,) (m) and angle (rad) at arc length `station_m` from the sheath's exit, (2.2)-(2.4)."""
+def shortened(arcs: Arcs, station_m: float) -> Arcs:
+    """The arcs up to arc length `station_m` from the sheath's exit; those beyond have length zero. Raises ValueError."""
     ends = np.cumsum(arcs.length_m)
     if not 0.0 <= station_m <= ends[-1] * (1.0 + 1e-12):
         raise ValueError(f"station_m: found {station_m}, wanted 0 to {float(ends[-1])}")
-    length = np.clip(station_m - (ends - arcs.length_m), 0.0, arcs.length_m)
+    return replace(arcs, length_m=np.clip(station_m - (ends - arcs.length_m), 0.0, arcs.length_m))
+
+
+def point_at(arcs: Arcs, curvature_per_m: ArrayLike, station_m: float) -> tuple[Array, float]:
+    """Position (2,) (m) and angle (rad) at arc length `station_m` from the sheath's exit, (2.2)-(2.4)."""
+    length = shortened(arcs, station_m).length_m
     work = np.empty((kernels.ROWS, length.size))
     x, y, angle = kernels.evaluate(length, np.asarray(curvature_per_m, dtype=float), 0.0, 0.0, NO_DRAG, 0.0, work)
     return np.array([x, y]), angle
@@ -216,34 +221,37 @@ def tangent_stiffness(arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike
 
 
 @dataclass(frozen=True)
-class TipSensitivity:
-    """Derivatives of the tip's (x, y, angle) at an equilibrium."""
+class PoseSensitivity:
+    """Derivatives of the pose (x, y, angle) of a point of the catheter at an equilibrium."""
 
     by_force: Array      # (3, 2): m/N, m/N, rad/N
     by_curvature: Array  # (3,): per 1/m of unloaded curvature of the distal shaft
     by_insertion: Array  # (3,): per m of insertion; where the body just begins to come out, that on the way back
 
 
-def tip_sensitivity(arcs: Arcs, equilibrium: Equilibrium, force_N: ArrayLike) -> TipSensitivity:
-    """Exact derivatives of the loaded tip pose by force and by actuation, for control and for estimation.
+def pose_sensitivity(arcs: Arcs, equilibrium: Equilibrium, force_N: ArrayLike,
+                     back_m: float = 0.0) -> PoseSensitivity:
+    """Exact derivatives of a loaded pose by force and by actuation, for control and for estimation.
 
-    Arguments: `arcs` and `force_N` (2,) of the solved `equilibrium`.
+    Arguments: `arcs` and `force_N` (2,) of the solved `equilibrium`; `back_m`, arc length back from the tip, where
+    the point stays on the catheter as it moves.
     """
     kappa = equilibrium.curvature_per_m
     force = _force(force_N)
     out = arcs.length_m > 0.0
-    jacobian = kinematic_jacobian(arcs, kappa)
     stiffness = tangent_stiffness(arcs, kappa, force)[np.ix_(out, out)]
     delta = kappa - arcs.unloaded_curvature_per_m
     elastic = arcs.EI_N_m2 * (1.0 + 3.0 * arcs.cubic_stiffening_m2 * delta**2) * arcs.length_m
+    part = shortened(arcs, arcs.total_length_m - back_m)
     pose_by_insertion, moment_by_insertion = np.zeros(3), np.zeros(kappa.size)
     for arc in np.flatnonzero(arcs.length_by_insertion):
-        pose, moment = by_arc_length(arcs, kappa, force, int(arc))
-        pose_by_insertion += arcs.length_by_insertion[arc] * pose
-        moment_by_insertion += arcs.length_by_insertion[arc] * moment
-    right = np.column_stack([jacobian[:2].T, np.where(arcs.distal, elastic, 0.0), moment_by_insertion])[out]
-    response = jacobian[:, out] @ np.linalg.solve(stiffness, right)
-    return TipSensitivity(response[:, :2], response[:, 2], response[:, 3] + pose_by_insertion)
+        share = arcs.length_by_insertion[arc]
+        moment_by_insertion += share * by_arc_length(arcs, kappa, force, int(arc))[1]
+        pose_by_insertion += share * by_arc_length(part, kappa, force, int(arc))[0]
+    right = np.column_stack([kinematic_jacobian(arcs, kappa)[:2].T, np.where(arcs.distal, elastic, 0.0),
+                             moment_by_insertion])[out]
+    response = kinematic_jacobian(part, kappa)[:, out] @ np.linalg.solve(stiffness, right)
+    return PoseSensitivity(response[:, :2], response[:, 2], response[:, 3] + pose_by_insertion)
 
 
 def by_arc_length(arcs: Arcs, curvature_per_m: ArrayLike, force: Array, arc: int) -> tuple[Array, Array]:

@@ -35,7 +35,7 @@ EVALUATION_LIMIT = 400
 SYMMETRIC_rad = 1e-13           # no moment at all: a straight arc under axial load, stable or not
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def evaluate(length: Array, kappa: Array, force_x: float, force_y: float, drag: Array, load: float,
              work: Array) -> tuple[float, float, float]:
     """Moments and their derivatives at curvatures `kappa` under `load` times the external load.
@@ -89,7 +89,7 @@ def evaluate(length: Array, kappa: Array, force_x: float, force_y: float, drag: 
     return x, y, angle
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def arms(work: Array) -> None:
     """Mean lever of the tip force on each arc after `evaluate`: d tip / d kappa_i = l_i (-ARM_Y, ARM_X) (2.15)."""
     n = work.shape[1]
@@ -101,7 +101,7 @@ def arms(work: Array) -> None:
         y += work[CHORD_Y, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def factorize(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array) -> int:
     """Pivots of the tangent stiffness (second variation of the energy), in O(n): returns how many are not positive.
 
@@ -125,7 +125,7 @@ def factorize(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Arra
     return negative
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def back_substitute(length: Array, work: Array, row: int) -> None:
     """Solves tangent * x = work[row] in place, after `factorize`."""
     n = length.size
@@ -142,7 +142,7 @@ def back_substitute(length: Array, work: Array, row: int) -> None:
         work[row, i] = value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array,
                 work: Array) -> tuple[int, float]:
     """Newton's step into work[STEP] after `evaluate`. Result: pivots that are not positive, turning of the step."""
@@ -157,7 +157,7 @@ def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Ar
     return negative, turning
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def correct(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
             load: float, tolerance: float, first: float, kappa: Array,
             work: Array) -> tuple[bool, int, float, float]:
@@ -187,7 +187,7 @@ def correct(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: floa
     return False, 11, start, worst
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def tangent(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
             load: float, kappa: Array, work: Array) -> tuple[int, float, float, float]:
     """d kappa / d load into work[TANGENT], residual step into work[STEP]. Result: pivots not positive, squared turning
@@ -205,7 +205,7 @@ def tangent(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: floa
     return negative, square, product, turning
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def arc_length_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
                     evaluations: int, kappa: Array, work: Array) -> tuple[int, int, float]:
     """Follows the branch anew by arc length in (turning of the arcs, load), so that a sharp turn is passed and a fold is
@@ -248,7 +248,7 @@ def arc_length_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force
     return NOT_CONVERGED, evaluations, load
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def restore(load: float, kappa: Array, work: Array) -> float:
     """Back to the last point of the path, kept in work[TRIAL]; returns its load."""
     for i in range(kappa.size):
@@ -256,7 +256,7 @@ def restore(load: float, kappa: Array, work: Array) -> float:
     return load
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def turned_back(length: Array, work: Array) -> bool:
     """Whether the path, going on in its own direction, now goes towards smaller loads: the mark of a fold."""
     product = 1.0
@@ -265,7 +265,7 @@ def turned_back(length: Array, work: Array) -> bool:
     return product < 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def correct_on_arc(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
                    load: float, step: float, kappa: Array, work: Array) -> tuple[bool, int, float, float]:
     """Newton back to the branch, at right angles to the tangent kept in work[ARM_X] (borrowed).
@@ -300,7 +300,7 @@ def correct_on_arc(length: Array, EI: Array, cubic: Array, kappa0: Array, force_
     return False, 8, load, worst
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def load_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
               kappa: Array, work: Array) -> tuple[int, int, float]:
     """Curvatures at full load on the branch that starts at the unloaded shape. Writes `kappa`.

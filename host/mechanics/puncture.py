@@ -27,7 +27,7 @@ class PuncturedEquilibrium:
     reaction_N: Array  # (2,) base frame
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_reaction(length: Array, arc: int, part: float, reaction: Array, kappa: Array, work: Array,
                  short: Array, short_work: Array) -> tuple[float, float]:
     """Adds the reaction's moments to `work` after `evaluate`; leaves the held point's levers in `short_work`.
@@ -54,7 +54,7 @@ def add_reaction(length: Array, arc: int, part: float, reaction: Array, kappa: A
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def constrained_step(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array, load: float,
                      arc: int, part: float, point: Array, compliance: float, kappa: Array, reaction: Array,
                      work: Array, short: Array, short_work: Array) -> tuple[int, float, float, float]:
@@ -97,7 +97,7 @@ def constrained_step(length: Array, EI: Array, cubic: Array, kappa0: Array, forc
     return negative + positive - 2, turning, d_x, d_y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def constrained_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array, arc: int,
                      part: float, point: Array, kappa: Array, reaction: Array,
                      work: Array) -> tuple[int, int, float, int]:

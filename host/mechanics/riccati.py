@@ -38,10 +38,10 @@ def linearize(segments: Array, load: float, Q: Array, M: Array, bend: float, phi
 def correct(Q: Array, phi: Array, gap: Array, step: Array, by_load: Array, gain: Array) -> int:
     """Newton step of every node and its change with lane 6; returns the number of unstable modes.
 
-    Arguments: Q (n + 1, 4) nodes; phi (n, 6 or 9, 8), gap (n, 6) from `linearize`; step, by_load (n + 1, 6), written: turn in the section's
-    frame (rad), moment (N m); gain (n, 3, 5), scratch. Backwards, dm = S dtheta + g with S = 0, g = 0 at the free tip;
-    D - S B, brought to one frame, has a negative eigenvalue for each conjugate point inside the segment, and each
-    conjugate point is a mode in which the equilibrium is unstable.
+    Arguments: Q (n + 1, 4) nodes; phi (n, 6 or 9, 8), gap (n, 6) from `linearize`; gain (n, 3, 5), scratch.
+    Written: step, by_load (n + 1, 6), turn in the section's frame (rad) and moment (N m).
+    Backwards, dm = S dtheta + g with S = 0, g = 0 at the free tip; D - S B, brought to one frame, has a negative
+    eigenvalue for each conjugate point inside the segment, and each is a mode in which the equilibrium is unstable.
     """
     n = phi.shape[0]
     S, g, gt = np.zeros((3, 3)), np.zeros(3), np.zeros(3)

@@ -66,9 +66,3 @@ def checked_stations(stations_m: Sequence[float] | Array) -> Array:
     if stations.ndim != 1 or not np.all(np.isfinite(stations)) or np.any(stations < 0.0):
         raise BadInput("stations_m", np.asarray(stations_m).tolist(), "a list of arc lengths back from the tip, 0 or more")
     return stations
-
-
-def rotation_about_e3(roll_rad: float) -> Array:
-    """Matrix (3, 3) of the handle's roll: turns the whole shape about the sheath's axis (section 3.2.3)."""
-    c, s = np.cos(roll_rad), np.sin(roll_rad)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -12,14 +12,20 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
+def product_into(p: Array, q: Array, out: Array) -> None:
+    """out (4,) = Hamilton product p q of quaternions (4,): first turn by q, then by p. out must be neither."""
+    out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
+    out[1] = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
+    out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
+    out[3] = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
+
+
+@njit(cache=True, nogil=True)
 def quaternion_product(p: Array, q: Array) -> Array:
     """Hamilton product p q of quaternions (4,): first turn by q, then by p."""
-    return np.array([
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    ])
+    out = np.empty(4)
+    product_into(p, q, out)
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -29,14 +35,20 @@ def conjugate(q: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def matrix_into(q: Array, R: Array) -> None:
+    """R (3, 3) = rotation matrix of the unit quaternion q (4,); (3.15) with the element (1, 3) put right."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+
+
+@njit(cache=True, nogil=True)
 def rotation_matrix(q: Array) -> Array:
     """Rotation matrix (3, 3) of the unit quaternion q (4,); (3.15) with the element (1, 3) put right."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ])
+    R = np.empty((3, 3))
+    matrix_into(q, R)
+    return R
 
 
 @njit(cache=True, nogil=True)
@@ -79,7 +91,16 @@ def vector_of_quaternion(q: Array) -> Array:
 @njit(cache=True, nogil=True)
 def rotate(q: Array, v: Array) -> Array:
     """Vector v (3,) turned by the unit quaternion q (4,)."""
-    return rotation_matrix(q) @ v
+    R = rotation_matrix(q)
+    return np.array([R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2] for i in range(3)])
+
+
+@njit(cache=True, nogil=True)
+def turn_back(q: Array, v: Array, out: Array) -> None:
+    """out (3,) = vector v (3,) turned by the inverse of the unit quaternion q (4,)."""
+    R = rotation_matrix(q)
+    for i in range(3):
+        out[i] = R[0, i] * v[0] + R[1, i] * v[1] + R[2, i] * v[2]
 
 
 @njit(cache=True, nogil=True)

@@ -18,6 +18,7 @@ from host.mechanics.cosserat_kernels import (
     BODY_LENGTH,
     COARSE,
     K0,
+    POSE,
     POSE_AND_FORCE_TANGENTS,
     SHAFT_1,
     SHAFT_LENGTH,
@@ -29,8 +30,11 @@ Array = NDArray[np.float64]
 
 NO_STATIONS = np.zeros(0)
 UNIQUE_BELOW = 2.0  # load number under which the equilibrium is taken as the only one (planar bound: pi^2 / 4)
-QUICK_BELOW = 12.0
+QUICK_BELOW = 25.0
+LANDED = 1e-3  # miss at which a load step counts as done: one more Newton step follows it
 TRUST = 0.15  # share of the force by which a predicted n(base) may miss
+DRIFT = 0.3  # a corrected load step that ends further than this share of itself from its prediction is not believed
+NEAR_SINGULAR = 0.02  # determinant of G below which a fold may be near
 PASSES = 12
 
 
@@ -86,7 +90,7 @@ def correct_once(rod: Array, force: Array, bend: float, x: Array, Gi: Array, scr
                  work: Array) -> tuple[float, float]:
     """One Newton step of the tip-frame force x (3,), in place. Returns (miss before it, determinant of G).
 
-    Arguments: force (3,) base frame; Gi (3, 3), written: inverse of G; scratch (2, 3), out (1, 48), work.
+    Arguments: force (3,) base frame; Gi (3, 3), written: inverse of G; scratch (2 or more, 3), out (1, 48), work.
     """
     sweep(rod, x, NO_STATIONS, bend, POSE_AND_FORCE_TANGENTS, out, work)
     miss, step = scratch[0], scratch[1]
@@ -101,28 +105,31 @@ def correct_once(rod: Array, force: Array, bend: float, x: Array, Gi: Array, scr
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def polish(rod: Array, force: Array, stations: Array, bend: float, width: int, x: Array, Gi: Array, goal: float,
-           out: Array, work: Array) -> tuple[float, int]:
+def polish(rod: Array, force: Array, stations: Array, bend: float, x: Array, Gi: Array, limit: float, goal: float,
+           scratch: Array, out: Array, work: Array) -> tuple[float, int]:
     """x (3,) refined at full accuracy by Broyden steps from the inverse Gi (3, 3). Returns (last miss, sweeps).
 
-    Leaves in out (n + 1, 48) the rows of the accepted x at the stations and the base.
+    Arguments: limit: largest first miss that is believed to be the same branch; goal: miss to reach; scratch (4, 3).
+    Leaves in out (n + 1, 48) the pose rows of the accepted x at the stations and the base.
     """
-    miss, step, before, change = np.empty(3), np.zeros(3), np.zeros(3), np.empty(3)
-    size, smallest, error = length3(force), 1e300, 0.0
+    miss, step, change, spare = scratch[0], scratch[1], scratch[2], scratch[3]
+    size, smallest, error = length3(force), 0.5 * limit, 0.0
     last = stations.shape[0]
     for sweeps in range(1, PASSES + 1):
-        sweep(rod, x, stations, bend, width, out, work)
+        if sweeps > 1:
+            for i in range(3):
+                change[i] = miss[i]
+        sweep(rod, x, stations, bend, POSE, out, work)
         error = miss_of(out[last], force, miss)
         if error < goal or not error < 2.0 * smallest:
             return error, sweeps
         smallest = min(error, smallest)
         if sweeps > 1:
             for i in range(3):
-                before[i] -= miss[i]
-            broyden(Gi, step, before, change)
+                change[i] -= miss[i]
+            broyden(Gi, step, change, spare)
         apply3(Gi, miss, step)
         for i in range(3):
-            before[i] = miss[i]
             x[i] += step[i]
         scale_to(x, size)
     return error, PASSES
@@ -163,23 +170,33 @@ def land(rod: Array, goal: Array, bend: float, trust: float, x: Array, Gi: Array
             first = error
             if not error < trust:
                 return False, first, determinant, sweeps
-        elif not error < max(0.3 * before, 1e-3):
+        elif not error < max(0.3 * before, LANDED):
             return False, first, determinant, sweeps
         before = error
-        if error < 1e-3:
+        if error < LANDED:
             return True, first, determinant, sweeps
     return False, first, determinant, 6
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def drifted(start: Array, guess: Array, end: Array) -> bool:
+    """Whether Newton went from `guess` to `end` (3,) by more than DRIFT of the step from `start`: another branch?"""
+    moved = stepped = 0.0
+    for i in range(3):
+        moved += (end[i] - guess[i]) ** 2
+        stepped += (guess[i] - start[i]) ** 2
+    return moved > DRIFT * DRIFT * stepped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def quick_branch(rod: Array, force: Array, x: Array, Gi: Array, out: Array, work: Array) -> tuple[bool, int, int]:
     """x (3,) = tip-frame force on the branch from the unloaded shape, to about 1e-5. Returns (found, sweeps, steps).
 
-    Gives up (for `branch.follow` to take over) where a load step fails eight times or the determinant changes sign.
+    Gives up, for `branch.follow` to take over, where load steps keep failing or a fold may be near.
     """
     size = length3(force)
     number = load_number(rod, size)
-    slope, x0, slope0, guess, goal = np.empty(3), np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
+    slope, x0, slope0, guess, end, goal = np.empty(3), np.zeros(3), np.zeros(3), np.empty(3), np.empty(3), np.empty(3)
     scratch = np.empty((2, 3))
     x[:] = 0.0
     unloaded_direction(rod, force, slope)
@@ -193,11 +210,12 @@ def quick_branch(rod: Array, force: Array, x: Array, Gi: Array, out: Array, work
         for i in range(3):
             goal[i] = (load + h) * force[i]
         scale_to(guess, (load + h) * size)
-        trust = 3.0 if (load + h) * number <= UNIQUE_BELOW * 1.001 else TRUST
-        landed, first, determinant, used = land(rod, goal, COARSE, trust, guess, Gi, scratch, out, work)
+        end[:] = guess
+        unique = (load + h) * number <= UNIQUE_BELOW * 1.001
+        landed, first, determinant, used = land(rod, goal, COARSE, 3.0 if unique else TRUST, end, Gi, scratch, out, work)
         sweeps += used
-        if landed and determinant > 0.0:
-            x0[:], slope0[:], x[:] = x, slope, guess
+        if landed and (unique or (determinant > NEAR_SINGULAR and not drifted(x, guess, end))):
+            x0[:], slope0[:], x[:] = x, slope, end
             apply3(Gi, force, slope)
             load, span, steps = load + h, h, steps + 1
             h *= min(3.0, max(0.5, (0.3 * TRUST / max(first, 1e-9)) ** 0.25))

@@ -34,7 +34,8 @@ class AuroraConfig:
     """tools: wanted port handles, () for all; latency_s: from sampling to the first byte of a reply at no waiting;
     baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: rest of the line between a reply
     that brought nothing new and the next poll; settle_frames: frames from which times are learnt before poses are told
-    (the first frame seen may be nearly a period old)."""
+    (the first frame seen may be nearly a period old); frozen_after: frames with one and the same pose, bit for bit,
+    after which it is no measurement any more (real ones have noise), 0: never."""
 
     tools: tuple[str, ...] = ("0A", "0B")
     rate_hz: float = 40.0
@@ -49,6 +50,7 @@ class AuroraConfig:
     retry_s: float = 0.5
     max_distance_m: float = 3.0
     settle_frames: int = 20
+    frozen_after: int = 8
 
     def __post_init__(self) -> None:
         wanted = {
@@ -77,6 +79,7 @@ class AuroraCounters:
     poses: int = 0
     missing: int = 0
     not_a_pose: int = 0
+    frozen: int = 0
     warnings: int = 0
     errors: int = 0
     sessions: int = 0
@@ -110,6 +113,7 @@ class AuroraClient:
         self._pausing = False
         self._baud = 9600
         self._was_tracking = False
+        self._last_error = ""
         self._now_ns = 0
         self._begin_tracking()
 
@@ -173,9 +177,12 @@ class AuroraClient:
     # Session: the scripts of aurora_session, one reply or time-out at a time.
 
     def event(self, kind: EventKind, text: str, now_ns: int | None = None) -> None:
-        """Note an event; for the session's scripts."""
+        """Note an event, an error that only repeats the last one once; for the session's scripts."""
         self._counters.warnings += kind is EventKind.WARNING
         self._counters.errors += kind is EventKind.ERROR
+        if kind is EventKind.ERROR and text == self._last_error:
+            return
+        self._last_error = text if kind is EventKind.ERROR else ""
         self._events.append(DeviceEvent(self._now_ns if now_ns is None else now_ns, "aurora", kind, text))
 
     def line(self, action: LineAction) -> None:
@@ -228,6 +235,7 @@ class AuroraClient:
         self._tool_frames: dict[str, int] = {}
         self._system_status: int | None = None
         self._tool_flags: dict[str, PoseFlag] = {}
+        self._same: dict[str, tuple[tuple[float, ...], int]] = {}
 
     def _poll(self, now_ns: int) -> None:
         if self._flight is not None:
@@ -335,6 +343,9 @@ class AuroraClient:
             else:
                 flags |= PoseFlag.NOT_A_POSE
                 self._counters.not_a_pose += 1
+            if self._is_frozen(tool.handle, tool.quaternion_wxyz + tool.position_m):
+                flags |= PoseFlag.FROZEN
+                self._counters.frozen += 1
         missing = bool(flags & ~PoseFlag.PARTLY_OUT_OF_VOLUME)
         if missing:
             position, quaternion = np.full(3, np.nan), np.full(4, np.nan)
@@ -344,6 +355,12 @@ class AuroraClient:
             self._tool_flags[tool.handle] = flags
             self.event(EventKind.WARNING, f"tool {tool.handle}: {flag_words(flags)}", now_ns)
         return PoseSample(tool.handle, frame, stamp_ns, now_ns, position, quaternion, tool.error_m, missing, flags)
+
+    def _is_frozen(self, handle: str, numbers: tuple[float, ...]) -> bool:
+        before, run = self._same.get(handle, ((), 0))
+        run = run + 1 if numbers == before else 0
+        self._same[handle] = (numbers, run)
+        return 0 < self.config.frozen_after <= run
 
     def _system(self, status: int, now_ns: int) -> None:
         """Events when the system's status changes; a tool plugged in or pulled is enumerated anew."""

@@ -62,7 +62,8 @@ class ForceSample:
 @dataclass(frozen=True)
 class NetFtConfig:
     """ft_rate_hz: the box's internal rate, at which ft_sequence counts; latency_s: from gauge to UDP at no waiting;
-    wild_ratio: readings beyond this multiple of the rated range are not believed."""
+    wild_ratio: readings beyond this multiple of the rated range are not believed; frozen_after: records with the same six
+    counts after which they are no measurement any more (real ones have noise), 0: never."""
 
     calibration: NetFtCalibration
     ft_rate_hz: float = 7000.0
@@ -72,6 +73,7 @@ class NetFtConfig:
     max_gap: int = 10_000
     resync_after: int = 3
     wild_ratio: float = 10.0
+    frozen_after: int = 50
 
     def __post_init__(self) -> None:
         if not (self.ft_rate_hz > 0 and self.latency_s >= 0 and self.max_gap > 0 and self.resync_after > 0):
@@ -93,6 +95,7 @@ class NetFtCounters:
     lost: int = 0
     status_errors: int = 0
     wild: int = 0
+    frozen: int = 0
     resyncs: int = 0
     silences: int = 0
 
@@ -204,6 +207,9 @@ class NetFtClient:
         if is_fault(status):
             self._counters.status_errors += 1
             return None
+        if self._is_frozen(tuple(counts), now_ns):
+            self._counters.frozen += 1
+            return None
         force_N = np.array(counts[:3]) * self._newton
         torque_Nm = np.array(counts[3:]) * self._newton_metre
         if np.any(np.abs(np.concatenate((force_N, torque_Nm))) > self._wild):
@@ -221,6 +227,7 @@ class NetFtClient:
         self._stray: int | None = None
         self._stray_run = 0
         self._ft: int | None = None
+        self._same: tuple[tuple[int, ...], int] = ((), 0)
         self.clock.reset()
 
     def _follow(self, sequence: int) -> int | None:
@@ -249,6 +256,14 @@ class NetFtClient:
         self._restart()
         self._last = sequence
         return 0
+
+    def _is_frozen(self, counts: tuple[int, ...], now_ns: int) -> bool:
+        before, run = self._same
+        run = run + 1 if counts == before else 0
+        self._same = (counts, run)
+        if run == self.config.frozen_after > 0:
+            self._event(EventKind.WARNING, f"the same reading {run} times in a row: frozen", now_ns)
+        return 0 < self.config.frozen_after <= run
 
     def _stamp(self, ft_sequence: int, now_ns: int) -> int:
         near = self._ft if self._ft is not None else ft_sequence

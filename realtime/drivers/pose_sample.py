@@ -21,6 +21,7 @@ class PoseFlag(IntFlag):
     SENSOR_BROKEN = 32
     PROCESSING_EXCEPTION = 64
     NOT_A_POSE = 128
+    FROZEN = 256
 
 
 NO_FLAGS = PoseFlag(0)

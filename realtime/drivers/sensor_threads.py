@@ -29,11 +29,13 @@ OnEvent = Callable[[DeviceEvent], None]
 class SensorThread(threading.Thread):
     """A daemon thread with `start()`, `stop()` and `failures` (times that the port or socket was lost or not there).
 
+    `now_ns` is the clock of all stamps, CLOCK_MONOTONIC unless another is given.
     Events and samples are handed over in this thread; what the callbacks raise ends it and is kept in `error`.
     """
 
-    def __init__(self, name: str, on_event: OnEvent | None) -> None:
+    def __init__(self, name: str, on_event: OnEvent | None, now_ns: Callable[[], int]) -> None:
         super().__init__(name=name, daemon=True)
+        self._now_ns = now_ns
         self.failures = 0
         self.error: BaseException | None = None
         self._halt = threading.Event()
@@ -75,8 +77,9 @@ class AuroraThread(SensorThread):
     """Reads an Aurora. `open_transport()` opens the port at 9600 baud (OSError when it is not there)."""
 
     def __init__(self, open_transport: Callable[[], Transport], callback: Callable[[PoseSample], None],
-                 config: AuroraConfig | None = None, on_event: OnEvent | None = None) -> None:
-        super().__init__("aurora", on_event)
+                 config: AuroraConfig | None = None, on_event: OnEvent | None = None,
+                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__("aurora", on_event, now_ns)
         self.client = AuroraClient(config)
         self._open, self._callback = open_transport, callback
 
@@ -89,7 +92,7 @@ class AuroraThread(SensorThread):
             transport.close()
 
     def _turn(self, transport: Transport) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = self._now_ns()
         sending = self.client.outgoing(now_ns)
         for action in self.client.line_actions():
             apply_line_action(transport, action)
@@ -97,17 +100,17 @@ class AuroraThread(SensorThread):
             transport.write(sending)
         self._tell(self.client.take_events())
         due_ns = self.client.next_due_ns
-        wait_s = 0.0 if due_ns is None else min(max((due_ns - time.monotonic_ns()) * 1e-9, 0.0), _MAX_WAIT_S)
+        wait_s = 0.0 if due_ns is None else min(max((due_ns - self._now_ns()) * 1e-9, 0.0), _MAX_WAIT_S)
         if not select.select([transport.fileno()], [], [], wait_s)[0]:
             return
         data = transport.read()
         if not data:
             raise OSError("serial port hung up (unplugged?)")
-        for sample in self.client.feed(data, time.monotonic_ns()):
+        for sample in self.client.feed(data, self._now_ns()):
             self._callback(sample)
 
     def _lost(self, why: str) -> None:
-        self.client.lost(time.monotonic_ns(), why)
+        self.client.lost(self._now_ns(), why)
         self._tell(self.client.take_events())
 
 
@@ -115,8 +118,9 @@ class NetFtThread(SensorThread):
     """Reads a Net F/T box by UDP. `request_bias()` may be called from any thread."""
 
     def __init__(self, host: str, callback: Callable[[ForceSample], None], config: NetFtConfig,
-                 on_event: OnEvent | None = None, port: int = RDT_PORT) -> None:
-        super().__init__("net_ft", on_event)
+                 on_event: OnEvent | None = None, port: int = RDT_PORT,
+                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__("net_ft", on_event, now_ns)
         self.client = NetFtClient(config)
         self._address, self._callback = (host, port), callback
         self._bias_wanted = threading.Event()
@@ -137,7 +141,7 @@ class NetFtThread(SensorThread):
                 _send_quietly(link, self.client.stop() if self._halt.is_set() else b"")
 
     def _turn(self, link: socket.socket) -> None:
-        sending = self.client.outgoing(time.monotonic_ns())
+        sending = self.client.outgoing(self._now_ns())
         if sending:
             link.send(sending)
         if self._bias_wanted.is_set():
@@ -147,12 +151,12 @@ class NetFtThread(SensorThread):
         if not select.select([link], [], [], _MAX_WAIT_S)[0]:
             return
         datagram = link.recv(2048)
-        sample = self.client.feed(datagram, time.monotonic_ns())
+        sample = self.client.feed(datagram, self._now_ns())
         if sample is not None:
             self._callback(sample)
 
     def _lost(self, why: str) -> None:
-        self.client.lost(time.monotonic_ns(), why)
+        self.client.lost(self._now_ns(), why)
         self._tell(self.client.take_events())
 
 

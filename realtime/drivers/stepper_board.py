@@ -149,8 +149,13 @@ class StepperBoardLink:
     # --- to the board ---------------------------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> bytes:
-        """Bytes that bring the link further: HELLO, then the limits; again every 100 ms until they are answered."""
+        """Bytes that bring the link further: HELLO, then the limits; again every 100 ms until they are answered.
+
+        A board that holds a fault takes no limits: the operator clears it first.
+        """
         if self.phase not in (LinkPhase.HELLO, LinkPhase.CONFIGURE):
+            return b""
+        if self.phase is LinkPhase.CONFIGURE and self.status is not None and self.status.state != State.DISARMED:
             return b""
         if self._sent_ns is not None and now_ns - self._sent_ns < RETRY_NS:
             return b""

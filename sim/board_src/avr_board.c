@@ -9,6 +9,7 @@
  * byte (simavr: 11), a receiver that holds three bytes (64), RXC as long as there is one (pulsed), a double-buffered
  * transmitter. Sleep costs no wall time. Interrupts are entered in no cycles (chip: 4 to 5).
  */
+#include <simavr/avr_extint.h>
 #include <simavr/avr_ioport.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
@@ -25,6 +26,7 @@
 #define LETTER(x) LETTER_(x)
 #define RECEIVER_BYTES 3 /* two in the FIFO, one in the shift register */
 #define RJMP_SELF 0xCFFFU
+#define CYCLES_LIMIT 1000000U /* between two looks at simavr's timers; its own default of 1 is five times slower */
 
 typedef struct {
     const char *name;
@@ -59,7 +61,7 @@ static struct {
     avr_t *avr;
     avr_uart_t *uart;
     void (*core_reset)(avr_t *);
-    uint64_t base_cycle; /* simavr's count starts anew with each reset */
+    uint64_t base_cycle, reset_cycle; /* some versions of simavr start their count anew with each reset */
     bool was_reset;
     uint8_t outputs;
     uint8_t encoder_lines, switches; /* on the pins */
@@ -240,7 +242,7 @@ static void sleep_free(avr_t *avr, avr_cycle_count_t cycles) {
 
 static void on_reset(avr_t *avr) {
     board.was_reset = true;
-    board.base_cycle += avr->cycle;
+    board.reset_cycle = now();
     board.receiver = (receiver_t){0};
     board.transmitter = (transmitter_t){0};
     board.outputs = 0;
@@ -250,9 +252,18 @@ static void on_reset(avr_t *avr) {
     if (board.core_reset) board.core_reset(avr);
 }
 
-/* simavr forgets its timers and the pins with a reset. */
+/* A low level on an external interrupt's pin makes simavr poll it every cycle, enabled or not. */
+static void stop_level_polling(void) {
+    for (uint8_t i = 0; i < EXTINT_COUNT; i++)
+        if (avr_extint_is_strict_lvl_trig(board.avr, i) > 0) avr_extint_set_strict_lvl_trig(board.avr, i, 0);
+}
+
+/* simavr forgets its timers, the pins and its settings with a reset. */
 static void after_reset(void) {
     board.was_reset = false;
+    board.base_cycle = board.reset_cycle - board.avr->cycle;
+    board.avr->run_cycle_limit = CYCLES_LIMIT;
+    stop_level_polling();
     uint8_t encoder_lines = board.encoder_lines, switches = board.switches;
     board.encoder_lines = (uint8_t)~encoder_lines;
     board.switches = (uint8_t)~switches;
@@ -347,7 +358,6 @@ static bool start(const char *name, const char *elf) {
     firmware.frequency = BOARD_CPU_HZ;
     avr_load_firmware(avr, &firmware);
     avr->log = LOG_ERROR;
-    avr->run_cycle_limit = 1000000;
     avr->sleep = sleep_free;
     board.core_reset = avr->reset;
     avr->reset = on_reset;

@@ -73,7 +73,7 @@ static void tick(produce_t *produce) {
             produce_edge(produce, board.cycle, axis, board.outputs >> (OUTPUT_DIRECTION_SHIFT + axis) & 1U);
     receive(board.cycle);
     board.outputs = controller_tick(encoders_lines(&board.encoders));
-    controller_poll();
+    while (controller_poll()) {}
     transmit(board.cycle, produce);
 }
 

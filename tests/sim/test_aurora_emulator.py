@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realtime.drivers import ndi_protocol as ndi
-from sim.aurora_emulator import FAULT_KINDS, AuroraEmulator, AuroraEmulatorConfig, Fault
+from sim.aurora_emulator import FAULT_KINDS, AuroraEmulator, AuroraEmulatorConfig
+from sim.sensor_faults import Fault
 
 VECTORS = json.loads((Path(__file__).parents[1] / "realtime" / "vectors" / "aurora.json").read_text(encoding="utf-8"))
 MS = 1_000_000
@@ -151,6 +152,19 @@ def test_a_reply_takes_ten_bit_times_a_byte(baud: int) -> None:
     assert len(early) == length - 1 and len(late) == 1
 
 
+def test_replies_leave_one_after_the_other() -> None:
+    console = Console()
+    console.device.feed(2 * ndi.command("VER", "0"), 0)
+    length = len(VECTORS["session"][2]["device"])
+    whole_ns = round(0.0002e9 + (10 + 2 * (length + 12)) * 10e9 / 9600)
+    data = console.device.read(whole_ns // 2) + console.device.read(10**9)
+    assert len(ndi.ReplyReader().feed(data)) == 2
+    assert len(console.device.read(2 * 10**9)) == 0
+    again = Console()
+    again.device.feed(2 * ndi.command("VER", "0"), 0)
+    assert len(again.device.read(round((10 + 1.5 * length) * 10e9 / 9600))) < 1.6 * length
+
+
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
 def test_a_frame_can_be_had_after_its_latency_and_not_before(late_s: float) -> None:
     emulator = AuroraEmulator(AuroraEmulatorConfig(**QUIET), 1, [Fault("late", 0, MS, value=late_s)])
@@ -159,6 +173,33 @@ def test_a_frame_can_be_had_after_its_latency_and_not_before(late_s: float) -> N
     assert emulator._frame_at(ready_ns - 1) is None
     frame = emulator._frame_at(ready_ns)
     assert frame is not None and frame.number == 1
+
+
+def test_poses_outside_the_volume_are_sent_only_when_asked_for() -> None:
+    console = Console(AuroraEmulatorConfig(handles=("0A",), **QUIET), (Fault("out_of_volume", 0, 10**18),))
+    console.start()
+    for option, state in (("0001", ndi.HandleState.MISSING), ("0801", ndi.HandleState.VALID)):
+        (binary,) = ndi.ReplyReader().feed(console.send(ndi.command("BX", option)))
+        (text,) = ndi.ReplyReader().feed(console.send(ndi.command("TX", option)))
+        for reply in (ndi.parse_bx(binary.binary or b""), ndi.parse_tx(text.text or "")):
+            (tool,) = reply.tools
+            assert tool.state is state and tool.status & ndi.PortStatus.OUT_OF_VOLUME
+
+
+def test_a_pulled_tool_is_stale_until_freed_and_new_when_plugged() -> None:
+    console = Console()
+    console.start()
+    assert console.ask("TSTOP") == "OKAY"
+    console.device.unplug("0B")
+    assert console.device._console.system_status == 0x80
+    assert console.ask("PHSR", "01") == "010B000"
+    assert console.ask("PINIT", "0B") == "ERROR0D"
+    assert console.ask("PHINF", "0B0001") == "UNOCCUPIED"
+    assert console.ask("PHF", "0B") == "OKAY"
+    assert console.ask("PHSR", "00") == "010A031" and console.ask("PINIT", "0B") == "ERROR2B"
+    console.device.plug("0B")
+    assert console.ask("PHSR", "02") == "010B001"
+    assert console.device._console.system_status == 0
 
 
 def test_frozen_poses_come_under_new_frame_numbers() -> None:
@@ -232,7 +273,7 @@ def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str) -> None:
 
 def test_an_unknown_fault_and_a_wrong_number_of_poses_are_refused() -> None:
     with pytest.raises(ValueError, match="gremlin"):
-        Fault("gremlin", 0, 1)
+        AuroraEmulator(faults=[Fault("gremlin", 0, 1)])
     with pytest.raises(ValueError, match="poses: found 1, wanted 2"):
         AuroraEmulator().sample(0, [STILL])
     with pytest.raises(ValueError, match="out of range"):

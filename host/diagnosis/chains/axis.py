@@ -28,6 +28,9 @@ class Axis:
     """
 
     kind = "axis"
+    fit_samples = 1000000000
+    coarsest_s = 0.0
+    screen_samples = 20000
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.axis is None:
@@ -53,7 +56,7 @@ class Axis:
         self.parameters = tuple(parameters)
         self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
         if "stiffness" not in self.spec.terms:
-            self.taken |= {"softening:"}
+            self.taken |= {"softening:", "contact_nonlinear:"}
         self.quiet_inputs = (self.spec.input,)
 
     def prepare(self, recording: Recording) -> Piece:
@@ -164,7 +167,7 @@ class Axis:
             return np.asarray(residual[-1])
         if port.name.endswith("_reading"):
             return np.asarray(residual[0])
-        size = dict(zip(self.spec.terms, theta, strict=True)).get("stiffness", 1.0)
+        size = dict(zip(self.spec.terms, theta, strict=False)).get("stiffness", 1.0)
         return np.asarray(residual[0] * size)
 
 

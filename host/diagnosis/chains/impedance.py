@@ -20,6 +20,9 @@ class Impedance:
     """Nominal model of kind `impedance`."""
 
     kind = "impedance"
+    fit_samples = 24000
+    coarsest_s = 0.02
+    screen_samples = 24000
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.impedance is None:
@@ -46,6 +49,8 @@ class Impedance:
         self.parameters = tuple(parameters)
         have = {"damping": "viscous_friction:", "mass": "added_mass"}
         self.taken = frozenset(have[term] for term in self.spec.terms if term in have)
+        if "stiffness" not in self.spec.terms:
+            self.taken |= {"contact_nonlinear:", "softening:"}
         self.quiet_inputs = (self.spec.input, *loads)
 
     def prepare(self, recording: Recording) -> Piece:

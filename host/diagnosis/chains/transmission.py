@@ -18,6 +18,9 @@ class Transmission:
     """Nominal model of kind `transmission`; several links may share channels."""
 
     kind = "transmission"
+    fit_samples = 24000
+    coarsest_s = 0.02
+    screen_samples = 24000
     taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:

@@ -6,7 +6,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import play
 
 
-
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Width of the gap."""
     low = max(s.tolerance, 1e-4 * s.span)
@@ -20,5 +19,5 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 EFFECTS = (
     Effect("backlash", "motion", 40, parameters, "After every reversal the output rests until a gap of {width} is taken up.",
-           "y = play(x, width/2)", apply),
+           "y = play(x, width/2)", apply, family="dry"),
 )

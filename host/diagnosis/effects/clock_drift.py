@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effects.latency import rows
 from host.diagnosis.operators import shift
 
 
@@ -18,7 +19,21 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return shift(signal, c.dt_s, p[0] * c.time_s)
 
 
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Every row of every pose later and later."""
+    return {**run, **{name: rows(run[name], c, p[0] * c.time_s) for name in ("tip", "shaft", "tip_R", "shaft_R")}}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Every row of the force later and later."""
+    return rows(signal, c, p[0] * c.time_s)
+
+
 SAYS = "One clock runs faster: the delay grows by {rate}."
 EFFECTS = tuple(
     Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True) for port in ("motion", "timing")
+) + (
+    Effect("clock_drift", "pose", 83, parameters, "The tracker's clock runs off: its delay grows by {rate}.", "y(t) = x(t - rate*t)", apply_pose, timed=True),
+    Effect("clock_drift", "forces", 83, parameters, "The force sensor's clock runs off: its delay grows by {rate}.", "y(t) = x(t - rate*t)", apply_force,
+           timed=True),
 )

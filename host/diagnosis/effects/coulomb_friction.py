@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -30,6 +29,6 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 EFFECTS = (
     Effect("coulomb_friction", "motion", 45, lost, "The output stays behind by {lost_motion}, against the motion, from the first step after a reversal.",
-           "y = x - lost_motion*sign(v)", apply),
-    Effect("coulomb_friction", "force", 10, force, "A constant force of {force} acts against the motion.", "F = force*sign(v)", slots=slots),
+           "y = x - lost_motion*sign(v)", apply, family="dry"),
+    Effect("coulomb_friction", "force", 10, force, "A constant force of {force} acts against the motion.", "F = force*sign(v)", slots=slots, family="dry"),
 )

@@ -44,7 +44,22 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"maxwell_stiffness": p[0], "maxwell_time": p[1]}
 
 
+def share(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Slow deflection against the prompt one, and its time constant."""
+    return (Parameter("slow_share", "", (0.2,), -5.0, 5.0, linear=True), taus(s))
+
+
+def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
+    """Under force the shaft goes on giving way (`force`); or the bend goes on following the knob (`bend`)."""
+    if form == "bend":
+        return {**state, "kappa": state["kappa"] + p[0] * (lag(state["kappa"], c.dt_s, p[1]) - state["kappa"])}
+    slow = np.vstack([lag(np.ascontiguousarray(row), c.dt_s, p[1]) for row in state["push"]])
+    return {**state, "push": state["push"] + p[0] * slow}
+
+
 EFFECTS = (
+    Effect("creep_relaxation", "shape", 22, share, "Under force the shaft goes on giving way over {time_constant}.",
+           "u = C (F + slow_share*lag(F, time_constant))", apply_shape, timed=True, forms=("force",)),
     Effect("creep_relaxation", "motion", 55, of_motion, "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
            "y = x + slow_share*(lag(x, time_constant) - x)", apply_motion, timed=True),
     Effect("creep_relaxation", "motion", 72, of_load, "Under {source} the output goes on giving way over {time_constant}.",

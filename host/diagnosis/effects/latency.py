@@ -20,7 +20,27 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return shift(signal, c.dt_s, np.full(signal.size, p[0]))
 
 
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Every row of every pose late."""
+    late = np.full(c.time_s.size, p[0])
+    return {**run, **{name: rows(run[name], c, late) for name in ("tip", "shaft", "tip_R", "shaft_R")}}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Every row of the force late."""
+    return rows(signal, c, np.full(c.time_s.size, p[0]))
+
+
+def rows(values: Array, c: Context, late: Array) -> Array:
+    """All rows of `values` (..., n) shifted by `late` (n,)."""
+    flat = values.reshape(-1, values.shape[-1])
+    return np.vstack([shift(np.ascontiguousarray(row), c.dt_s, late) for row in flat]).reshape(values.shape)
+
+
 SAYS = "The channel is {delay} late, at every frequency alike."
 EFFECTS = tuple(
     Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True) for port in ("motion", "timing")
+) + (
+    Effect("latency", "pose", 82, parameters, "The tracker's poses are {delay} late.", "y(t) = x(t - delay)", apply_pose, timed=True),
+    Effect("latency", "forces", 82, parameters, "The force readings are {delay} late.", "y(t) = x(t - delay)", apply_force, timed=True),
 )

@@ -34,7 +34,18 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"quadratic": p[0], "cubic": p[1]} if form == "quadratic" else {"cubic": p[0]}
 
 
+def bend(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Change of compliance with the size of the force."""
+    return (Parameter("per_force_squared", "1/N2", (1.0,), linear=True),)
+
+
+def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
+    """Deflection grows with the force by an extra cubic part."""
+    return {**state, "push": state["push"] * (1.0 + p[0] * np.sum(state["push"] ** 2, axis=0))}
+
+
 EFFECTS = (
+    Effect("nonlinear_stiffness", "shape", 20, bend, "The shaft's deflection is not linear in the force.", "u = C F (1 + a F^2)", apply_shape),
     Effect("nonlinear_stiffness", "motion", 71, per_load, "The spring between input and output is not linear in {source}.",
            "y = x + compliance*load + cubic*load^3", apply, side="output", source="load", contains=("compliance",)),
     Effect("nonlinear_stiffness", "force", 20, force, "The spring hardens or softens with deflection: cubic coefficient {cubic}.",

@@ -31,7 +31,23 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 SAYS = "A periodic disturbance rides on the signal."
+def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Motion of the wall along its normal."""
+    top = min(0.2 / s.dt_s, 5.0)
+    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    return (Parameter("sine", "m", (3e-4,), linear=True), Parameter("cosine", "m", (3e-4,), linear=True),
+            Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+
+
+def apply_wall(law: dict, c: Context, p: Array, form: str) -> dict:
+    """The wall moves to and fro."""
+    phase = 2.0 * np.pi * p[2] * c.time_s
+    return {**law, "gap": law["gap"] + p[0] * np.sin(phase) + p[1] * np.cos(phase)}
+
+
 EFFECTS = (
+    Effect("periodic_disturbance", "contact", 10, wall, "The wall moves to and fro at {frequency}.", "depth = depth + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+           apply_wall, timed=True),
     Effect("periodic_disturbance", "motion", 75, parameters, SAYS, "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, side="output", timed=True),
     Effect("periodic_disturbance", "motion", 25, parameters, SAYS, "y = x + sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)", apply, forms=("place",)),
     Effect("periodic_disturbance", "force", 30, parameters, SAYS, "F = sine*sin(2 pi f t) + cosine*cos(2 pi f t)", slots=slots, timed=True),

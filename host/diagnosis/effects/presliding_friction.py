@@ -8,7 +8,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import dahl, maxwell_slip
 
 
-
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion when fully built up, and the distance over which that happens."""
     return (Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
@@ -36,7 +35,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 EFFECTS = (
     Effect("presliding_friction", "motion", 46, lost, "The output stays behind by up to {lost_motion}, built up over {distance} after each reversal.",
-           "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance", apply, forms=("dahl", "maxwell"), contains=("backlash", "coulomb_friction")),
+           "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance", apply, forms=("dahl", "maxwell"), contains=("backlash", "coulomb_friction"), family="dry"),
     Effect("presliding_friction", "force", 11, force, "Friction of {force} builds up over {distance} after each reversal.",
-           "F = force*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, forms=("dahl", "maxwell"), contains=("coulomb_friction",)),
+           "F = force*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, forms=("dahl", "maxwell"), contains=("coulomb_friction",), family="dry"),
 )

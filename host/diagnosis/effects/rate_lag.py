@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.operators import lag
 
@@ -17,7 +19,27 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return lag(signal, c.dt_s, p[0])
 
 
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Every row of every pose through the low pass."""
+    return {**run, **{name: rows(run[name], c, p[0]) for name in ("tip", "shaft", "tip_R", "shaft_R")}}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Every row of the force through the low pass."""
+    return rows(signal, c, p[0])
+
+
+def rows(values: Array, c: Context, time_constant_s: float) -> Array:
+    """All rows of `values` (..., n) through the low pass."""
+    flat = values.reshape(-1, values.shape[-1])
+    return np.vstack([lag(np.ascontiguousarray(row), c.dt_s, time_constant_s) for row in flat]).reshape(values.shape)
+
+
 SAYS = "The output follows with a first-order lag of {time_constant}."
 EFFECTS = tuple(
     Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True) for port in ("motion", "timing")
+) + (
+    Effect("rate_lag", "pose", 81, parameters, "The tracker follows with a lag of {time_constant}.", "time_constant*dy/dt + y = x", apply_pose, timed=True),
+    Effect("rate_lag", "forces", 81, parameters, "The force sensor follows with a lag of {time_constant}.", "time_constant*dy/dt + y = x", apply_force,
+           timed=True),
 )

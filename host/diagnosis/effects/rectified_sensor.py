@@ -18,6 +18,12 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + p[0] * (np.abs(signal) - signal))
 
 
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """All components lose their sign."""
+    return np.asarray(signal + p[0] * (np.abs(signal) - signal))
+
+
 EFFECTS = (
+    Effect("rectified_sensor", "forces", 90, parameters, "The force sensor gives magnitudes only.", "y = |x|", apply_force),
     Effect("rectified_sensor", "drift", 90, parameters, "The sensor gives the magnitude only: its reading folds at zero.", "y = |x|", apply),
 )

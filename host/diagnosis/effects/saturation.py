@@ -19,7 +19,20 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(np.minimum(signal, p[0]) if form == "upper" else np.maximum(signal, p[0]))
 
 
+def largest(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Largest reading of either sign."""
+    top = max(abs(s.low), abs(s.high))
+    return (Parameter("limit", s.unit, tuple(f * top for f in (0.97, 0.85, 0.7, 0.5)), 0.05 * top, top, step=0.05 * top),)
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Every component clipped."""
+    return np.asarray(np.clip(signal, -p[0], p[0]))
+
+
 SAYS = "Beyond {limit} nothing follows."
 EFFECTS = tuple(
     Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower")) for port in ("motion", "limit")
+) + (
+    Effect("saturation", "forces", 89, largest, "The force sensor does not read beyond {limit}.", "y = clip(x, -limit, limit)", apply_force),
 )

@@ -23,7 +23,34 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + p[0] * c.time_s)
 
 
+def vector(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Rates along the base axes; second form: levels and time constant of a warm-up."""
+    if form == "warm_up":
+        level = tuple(Parameter(f"level_{a}", s.unit, (s.need,), linear=True) for a in "xyz")
+        return (*level, Parameter("time_constant", "s", spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3), 0.01 * s.duration_s, 3 * s.duration_s, log=True))
+    return tuple(Parameter(f"rate_{a}", f"{s.unit}/s", (s.need / s.duration_s,), linear=True) for a in "xyz")
+
+
+def _wander(c: Context, p: Array, form: str) -> Array:
+    return np.outer(p[:3], 1.0 - np.exp(-c.time_s / p[3]) if form == "warm_up" else c.time_s)
+
+
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Both positions wander alike."""
+    wander = _wander(c, p, form)
+    return {**run, "tip": run["tip"] + wander, "shaft": run["shaft"] + wander}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """The force reading wanders."""
+    return np.asarray(signal + _wander(c, p, form))
+
+
 EFFECTS = (
+    Effect("sensor_drift", "pose", 88, vector, "The tracker's positions drift with time, whatever moves.", "y = x + rate*t", apply_pose, timed=True,
+           forms=("", "warm_up")),
+    Effect("sensor_drift", "forces", 88, vector, "The force sensor drifts with time, whatever touches.", "y = x + rate*t", apply_force, timed=True,
+           forms=("", "warm_up")),
     Effect("sensor_drift", "drift", 80, parameters, "The reading drifts with time, whatever moves.", "y = x + rate*t", apply, timed=True,
            forms=("", "warm_up")),
 )

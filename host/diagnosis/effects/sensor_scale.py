@@ -10,12 +10,20 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Relative error of gain."""
-    return (Parameter("gain_error", "", (s.need / s.span,), -0.9, 3.0, linear=True),)
+    return (Parameter("gain_error", "", (0.02,), -0.9, 3.0, linear=True),)
 
 
-def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Reading times 1 + p[0]."""
-    return np.asarray(signal * (1.0 + p[0]))
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Positions of both sensors times 1 + p[0]."""
+    return {**run, "tip": run["tip"] * (1.0 + p[0]), "shaft": run["shaft"] * (1.0 + p[0])}
 
 
-EFFECTS = (Effect("sensor_scale", "vector", 85, parameters, "The sensor reads {gain_error} too much.", "y = x*(1 + gain_error)", apply),)
+def apply_force(force: Array, c: Context, p: Array, form: str) -> Array:
+    """Force times 1 + p[0]."""
+    return np.asarray(force * (1.0 + p[0]))
+
+
+EFFECTS = (
+    Effect("sensor_scale", "pose", 85, parameters, "The tracker reads lengths {gain_error} too large.", "y = x*(1 + gain_error)", apply_pose),
+    Effect("sensor_scale", "forces", 85, parameters, "The force sensor reads {gain_error} too much.", "y = x*(1 + gain_error)", apply_force),
+)

@@ -8,7 +8,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import dahl
 
 
-
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Extra lost motion at rest, and the speed at which it has gone."""
     return (Parameter("kinetic", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
@@ -36,7 +35,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 EFFECTS = (
     Effect("stribeck_friction", "motion", 48, lost, "The output stays behind most at low speed: by {static_excess} more at rest than when fast.",
-           "y = x - (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", apply, timed=True, contains=("coulomb_friction",)),
+           "y = x - (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", apply, timed=True, contains=("coulomb_friction",), family="dry"),
     Effect("stribeck_friction", "force", 13, force, "Friction falls from {static_excess} above {kinetic_force} as speed passes {speed}.",
-           "F = (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", slots=slots, timed=True, contains=("coulomb_friction",)),
+           "F = (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", slots=slots, timed=True, contains=("coulomb_friction",), family="dry"),
 )

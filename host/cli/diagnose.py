@@ -1,0 +1,82 @@
+"""`seldinger diagnose`: recordings and a nominal model in, verdict out, as JSON and as a report page."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from host.cli.contract_io import write_json
+
+
+class Progress:
+    """One line on standard error that says what is being done; drawn over itself on a terminal, one line a task elsewhere."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.quiet, self.last, self.drawn, self.began = quiet, "", 0.0, time.monotonic()
+        self.live = sys.stderr.isatty()
+
+    def __call__(self, what: str, part: float) -> None:
+        """`part` of `what` is done, 0 to 1."""
+        now = time.monotonic()
+        if self.quiet or (what == self.last and (not self.live or now - self.drawn < 0.1)):
+            return
+        bar = "#" * round(20 * part)
+        text = f"[{bar:<20}] {now - self.began:5.1f} s  {what}"
+        sys.stderr.write(f"\r{text[:110]:<110}" if self.live else f"{text}\n")
+        sys.stderr.flush()
+        self.last, self.drawn = what, now
+
+    def close(self) -> None:
+        """Ends the line."""
+        if self.live and not self.quiet:
+            sys.stderr.write("\r" + " " * 110 + "\r")
+
+
+def diagnose(
+    recordings: Annotated[list[str] | None, typer.Argument(help="tables or folders; without any, those the nominal TOML names")] = None,
+    nominal: Annotated[str, typer.Option(help="nominal model, a TOML file or the name of one that ships")] = "",
+    json: Annotated[str | None, typer.Option(help="where the verdict goes; - for standard output")] = None,
+    report: Annotated[str | None, typer.Option(help="where the report page goes (one HTML file)")] = None,
+    data: Annotated[str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")] = None,
+    without: Annotated[list[str] | None, typer.Option(help="effect id the finder is not to know")] = None,
+    quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
+) -> None:
+    """Where simulation and recording part, what physics was left out, its model, and the proof."""
+    from host.cli.contract_io import BadInput
+    from host.diagnosis.dataset import find_files
+    from host.diagnosis.effect import library
+    from host.diagnosis.nominal import read_nominal
+    from host.diagnosis.pipeline import diagnose as run
+    from host.diagnosis.verdict import as_json
+
+    began = time.monotonic()
+    known = {effect.id for effect in library()}
+    for effect_id in without or []:
+        if effect_id not in known:
+            raise BadInput("--without", effect_id, "one of " + ", ".join(sorted(known)))
+    if not nominal:
+        raise BadInput("--nominal", "nothing", "a TOML file")
+    spec = read_nominal(nominal_path(nominal))
+    files = find_files(spec, recordings or [], data or os.environ.get("SELDINGER_DATA"))
+    progress = Progress(quiet)
+    result = run(spec, files, progress, frozenset(without or []))
+    progress.close()
+    verdict = as_json(result, time.monotonic() - began)
+    if report:
+        from host.diagnosis.report import write_report
+
+        write_report(result, verdict, Path(report))
+    if json or not report:
+        write_json(verdict, json)
+
+
+def nominal_path(name: str) -> Path:
+    """The file `name`, or the shipped nominal of that name."""
+    path = Path(name)
+    shipped = Path(__file__).parent.parent / "diagnosis" / "nominals" / f"{name}.toml"
+    return shipped if not path.exists() and shipped.exists() else path

@@ -1,0 +1,216 @@
+"""Shape of the rig's catheter: constant-curvature arc plus linear elastic deflection by the tip force, and the contact force it meets."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Array = npt.NDArray[np.float64]
+NODES, WEIGHTS = (np.ascontiguousarray(a) for a in np.polynomial.legendre.leggauss(5))
+SHORTEST_M = 1e-3
+
+
+@njit(cache=True)
+def _free_point(s: float, straight: float, kappa: float) -> tuple[float, float, float]:
+    """(y, z, angle) of the unloaded arc at arc length s, roll 0: bends towards -y."""
+    if s <= straight:
+        return 0.0, s, 0.0
+    a = s - straight
+    theta = kappa * a
+    if abs(theta) < 1e-5:
+        return -0.5 * theta * a, straight + a, theta
+    return -(1.0 - math.cos(theta)) / kappa, straight + math.sin(theta) / kappa, theta
+
+
+@njit(cache=True)
+def _deflection(s1: float, length: float, straight: float, kappa: float, fx: float, fy: float, fz: float, flex: float, twist: float,
+                nodes: Array, weights: Array, out: Array) -> None:
+    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force, roll 0: integrals of curvature change over [0, s1]."""
+    out[:] = 0.0
+    yt, zt, _ = _free_point(length, straight, kappa)
+    y1, z1, _ = _free_point(s1, straight, kappa)
+    for part in range(2):
+        a = 0.0 if part == 0 else min(straight, s1)
+        b = min(straight, s1) if part == 0 else s1
+        if b - a <= 0.0:
+            continue
+        for k in range(nodes.size):
+            s = 0.5 * (a + b) + 0.5 * (b - a) * nodes[k]
+            w = 0.5 * (b - a) * weights[k]
+            y, z, theta = _free_point(s, straight, kappa)
+            dy, dz = yt - y, zt - z
+            mx, my, mz = dy * fz - dz * fy, dz * fx, -dy * fx
+            c, sn = math.cos(theta), math.sin(theta)
+            about_b = flex * (my * c + mz * sn)
+            about_t = twist * (-my * sn + mz * c)
+            kx, ky, kz = w * flex * mx, w * (about_b * c - about_t * sn), w * (about_b * sn + about_t * c)
+            ey, ez = y1 - y, z1 - z
+            out[0] += ky * ez - kz * ey
+            out[1] += -kx * ez
+            out[2] += kx * ey
+            out[3] += kx
+            out[4] += ky
+            out[5] += kz
+
+
+@njit(cache=True)
+def _turn(v: Array, c: float, s: float) -> tuple[float, float, float]:
+    """Rz v."""
+    return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
+
+
+@njit(cache=True)
+def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p: Array, R: Array) -> None:
+    """Position p (3,) and rotation R (3, 3) at s1 in the base frame after deflection `bend`."""
+    y, z, theta = _free_point(s1, straight, kappa)
+    c, s = math.cos(roll), math.sin(roll)
+    ct, st = math.cos(theta), math.sin(theta)
+    x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
+    p[0], p[1], p[2] = c * x0 - s * y0, s * x0 + c * y0, z0
+    rx, ry, rz = bend[3], bend[4], bend[5]
+    angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+    a = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    b = (1.0 - math.cos(angle)) / (angle * angle) if angle > 1e-5 else 0.5
+    free = np.zeros((3, 3))
+    free[0, 0], free[1, 1], free[1, 2], free[2, 1], free[2, 2] = 1.0, ct, -st, st, ct
+    for j in range(3):
+        vx, vy, vz = free[0, j], free[1, j], free[2, j]
+        ux, uy, uz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
+        wx, wy, wz = ry * uz - rz * uy, rz * ux - rx * uz, rx * uy - ry * ux
+        gx, gy, gz = vx + a * ux + b * wx, vy + a * uy + b * wy, vz + a * uz + b * wz
+        R[0, j], R[1, j], R[2, j] = c * gx - s * gy, s * gx + c * gy, gz
+
+
+@njit(cache=True)
+def shapes(insertion: Array, roll: Array, kappa: Array, force: Array, extra: Array, flex: Array, twist_ratio: float, distal: float,
+           offset: float, normal: Array, nodes: Array, weights: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Poses under tip force, and the free tip with its compliance.
+
+    Arguments:
+        insertion, roll, kappa: (n,). force: (3, n) on the tip, base frame; extra: (3, n) further tip force that is there without contact.
+        flex: (n,) 1/EI. twist_ratio: EI/GJ. distal: length of the arc fully out. offset: of the second sensor behind the tip.
+        normal: (3,) of the wall.
+    Returns:
+        tip position (3, n), tip rotation (3, 3, n), shaft position, shaft rotation, free tip (3, n), compliance by a unit normal force (3, n).
+    """
+    n = insertion.size
+    tip, shaft, free, soft = np.empty((3, n)), np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
+    tip_R, shaft_R = np.empty((3, 3, n)), np.empty((3, 3, n))
+    bend, unit, p, R = np.zeros(6), np.zeros(6), np.zeros(3), np.zeros((3, 3))
+    for i in range(n):
+        straight = max(insertion[i], 0.0)
+        length = straight + max(distal + min(insertion[i], 0.0), SHORTEST_M)
+        c, s = math.cos(roll[i]), math.sin(roll[i])
+        twist = flex[i] * twist_ratio
+        fx, fy, fz = force[0, i] + extra[0, i], force[1, i] + extra[1, i], force[2, i] + extra[2, i]
+        gx, gy = c * fx + s * fy, -s * fx + c * fy
+        _deflection(length, length, straight, kappa[i], gx, gy, fz, flex[i], twist, nodes, weights, bend)
+        _pose(length, straight, kappa[i], roll[i], bend, p, R)
+        tip[:, i] = p
+        tip_R[:, :, i] = R
+        s1 = length - offset
+        if s1 > 0.0:
+            _deflection(s1, length, straight, kappa[i], gx, gy, fz, flex[i], twist, nodes, weights, bend)
+            _pose(s1, straight, kappa[i], roll[i], bend, p, R)
+        else:
+            bend[:] = 0.0
+            _pose(0.0, straight, 0.0, roll[i], bend, p, R)
+            p[2] = s1
+        shaft[:, i] = p
+        shaft_R[:, :, i] = R
+        y, z, _ = _free_point(length, straight, kappa[i])
+        ex, ey, ez = extra[0, i], extra[1, i], extra[2, i]
+        bend[:] = 0.0
+        if ex != 0.0 or ey != 0.0 or ez != 0.0:
+            _deflection(length, length, straight, kappa[i], c * ex + s * ey, -s * ex + c * ey, ez, flex[i], twist, nodes, weights, bend)
+        x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
+        free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z0
+        nx, ny, nz = normal[0], normal[1], normal[2]
+        _deflection(length, length, straight, kappa[i], c * nx + s * ny, -s * nx + c * ny, nz, flex[i], twist, nodes, weights, unit)
+        soft[0, i], soft[1, i], soft[2, i] = c * unit[0] - s * unit[1], s * unit[0] + c * unit[1], unit[2]
+    return tip, tip_R, shaft, shaft_R, free, soft
+
+
+@njit(cache=True)
+def contact(gap: Array, soft: Array, stiffness: Array, exponent: float, reference: float, damping: float, crossley: float, relax: float,
+            relax_time: float, dt_s: float) -> Array:
+    """Normal force (n,) on the wall in equilibrium with the shaft.
+
+    gap: (n,) how far the free tip would be inside; soft: (n,) normal compliance of the shaft; depth = gap - soft * force.
+    Law: k r (depth/r)^exponent + damping depth' + crossley k depth depth' + a Maxwell branch (relax k, relax_time). exponent 1: linear.
+    """
+    out = np.zeros(gap.size)
+    depth_old, slow = 0.0, 0.0
+    decay = math.exp(-dt_s / relax_time) if relax_time > 0.0 else 0.0
+    for i in range(gap.size):
+        k, c = stiffness[i], max(soft[i], 0.0)
+        if gap[i] <= 0.0:
+            depth_old, slow = 0.0, slow * decay
+            continue
+        low, high = 0.0, gap[i] / max(c, 1e-9)
+        high = min(high, 50.0)
+        f = min(gap[i] / (1.0 / k + c), high)
+        plain = exponent == 1.0 and damping == 0.0 and crossley == 0.0 and relax == 0.0
+        for _ in range(0 if plain else 60):
+            depth = gap[i] - c * f
+            rate = (depth - depth_old) / dt_s
+            branch = depth + (slow - depth) * decay
+            law = k * reference * (max(depth, 0.0) / reference) ** exponent + damping * rate + crossley * k * max(depth, 0.0) * rate
+            law += relax * k * (depth - branch)
+            if law > f:
+                low = f
+            else:
+                high = f
+            if high - low < 1e-7:
+                break
+            f = 0.5 * (low + high)
+        out[i] = f
+        depth_old = gap[i] - c * f
+        slow = depth_old + (slow - depth_old) * decay
+    return out
+
+
+@njit(cache=True)
+def drag_along(tangent: Array, distance: float) -> Array:
+    """Vector friction state (3, n), length at most one, dragged along by the tip's tangential path (3, n) over `distance`."""
+    out = np.zeros(tangent.shape)
+    z = np.zeros(3)
+    for i in range(1, tangent.shape[1]):
+        size = 0.0
+        for j in range(3):
+            z[j] += (tangent[j, i] - tangent[j, i - 1]) / distance
+            size += z[j] * z[j]
+        if size > 1.0:
+            z /= math.sqrt(size)
+        out[:, i] = z
+    return out
+
+
+@njit(cache=True)
+def rotation_logs(reference: Array, R: Array) -> Array:
+    """Rotation vectors (3, n) of reference^T R, both (3, 3, n)."""
+    n = R.shape[2]
+    out = np.empty((3, n))
+    for i in range(n):
+        m = np.zeros((3, 3))
+        for a in range(3):
+            for b in range(3):
+                m[a, b] = reference[0, a, i] * R[0, b, i] + reference[1, a, i] * R[1, b, i] + reference[2, a, i] * R[2, b, i]
+        wx, wy, wz = 0.5 * (m[2, 1] - m[1, 2]), 0.5 * (m[0, 2] - m[2, 0]), 0.5 * (m[1, 0] - m[0, 1])
+        sine = math.sqrt(wx * wx + wy * wy + wz * wz)
+        cosine = 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1.0)
+        angle = math.atan2(sine, cosine)
+        scale = angle / sine if sine > 1e-9 else 1.0
+        out[0, i], out[1, i], out[2, i] = scale * wx, scale * wy, scale * wz
+    return out
+
+
+def matrices(quaternion: Array) -> Array:
+    """Rotation matrices (3, 3, n) of quaternions (4, n), scalar first; NaN stays NaN."""
+    w, x, y, z = quaternion / np.sqrt(np.sum(quaternion**2, axis=0))
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                     [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])

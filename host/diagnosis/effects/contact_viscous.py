@@ -1,0 +1,33 @@
+"""Viscous contact: tissue force depends on rate or relaxes."""
+
+from __future__ import annotations
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def damping(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Damping, constant or growing with depth."""
+    unit = "s/m" if form == "crossley" else "N s/m"
+    return (Parameter("damping", unit, (3.0, 20.0, 100.0), 1e-2, 1e4, log=True),)
+
+
+def relaxation(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Share that relaxes, and time constant."""
+    return (Parameter("relaxing_share", "", (0.2, 0.6), 1e-3, 20.0, log=True),
+            Parameter("time_constant", "s", spread(0.1, 0.2 * s.duration_s, 4), 0.02, s.duration_s, log=True))
+
+
+def apply(law: dict, c: Context, p: Array, form: str) -> dict:
+    """Adds damping, or a Maxwell branch."""
+    if form == "relaxation":
+        return {**law, "relax": float(p[0]), "relax_time": float(p[1])}
+    return {**law, ("crossley" if form == "crossley" else "damping"): float(p[0])}
+
+
+EFFECTS = (
+    Effect("contact_viscous", "contact", 21, damping, "The tissue resists speed: {damping}.", "F = k*depth + damping*rate", apply, timed=True,
+           forms=("", "crossley")),
+    Effect("contact_viscous", "contact", 22, relaxation, "The tissue's force relaxes over {time_constant}.", "F = k*depth + branch that relaxes",
+           apply, timed=True, forms=("relaxation",)),
+)

@@ -1,0 +1,30 @@
+"""Flow drag: blood flow on the exposed shaft, pulsatile at the beat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Drag per exposed length, steady and pulsatile, across the axis; frequency of the beat."""
+    parts = tuple(Parameter(f"{part}_{a}", "N/m", (0.05,), linear=True) for a in "xy" for part in ("steady", "sine", "cosine"))
+    lines = tuple(np.arange(0.3, min(3.0, 0.4 / s.dt_s), 0.5 / s.duration_s))
+    return (*parts, Parameter("frequency", "Hz", lines, 0.1, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+
+
+def apply(state: dict, c: Context, p: Array, form: str) -> dict:
+    """Tip force that bends the shaft as an even drag does, pulsing."""
+    exposed = np.maximum(state["distal"] + state["insertion"], 1e-3)
+    phase = 2.0 * np.pi * p[6] * c.time_s
+    wave = np.vstack([np.ones_like(phase), np.sin(phase), np.cos(phase)])
+    force = np.vstack([p[0:3] @ wave, p[3:6] @ wave, np.zeros_like(phase)])
+    return {**state, "extra": state["extra"] + 0.375 * force * exposed}
+
+
+EFFECTS = (
+    Effect("flow_drag", "shape", 31, parameters, "Flow drags on the exposed shaft and pulses at {frequency}.",
+           "F_tip = 3/8 (steady + pulse)*exposed length", apply, timed=True),
+)

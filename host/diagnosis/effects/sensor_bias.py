@@ -1,0 +1,36 @@
+"""Sensor bias: a constant offset of a sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+
+
+def pose(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Offsets of position along the base axes."""
+    return tuple(Parameter(f"offset_{a}", "m", (1e-3,), linear=True) for a in "xyz")
+
+
+def force(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Offsets of force along the base axes."""
+    return tuple(Parameter(f"offset_{a}", "N", (0.02,), linear=True) for a in "xyz")
+
+
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Both positions shifted; the tip sensor alone in form `tip`."""
+    shift = p[:, None]
+    return {**run, "tip": run["tip"] + shift, "shaft": run["shaft"] + (0.0 if form == "tip" else shift)}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Force shifted."""
+    return np.asarray(signal + p[:, None])
+
+
+EFFECTS = (
+    Effect("sensor_bias", "pose", 86, pose, "The tracker reads positions shifted by ({offset_x}, {offset_y}, {offset_z}).", "y = x + offset", apply_pose,
+           forms=("", "tip")),
+    Effect("sensor_bias", "forces", 86, force, "The force sensor reads ({offset_x}, {offset_y}, {offset_z}) too much.", "y = x + offset", apply_force),
+)

@@ -1,0 +1,212 @@
+"""One diagnosis from files to findings: load, noise, search, equals, intervals, location, and figures on untouched samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis import noise as noise_module
+from host.diagnosis.chains import build, channels_of
+from host.diagnosis.dataset import Recording, load, thin
+from host.diagnosis.effect import candidates
+from host.diagnosis.equivalence import Standing, standings
+from host.diagnosis.evidence import whiteness
+from host.diagnosis.fit import Fit, Problem
+from host.diagnosis.locate import Condition, condition, inside, mismatch_of, windows
+from host.diagnosis.model import Model, Piece
+from host.diagnosis.noise import Noise
+from host.diagnosis.nominal import NominalSpec
+from host.diagnosis.search import Found, search
+from host.diagnosis.uncertainty import intervals
+
+Array = npt.NDArray[np.float64]
+Tell = Callable[[str, float], None]
+
+
+@dataclass
+class Location:
+    """One subsystem found at fault."""
+
+    subsystem: str
+    channels: list[str]
+    windows_s: list[tuple[float, float]]
+    condition: Condition | None
+    residual_share: float
+
+
+@dataclass
+class Figures:
+    """RMSE on held-out samples at full rate, per output."""
+
+    before: Array
+    after: Array
+    floor: Array
+    white_before: Array
+    white_after: Array
+    primary: int
+
+
+@dataclass
+class Diagnosis:
+    """All that a verdict and a report are made of."""
+
+    spec: NominalSpec
+    model: Model
+    problem: Problem
+    full: Problem
+    found: Found
+    standings: list[Standing]
+    intervals: list[tuple[float, float]]
+    located: list[Location]
+    figures: Figures
+    verdict: str = "nothing_missing"
+    notes: list[str] = field(default_factory=list)
+
+
+def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Problem]:
+    """Model, the problem at the rate that is fitted, and the problem at full rate."""
+    recordings = load(spec, files, *channels_of(spec))
+    model = build(spec)
+    factor = thinning(model, recordings)
+    full = _problem(model, recordings)
+    return model, (_problem(model, [thin(r, factor) for r in recordings]) if factor > 1 else full), full
+
+
+def thinning(model: Model, recordings: list[Recording]) -> int:
+    """Samples averaged into one, so that a fit stays in seconds; never coarser than the model allows."""
+    total = sum(r.n for r in recordings)
+    factor = max(1, round(total / model.fit_samples))
+    if recordings[0].timed:
+        factor = min(factor, max(1, int(model.coarsest_s / recordings[0].dt_s + 1e-9)))
+    return factor
+
+
+def _problem(model: Model, recordings: list[Recording]) -> Problem:
+    pieces = [model.prepare(r) for r in recordings]
+    still = [noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed) for p in pieces]
+    noises: list[Noise] = []
+    for row in range(len(model.outputs)):
+        found = noise_module.estimate([p.y[row] for p in pieces], still)
+        noises.append(found)
+        for piece in pieces:
+            piece.y[row, noise_module.wild(piece.y[row], found.sigma)] = np.nan
+    return Problem(model, pieces, noises, np.ones(len(model.outputs)))
+
+
+def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozenset[str] = frozenset()) -> Diagnosis:
+    """The whole diagnosis. `left_out`: effect ids the finder is not to know (leave-one-out proof)."""
+    tell("reading recordings", 0.0)
+    model, problem, full = prepare(spec, files)
+    pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
+    pool = [c for c in pool if c.effect.id not in left_out]
+    found = search(problem, pool, tell)
+    tell("weighing what stands in their place", 0.0)
+    floor = np.array([n.sigma for n in problem.noise])
+    standing = standings(problem, found, floor)
+    tell("intervals", 0.0)
+    spans = intervals(problem, found.best)
+    located, figures = _locate(full, found, problem), _figures(full, found)
+    result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
+    result.verdict = "missing_physics" if found.best.terms else "nothing_missing"
+    return result
+
+
+def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
+    """`fit` simulated on the samples of `full`."""
+    for piece, coarse in zip(full.pieces, like.pieces, strict=True):
+        piece.start = coarse.start
+    again = replace(fit)
+    again.residuals = [piece.y - full.simulate(piece, fit.terms, fit.values) for piece in full.pieces]
+    return again
+
+
+def _figures(full: Problem, found: Found) -> Figures:
+    rows = range(len(full.noise))
+    before, after, white_b, white_a = (np.zeros(len(full.noise)) for _ in range(4))
+    nominal, best = found.nominal_full, found.best_full
+    for row in rows:
+        for store, fit in ((before, nominal), (after, best)):
+            store[row] = _rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.pieces, strict=True)])
+        for store, fit in ((white_b, nominal), (white_a, best)):
+            masks = [p.heldout for p in full.pieces]
+            store[row] = whiteness([full.noise[row].whiten(r[row]) for r in fit.residuals], masks)
+    ratio = np.where(after > 0, before / np.maximum(after, 1e-300), 1.0)
+    used = np.isfinite(before) & (before > 0)
+    primary = int(np.argmax(np.where(used, ratio, 0.0)))
+    return Figures(before, after, np.array([n.sigma for n in full.noise]), white_b, white_a, primary)
+
+
+def _rms(parts: list[Array]) -> float:
+    together = np.concatenate(parts)
+    together = together[np.isfinite(together)]
+    return float(np.sqrt(np.mean(together**2))) if together.size else float("nan")
+
+
+def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
+    found.nominal_full = at_full_rate(full, found.nominal, coarse)
+    found.best_full = at_full_rate(full, found.best, coarse)
+    out: list[Location] = []
+    for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):
+        alone = _contribution(full, found, subsystem)
+        rows = _rows_touched(full, alone)
+        if not rows:
+            continue
+        top = max(rows, key=lambda row: _weight(full, alone, row))
+        spans = [_windows(piece, m[top]) for piece, m in zip(full.pieces, alone, strict=True)]
+        longest = max(range(len(spans)), key=lambda k: _energy(full.pieces[k], alone[k][top]))
+        share = _share(full, found, spans, top)
+        where = condition(full, alone, top, max(1, sum(p.n for p in full.pieces) // 20000))
+        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], spans[longest], where, share))
+    return out
+
+
+def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
+    """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted for neither."""
+    if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
+        return mismatch_of(full, found.nominal_full, found.best_full)
+    n = len(full.model.parameters)
+    terms, values, at = [], list(found.best.values[:n]), n
+    for term in found.best.terms:
+        part = found.best.values[at: at + len(term.parameters)]
+        at += len(term.parameters)
+        if term.candidate.port.subsystem != subsystem:
+            terms.append(term)
+            values += list(part)
+    out = []
+    for piece, r in zip(full.pieces, found.best_full.residuals, strict=True):
+        change = (piece.y - r) - full.simulate(piece, tuple(terms), np.array(values))
+        out.append(change - np.nanmean(change, axis=1, keepdims=True))
+    return out
+
+
+def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
+    """Outputs in which the change is at least a third of the largest, in units of noise."""
+    weights = [_weight(full, change, row) for row in range(len(full.noise))]
+    return [row for row, weight in enumerate(weights) if weight >= max(weights) / 3.0 and weight > 0.0]
+
+
+def _weight(full: Problem, change: list[Array], row: int) -> float:
+    return _rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300) if any(np.isfinite(c[row]).any() for c in change) else 0.0
+
+
+def _windows(piece: Piece, change: Array) -> list[tuple[float, float]]:
+    return windows(change, piece.recording.time_s, piece.recording.dt_s)
+
+
+def _energy(piece: Piece, change: Array) -> float:
+    return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
+
+
+def _share(full: Problem, found: Found, spans: list[list[tuple[float, float]]], row: int) -> float:
+    """Part of the nominal model's residual energy above noise that falls into the windows."""
+    held = total = 0.0
+    for piece, r, span in zip(full.pieces, found.nominal_full.residuals, spans, strict=True):
+        good = np.isfinite(r[row])
+        above = np.where(good, r[row] ** 2 - full.noise[row].sigma ** 2, 0.0)
+        total += float(above.sum())
+        held += float(above[inside(span, piece.recording.time_s)].sum())
+    return float(np.clip(held / total, 0.0, 1.0)) if total > 0.0 else 0.0

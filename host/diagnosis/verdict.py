@@ -1,0 +1,75 @@
+"""The findings as the JSON object that the contract asks for, with one plain sentence for each effect."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from host.diagnosis.effect import Candidate, Parameter
+from host.diagnosis.equivalence import Standing
+from host.diagnosis.experiment import experiment
+from host.diagnosis.pipeline import Diagnosis, Location
+
+
+def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
+    """One JSON object exactly as the contract has it."""
+    figures = result.figures
+    primary = figures.primary
+    per_channel = {
+        output.channel: {"rmse_before": figures.before[row], "rmse_after": figures.after[row], "noise_floor": figures.floor[row],
+                         "unit": output.unit, "whiteness_p_before": figures.white_before[row], "whiteness_p_after": figures.white_after[row]}
+        for row, output in enumerate(result.model.outputs) if np.isfinite(figures.before[row])}
+    return {
+        "verdict": result.verdict,
+        "located": [_located(location) for location in result.located],
+        "effects": effects(result),
+        "fit": {"heldout": True, "rmse_before": figures.before[primary], "rmse_after": figures.after[primary],
+                "noise_floor": figures.floor[primary], "unit": result.model.outputs[primary].unit, "per_channel": per_channel,
+                "whiteness_p_before": figures.white_before[primary], "whiteness_p_after": figures.white_after[primary]},
+        "seconds": seconds,
+    }
+
+
+def _located(location: Location) -> dict[str, Any]:
+    return {"subsystem": location.subsystem, "channels": location.channels, "windows_s": [list(span) for span in location.windows_s],
+            "condition": location.condition.says if location.condition else "all along", "residual_share": location.residual_share}
+
+
+def effects(result: Diagnosis) -> list[dict[str, Any]]:
+    """One entry for every effect of the best model, strongest evidence first."""
+    entries = []
+    at = len(result.model.parameters)
+    for term, standing in zip(result.found.best.terms, result.standings, strict=True):
+        count = len(term.parameters)
+        values, spans = result.found.best.values[at: at + count], result.intervals[at: at + count]
+        at += count
+        entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
+    return [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
+
+
+def _effect(result: Diagnosis, parameters: tuple[Parameter, ...], values: Any, spans: Any, standing: Standing) -> dict[str, Any]:
+    candidate = standing.candidate
+    shown = {p.key: {"value": float(v), "ci95": [float(a), float(b)]} for p, v, (a, b) in zip(parameters, values, spans, strict=True)
+             if p.high > p.low}
+    return {
+        "id": candidate.effect.id, "subsystem": candidate.port.subsystem, "says": sentence(candidate, parameters, values),
+        "equation": equation(candidate), "parameters": shown,
+        "evidence": {"heldout_log_likelihood_gain": standing.gain.log_likelihood, "p_value": standing.gain.p_value},
+        "indistinguishable_from": [other.name for other in standing.alike],
+        "experiment_to_tell_apart": experiment(result.model, candidate, standing.alike, result.problem),
+    }
+
+
+def sentence(candidate: Candidate, parameters: tuple[Parameter, ...], values: Any) -> str:
+    """The effect's own words with its values put in."""
+    text = {p.name: f"{float(v):.3g} {p.unit}".strip() for p, v in zip(parameters, values, strict=True)}
+    text["source"] = candidate.source.replace("_", " ")
+    said = re.sub(r"\{(\w+)\}", lambda m: text.get(m.group(1), m.group(1)), candidate.effect.says)
+    return said[:1].upper() + said[1:]
+
+
+def equation(candidate: Candidate) -> str:
+    """The effect's equation, its load or other channel named."""
+    return re.sub(r"\b(load|other)\b", candidate.source, candidate.effect.equation) if candidate.source else candidate.effect.equation

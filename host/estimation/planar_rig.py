@@ -1,0 +1,176 @@
+"""The running rig's planar estimator: both tracked poses, projected by roll, with play in insertion and curvature.
+
+An error of 1 mm in the insertion would read as 0.1 N, so insertion and curvature are estimated along with the force,
+held by how well the transmission is known; the second sensor tells them apart from the force.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.estimation.interface import Actuation, ForceEstimate, PoseReading
+from host.estimation.planar import UNSEEN_STD_N, tip_covariance
+from host.mechanics.catheter import Catheter, load_catheter
+from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
+from realtime.rig_file import Rig
+
+Array = NDArray[np.float64]
+
+STEPS = 12
+LONGEST_ARC_m = 0.0056          # the 11 mm arcs of the catheter file, halved: 0.1 % of the force
+END_N = 1e-6
+LARGEST_FORCE_STEP_N = 0.1
+FORCE_LIMIT_N = 2.0
+CHI_SQUARE_PER_FREEDOM = 12.0   # about 3.5 standard deviations throughout: beyond it no force explains the poses
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """How well the actuation and the contact are known before the poses are seen, standard deviations."""
+
+    insertion_m: float = 0.4e-3
+    curvature_per_m: float = 1.0
+    roll_rad: float = 0.08
+    force_N: float = 1.0                # in the bending plane: weak, keeps an unseen direction finite
+    out_of_plane_force_N: float = 0.05  # planar poses do not show it
+
+
+@dataclass(frozen=True)
+class _Fit:
+    parameters: Array    # force x, y (N), insertion error (m), curvature error (1/m)
+    covariance: Array    # (4, 4)
+    chi_square: float
+    residual: float
+    ended: bool
+
+
+def bending_plane(roll_rad: float) -> tuple[Array, Array]:
+    """Unit vectors in the base frame: y of the planar model, and the plane's normal (e1 at roll 0)."""
+    cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
+    return np.array([sine, -cosine, 0.0]), np.array([cosine, sine, 0.0])
+
+
+def tangent_of(quaternion_wxyz: Array) -> Array:
+    """The catheter's direction (third axis of the sensor's frame) in the base frame."""
+    w, x, y, z = quaternion_wxyz
+    return np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+
+
+class PlanarRigEstimator:
+    """Implements `host.estimation.interface.Estimator` with the planar model. Keeps only the branch it is on."""
+
+    def __init__(self, catheter: Catheter, shaft_offset_m: float, position_std_m: float, angle_std_rad: float,
+                 knowledge: Knowledge | None = None) -> None:
+        self._catheter = catheter
+        self._shaft_offset_m = shaft_offset_m
+        self._position_std_m = position_std_m
+        self._weight = np.linalg.inv(tip_covariance(position_std_m, angle_std_rad))
+        self._known = knowledge or Knowledge()
+        self._branch = np.zeros(4)
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
+        """For the catheter and the tracker of a rig file. Raises BadInput where the catheter is not known."""
+        tracker = rig.tracker
+        return cls(load_catheter(rig.catheter.name), tracker.shaft_sensor_offset_m, tracker.position_noise_m,
+                   tracker.orientation_noise_rad)
+
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+        """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
+        values = [*pose_tip.position_m, *pose_tip.quaternion_wxyz, *actuation[:3]]
+        if not np.isfinite(values).all():
+            raise ValueError("pose_tip, actuation: found NaN or infinity, wanted finite numbers")
+        arcs_of(self._catheter, actuation.insertion_m, actuation.curvature_per_m)   # refuses what is out of range
+        y_axis, normal = bending_plane(self._roll(pose_tip, actuation))
+        poses = {0.0: self._planar(pose_tip, y_axis, actuation)}
+        seen = pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all()
+        outside = self._catheter.distal_length_m + actuation.insertion_m
+        if pose_shaft is not None and seen and self._shaft_offset_m < outside - 3.0 * self._known.insertion_m:
+            poses[self._shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
+        fit = self._fit(poses, actuation, self._branch)
+        if not fit.ended and self._branch.any():
+            fit = self._fit(poses, actuation, np.zeros(4))
+        freedom = 3 * len(poses)
+        converged = fit.ended and fit.chi_square <= CHI_SQUARE_PER_FREEDOM * freedom
+        self._branch = fit.parameters if converged else np.zeros(4)
+        axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
+        covariance = axes @ fit.covariance[:2, :2] @ axes.T
+        covariance += self._known.out_of_plane_force_N**2 * np.outer(normal, normal)
+        return ForceEstimate(-axes @ fit.parameters[:2], 0.5 * (covariance + covariance.T), converged, fit.residual,
+                             pose_tip.stamp_ns)
+
+    def _roll(self, tip: PoseReading, actuation: Actuation) -> float:
+        """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
+        y_axis, normal = bending_plane(actuation.roll_rad)
+        lateral, beside = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
+        seen = lateral * lateral / self._position_std_m**2
+        held = 1.0 / self._known.roll_rad**2
+        return actuation.roll_rad - math.atan2(beside * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
+
+    @staticmethod
+    def _planar(reading: PoseReading, y_axis: Array, actuation: Actuation) -> Array:
+        tangent = tangent_of(np.asarray(reading.quaternion_wxyz))
+        angle = math.atan2(float(tangent @ y_axis), float(tangent[2]))
+        position = np.asarray(reading.position_m)
+        # more than half a turn is told apart by which way the shaft is bent
+        if abs(angle) > 0.5 * math.pi and angle * actuation.curvature_per_m < 0.0:
+            angle += math.copysign(2.0 * math.pi, actuation.curvature_per_m)
+        return np.array([position[2], float(position @ y_axis), angle])
+
+    def _fit(self, poses: dict[float, Array], actuation: Actuation, start: Array) -> _Fit:
+        """Gauss-Newton on force, insertion error and curvature error, held by what is known of them."""
+        known = self._known
+        held = np.diag([known.force_N**-2, known.force_N**-2, known.insertion_m**-2, known.curvature_per_m**-2])
+        parameters, ended, chi_square, residual = start.copy(), False, math.inf, math.inf
+        information = held
+        for _ in range(STEPS):
+            linear = self._linearize(poses, actuation, parameters)
+            if linear is None:
+                parameters = 0.5 * parameters
+                continue
+            information, gradient = held.copy(), -held @ parameters
+            chi_square, residual = float(parameters @ held @ parameters), 0.0
+            for error, jacobian in linear:
+                information += jacobian.T @ self._weight @ jacobian
+                gradient += jacobian.T @ self._weight @ error
+                chi_square += float(error @ self._weight @ error)
+                outside = self._catheter.distal_length_m + actuation.insertion_m
+                residual = max(residual, math.hypot(*(error[:2] / outside), error[2]))
+            step = np.linalg.solve(information, gradient)
+            parameters = parameters + step * min(1.0, LARGEST_FORCE_STEP_N / max(np.hypot(*step[:2]), 1e-12))
+            if not np.hypot(*parameters[:2]) < FORCE_LIMIT_N:
+                break
+            if np.hypot(*step[:2]) < END_N:
+                ended = True
+                break
+        return _Fit(parameters, _capped(information), chi_square, residual, ended)
+
+    def _linearize(self, poses: dict[float, Array], actuation: Actuation,
+                   parameters: Array) -> list[tuple[Array, Array]] | None:
+        """Error and Jacobian of each pose; None where the force has no equilibrium on the branch."""
+        insertion = max(actuation.insertion_m + parameters[2], -self._catheter.distal_length_m + 1e-3)
+        arcs = arcs_of(self._catheter, insertion, actuation.curvature_per_m + parameters[3], LONGEST_ARC_m)
+        found = solve(arcs, parameters[:2])
+        if not found.converged:
+            return None
+        return [self._one_pose(arcs, found, parameters[:2], back, pose) for back, pose in poses.items()]
+
+    @staticmethod
+    def _one_pose(arcs: Arcs, found: Equilibrium, force: Array, back_m: float, pose: Array) -> tuple[Array, Array]:
+        back_m = min(back_m, arcs.total_length_m)
+        position, angle = point_at(arcs, found.curvature_per_m, arcs.total_length_m - back_m)
+        by = pose_sensitivity(arcs, found, force, back_m)
+        jacobian = np.column_stack([by.by_force, by.by_insertion, by.by_curvature])
+        return pose - np.array([*position, angle]), jacobian
+
+
+def _capped(information: Array) -> Array:
+    """Inverse of the information, no variance beyond that of `UNSEEN_STD_N`."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(scale, scale)
+    return np.asarray(inverse * min(1.0, UNSEEN_STD_N**2 / max(float(inverse[:2, :2].max()), 1e-300)))

@@ -1,0 +1,271 @@
+"""Levenberg-Marquardt on the tip-frame force: coarse sweeps with exact tangents until close, then fine ones without."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, residuals
+from host.mechanics.cosserat_kernels import ALL_TANGENTS, COARSE, POSE, ROW, WORK, sweep
+from host.mechanics.small_matrices import apply3, inverse3
+from host.mechanics.tip_shooting import length3
+
+Array = NDArray[np.float64]
+
+BEND = 0.5  # of the fine sweeps: 1e-9 m at the tip, 1e-7 N of force along the stiffest direction
+MOST_ITERATIONS = 40
+MOST_REFINEMENTS = 12
+CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last one of the coarse sweeps
+CLOSE_N = 2e-3
+GOAL_N = 5e-8  # expected error of the force at which the fine sweeps stop
+LARGEST_DAMPING = 1e9
+LARGEST_REFINEMENT_N = 0.2
+
+
+class Problem(NamedTuple):
+    """One sample: what was measured, where, and how sure."""
+
+    rod: Array  # (9,) record of the rod, cut off behind the last sensor in cases 5 and 6 without a prior
+    stations: Array  # (k,) arc lengths of the sensors back from the tip, ascending, exposed
+    inside: Array  # (k,) how far each is inside the straight sheath, m
+    case: int
+    positions: Array  # (k, 3) base frame, m
+    quaternions: Array  # (k, 4)
+    whitening: Array  # (m, m) lower triangular: inverse root of the residuals' covariance
+    prior: Array  # (2, 3) directions across the surface's normal over their standard deviation (1/N), or (0, 3)
+
+
+class Scratch(NamedTuple):
+    """Arrays of one estimation, used again from sample to sample; `new_scratch` makes them."""
+
+    sweep: Array
+    residual: Array
+    rows: Array  # (k + 1, 48)
+    raw: Array  # (MOST_ROWS,) residuals, and their sensitivities, before ...
+    raw_A: Array
+    z: Array  # ... and after whitening
+    A: Array
+    kept_raw_A: Array  # sensitivities of the last accepted force
+    kept_A: Array
+    information: Array  # (3, 3) 1/N^2
+    inverse: Array  # (3, 3)
+    vectors: Array  # (3, 3): trial, slope, step
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def new_scratch(sensors: int) -> Scratch:
+    """Scratch for that many sensors."""
+    m = MOST_ROWS
+    return Scratch(np.zeros(WORK), np.zeros(SCRATCH), np.zeros((sensors + 1, ROW)), np.zeros(m), np.zeros((m, 3)),
+                   np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((3, 3)), np.zeros((3, 3)),
+                   np.zeros((3, 3)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cost_at(p: Problem, x: Array, bend: float, tangents: bool, s: Scratch) -> float:
+    """|W (measured - modelled)|^2 at the force x (3,) in N; fills s.raw, s.z and, with `tangents`, s.raw_A, s.A."""
+    sweep(p.rod, x, p.stations, bend, ALL_TANGENTS if tangents else POSE, s.rows, s.sweep)
+    residuals(p.case, s.rows, p.inside, p.positions, p.quaternions, tangents, s.raw, s.raw_A, s.residual)
+    m, cost = ROWS_OF_CASE[p.case], 0.0
+    for i in range(m):
+        z = a0 = a1 = a2 = 0.0
+        for j in range(i + 1):
+            w = p.whitening[i, j]
+            z += w * s.raw[j]
+            if tangents:
+                a0, a1, a2 = a0 + w * s.raw_A[j, 0], a1 + w * s.raw_A[j, 1], a2 + w * s.raw_A[j, 2]
+        s.z[i], cost = z, cost + z * z
+        if tangents:
+            s.A[i, 0], s.A[i, 1], s.A[i, 2] = a0, a1, a2
+    base = s.rows[s.rows.shape[0] - 1]
+    for k in range(p.prior.shape[0]):
+        t = p.prior[k]
+        s.z[m + k] = -(t[0] * base[3] + t[1] * base[4] + t[2] * base[5])
+        cost += s.z[m + k] ** 2
+        if tangents:
+            for c in range(3):
+                s.A[m + k, c] = t[0] * base[24 + c] + t[1] * base[28 + c] + t[2] * base[32 + c]
+    return cost
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def keep(m: int, s: Scratch) -> None:
+    """The sensitivities of a force that was accepted, and with them the information matrix A' A and the slope A' z."""
+    slope = s.vectors[1]
+    for i in range(3):
+        slope[i] = 0.0
+        for j in range(3):
+            s.information[i, j] = 0.0
+    for k in range(m):
+        for i in range(3):
+            s.kept_A[k, i], s.kept_raw_A[k, i] = s.A[k, i], s.raw_A[k, i]
+            slope[i] += s.A[k, i] * s.z[k]
+            for j in range(3):
+                s.information[i, j] += s.A[k, i] * s.A[k, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def damped_step(damping: float, s: Scratch) -> float:
+    """s.vectors[2] = Levenberg-Marquardt step (3,), damped in proportion to the diagonal; returns its length in N."""
+    floor = 1e-9 * (s.information[0, 0] + s.information[1, 1] + s.information[2, 2]) + 1e-300
+    for i in range(3):
+        for j in range(3):
+            s.A[i, j] = s.information[i, j]
+        s.A[i, i] += damping * (s.information[i, i] + floor) + 1e-6 * floor
+    inverse3(s.A[:3], s.inverse)
+    step = s.vectors[2]
+    apply3(s.inverse, s.vectors[1], step)
+    return length3(step)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def descend(p: Problem, largest_N: float, bend: float, close: float, close_N: float, x: Array,
+            s: Scratch) -> tuple[bool, float, int]:
+    """x (3,), in place, until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
+
+    A step that does not lower the cost is damped; forces above `largest_N` are not entered.
+    """
+    m = ROWS_OF_CASE[p.case] + p.prior.shape[0]
+    damping, sweeps = 0.0, 1
+    cost = cost_at(p, x, bend, True, s)
+    keep(m, s)
+    trial, step = s.vectors[0], s.vectors[2]
+    for _ in range(MOST_ITERATIONS):
+        size = damped_step(damping, s)
+        for i in range(3):
+            trial[i] = x[i] + step[i]
+        if size < max(close_N, close * length3(x)) and damping < 1e-2:
+            x[:] = trial
+            return True, cost, sweeps
+        new = 1e300
+        if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 <= largest_N**2:
+            new = cost_at(p, trial, bend, True, s)
+            sweeps += 1
+        if new < cost:
+            x[:] = trial
+            cost = new
+            keep(m, s)
+            damping = 0.1 * damping if damping > 1e-6 else 0.0
+        else:
+            damping = 10.0 * damping if damping > 0.0 else 1e-3
+            if damping > LARGEST_DAMPING or size < 0.1 * close_N:
+                return size < close_N, cost, sweeps
+    return False, cost, sweeps
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
+    """Fine phase: chord steps of x (3,), in place, with the kept sensitivities. Returns (settled, cost, sweeps).
+
+    Stops where the error left, guessed from how fast the steps shrink, is below GOAL_N; the residuals s.raw and s.z
+    are carried over the last step by their sensitivities.
+    """
+    m = ROWS_OF_CASE[p.case] + p.prior.shape[0]
+    slope, step = s.vectors[1], s.vectors[2]
+    before, settled, cost, sweeps = damped_step(0.0, s), False, 0.0, 0
+    while sweeps < MOST_REFINEMENTS and not settled:
+        cost_at(p, x, BEND, False, s)
+        sweeps += 1
+        for i in range(3):
+            slope[i] = 0.0
+            for k in range(m):
+                slope[i] += s.kept_A[k, i] * s.z[k]
+        apply3(s.inverse, slope, step)
+        size = length3(step)
+        if not size < LARGEST_REFINEMENT_N:
+            return False, cost, sweeps
+        for i in range(3):
+            x[i] += step[i]
+        shrink = size / max(before, 1e-300)
+        if shrink > 0.9 and size > 10.0 * GOAL_N and sweeps > 1:
+            break
+        settled = size * min(shrink, 0.9) < GOAL_N
+        before = size
+    for k in range(m):
+        move = move_raw = 0.0
+        for i in range(3):
+            move += s.kept_A[k, i] * step[i]
+            move_raw += s.kept_raw_A[k, i] * step[i]
+        s.z[k] -= move
+        s.raw[k] -= move_raw
+        cost += s.z[k] ** 2
+    return settled, cost, sweeps
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def unweighted(case: int, length_m: float, s: Scratch) -> float:
+    """The thesis' cost (5.6) to (5.11) at the answer, root of the sum of squares: positions over `length_m`, turns."""
+    total = 0.0
+    positions = 0 if case >= 5 else 3
+    for i in range(ROWS_OF_CASE[case]):
+        scale = 1.0 / length_m if i < positions else 1.0
+        total += (scale * s.raw[i]) ** 2
+    return math.sqrt(total)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def estimate(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+    """From the guess x (3,), in place, to the force that explains the sample best nearby. (settled, cost, sweeps).
+
+    Where the chord steps do not shrink (poses that hardly tell the force), fine damped steps go on in their place.
+    """
+    settled, cost, sweeps = descend(p, largest_N, COARSE, CLOSE, CLOSE_N, x, s)
+    if not settled:
+        return False, cost, sweeps
+    settled, cost, more = refine(p, x, s)
+    sweeps += more
+    if not settled and length3(x) <= largest_N:
+        settled, cost, more = descend(p, largest_N, BEND, 0.0, GOAL_N, x, s)
+        sweeps += more
+    return settled and length3(x) <= 1.01 * largest_N, cost, sweeps
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def search(p: Problem, largest_N: float, starts: Array, believable: float, found: Array, s: Scratch) -> tuple[int, int]:
+    """All forces found from the starts (n, 3) that explain the sample: found (k, 3), written. Returns (count, sweeps).
+
+    A force counts where its cost is below `believable` and it is not one found before; at most k are kept.
+    """
+    count = sweeps = 0
+    x = np.empty(3)
+    for i in range(starts.shape[0]):
+        x[:] = starts[i]
+        settled, cost, used = estimate(p, largest_N, x, s)
+        sweeps += used
+        if not settled or cost > believable or count == found.shape[0]:
+            continue
+        new = True
+        for j in range(count):
+            apart = (x[0] - found[j, 0]) ** 2 + (x[1] - found[j, 1]) ** 2 + (x[2] - found[j, 2]) ** 2
+            if apart < 1e-8 + 1e-6 * (x[0] ** 2 + x[1] ** 2 + x[2] ** 2):
+                new = False
+        if new:
+            found[count] = x
+            count += 1
+    return count, sweeps
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def best_of(p: Problem, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+    """From x (3,) and, while the cost stays above `fair`, from the starts (n, 3): the cheapest force, left in x.
+
+    Returns (settled, cost, sweeps); s holds the residuals and sensitivities that belong to x.
+    """
+    settled, cost, sweeps = estimate(p, largest_N, x, s)
+    if settled and cost <= fair:
+        return True, cost, sweeps
+    trial = np.empty(3)
+    for i in range(starts.shape[0]):
+        trial[:] = starts[i]
+        ok, new, used = estimate(p, largest_N, trial, s)
+        sweeps += used
+        if ok and (not settled or new < cost):
+            settled, cost, x[:] = True, new, trial
+            if cost <= fair:
+                return True, cost, sweeps
+    _, cost, used = estimate(p, largest_N, x, s)
+    return settled, cost, sweeps + used

@@ -1,0 +1,1 @@
+"""Identification: from recorded shapes under known loads to a catheter's parameters."""

@@ -1,0 +1,153 @@
+"""Calibration: fit, confidence, identifiability and leave-one-out error, in one report."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.identification.robust_fit import Fit, Objective, ShapeModel, gauss_newton, nelder_mead, noise_scale
+
+Array = NDArray[np.float64]
+
+UNTOLD_STD = 0.5        # relative standard deviation beyond which the data are said not to tell a parameter
+ROUNDS = 4              # of scale and fit in turns
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One parameter with its 95 % interval; `told` is False where the data do not determine it."""
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    told: bool
+
+
+@dataclass(frozen=True)
+class UntoldDirection:
+    """A combination of parameters that the data do not tell: moving along it hardly moves a marker."""
+
+    combination: dict[str, float]   # unit vector in relative parameters
+    relative_std: float
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Error on a recording that the fit has not seen."""
+
+    recording: int
+    rms_m: float
+    max_m: float
+    tip_m: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All that calibration finds out."""
+
+    x: Array
+    parameters: list[FittedParameter]
+    fits: list[Fit]                     # on the same objective
+    noise_m: float                      # robust, per axis
+    rms_m: float
+    max_m: float
+    outliers: list[tuple[int, int]]     # (recording, marker) beyond four standard deviations
+    singular_values: Array              # of the scaled sensitivities, largest first
+    untold: list[UntoldDirection]
+    left_out: list[LeftOut]
+
+
+def calibrate_model(model: ShapeModel, names: list[tuple[str, str, bool]], loss: str = "huber", method: str = "gauss-newton",
+                    leave_one_out: bool = True) -> Calibration:
+    """Fits `model` to its recordings.
+
+    Arguments: `names`, (name, unit, logarithmic) of each parameter; `loss`, a key of `LOSSES`; `method`, gauss-newton,
+    nelder-mead or both (the answer is then that of Gauss-Newton). Result: `Calibration`. Source: 2.3.1 and (2.20),
+    with robust loss, exact sensitivities and statistics added. Raises: ValueError where the start has no equilibrium.
+    """
+    x = model.start()
+    if not math.isfinite(Objective(model, loss, 1.0)(x)):
+        raise ValueError("catheter: found start values under which a recorded load has no equilibrium, wanted stiffer ones")
+    objective = Objective(model, loss, noise_scale(model, x))
+    search = nelder_mead if method == "nelder-mead" else gauss_newton
+    fit = search(objective, x)
+    for _ in range(ROUNDS):
+        noise = noise_scale(model, fit.x)
+        if abs(noise / objective.noise_m - 1.0) < 1e-3:
+            break
+        objective = Objective(model, loss, noise)
+        fit = search(objective, fit.x)
+    fits = [fit]
+    if method == "both":
+        fits = [search(objective, x) for search in (gauss_newton, nelder_mead)]
+        fit = fits[0]
+    parameters, singular, untold = _confidence(model, objective, fit.x, names)
+    rms, largest, outliers = _errors(model, fit.x, objective.noise_m)
+    left_out = _leave_one_out(model, objective, fit.x) if leave_one_out and len(model.recordings) > 1 else []
+    return Calibration(fit.x, parameters, fits, objective.noise_m, rms, largest, outliers, singular, untold, left_out)
+
+
+def _confidence(model: ShapeModel, objective: Objective, x: Array,
+                names: list[tuple[str, str, bool]]) -> tuple[list[FittedParameter], Array, list[UntoldDirection]]:
+    """Intervals from the sandwich over recordings (the markers of one shape err together), and what is not told."""
+    from scipy.stats import t as student
+    linear = objective.linearize(x)
+    assert linear is not None
+    _, _, matrix, parts = linear
+    scale = model.scale()
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    floor = max(float(values.max()), 1e-300) * 1e-14
+    inverse = (vectors / np.maximum(values, floor)) @ vectors.T * np.outer(scale, scale)
+    scores = np.array(parts)
+    count, size = scores.shape
+    sandwich = inverse @ (scores.T @ scores) @ inverse * (count / max(count - 1, 1))
+    # few recordings say little about how they scatter: never narrower than independent markers would make it
+    variance = np.maximum(np.diag(sandwich), np.diag(inverse))
+    quantile = float(student.ppf(0.975, max(count - size, 1))) if count > 1 else 12.7
+    relative = np.sqrt(np.diag(inverse)) / scale
+    fitted = [_interval(names[i], x[i], math.sqrt(variance[i]) * quantile, relative[i] < UNTOLD_STD) for i in range(size)]
+    untold = [UntoldDirection({names[i][0]: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
+                              float(1.0 / math.sqrt(max(values[k], floor))))
+              for k in range(size) if 1.0 / math.sqrt(max(values[k], floor)) > UNTOLD_STD]
+    return fitted, np.sqrt(np.maximum(values[::-1], 0.0)), untold
+
+
+def _interval(name: tuple[str, str, bool], x: float, half: float, told: bool) -> FittedParameter:
+    low, high = x - half, x + half
+    if name[2]:
+        x, low, high = (math.exp(min(max(value, -700.0), 700.0)) for value in (x, low, high))
+    return FittedParameter(name[0], name[1], float(x), float(low), float(high), bool(told))
+
+
+def _errors(model: ShapeModel, x: Array, noise_m: float) -> tuple[float, float, list[tuple[int, int]]]:
+    squares, largest, outliers = [], 0.0, []
+    for index, recording in enumerate(model.recordings):
+        predicted = model.predict(x, index)
+        if predicted is None:
+            continue
+        distance = np.linalg.norm(predicted[0] - recording.position_m, axis=1)
+        squares.append(distance**2)
+        largest = max(largest, float(distance.max()))
+        outliers += [(index, int(j)) for j in np.flatnonzero(distance > 4.0 * noise_m * math.sqrt(2.0))]
+    return float(np.sqrt(np.mean(np.concatenate(squares)))), largest, outliers
+
+
+def _leave_one_out(model: ShapeModel, objective: Objective, x: Array) -> list[LeftOut]:
+    found = []
+    for index, recording in enumerate(model.recordings):
+        others = [k for k in range(len(model.recordings)) if k != index]
+        fit = gauss_newton(Objective(model, objective.loss, objective.noise_m, others), x)
+        predicted = model.predict(fit.x, index)
+        if predicted is None:
+            found.append(LeftOut(index, math.inf, math.inf, math.inf))
+            continue
+        distance = np.linalg.norm(predicted[0] - recording.position_m, axis=1)
+        tip = int(np.argmin(recording.offset_m))
+        found.append(LeftOut(index, float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(distance[tip])))
+    return found
+

@@ -1,0 +1,113 @@
+"""Marker positions of a loaded planar shape and their exact derivatives by stiffness, length and curvature."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from host.mechanics import pcar_kernels as kernels
+from host.mechanics.arc_integrals import phi
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nodes_of(length: Array, kappa: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128]) -> None:
+    """Positions x + iy of the arcs' ends into `node` (n + 1,), directions exp(i angle) into `turn` (n + 1,)."""
+    node[0], turn[0] = 0.0 + 0.0j, 1.0 + 0.0j
+    for i in range(length.size):
+        re0, im0, _, _, _, _, cosine, sine = phi(kappa[i] * length[i])
+        node[i + 1] = node[i] + length[i] * turn[i] * complex(re0, im0)
+        turn[i + 1] = turn[i] * complex(cosine, sine)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def station_of(length: Array, station: float) -> tuple[int, float]:
+    """Index of the arc that bears arc length `station` from the base, and how far into it."""
+    before = 0.0
+    last = 0
+    for i in range(length.size):
+        if length[i] > 0.0:
+            last = i
+            if station <= before + length[i]:
+                return i, station - before
+        before += length[i]
+    return last, length[last]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def curvature_response(length: Array, EI: Array, cubic: Array, kappa0: Array, distal: NDArray[np.bool_], force: Array,
+                       length_by: Array, kappa: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128],
+                       work: Array, response: Array) -> None:
+    """d kappa / d parameters, (n, n + q + 1), at the equilibrium `kappa` under the tip `force`.
+
+    Parameters: EI of each arc (n), the q length parameters whose columns are `length_by` (n, q), the unloaded
+    curvature of the `distal` arcs (1). Source: the static equations (2.8), differentiated.
+    """
+    n, q = length_by.shape
+    kernels.evaluate(length, kappa, force[0], force[1], np.zeros((0, 2)), 1.0, work)
+    kernels.factorize(length, EI, cubic, kappa0, kappa, work)
+    conjugate = complex(force[0], -force[1])
+    tip = node[n]
+    for p in range(n + q + 1):
+        for i in range(n):
+            delta = kappa[i] - kappa0[i]
+            value = 0.0
+            if p < n:
+                value = -delta * (1.0 + cubic[i] * delta * delta) if p == i else 0.0
+            elif p == n + q:
+                value = EI[i] * (1.0 + 3.0 * cubic[i] * delta * delta) if distal[i] else 0.0
+            else:
+                _, _, re1, im1, re2, im2, _, _ = phi(kappa[i] * length[i])
+                phi1, phi2 = complex(re1, im1), complex(re2, im2)
+                arm = length[i] * turn[i] * phi1 + tip - node[i + 1]
+                change = 0.0 + 0.0j
+                for k in range(n):
+                    moved = length_by[k, p - n]
+                    if moved == 0.0:
+                        continue
+                    beyond = 1j * kappa[k] * (tip - node[k + 1])
+                    if k < i:
+                        change += moved * 1j * kappa[k] * arm
+                    elif k == i:
+                        change += moved * (turn[i] * (phi1 + 1j * kappa[i] * length[i] * phi2) + beyond)
+                    else:
+                        change += moved * (turn[k + 1] + beyond)
+                value = (conjugate * 1j * change).real
+            work[kernels.STEP, i] = value
+        kernels.back_substitute(length, work, kernels.STEP)
+        response[:, p] = work[kernels.STEP]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def marker_positions(length: Array, kappa: Array, station: Array, node: NDArray[np.complex128],
+                     turn: NDArray[np.complex128], position: Array) -> None:
+    """Positions (m, 2) of the points at arc lengths `station` (m,) from the base; `node`, `turn` from `nodes_of`."""
+    for j in range(station.size):
+        arc, part = station_of(length, station[j])
+        re0, im0, _, _, _, _, _, _ = phi(kappa[arc] * part)
+        point = node[arc] + part * turn[arc] * complex(re0, im0)
+        position[j, 0], position[j, 1] = point.real, point.imag
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def marker_jacobian(length: Array, kappa: Array, station: Array, length_by: Array, response: Array,
+                    node: NDArray[np.complex128], turn: NDArray[np.complex128], jacobian: Array) -> None:
+    """Derivatives (m, 2, n + q + 1) of the marker positions; arguments as above. The markers stay at their arc length."""
+    n, q = length_by.shape
+    for j in range(station.size):
+        arc, part = station_of(length, station[j])
+        re0, im0, re1, im1, _, _, cosine, sine = phi(kappa[arc] * part)
+        point = node[arc] + part * turn[arc] * complex(re0, im0)
+        ahead = turn[arc] * complex(cosine, sine)
+        for p in range(n + q + 1):
+            change = 1j * part * part * turn[arc] * complex(re1, im1) * response[arc, p]
+            for i in range(arc):
+                _, _, own_re, own_im, _, _, _, _ = phi(kappa[i] * length[i])
+                lever = length[i] * turn[i] * complex(own_re, own_im) + point - node[i + 1]
+                change += 1j * length[i] * lever * response[i, p]
+                if n <= p < n + q:
+                    grown = turn[i + 1] + 1j * kappa[i] * (point - node[i + 1]) - ahead
+                    change += length_by[i, p - n] * grown
+            jacobian[j, 0, p], jacobian[j, 1, p] = change.real, change.imag

@@ -1,0 +1,209 @@
+"""The main job on the wall clock: simulated rig, realtime and model process each on its own, and an operator here."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from host.demo import TARGET_M, DemoRun, DemoSettings, Progress, new_recording_path
+from protocol.topics import Command, LoopTiming, Reply, RigState
+from protocol.zenoh_session import Session
+from realtime.rig_file import load_rig
+from sim.scenario import ContactJob, Outcome
+
+_START_TIMEOUT_S = 60.0
+_STOP_TIMEOUT_S = 2.0
+_LIFE_NS = 500_000_000
+
+
+class Fleet:
+    """The three processes. Use as a context: leaving it stops everything in order, within two seconds."""
+
+    def __init__(self, settings: DemoSettings, recording: Path) -> None:
+        self._settings, self._recording = settings, recording
+        self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
+        self.rig_file = Path(self._folder.name) / "rig.toml"
+        self.processes: dict[str, subprocess.Popen[str]] = {}
+        self.rig_summary: dict[str, Any] = {}
+
+    def __enter__(self) -> Fleet:
+        try:
+            self._start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _start(self) -> None:
+        text = self._settings.rig_file.read_text(encoding="utf-8")
+        self.rig_file.write_text(_with_endpoint(text, f"tcp/127.0.0.1:{_free_port()}"), encoding="utf-8")
+        load_rig(self.rig_file)
+        rig = str(self.rig_file)
+        ports = json.loads(self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
+                                       "--seed", str(self._settings.seed)))
+        self._spawn("host", "host.estimator_process", rig, "--record", str(self._recording),
+                    "--estimator", self._settings.estimator, "--seed", str(self._settings.seed))
+        self._spawn("realtime", "realtime", "--rig", rig, "--board-port", ports["board"],
+                    "--tracker-port", ports["tracker"], "--force-port", str(ports["force_port"]),
+                    "--force-source", self._settings.force_source, answers=False)
+
+    def _spawn(self, name: str, module: str, *arguments: str, answers: bool = True) -> str:
+        log = open(Path(self._folder.name) / f"{name}.log", "w", encoding="utf-8")
+        process = subprocess.Popen([sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, stderr=log,
+                                   text=True)
+        self.processes[name] = process
+        assert process.stdout is not None
+        line = process.stdout.readline() if answers else ""
+        if answers and not line:
+            process.wait()
+            raise OSError(f"{name}: found that it ended at its start, wanted it to run: {self.last_words(name)}")
+        return line
+
+    def last_words(self, name: str) -> str:
+        """The last line that process `name` wrote to its log."""
+        lines = (Path(self._folder.name) / f"{name}.log").read_text(encoding="utf-8").strip().splitlines()
+        return lines[-1] if lines else "no message"
+
+    def dead(self) -> list[str]:
+        """Names of processes that have ended."""
+        return [name for name, process in self.processes.items() if process.poll() is not None]
+
+    def close(self) -> None:
+        """Realtime first (it disarms), then the recorder, then the rig."""
+        deadline = time.monotonic() + _STOP_TIMEOUT_S
+        for name in ("realtime", "host", "rig"):
+            process = self.processes.get(name)
+            if process is None:
+                continue
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+            try:
+                out, _ = process.communicate(timeout=max(deadline - time.monotonic(), 0.2))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                out, _ = process.communicate()
+            if name == "rig" and out.strip():
+                self.rig_summary = json.loads(out.strip().splitlines()[-1])
+        self._folder.cleanup()
+
+
+class Operator:
+    """Commands and what comes back, over zenoh."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        rig = load_rig(fleet.rig_file)
+        self._fleet, self.session = fleet, Session(rig.name, [], rig.zenoh.connect)
+        self._states, self._loops = self.session.latest("state"), self.session.latest("loop")
+        self.state: RigState | None = None
+        self.timing: LoopTiming | None = None
+        self.causes: list[str] = []
+
+    def look(self) -> None:
+        """Take in the newest state and timing."""
+        state, timing = self._states.take(), self._loops.take()
+        if isinstance(state, RigState):
+            self.state = state
+            if state.safety_action in ("retract", "stop") and state.cause not in self.causes:
+                self.causes.append(state.cause)
+        if isinstance(timing, LoopTiming):
+            self.timing = timing
+
+    def ask(self, action: str, target: str = "none", **fields: Any) -> Reply | None:
+        """Send a command; None where nobody answers."""
+        now_ns = time.monotonic_ns()
+        return self.session.ask(Command(stamp_ns=now_ns, id=uuid.uuid4().hex, expires_ns=now_ns + _LIFE_NS,
+                                        action=action, target=target, **fields))
+
+    def wait(self, seconds: float, done: Callable[[], bool], each: Callable[[float], None] = lambda share: None) -> bool:
+        """Look every 10 ms until `done`, a process has died, or `seconds` are over."""
+        begin = time.monotonic()
+        while time.monotonic() - begin < seconds and not self._fleet.dead():
+            self.look()
+            each((time.monotonic() - begin) / seconds)
+            if done():
+                return True
+            time.sleep(0.01)
+        return False
+
+    def mode(self) -> str:
+        """The loop's phase, empty before it was heard of."""
+        return self.state.mode if self.state else ""
+
+
+def run_wall_clock(settings: DemoSettings, progress: Progress) -> DemoRun:
+    """The job of `run_lockstep` with processes, ptys and CLOCK_MONOTONIC. Raises as that does, and OSError."""
+    path = new_recording_path(settings.directory, "demo-wall-clock")
+    run = DemoRun(path, Outcome(), settings.board)
+    with Fleet(settings, path) as fleet:
+        operator = Operator(fleet)
+        try:
+            _press(operator, run.outcome, ContactJob(TARGET_M, force_N=settings.force_N, hold_s=settings.hold_s), progress)
+        except KeyboardInterrupt:
+            run.interrupted = "SIGINT"
+        operator.look()
+        timing = operator.timing
+        run.outcome.notes += [f"{name} ended: {fleet.last_words(name)}" for name in fleet.dead()] + operator.causes
+        operator.session.close()
+    run.counts = {
+        "tick_us": None if timing is None else
+        {"p50": timing.tick_p50_us, "p99": timing.tick_p99_us, "p999": timing.tick_p999_us, "max": timing.tick_max_us},
+        "missed_ticks": 0 if timing is None else timing.missed_ticks, "faults": operator.causes,
+        "longest_gap_ms": None if timing is None else timing.longest_gap_ns * 1e-6,
+        "longest_gap_where": "" if timing is None else timing.longest_gap_where,
+        "rig": fleet.rig_summary,
+    }
+    run.board_kind = str(fleet.rig_summary.get("board", settings.board))
+    return run
+
+
+def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Progress) -> None:
+    def force() -> float:
+        return operator.state.force_N or 0.0 if operator.state else 0.0
+
+    def armed() -> bool:
+        time.sleep(0.1)
+        reply = operator.ask("arm")
+        return reply is not None and reply.result == "accepted" and operator.wait(1.0, lambda: operator.mode() == "hold")
+
+    if not operator.wait(_START_TIMEOUT_S, armed, lambda share: progress("start", share, 0.0)):
+        outcome.notes.append(f"devices not ready after {_START_TIMEOUT_S} s")
+        return
+    before = np.array(job.target_m) - job.clearance_m * np.array(job.into)
+    operator.ask("target", "position", target_m=tuple(map(float, before)))
+    operator.wait(6.0, lambda: bool(operator.state and operator.state.tip_m and
+                                    np.linalg.norm(np.array(operator.state.tip_m) - before) < 5e-4))
+    operator.ask("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+    outcome.contact = operator.wait(job.approach_s, lambda: operator.mode() in ("contact", "stopped"),
+                                    lambda share: progress("approach", share, force())) and operator.mode() == "contact"
+    if outcome.contact:
+        operator.wait(job.hold_s, lambda: operator.mode() == "stopped", lambda share: progress("hold", share, force()))
+    outcome.stopped = operator.mode() == "stopped"
+    operator.ask("target", "retract")
+    operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))
+    operator.ask("disarm")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _with_endpoint(text: str, endpoint: str) -> str:
+    """The rig file's text with its zenoh endpoints replaced, so that two runs do not meet."""
+    return re.sub(r'^(listen|connect) = \[.*\]$', rf'\1 = ["{endpoint}"]', text, flags=re.M)

@@ -1,0 +1,132 @@
+"""The simulated rig on the wall clock: board and tracker on ptys, force box on UDP, paced to CLOCK_MONOTONIC."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import pty
+import signal
+import sys
+import time
+import tty
+from pathlib import Path
+from types import FrameType
+
+from realtime.rig_file import load_rig
+from sim.board import Board
+from sim.plant import Plant, PlantConfig
+from sim.sensor_servers import AuroraPty, NetFtUdp
+from sim.world import World
+
+SLICE_NS = 1_000_000
+# After a stall the world catches up at most this much in one go, then looks at its lines again.
+CATCH_UP_SLICES = 5
+
+
+class RigServer:
+    """Owns the world and its lines. `serve` until `stop`."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self._board_line, self._board_end = pty.openpty()
+        tty.setraw(self._board_end)
+        os.set_blocking(self._board_line, False)
+        self.tracker, self.force_box = AuroraPty(world.tracker), NetFtUdp(world.force_box)
+        self._running = True
+        self.longest_stall_ns, self.longest_stall_at_ns = 0, 0
+        self.last_byte_ns, self.last_edge_ns = 0, 0
+
+    @property
+    def ports(self) -> dict[str, str | int]:
+        """Where the devices are to be found."""
+        return {"board": os.ttyname(self._board_end), "tracker": self.tracker.path, "force_port": self.force_box.rdt_port,
+                "page_port": self.force_box.web_port}
+
+    def stop(self) -> None:
+        """Ends `serve` after the present slice."""
+        self._running = False
+
+    def serve(self) -> None:
+        """Advance the world with CLOCK_MONOTONIC."""
+        begin_ns = last_ns = time.monotonic_ns()
+        while self._running:
+            now_ns = time.monotonic_ns()
+            if now_ns - last_ns > self.longest_stall_ns:
+                self.longest_stall_ns, self.longest_stall_at_ns = now_ns - last_ns, self.world.now_ns
+            last_ns = now_ns
+            for _ in range(CATCH_UP_SLICES):
+                if self.world.now_ns + SLICE_NS > now_ns - begin_ns:
+                    break
+                self._slice()
+            ahead_ns = begin_ns + self.world.now_ns + SLICE_NS - time.monotonic_ns()
+            if ahead_ns > 0:
+                time.sleep(ahead_ns * 1e-9)
+
+    def _slice(self) -> None:
+        data = b""
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(self._board_line, 4096)
+        if data:
+            self.last_byte_ns = self.world.now_ns
+        out = self.world.advance(self.world.now_ns + SLICE_NS, data)
+        if self.world.slice is not None and len(self.world.slice.edge_cycle):
+            self.last_edge_ns = self.world.now_ns
+        if out:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._board_line, out)
+        self.tracker.step(self.world.now_ns)
+        self.force_box.step(self.world.now_ns)
+
+    def summary(self) -> dict[str, object]:
+        """What the rig itself counted, for a test or a report."""
+        world = self.world
+        return {"virtual_s": world.now_ns * 1e-9, "steps_on_pins": world.steps.tolist(), "edges": world.edges.tolist(),
+                "longest_stall_ms": self.longest_stall_ns * 1e-6, "longest_stall_at_s": self.longest_stall_at_ns * 1e-9,
+                "last_byte_s": self.last_byte_ns * 1e-9, "last_edge_s": self.last_edge_ns * 1e-9,
+                "peak_force_N": world.peak_force_N, "board": world.board.kind}
+
+    def close(self) -> None:
+        """Gives the lines back."""
+        self.tracker.close()
+        self.force_box.close()
+        for fd in (self._board_line, self._board_end):
+            os.close(fd)
+
+
+def _ask_for_priority() -> None:
+    """A real board does not slow down with this computer; where allowed, neither does this one (below the loop)."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Serve until SIGTERM or SIGINT. First line of output: the ports; last line: the summary (JSON both)."""
+    parser = argparse.ArgumentParser(prog="python -m sim.rig_server", description=__doc__)
+    parser.add_argument("--rig", type=Path, required=True)
+    parser.add_argument("--board", default="auto")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    _ask_for_priority()
+    rig = load_rig(options.rig)
+    plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), options.seed)
+    with Board(options.board) as board:
+        world = World(rig, plant, board, options.seed)
+        world.advance(SLICE_NS, b"")
+        server = RigServer(world)
+
+        def on_signal(number: int, frame: FrameType | None) -> None:
+            server.stop()
+
+        signal.signal(signal.SIGTERM, on_signal)
+        signal.signal(signal.SIGINT, on_signal)
+        print(json.dumps(server.ports), flush=True)
+        server.serve()
+        print(json.dumps(server.summary()), flush=True)
+        server.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,286 @@
+"""Figures of merit, verdict, contract JSON and report of recordings whose answers are known."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from dataclasses import dataclass, field, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from host.cli.contract_io import plain
+from host.demo_summary import demo_result, print_summary
+from host.recording import Header, Recording, RecordingWriter
+from host.report import lateness_of, render, verdict_of, write_report
+from host.report_style import thinned
+from host.run_summary import spans, summarize
+from protocol.topics import (
+    HISTOGRAM_BUCKETS,
+    BoardCounters,
+    Command,
+    ForceEstimate,
+    ForceSensor,
+    Log,
+    LoopTiming,
+    Pose,
+    Reply,
+    RigState,
+    Stage,
+)
+
+MS = 1_000_000
+CONFIGURATION = {"safety": {"over_force_N": 0.5}, "stages": {"insertion": {"encoder_counts_per_step": 2.0}},
+                 "name": "simulated", "control": {"loop_hz": 1000, "odd": [1.0, 2.5]}}
+
+
+@dataclass
+class Story:
+    """A contact run of 20 s: 2 s position, 16 s contact from 2 s on, 2 s retract. Each field is a thing to vary."""
+
+    force_N: float = 0.2
+    swing_N: float = 0.03
+    sideways_m: float = 0.001
+    action: str = "none"
+    cause: str = ""
+    fault: int = 0
+    crc_errors: int = 0
+    estimate_off_N: float = 0.02
+    log: str = "hello"
+    contact: bool = True
+    fields: dict[str, Any] = field(default_factory=dict)
+
+    def mode(self, ms: int) -> str:
+        if ms < 2000 or not self.contact:
+            return "position"
+        return "contact" if ms < 18000 else "retract"
+
+    def write(self, path: Path) -> Recording:
+        header = Header("simulated", "virtual", CONFIGURATION, {"name": "blazer_prime_xp", "distal_length_m": 0.11}, 5)
+        with RecordingWriter(path, header) as writer:
+            for ms in range(0, 20000, 10):
+                self._tick(writer, ms)
+        return Recording(path)
+
+    def _tick(self, writer: RecordingWriter, ms: int) -> None:
+        time_ns, mode = ms * MS, self.mode(ms)
+        pressing = mode == "contact"
+        force_N = self.force_N + self.swing_N * (1 if ms % 20 else -1) if pressing else 0.0
+        writer.write("force/sensor", ForceSensor(stamp_ns=time_ns, arrival_ns=time_ns, force_N=(0.0, 0.0, force_N)))
+        writer.write("stage", Stage(stamp_ns=time_ns, command_insertion_m=0.01, command_roll_rad=0.0, command_knob_rad=1.0,
+                                    encoder_insertion_m=0.01, encoder_roll_rad=0.0, encoder_knob_rad=1.0))
+        acting = self.action if 10000 <= ms < 11000 else "none"
+        writer.write("state", RigState(
+            stamp_ns=time_ns, mode=mode, safety_action=acting, cause=self.cause if acting != "none" else "",
+            target_m=(0.0, -0.01, 0.025), tip_m=(0.0, -0.01, 0.02), force_direction=(0.0, 0.0, 1.0),
+            target_force_N=0.2 if pressing else None, force_N=force_N))
+        if ms % 30 == 0:
+            pose = Pose(stamp_ns=time_ns, arrival_ns=time_ns, frame=1, missing=False, quaternion_wxyz=(1.0, 0.0, 0.0, 0.0),
+                        position_m=(self.sideways_m, -0.01, 0.02))
+            writer.write("pose/tip", pose)
+            writer.write("pose/shaft", pose)
+            writer.write("force/estimate", ForceEstimate(
+                stamp_ns=time_ns, frame="base", converged=True, force_N=(0.0, 0.0, self.force_N + self.estimate_off_N),
+                covariance_N2=np.diag([1.0, 1.0, 0.03**2]), published_ns=time_ns + 5 * MS, compute_us=50.0))
+        if ms % 1000 == 0:
+            self._slow(writer, time_ns)
+
+    def _slow(self, writer: RecordingWriter, time_ns: int) -> None:
+        histogram = [0] * HISTOGRAM_BUCKETS
+        histogram[17] = 20000
+        writer.write("loop", LoopTiming(
+            stamp_ns=time_ns, loop_hz=1000.0, ticks=20000, missed_ticks=0, tick_p50_us=20.0, tick_p99_us=30.0,
+            tick_p999_us=40.0, tick_max_us=50.0, tick_histogram=tuple(histogram)))
+        writer.write("board", BoardCounters(
+            stamp_ns=time_ns, mcu_time_us=0, state=2, fault=self.fault, inputs=0, queue_depth=2, last_setpoint=1,
+            fault_name="deadman" if self.fault else "", position_steps=(100, 5, -7), encoder_counts=(204, 5, -7),
+            crc_errors=self.crc_errors, underruns=0, rejected=0, boot_count=3, deadman_age_ms=1.0))
+        writer.write("log", Log(stamp_ns=time_ns, level="info", source="test", text=self.log))
+        if time_ns == 2000 * MS:
+            writer.write("command", Command(
+                stamp_ns=time_ns, id="c1", expires_ns=time_ns + 1, action="target", target="contact", force_N=0.2,
+                target_m=(0.0, -0.01, 0.025), normal=(0.0, 0.0, 1.0)))
+            writer.write("reply", Reply(stamp_ns=time_ns, id="c1", result="accepted"))
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return Story().write(tmp_path_factory.mktemp("report") / "good.mcap")
+
+
+def test_figures_are_those_that_went_in(good: Recording) -> None:
+    summary = summarize(good)
+    assert summary.target_force_N == 0.2 and summary.force_limit_N == 0.5
+    assert summary.force_mean_last_10_s_N == pytest.approx(0.2, abs=1e-4)
+    assert summary.force_rms_error_N == pytest.approx(0.03, abs=1e-4)
+    assert summary.force_peak_N == pytest.approx(0.23)
+    assert summary.tip_rms_error_m == pytest.approx(0.001)
+    assert summary.contact_seconds == pytest.approx(16.0, abs=0.02)
+    assert [(span.name, round(span.seconds, 2)) for span in summary.modes] == [
+        ("position", 2.0), ("contact", 16.0), ("retract", 1.99)]
+    assert summary.board.known and summary.board.resets == 0 and summary.board.encoder_gap_steps == (2, 0, 0)
+    assert summary.lost == {} and summary.worst_action == "none"
+
+
+def test_estimate_is_judged_along_the_force_direction(good: Recording) -> None:
+    quality = summarize(good).estimate
+    assert quality.median_sd_N == pytest.approx(0.03) and quality.median_delay_s == pytest.approx(0.005)
+    assert quality.converged_share == 1.0
+    assert quality.rms_error_N == pytest.approx(np.sqrt((0.05**2 + 0.01**2) / 2), abs=2e-3)
+    assert quality.within_2sd_share == 1.0 and quality.mean_error_N == pytest.approx(0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize(("story", "level", "says"), [
+    (Story(), "good", "0.200"),
+    (Story(force_N=0.25), "fair", "a tenth off"),
+    (Story(force_N=0.5, swing_N=0.2), "fair", "above the limit"),
+    (Story(action="hold", cause="no fresh pose"), "fair", "hold, no fresh pose"),
+    (Story(action="stop", cause="pose lost"), "bad", "stop, pose lost"),
+    (Story(fault=2), "bad", "deadman"),
+    (Story(crc_errors=3), "fair", "3 damaged frames"),
+    (Story(contact=False), "fair", "No contact"),
+])
+def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_path: Path) -> None:
+    verdict = verdict_of(summarize(story.write(tmp_path / "a.mcap")))
+    assert verdict.level == level
+    assert says in " ".join([verdict.sentence, *verdict.remarks])
+
+
+def test_missing_messages_are_counted(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", Header("simulated", "wall", {}, {})) as writer:
+        for number in (0, 1, 2, 7, 8):
+            writer._sequence["log"] = number
+            writer.write("log", Log(stamp_ns=number, level="info", source="a", text="b"))
+    assert summarize(Recording(tmp_path / "a.mcap")).lost == {"log": 4}
+
+
+def test_a_time_without_change_is_one_span() -> None:
+    assert spans(np.array([], dtype=int), np.array([], dtype=str)) == []
+    found = spans(np.arange(6) * 10, np.array(list("aabbba")))
+    assert [(span.name, span.start_ns, span.end_ns) for span in found] == [("a", 0, 20), ("b", 20, 50), ("a", 50, 50)]
+
+
+class Links(HTMLParser):
+    """Collects what a page loads, and whether its tags close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "data", "srcset")]
+
+
+def test_report_is_one_file_that_loads_nothing(good: Recording, tmp_path: Path) -> None:
+    page = write_report(good, tmp_path / "report.html").read_text(encoding="utf-8")
+    links = Links()
+    links.feed(page)
+    assert links.loaded and all(address.startswith("data:image/svg+xml;base64,") for address in links.loaded)
+    assert not {"script", "link", "iframe", "object"} & set(links.tags)
+    assert "url(" not in page and "@import" not in page
+    for address in links.loaded:
+        ElementTree.fromstring(base64.b64decode(address.partition(",")[2]))
+    assert links.tags.count("figure") == 7 and page.count('class="narrow"') == 7
+    assert "name=\"viewport\"" in page and len(page) < 4_000_000
+
+
+def test_report_shows_figures_and_settings(good: Recording) -> None:
+    page = render(good)
+    for text in ("0.200\u00a0N", "30\u00a0mN", "0.230\u00a0N", "1.00\u00a0mm", "blazer_prime_xp", "encoder_counts_per_step",
+                 "target contact 0.20 N: accepted", "No fault, no damaged frame"):
+        assert text in page, text
+    assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
+
+
+def test_ticks_beyond_the_period_are_not_passed_over(good: Recording) -> None:
+    assert "virtual time: the world waits" in render(good) and "too late" not in lateness_of(summarize(good))
+    assert lateness_of(replace(summarize(good), virtual=False)) == "0 too late"
+
+
+def test_same_recording_same_report(good: Recording) -> None:
+    assert render(good) == render(Recording(good.path))
+
+
+def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
+    story = Story(log="<script>alert(1)</script> & more", action="warn", cause="<img src=x onerror=alert(1)>")
+    page = render(story.write(tmp_path / "a.mcap"))
+    assert "<script>" not in page and "<img src=x" not in page and "&lt;script&gt;" in page
+
+
+@pytest.mark.parametrize("topics", [set(), {"log"}, {"state"}, {"force/sensor"}, {"pose/tip"}, {"pose/tip", "state"},
+                                    {"stage"}, {"board", "loop"}, {"force/estimate"}, {"state", "force/estimate"}])
+def test_recordings_without_some_topics_are_reported_too(topics: set[str], good: Recording, tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "part.mcap", Header("simulated", "wall", {}, {})) as writer:
+        for topic in sorted(topics):
+            for row in good._rows[topic][:50]:
+                writer.write_encoded(topic, row.data, row.recorded_ns, 0)
+    page = render(Recording(tmp_path / "part.mcap"))
+    assert "No contact" in page
+    assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
+
+
+def test_a_cut_recording_is_reported_as_such(good: Recording, tmp_path: Path) -> None:
+    content = good.path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
+    assert "The recording is incomplete" in render(Recording(tmp_path / "cut.mcap"))
+
+
+@dataclass
+class Ended:
+    """As much of a scenario's outcome as the summary needs."""
+
+    steps_commanded: list[int] = field(default_factory=list)
+    steps_on_pins: list[int] = field(default_factory=list)
+    steps_reported: list[int] = field(default_factory=list)
+
+
+@dataclass
+class Ran:
+    """As much of a demo's run as the summary needs."""
+
+    recording: Path
+    outcome: Ended = field(default_factory=Ended)
+    counts: dict[str, Any] = field(default_factory=dict)
+    interrupted: str = ""
+
+
+CONTRACT_KEYS = {"target_force_N", "force_rms_error_N", "force_peak_N", "tip_rms_error_m", "contact_seconds", "loop_hz",
+                 "tick_us", "missed_ticks", "firmware", "recording", "report"}
+
+
+def test_contract_json(good: Recording) -> None:
+    run = Ran(good.path, Ended([1, 2, 3], [1, 2, 3], [1, 2, 3]), {"faults": ["queue_overflow"], "crc_errors": 2})
+    result = json.loads(json.dumps(plain(demo_result(good, run, Path("r.html"))), allow_nan=False))
+    assert CONTRACT_KEYS <= set(result)
+    assert result["tick_us"] == {"p50": 20.0, "p99": 30.0, "p999": 40.0, "max": 50.0} and result["loop_hz"] == 1000
+    assert result["firmware"] == {"faults": ["queue_overflow"], "crc_errors": 2, "underruns": 0}
+    assert result["steps"]["on_pins"] == [1, 2, 3]
+    assert "steps" not in demo_result(good, Ran(good.path), Path("r.html"))
+    assert result["force_peak_N"] == pytest.approx(0.23) and result["contact_seconds"] == pytest.approx(16, abs=0.02)
+
+
+def test_table_for_people(good: Recording) -> None:
+    run = Ran(good.path, Ended([1, 2, 4], [1, 2, 3], [1, 2, 3]), interrupted="SIGINT")
+    buffer = io.StringIO()
+    print_summary(demo_result(good, run, Path("r.html")), run, Console(file=buffer, width=160))
+    shown = buffer.getvalue()
+    for text in ("0.200\u00a0N", "wanted 0.20\u00a0N", "no fault", "differ", "SIGINT", str(good.path), "r.html"):
+        assert text in shown, text
+
+
+def test_thinning_keeps_the_peaks() -> None:
+    y = np.zeros(100_000)
+    y[[123, 77_777]] = (5.0, -3.0)
+    _, kept = thinned(np.arange(100_000.0), y)
+    assert len(kept) <= 1400 and kept.max() == 5.0 and kept.min() == -3.0
+    short = np.array([1.0, np.nan, 2.0])
+    assert thinned(np.arange(3.0), short)[1].tolist() == [1.0, 2.0]

@@ -1,0 +1,51 @@
+"""The processes of the rig on the wall clock, one of them killed in contact: the stages rest, the recording reads back.
+
+Times that are asserted are the simulated board's own; the wall clock is only waited for.
+"""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from host.demo import TARGET_M, DemoSettings
+from host.recording import Recording
+from host.wall_clock import Fleet, Operator
+
+pytestmark = pytest.mark.slow
+
+
+def in_contact(operator: Operator) -> bool:
+    def armed() -> bool:
+        reply = operator.ask("arm")
+        return reply is not None and reply.result == "accepted" and operator.wait(1.0, lambda: operator.mode() == "hold")
+
+    if not operator.wait(60.0, armed):
+        return False
+    operator.ask("target", "position", target_m=(0.0, -0.0107, 0.021))
+    operator.wait(4.0, lambda: False)
+    operator.ask("target", "contact", target_m=TARGET_M, normal=(0.0, 0.0, 1.0), force_N=0.15)
+    return operator.wait(15.0, lambda: operator.mode() in ("contact", "stopped"))
+
+
+@pytest.mark.parametrize("victim", ["realtime", "host", "rig"])
+def test_killing_a_process_in_contact(victim: str, tmp_path: Path) -> None:
+    settings = DemoSettings(board="native", directory=tmp_path, estimator="tests.host.no_estimator:make")
+    recording = tmp_path / "kill.mcap"
+    with Fleet(settings, recording) as fleet:
+        operator = Operator(fleet)
+        assert in_contact(operator), [fleet.last_words(name) for name in fleet.processes]
+        os.kill(fleet.processes[victim].pid, signal.SIGKILL)
+        fleet.processes[victim].wait()
+        operator.wait(1.0, lambda: False)
+        others = set(fleet.processes) - {victim}
+        assert fleet.dead() == [victim], f"{others} must live on"
+        operator.session.close()
+    if victim != "rig":
+        summary = fleet.rig_summary
+        assert summary["peak_force_N"] < 0.55
+    if victim == "realtime":
+        assert summary["last_edge_s"] - summary["last_byte_s"] <= 0.100
+    read = Recording(recording)
+    assert read.topics["state"] > 100 and len(read.table("pose/tip")["x_m"]) > 20

@@ -1,0 +1,1 @@
+"""Independent reference models, and the scripts that make reference values with them."""
