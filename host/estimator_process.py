@@ -19,6 +19,7 @@ from host.recording import Header, RecordingWriter
 from protocol.topics import Log
 from protocol.zenoh_session import Session
 from realtime.rig_file import Rig, load_rig
+from realtime.service_notify import ServiceNotifier
 
 POLL_S = 0.002
 QUIET_S = 1.0
@@ -48,9 +49,11 @@ class EstimatorProcess:
         self._logs = session.publisher("log")
         self._heard_s = self._told_s = time.monotonic()
         self._told = ""
+        self._steps = 0
 
     def step(self) -> bool:
         """Take in what has come, record it, answer the newest pose. True if there was anything."""
+        self._steps += 1
         taken = self._everything.take()
         self._newest_ns = max([self._newest_ns, *(message.stamp_ns for _, message, _ in taken)])
         now_ns = self._now_ns()
@@ -85,8 +88,11 @@ class EstimatorProcess:
             self.log("warning", text)
 
     def run(self, stop: threading.Event) -> None:
-        """Steps until `stop`, then takes in what is left."""
+        """Steps until `stop`, then takes in what is left. Steps feed the service manager's watchdog."""
+        manager = ServiceNotifier()
+        manager.ready("waits for poses")
         while not stop.is_set():
+            manager.beat(self._steps)
             if not self.step():
                 stop.wait(POLL_S)
         self.step()

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares, lsq_linear
 
 Array = NDArray[np.float64]
 Z95 = 1.959964
-# Longest delay between encoder and pose that a fit may find (s).
-MAX_DELAY_S = 0.03
+# Longest delay between encoder and pose that a fit may find, and how well the stamps are trusted beforehand (s).
+MAX_DELAY_S, STAMPS_WITHIN_S = 0.03, 0.005
 _HUBER_SIGMA = 2.0
 
 
@@ -121,7 +121,7 @@ def fit_play(runs: Sequence[Run], max_width: float, sigma: float, with_width: bo
         return x[1] * play(given, abs(x[0]), given[0] - 0.5 * abs(x[0])) + x[2]
 
     def residuals_of(chosen: Sequence[Run]):  # type: ignore[no-untyped-def]
-        return lambda x: np.concatenate([model(run, x) - run.output for run in chosen])
+        return lambda x: np.concatenate([*(model(run, x) - run.output for run in chosen), [sigma * x[3] / STAMPS_WITHIN_S]])
 
     amplitude = max(run.amplitude for run in late)
     swing = np.mean([np.ptp(run.output) / (2 * run.amplitude) for run in late])
@@ -133,8 +133,9 @@ def fit_play(runs: Sequence[Run], max_width: float, sigma: float, with_width: bo
     start = np.clip(start, low, high - 1e-10 * np.isfinite(high))
     x, covariance, noise = _solve(residuals_of(late), start, scale, sigma, low, high)
     alone = []
+    low[3], high[3] = x[3] - 1e-7, x[3] + 1e-7
     for run in late:
-        y, _, _ = _solve(residuals_of([run]), np.clip(x, low, high), scale, sigma, low, high)
+        y, _, _ = _solve(residuals_of([run]), np.clip(x, low, high - 1e-10), scale, sigma, low, high)
         alone.append([y[0], y[1]])
     per_run = np.array(alone)
     half = Z95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))

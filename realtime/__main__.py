@@ -12,6 +12,7 @@ from types import FrameType
 
 from realtime.process import RealtimeProcess
 from realtime.rig_file import RigFileError, load_rig
+from realtime.service_notify import ServiceNotifier, log_handler
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,8 +24,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--force-port", type=int, default=49152)
     parser.add_argument("--force-source", choices=("sensor", "estimate"), default="sensor")
     options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
-    stop = threading.Event()
+    logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
+    stop, manager = threading.Event(), ServiceNotifier()
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -42,9 +43,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"seldinger: {error}", file=sys.stderr)
         return 1
     process.start()
+    manager.ready("disarmed: waits for an operator")
     while not stop.wait(0.1) and process.alive:
-        pass
+        manager.beat(process.loop.heartbeat)
     failed = not process.alive
+    manager.stopping()
     process.stop()
     if failed:
         print(f"seldinger: realtime: {process.loop.error or process.failure}", file=sys.stderr)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from protocol.serial_frames import Fault, Reject
+from protocol.serial_frames import Fault, Reject, State
 from protocol.topics import BoardCounters
-from realtime.drivers.stepper_board import AxisLimits, StepperBoardLink
+from realtime.drivers.stepper_board import AxisLimits, LinkPhase, StepperBoardLink
 from realtime.rig_file import Rig
 
 # A better offset comes in by this much a STATUS (5 ms), so that execution times always rise; a larger error at once.
@@ -42,8 +42,10 @@ def take_status(record: np.record, link: StepperBoardLink, now_ns: int) -> None:
     record.mcu_offset_ns = offset_ns
     record.position_steps[:] = status.position_steps
     record.encoder_counts[:] = status.encoder_counts
-    record.state, record.fault = status.state, status.fault
-    record.ready = 1 if link.armed else 0
+    # A board that was reset, or is another one, is no longer where the loop believes it: as bad as a fault of its own.
+    strange = link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH)
+    record.state, record.fault = (State.FAULT if strange else status.state), status.fault
+    record.ready = 1 if link.armed and not strange else 0
 
 
 def board_message(link: StepperBoardLink, now_ns: int) -> BoardCounters:

@@ -23,11 +23,13 @@ from realtime.drivers.net_ft_calibration import NetFtCalibration
 from realtime.drivers.stepper_board import EventKind, StepperBoardLink
 from realtime.intake import Intake
 from realtime.operator_desk import OperatorDesk
-from realtime.records import INPUTS, OUTPUTS, STATE, new
+from realtime.records import INPUTS, OUTPUTS, PHASE_CONTACT, PHASE_DISARMED, STATE, new
 from realtime.rig_file import Rig
+from realtime.supervision import Supervision
 from realtime.tick import tick
 
 Publish = Callable[[str, Message], None]
+GAP_TOLD_NS = 10_000_000
 _LEVELS = {DeviceEventKind.LOST: "warning", DeviceEventKind.WARNING: "warning", DeviceEventKind.ERROR: "error"}
 
 
@@ -73,6 +75,9 @@ class LockstepLoop:
         self.desk = OperatorDesk(rig, self.inputs[0].command, self.link)
         self.tick_us: list[float] = []
         self.faults: list[str] = []
+        self.supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
+        self.missed_ticks = 0
+        self._last_ns = 0
         self._buffer = np.zeros(BUFFER_BYTES, np.uint8)
         self._estimates: deque[ForceEstimate] = deque()
         tick(self.params, self.state.copy(), self.inputs.copy(), self.outputs.copy())  # compiles; changes nothing
@@ -80,6 +85,8 @@ class LockstepLoop:
     def command(self, command: Command, now_ns: int) -> None:
         """An operator's command; its reply is published."""
         self.publish("command", command)
+        if command.action in ("arm", "clear_fault"):
+            self._supervised("", now_ns, restart=True)
         self.publish("reply", self.desk.obey(command, now_ns))
 
     def estimate_at(self, estimate: ForceEstimate) -> None:
@@ -88,6 +95,7 @@ class LockstepLoop:
 
     def step(self, now_ns: int, arriving: Arriving) -> Leaving:
         """One period: what arrived goes in, the tick runs, what is to be sent comes out."""
+        self._watch_time(now_ns)
         self._take_board(arriving.board, now_ns)
         self._take_poses(arriving.tracker, now_ns)
         self._take_forces(arriving.force, now_ns)
@@ -103,6 +111,17 @@ class LockstepLoop:
         return Leaving(frame + commands, self.tracker.outgoing(now_ns), self.tracker.line_actions(),
                        [request] if request else [])
 
+    def _watch_time(self, now_ns: int) -> None:
+        """Ticks that were due and did not come are counted; a gap longer than a few of them is told."""
+        gap_ns = now_ns - self._last_ns if self._last_ns else self.period_ns
+        self._last_ns = now_ns
+        missed = round(gap_ns / self.period_ns) - 1
+        if missed > 0:
+            self.missed_ticks += missed
+        if not 0 < gap_ns <= GAP_TOLD_NS:
+            self.log(now_ns, "warning", "realtime", f"the computer stood still, or its clock jumped: {gap_ns * 1e-6:.1f} ms "
+                     f"between two ticks, wanted {self.period_ns * 1e-6:g} ms")
+
     def _setpoint(self) -> bytes:
         y = self.outputs[0]
         if not y.valid:
@@ -114,11 +133,25 @@ class LockstepLoop:
         for event in self.link.feed(data, now_ns):
             if event.kind is EventKind.STATUS:
                 take_status(self.inputs[0].board, self.link, now_ns)
+                self._check_steps(now_ns)
             else:
                 level = "error" if event.kind in (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH) else "info"
                 if level == "error":
                     self.faults.append(event.message)
                 self.log(now_ns, level, "board", event.message)
+
+    def _check_steps(self, now_ns: int) -> None:
+        board = self.inputs[0].board
+        if self.outputs[0].phase != PHASE_DISARMED and board.ready:
+            self._supervised(self.supervision.status(board.position_steps, board.encoder_counts, now_ns), now_ns)
+
+    def _supervised(self, words: str, now_ns: int, restart: bool = False) -> None:
+        """Tell the tick and the people what the supervision has found."""
+        if restart:
+            self.supervision.restart()
+        self.desk.watch(self.supervision.flags)
+        if words:
+            self.log(now_ns, "warning", "supervision", words)
 
     def _take_poses(self, data: bytes, now_ns: int) -> None:
         tracker = self.rig.tracker
@@ -146,9 +179,16 @@ class LockstepLoop:
         while self._estimates and self._estimates[0].published_ns <= now_ns:
             estimate = self._estimates.popleft()
             self.publish("force/estimate", estimate)
+            self._supervised(self.supervision.host.heard(estimate.stamp_ns, now_ns), now_ns)
             if estimate.converged and estimate.force_N is not None and estimate.covariance_N2 is not None:
                 self.intake.estimate(self.inputs[0].estimate, estimate.stamp_ns, now_ns, np.array(estimate.force_N),
                                      np.array(estimate.covariance_N2).reshape(3, 3))
+                if self.outputs[0].phase == PHASE_CONTACT:
+                    sensor_N, estimate_N = self.inputs[0].sensor.force_N, self.inputs[0].estimate.force_N
+                    self._supervised(self.supervision.estimate(sensor_N, estimate_N, now_ns), now_ns)
+        words = self.supervision.host.silent(now_ns)
+        if words:
+            self._supervised(words, now_ns)
 
     def _tell(self, now_ns: int) -> None:
         """Publish what is due at this tick."""
@@ -162,7 +202,8 @@ class LockstepLoop:
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self.publish("board", board_message(self.link, now_ns))
         if number % self.rig.control.loop_hz == 0:
-            self.publish("loop", telemetry.loop_message(now_ns, self.rig.control.loop_hz, 0, np.array(self.tick_us)))
+            self.publish("loop", telemetry.loop_message(
+                now_ns, self.rig.control.loop_hz, self.missed_ticks, np.array(self.tick_us)))
 
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")

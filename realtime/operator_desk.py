@@ -40,6 +40,10 @@ class OperatorDesk:
         frames, self._frames = self._frames, []
         return frames
 
+    def watch(self, flags: int) -> None:
+        """Causes that the supervision beside the tick has found (bit set of `realtime.safety`); 0 when all is well."""
+        self._record.watch = flags
+
     def obey(self, command: Command, now_ns: int) -> Reply:
         """Carry out `command` at `now_ns` or refuse it; a refused command changes nothing."""
         actions = {"arm": self._arm, "disarm": self._disarm, "stop": self._stop, "clear_fault": self._clear_fault,

@@ -31,9 +31,10 @@ from realtime.latency import percentiles_us
 from realtime.loop_thread import NativeLoop, input_mailboxes
 from realtime.native_loop import GAP_PLACES, WORK_BIN_NS
 from realtime.operator_desk import OperatorDesk
-from realtime.records import INPUTS, OUTPUTS, STATE, new
+from realtime.records import INPUTS, OUTPUTS, PHASE_CONTACT, PHASE_DISARMED, STATE, new
 from realtime.rig_file import Rig
 from realtime.scheduling import RealtimeSettings
+from realtime.supervision import Supervision
 from realtime.tick import tick
 
 _POLL_S = 0.005
@@ -56,6 +57,8 @@ class RealtimeProcess:
         self._link = StepperBoardLink(axis_limits(rig))
         self._link_lock = threading.Lock()
         self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
+        self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
+        self._phase = PHASE_DISARMED
         self._params = tick_parameters(rig, force_source)
         self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
         os.set_blocking(self._port.fileno(), False)
@@ -162,6 +165,7 @@ class RealtimeProcess:
                     if event.kind is EventKind.STATUS:
                         take_status(self._mailboxes["board"].record[0], self._link, now_ns)
                         self._mailboxes["board"].publish()
+                        self._check_steps(now_ns)
                     else:
                         bad = event.kind in (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
                         self._log("error" if bad else "info", "board", event.message)
@@ -170,6 +174,23 @@ class RealtimeProcess:
                     last_status_ns = now_ns
                     self._publish("board", board_message(self._link, now_ns))
             self._take_estimate(now_ns)
+            self._tell_host(self._supervision.host.silent(now_ns))
+
+    def _check_steps(self, now_ns: int) -> None:
+        board = self._mailboxes["board"].record[0]
+        if self._phase != PHASE_DISARMED and board.ready:
+            self._supervised(self._supervision.status(board.position_steps, board.encoder_counts, now_ns))
+
+    def _supervised(self, words: str) -> None:
+        """Hand what the supervision has found to the tick, and tell it; the link's lock is held."""
+        self._desk.watch(self._supervision.flags)
+        if words:
+            self._mailboxes["command"].publish()
+            self._log("warning", "supervision", words)
+
+    def _tell_host(self, words: str) -> None:
+        if words:
+            self._log("warning", "supervision", words)
 
     def _send(self, frames: list[bytes]) -> None:
         for frame in b"".join(frames).split(b"\0"):
@@ -178,15 +199,25 @@ class RealtimeProcess:
 
     def _take_estimate(self, now_ns: int) -> None:
         estimate: Any = self._estimates.take()
-        if estimate is None or not estimate.converged:
+        if estimate is None:
+            return
+        self._tell_host(self._supervision.host.heard(estimate.stamp_ns, now_ns))
+        if not estimate.converged:
             return
         box = self._mailboxes["estimate"]
         self._intake.estimate(box.record[0], estimate.stamp_ns, now_ns, np.array(estimate.force_N),
                               np.array(estimate.covariance_N2).reshape(3, 3))
         box.publish()
+        if self._phase == PHASE_CONTACT:
+            sensor_N = self._mailboxes["sensor"].record[0].force_N
+            with self._link_lock:
+                self._supervised(self._supervision.estimate(sensor_N, box.record[0].force_N, now_ns))
 
     def _obey(self, command: Any) -> Any:
         with self._link_lock:
+            if command.action in ("arm", "clear_fault"):
+                self._supervision.restart()
+                self._desk.watch(0)
             reply = self._desk.obey(command, self.clock.now_ns())
             self._mailboxes["command"].publish()
             self._send(self._desk.take_frames())
@@ -213,6 +244,7 @@ class RealtimeProcess:
             for record in records:
                 outputs, number = record["outputs"], int(record["loop"]["tick"])
                 view = outputs.reshape(1).view(np.recarray)[0]
+                self._phase = int(view.phase)
                 if number % telemetry.STAGE_EVERY == 0:
                     self._publish("stage", telemetry.stage_message(self._params[0], inputs[0], view))
                 if number % telemetry.STATE_EVERY == 0:

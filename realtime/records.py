@@ -25,7 +25,7 @@ BOARD = np.dtype([
 ], align=True)
 COMMAND = np.dtype([
     ("count", "i8"), ("kind", "i8"), ("armed", "i8"), ("target_m", "f8", 3), ("normal", "f8", 3),
-    ("force_N", "f8"), ("clear", "i8"),
+    ("force_N", "f8"), ("clear", "i8"), ("watch", "i8"),
 ], align=True)
 
 INPUTS = np.dtype([

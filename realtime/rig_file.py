@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import tomllib
 from pathlib import Path
@@ -212,23 +213,55 @@ def _bounds(error: Any) -> str:
     return " and ".join(limits) or error["msg"].removeprefix("Value error, ")
 
 
+def _known_keys(path: tuple[Any, ...]) -> list[str]:
+    """The keys of the section that `path` (keys from the top) lies in."""
+    section: Any = Rig
+    for part in path[:-1]:
+        field = section.model_fields.get(str(part)) if hasattr(section, "model_fields") else None
+        if field is None:
+            return []
+        section = field.annotation
+    return list(section.model_fields) if hasattr(section, "model_fields") else []
+
+
+def _in_words(error: Any) -> str:
+    """One of pydantic's errors as key, what was found, what is wanted."""
+    key = ".".join(str(part) for part in error["loc"]) or "rig"
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(error["loc"])
+        near = difflib.get_close_matches(str(error["loc"][-1]), known, 1)
+        hint = f"; did you mean {near[0]}?" if near else f": {', '.join(known)}" if known else ""
+        return f"{key}: found an unknown key, wanted one that the rig file knows{hint}"
+    if error["type"] == "missing":
+        return f"{key}: found nothing, wanted a value (see host/rigs/simulated.toml for what it means)"
+    return f"{key}: found {repr(error['input'])[:80]}, wanted {_bounds(error)}"
+
+
+def problems_of(data: dict[str, Any]) -> list[str]:
+    """All that is wrong with `data`, one line each; empty for a good rig file."""
+    try:
+        Rig.model_validate(data)
+    except ValidationError as problem:
+        return [_in_words(error) for error in problem.errors()]
+    return []
+
+
 def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
     """`data` as a checked `Rig`. Raises RigFileError with the first offending key."""
     try:
         return Rig.model_validate(data)
     except ValidationError as problem:
-        error: Any = problem.errors()[0]
-        key = ".".join(str(part) for part in error["loc"]) or "rig"
-        if error["type"] == "extra_forbidden":
-            raise RigFileError(f"{name}: {key}: found an unknown key, wanted one that the rig file knows") from None
-        found = "nothing" if error["type"] == "missing" else repr(error["input"])[:80]
-        raise RigFileError(f"{name}: {key}: found {found}, wanted {_bounds(error)}") from None
+        raise RigFileError(f"{name}: {_in_words(problem.errors()[0])}") from None
+
+
+def read_rig_data(path: str | Path) -> dict[str, Any]:
+    """The TOML file `path`, unchecked. Raises RigFileError where it cannot be read."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise RigFileError(f"{path}: found {error}, wanted a readable TOML file") from None
 
 
 def load_rig(path: str | Path) -> Rig:
     """The rig in TOML file `path`. Raises RigFileError (unreadable file, unknown key, value out of its bounds)."""
-    try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise RigFileError(f"{path}: found {error}, wanted a readable TOML file") from None
-    return parse_rig(data, str(path))
+    return parse_rig(read_rig_data(path), str(path))

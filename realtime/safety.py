@@ -21,15 +21,18 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
     ("board_silent", STOP, True, "no status from the stepper board: stopped; check cable and power, then clear"),
     ("board_fault", STOP, True, "the stepper board latched a fault: stopped; see its fault code, then clear"),
     ("operator_stop", STOP, True, "stopped by the operator"),
+    ("steps_lost", STOP, True, "encoder and commanded steps have parted: stopped; look for a jam or a loose encoder plug, "
+     "clear, and home the axes"),
+    ("force_disagrees", RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 POSE_REJECTED, FORCE_REJECTED, POSE_STALE, POSES_WILD, FORCE_STALE, OVER_FORCE, POSE_LOST, FORCE_LOST, \
-    BOARD_SILENT, BOARD_FAULT, OPERATOR_STOP = (1 << index for index in range(len(CAUSES)))
+    BOARD_SILENT, BOARD_FAULT, OPERATOR_STOP, STEPS_LOST, FORCE_DISAGREES = (1 << index for index in range(len(CAUSES)))
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 
 _HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE
-_RETRACT_BITS = OVER_FORCE | FORCE_LOST
-_STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
+_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES
+_STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP | STEPS_LOST
 
 
 @njit(cache=True)

@@ -82,6 +82,8 @@ def _flags(params, state, inputs, pose_result: int, forces_rejected: int) -> int
         flags |= safety.BOARD_FAULT
     if armed and now_ns - inputs.board.arrival_ns > limits.board_timeout_ns:
         flags |= safety.BOARD_SILENT
+    if armed:
+        flags |= inputs.command.watch
     return flags
 
 

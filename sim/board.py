@@ -6,7 +6,7 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -23,6 +23,9 @@ _REQUEST = struct.Struct("<cBHIQ3i")
 _REPLY = struct.Struct("<QQQQIIIII")
 _EDGE = np.dtype([("cycle", "<u8"), ("axis", "i1"), ("sign", "i1")])
 _SIMAVR_HEADERS = (Path("/usr/include/simavr/sim_avr.h"), Path("/usr/local/include/simavr/sim_avr.h"))
+
+
+_built: set[str] = set()  # kinds that this process has seen up to date
 
 
 class CpuStats(NamedTuple):
@@ -44,6 +47,19 @@ class BoardSlice(NamedTuple):
     edge_sign: np.ndarray  # (n,) i1, +1 forwards
     edge_cycle: np.ndarray  # (n,) i8, processor cycles since the child started
     cpu: CpuStats
+    uart_cycle: np.ndarray  # (len(uart_out),) i8, cycle at which each byte had left whole
+
+    def timed_frames(self) -> Iterator[tuple[bytes, int]]:
+        """uart_out in pieces that each end with a frame's delimiter (or the slice), and when they had left, in us.
+
+        For whoever wants to stamp the arrival of a frame more finely than by the slice.
+        """
+        start = 0
+        for part in self.uart_out.split(b"\0"):
+            end = min(start + len(part) + 1, len(self.uart_out))
+            if end > start:
+                yield self.uart_out[start:end], -(-int(self.uart_cycle[end - 1]) // CYCLES_PER_US)
+            start = end
 
 
 class BoardUnavailable(RuntimeError):
@@ -85,6 +101,9 @@ def ensure_built(kind: str) -> Path:
     missing = _missing_tools(kind)
     if missing:
         raise BoardUnavailable(f"board {kind}: found no {', no '.join(missing)}; install it, or choose board native")
+    program = BUILD_DIR / f"{kind}_board"
+    if kind in _built and program.exists():
+        return program
     BUILD_DIR.mkdir(parents=True, exist_ok=True)
     with open(BUILD_DIR / ".lock", "w", encoding="ascii") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -93,7 +112,8 @@ def ensure_built(kind: str) -> Path:
     if result.returncode:
         said = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]
         raise BoardUnavailable(f"board {kind}: `make -C firmware {kind}-board` failed: {said[0]}")
-    return BUILD_DIR / f"{kind}_board"
+    _built.add(kind)
+    return program
 
 
 class Board:
@@ -114,7 +134,8 @@ class Board:
             program += [mcu, str(BUILD_DIR / f"seldinger-{mcu}.elf")]
         self.time_us = 0
         self._child: subprocess.Popen[bytes] = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
+            start_new_session=True)  # Ctrl-C is for the parent, which then ends its child in order
         assert self._child.stdin is not None and self._child.stdout is not None
         self._to_child = self._child.stdin.fileno()
         self._from_child = self._child.stdout.fileno()
@@ -175,15 +196,16 @@ class Board:
             os.write(self._to_child, request)
             head = _REPLY.unpack(self._read(_REPLY.size))
             cycle, isr_cycles, isr_count, idle_cycles, isr_max, starts, rx_lost, n_uart, n_edges = head
-            body = self._read(n_uart + n_edges * _EDGE.itemsize)
+            body = self._read(9 * n_uart + n_edges * _EDGE.itemsize)
         except (OSError, struct.error) as error:
             raise BoardUnavailable(f"board {self.kind}: the child process {self.pid} died ({error})") from error
-        edges = np.frombuffer(body, _EDGE, n_edges, n_uart)
+        edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
+        uart_cycle = np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64)
         cycles = edges["cycle"].astype(np.int64)
         mean = isr_cycles / isr_count if isr_count else 0.0
         cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost)
         return BoardSlice(body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(),
-                          cycles, cpu)
+                          cycles, cpu, uart_cycle)
 
     def _read(self, n: int) -> bytes:
         parts = []

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from realtime.rig_file import load_rig
+from realtime.service_notify import ServiceNotifier
 from sim.board import Board
 from sim.plant import Plant, PlantConfig
 from sim.sensor_servers import AuroraPty, NetFtUdp
@@ -50,12 +51,15 @@ class RigServer:
 
     def serve(self) -> None:
         """Advance the world with CLOCK_MONOTONIC."""
+        manager = ServiceNotifier()
+        manager.ready("devices are there")
         begin_ns = last_ns = time.monotonic_ns()
         while self._running:
             now_ns = time.monotonic_ns()
             if now_ns - last_ns > self.longest_stall_ns:
                 self.longest_stall_ns, self.longest_stall_at_ns = now_ns - last_ns, self.world.now_ns
             last_ns = now_ns
+            manager.beat(self.world.now_ns)
             for _ in range(CATCH_UP_SLICES):
                 if self.world.now_ns + SLICE_NS > now_ns - begin_ns:
                     break
@@ -101,12 +105,21 @@ def _ask_for_priority() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
 
 
+def _write_ports(path: Path, ports: dict[str, str | int]) -> None:
+    """The ports as NAME=value lines, whole or not at all."""
+    part = path.with_suffix(".part")
+    part.write_text("".join(f"{name}={ports[key]}\n" for name, key in (
+        ("BOARD_PORT", "board"), ("TRACKER_PORT", "tracker"), ("FORCE_PORT", "force_port"))), encoding="ascii")
+    part.replace(path)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Serve until SIGTERM or SIGINT. First line of output: the ports; last line: the summary (JSON both)."""
     parser = argparse.ArgumentParser(prog="python -m sim.rig_server", description=__doc__)
     parser.add_argument("--rig", type=Path, required=True)
     parser.add_argument("--board", default="auto")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--ports-file", type=Path, help="Where to write the ports, for a service's EnvironmentFile.")
     options = parser.parse_args(arguments)
     _ask_for_priority()
     rig = load_rig(options.rig)
@@ -122,6 +135,8 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, on_signal)
         signal.signal(signal.SIGINT, on_signal)
         print(json.dumps(server.ports), flush=True)
+        if options.ports_file is not None:
+            _write_ports(options.ports_file, server.ports)
         server.serve()
         print(json.dumps(server.summary()), flush=True)
         server.close()

@@ -41,6 +41,7 @@ class Stages:
         self._lost = np.zeros(3)                 # steps that the rotor did not follow
         self._rotor, self._speed = np.zeros(3), np.zeros(3)
         self._time_s = 0.0
+        self._encoder_stands: dict[int, int] = {}
         self._losses = [(PORTS.index(e.port), e.start_s, e.says()["parameters"]) for e in effects if e.id == "missed_steps"]
         self._next_loss_s = [start for _, start, _ in self._losses]
 
@@ -78,6 +79,14 @@ class Stages:
                 every = parameters["every_s"]
                 self._next_loss_s[i] += every if every > 0.0 else math.inf
 
+    def lose_steps(self, axis: int, steps: float) -> None:
+        """The rotor of `axis` falls behind its field by `steps` now, as after a jam."""
+        self._lost[axis] += steps
+
+    def unplug_encoder(self, axis: int) -> None:
+        """The encoder of `axis` shows the same count from now on."""
+        self._encoder_stands[axis] = int(self.encoder_counts[axis])
+
     @property
     def step_counts(self) -> Array:
         """Edges counted on the pins (3,), as the board believes the stages to be."""
@@ -86,7 +95,10 @@ class Stages:
     @property
     def encoder_counts(self) -> Array:
         """Encoder counts (3,) int64 of the rotors."""
-        return np.floor(self._rotor * np.array(self.config.encoder_counts_per_step) + 0.5).astype(np.int64)
+        counts = np.floor(self._rotor * np.array(self.config.encoder_counts_per_step) + 0.5).astype(np.int64)
+        for axis, stands in self._encoder_stands.items():
+            counts[axis] = stands
+        return counts
 
     @property
     def position(self) -> Array:

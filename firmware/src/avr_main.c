@@ -96,7 +96,7 @@ void firmware_setup(void) {
     start_uart();
     start_timer();
     set_sleep_mode(SLEEP_MODE_IDLE);
-    wdt_enable(WDTO_60MS);
+    wdt_enable(WDTO_60MS); /* the Mega's first bootloaders hang after a reset by it: use one that turns it off */
     sei();
 }
 

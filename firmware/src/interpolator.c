@@ -15,6 +15,12 @@ void motion_rename_position(uint8_t axis, int32_t position) {
     motion.axis[axis].fresh = 0;
 }
 
+int16_t motion_ramp_speed_q15(uint8_t axis) {
+    if (motion.mode != MOTION_RAMP) return 0;
+    int16_t speed = (int16_t)(motion.axis[axis].rate_q16 >> 1);
+    return motion.axis[axis].direction < 0 ? (int16_t)-speed : speed;
+}
+
 static inline void load_axis(uint8_t index, const segment_t *segment, uint8_t ticks) {
     axis_motion_t *axis = &motion.axis[index];
     uint16_t distance = (uint16_t)(segment->target[index] - ((uint16_t)axis->position + (uint16_t)axis->fresh));

@@ -60,6 +60,9 @@ static inline uint8_t motion_waiting(void) { return (uint8_t)(motion.head - moti
 static inline int32_t motion_position(uint8_t axis) { return motion.axis[axis].position + motion.axis[axis].fresh; }
 void motion_rename_position(uint8_t axis, int32_t position);
 
+/* With the interrupts locked: speed of an axis that is not in a segment. */
+int16_t motion_ramp_speed_q15(uint8_t axis);
+
 /* Where the next segment is to be written; nothing reads it before motion_append(). */
 static inline segment_t *motion_free_slot(void) { return &motion.queue[motion.head]; }
 

@@ -8,6 +8,7 @@
 
 #define TRAVEL_MAX 1000000000L           /* keeps differences of positions within 32 bits */
 #define LATE_TICKS TICKS_PER_MS          /* a late set-point gets one control period */
+#define LEAST_TICKS (TICKS_PER_MS / 2)   /* the step and tick grids make speeds over less meaningless */
 #define STOP_MS (STOP_US / 1000)
 
 gate_t gate;
@@ -16,7 +17,9 @@ gate_t gate;
 typedef struct {
     uint32_t time_us;
     uint16_t tick, end_tick; /* now, and where the plan ends */
+    bool at_rest;            /* no set-point in execution or waiting: the plan ends now */
     uint8_t waiting, state, inputs;
+    int16_t speed_q15[AXIS_COUNT]; /* at the end of the new segment */
 } plan_t;
 
 void gate_start(void) { gate = (gate_t){0}; }
@@ -60,9 +63,13 @@ static void snapshot(plan_t *plan) {
     plan->state = safety.state;
     plan->inputs = safety.inputs;
     plan->end_tick = motion.planned_tick;
-    if (motion.mode != MOTION_SEGMENT && !plan->waiting) {
+    plan->at_rest = motion.mode != MOTION_SEGMENT && !plan->waiting;
+    if (plan->at_rest) {
         plan->end_tick = motion.tick;
-        for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) gate.planned[axis] = motion_position(axis);
+        for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) {
+            gate.planned[axis] = motion_position(axis);
+            gate.speed_q15[axis] = motion_ramp_speed_q15(axis);
+        }
     }
     port_unlock(lock);
 }
@@ -77,8 +84,8 @@ static uint8_t check_time(const frame_setpoint_t *setpoint, const plan_t *plan, 
     if (ahead_us + (int32_t)setpoint->expiry_us < 0) return REJECT_EXPIRED;
     if (ahead_us > 0) {
         segment->end_tick = (uint16_t)(plan->tick + to_ticks((uint16_t)ahead_us));
-        if ((int16_t)(segment->end_tick - plan->end_tick) > 0) return REJECT_NONE;
-        if ((uint16_t)ahead_us >= TICK_US) return REJECT_ORDER;
+        if ((int16_t)(segment->end_tick - plan->end_tick) >= (int16_t)LEAST_TICKS) return REJECT_NONE;
+        if (!plan->at_rest) return REJECT_ORDER;
     }
     segment->end_tick = (uint16_t)(plan->end_tick + LATE_TICKS);
     gate.late++;
@@ -95,8 +102,25 @@ static uint8_t check_travel(const frame_setpoint_t *setpoint, uint8_t inputs, ui
     return REJECT_NONE;
 }
 
+/* The speed from which a ramp may have to start. It follows the set-points no faster than the axis accelerates (and a
+ * quarter more): a single jump in position is no speed, and must not be run out like one. */
+static uint16_t follow_speed(uint8_t index, int32_t delta, uint16_t rate_q16, uint8_t ticks, int16_t *followed_q15) {
+    uint16_t change = (uint16_t)(((uint32_t)motion.axis[index].ramp_q16 * ticks) >> 5); /* q15; 1.25 / 2 / 20 */
+    int32_t wanted = delta < 0 ? -(int32_t)(rate_q16 >> 1) : (int32_t)(rate_q16 >> 1);
+    int32_t speed = gate.speed_q15[index];
+    if (wanted > speed + change)
+        speed += change;
+    else if (wanted < speed - change)
+        speed -= change;
+    else
+        speed = wanted;
+    *followed_q15 = (int16_t)speed;
+    if ((speed < 0) != (delta < 0)) return 0;
+    return (uint16_t)(speed < 0 ? -2 * speed : 2 * speed);
+}
+
 /* The step grid and the tick grid each allow for one count more than the limit. */
-static uint8_t check_axes(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
+static uint8_t check_axes(const frame_setpoint_t *setpoint, plan_t *plan, segment_t *segment) {
     uint8_t ticks = (uint8_t)(segment->end_tick - plan->end_tick);
     uint16_t per_step_q16 = ticks == TICKS_PER_MS ? 0xFFFFU / TICKS_PER_MS : (uint16_t)(0xFFFFU / ticks);
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
@@ -107,7 +131,8 @@ static uint8_t check_axes(const frame_setpoint_t *setpoint, const plan_t *plan, 
         uint32_t distance = (uint32_t)(delta < 0 ? -delta : delta);
         uint16_t most = (uint16_t)(((uint32_t)gate.axis[i].speed_q16 * (uint16_t)(ticks + 1)) >> 16) + 1;
         if (distance > most) return REJECT_SPEED;
-        segment->rate_q16[i] = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
+        uint16_t rate_q16 = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
+        segment->rate_q16[i] = follow_speed(i, delta, rate_q16, ticks, &plan->speed_q15[i]);
         segment->target[i] = (uint16_t)wanted;
     }
     return REJECT_NONE;
@@ -126,6 +151,15 @@ static uint8_t commit(void) {
     return reject;
 }
 
+static void remember(const frame_setpoint_t *setpoint, const plan_t *plan) {
+    gate.last_number = setpoint->number;
+    gate.have_number = true;
+    for (uint8_t i = 0; i < AXIS_COUNT; i++) {
+        gate.planned[i] = setpoint->position_steps[i];
+        gate.speed_q15[i] = plan->speed_q15[i];
+    }
+}
+
 static uint8_t judge(const frame_setpoint_t *setpoint) {
     plan_t plan;
     segment_t *segment = motion_free_slot();
@@ -136,17 +170,13 @@ static uint8_t judge(const frame_setpoint_t *setpoint) {
     uint8_t reject = check_time(setpoint, &plan, segment);
     if (!reject) reject = check_axes(setpoint, &plan, segment);
     if (!reject) reject = commit();
+    if (!reject) remember(setpoint, &plan);
     return reject;
 }
 
 void gate_take(const frame_setpoint_t *setpoint) {
     uint8_t reject = judge(setpoint);
-    if (!reject) {
-        gate.last_number = setpoint->number;
-        gate.have_number = true;
-        for (uint8_t i = 0; i < AXIS_COUNT; i++) gate.planned[i] = setpoint->position_steps[i];
-        return;
-    }
+    if (!reject) return;
     gate.last_reject = reject;
     if (reject == REJECT_EXPIRED)
         gate.expired++;

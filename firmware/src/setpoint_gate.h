@@ -15,7 +15,8 @@ typedef struct {
 
 typedef struct {
     axis_limits_t axis[AXIS_COUNT];
-    int32_t planned[AXIS_COUNT]; /* where the last accepted set-point ends */
+    int32_t planned[AXIS_COUNT];   /* where the last accepted set-point ends */
+    int16_t speed_q15[AXIS_COUNT]; /* and with what speed, steps per tick */
     uint16_t last_number;
     bool have_number;
     uint8_t last_reject;

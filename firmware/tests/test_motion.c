@@ -39,7 +39,7 @@ static void deadman_ramp(void) {
         bring_up();
         int32_t position[AXIS_COUNT] = {0}, speed[AXIS_COUNT] = {0};
         speed[axis] = (int32_t)(LIMITS[axis].max_speed_steps_per_s / 1000);
-        cruise_ms(30, position, speed);
+        cruise_ms(60, position, speed); /* the board believes in the speed after v/a */
         uint32_t last_setpoint_us = clock_now_us() - 1000;
         run_ms(120);
         CHECK_EQUAL(safety.state, STATE_FAULT);
@@ -91,6 +91,53 @@ static void underrun_and_back(void) {
     }
 }
 
+/* Positions that jump to and fro, late, with pauses: no speed, so nothing runs on. */
+static void jumps_do_not_run_on(void) {
+    bring_up();
+    for (unsigned i = 0; i < 2000; i++) {
+        const int32_t target[AXIS_COUNT] = {i & 1 ? 6 : 0, i & 2 ? 4 : 0, 0};
+        send_setpoint(++bench.number, (int32_t)(random_u32() % 1200) - 300, 2000, target);
+        unsigned ticks = 10 + random_u32() % 30;
+        while (ticks--) {
+            tick();
+            CHECK(bench.steps[0] >= -2 && bench.steps[0] <= 8);
+            CHECK(bench.steps[1] >= -2 && bench.steps[1] <= 6);
+        }
+    }
+    CHECK(bench.status.last_setpoint > 1500);
+}
+
+/* Right after a reversal the board does not run on in the new direction with the old speed. */
+static void reversal_does_not_run_on(void) {
+    bring_up();
+    int32_t position[AXIS_COUNT] = {0};
+    cruise_ms(60, position, (const int32_t[]){12, 0, 0});
+    cruise_ms(1, position, (const int32_t[]){-6, 0, 0});
+    run_ms(60);
+    CHECK(bench.steps[0] >= position[0] - 2);
+}
+
+/* Limits rounded a little past what stops in time: the stop takes its time all the same. */
+static void stops_in_time_at_the_edge(void) {
+    power_up(RESET_CAUSE_POWER, false);
+    hello();
+    configure_all();
+    frame_configure_t edge = LIMITS[1];
+    edge.max_accel_steps_per_s2 = 240000; /* 50.9 ms from full speed */
+    CHECK_EQUAL(command(FRAME_CONFIGURE, &edge, sizeof edge), RESULT_OK);
+    arm();
+    int32_t position[AXIS_COUNT] = {0};
+    for (unsigned i = 0; i < 20; i++) { /* 12.2 steps/ms */
+        cruise_ms(4, position, (const int32_t[]){0, 12, 0});
+        cruise_ms(1, position, (const int32_t[]){0, 13, 0});
+    }
+    while (motion_waiting()) tick(); /* until the fastest of them is executed */
+    uint32_t now_us = clock_now_us();
+    command(FRAME_DISARM, NULL, 0);
+    while (motion.mode != MOTION_HOLD) tick();
+    CHECK(clock_now_us() - now_us <= STOP_US);
+}
+
 static void encoders(void) {
     static const uint8_t AB[4] = {0, 1, 3, 2};
     bring_up();
@@ -117,6 +164,9 @@ int main(void) {
     deadman_ramp();
     ramp_never_speeds_up();
     underrun_and_back();
+    jumps_do_not_run_on();
+    reversal_does_not_run_on();
+    stops_in_time_at_the_edge();
     encoders();
     puts("motion: ok");
     return 0;

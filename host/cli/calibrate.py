@@ -16,7 +16,8 @@ MODELS = {"pcar": ("planar_model", "PlanarModel"), "cosserat": ("spatial_model",
 
 
 def calibrate(
-    shapes: Annotated[str, typer.Argument(help="recorded shapes: .csv, .json, or - for JSON on standard input")],
+    shapes: Annotated[str, typer.Argument(
+        help="recorded shapes: .csv, .json, or - (JSON); format: host/identification/recorded_shapes.py")],
     catheter: Annotated[str, typer.Option(help="where the search starts: a shipped catheter or a .toml file")],
     out: Annotated[Path | None, typer.Option(help="write the calibrated catheter into this .toml file")] = None,
     name: Annotated[str | None, typer.Option(help="name of the calibrated catheter")] = None,
@@ -27,7 +28,12 @@ def calibrate(
     leave_one_out: Annotated[bool, typer.Option(help="refit without each recording in turn")] = True,
     json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
-    """Identify a catheter: stiffness, lengths and initial curvature with confidence, and what the data do not tell."""
+    """Identify a catheter: stiffness, lengths and initial curvature with confidence, and what the data do not tell.
+
+    The shapes: {"recordings": [{"insertion_m": 0.0485, "curvature_per_m": 15.7, "force_N": [0.0, -0.1197], "markers":
+    [{"offset_m": 0.0, "position_m": [0.1145, -0.0283]}, ...]}, ...]}, offset_m back from the tip, SI; or a CSV of one row a
+    marker headed recording,insertion_m,curvature_per_m,force_x_N,force_y_N,offset_m,x_m,y_m (spatial: and force_z_N, z_m).
+    """
     from host.identification.calibration import calibrate_model
     from host.identification.recorded_shapes import read_recorded_shapes
     from host.identification.robust_fit import LOSSES

@@ -40,7 +40,9 @@ def demo(
     except BoardUnavailable as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
-    except (RigFileError, ValueError) as error:
+    except ValueError as error:
+        if isinstance(error, RigFileError):
+            raise
         key, _, rest = str(error).partition(": found ")
         found, _, wanted = rest.partition(", wanted ")
         raise BadInput(key, found, wanted) from None

@@ -10,7 +10,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.shape_plot import check_plot_path, plot_shape
 from host.cli.solve import PLOT_POINTS
-from host.cli.static_requests import CosseratEstimate, PcarEstimate, catheter_for, read_request, refused
+from host.cli.static_requests import CosseratEstimate, PcarEstimate, catheter_for, read_request
 
 
 def estimate(
@@ -51,10 +51,7 @@ def _spatial(request: CosseratEstimate, plot: str | None) -> dict[str, Any]:
     catheter = catheter_for(request, "cosserat")
     sensors = [PoseSensor(sensor.offset_m, sensor.position_m, sensor.quaternion_wxyz) for sensor in request.sensors]
     arguments = (catheter, request.insertion_m, request.curvature_per_m)
-    try:
-        found = estimate_cosserat(*arguments, request.case, sensors)
-    except ValueError as error:
-        raise refused(error) from None
+    found = estimate_cosserat(*arguments, request.case, sensors)
     if plot is not None:
         from host.mechanics.cosserat import solve_cosserat
         drawn = np.linspace(catheter.distal_length_m + request.insertion_m, 0.0, PLOT_POINTS)

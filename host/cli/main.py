@@ -8,6 +8,7 @@ import sys
 import typer
 
 from host.cli.contract_io import BadInput
+from realtime.rig_file import RigFileError
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -23,29 +24,35 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 
 
 def build(argv: list[str]) -> typer.Typer:
-    """The application with the called command in it, or with all of them when none is named (help)."""
+    """The application with the called command in it, or with all their lines when none is named (help)."""
     app = typer.Typer(
         name="seldinger", help="Control stack for robotic steerable catheters. Not a medical device.",
         no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
     )
     app.callback()(lambda: None)
     called = next((word for word in argv if not word.startswith("-")), None)
-    names = [called] if called in COMMANDS else list(COMMANDS)
-    for name in names:
-        module, function, line = COMMANDS[str(name)]
-        target = getattr(importlib.import_module(module), function)
-        if isinstance(target, typer.Typer):
-            app.add_typer(target, name=name, help=line)
-        else:
-            app.command(name, help=line)(target)
+    if called not in COMMANDS:
+        for name, (_, _, line) in COMMANDS.items():
+            app.command(name, help=line)(_only_listed)
+        return app
+    module, function, line = COMMANDS[called]
+    target = getattr(importlib.import_module(module), function)
+    if isinstance(target, typer.Typer):
+        app.add_typer(target, name=called, help=line)
+    else:
+        app.command(called, help=line)(target)
     return app
+
+
+def _only_listed() -> None:
+    """Stands for every command where none is called, so that the overview imports nothing."""
 
 
 def main() -> None:
     """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else."""
     try:
         build(sys.argv[1:])()
-    except BadInput as error:
+    except (BadInput, RigFileError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         sys.exit(2)
 

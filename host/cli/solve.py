@@ -9,7 +9,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.shape_plot import check_plot_path, plot_shape
-from host.cli.static_requests import CosseratSolve, PcarSolve, catheter_for, check_stations, read_request, refused
+from host.cli.static_requests import CosseratSolve, PcarSolve, catheter_for, read_request
 
 PLOT_POINTS = 121
 
@@ -39,12 +39,13 @@ def _planar(request: PcarSolve, plot: str | None) -> dict[str, Any]:
     catheter = catheter_for(request, "pcar")
     arcs = pcar.arcs_of(catheter, request.insertion_m, request.curvature_per_m)
     total = arcs.total_length_m
-    check_stations(request.stations_m, total)
     found = pcar.solve(arcs, request.force_N)
     if not found.converged:
         return {"converged": False, "reason": found.status.name.lower(), "load_reached": found.load_share,
                 "iterations": found.iterations}
-    stations = [pcar.point_at(arcs, found.curvature_per_m, max(0.0, total - back)) for back in request.stations_m]
+    # inside the sheath the catheter is straight
+    stations = [pcar.point_at(arcs, found.curvature_per_m, total - back) if back <= total
+                else (np.array([total - back, 0.0]), 0.0) for back in request.stations_m]
     if plot is not None:
         plot_shape(plot, f"{catheter.name}, circular arcs", pcar.shape(arcs, found.curvature_per_m, PLOT_POINTS),
                    pcar.shape(arcs, arcs.unloaded_curvature_per_m, PLOT_POINTS), np.array(request.force_N),
@@ -59,14 +60,10 @@ def _spatial(request: CosseratSolve, plot: str | None) -> dict[str, Any]:
     from host.mechanics.cosserat import solve_cosserat
     catheter = catheter_for(request, "cosserat")
     total = catheter.distal_length_m + request.insertion_m
-    check_stations(request.stations_m, total)
     drawn = np.linspace(total, 0.0, PLOT_POINTS) if plot is not None else np.empty(0)
     arguments = (catheter, request.insertion_m, request.curvature_per_m)
-    try:
-        found = solve_cosserat(*arguments, request.force_N, request.force_frame, request.tendon_tension_N,
-                               np.concatenate([request.stations_m, drawn]))
-    except ValueError as error:
-        raise refused(error) from None
+    found = solve_cosserat(*arguments, request.force_N, request.force_frame, request.tendon_tension_N,
+                           np.concatenate([request.stations_m, drawn]))
     if not found.converged:
         return {"converged": False, "reason": found.reason, "load_reached": found.load_reached,
                 "iterations": found.iterations}

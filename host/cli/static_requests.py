@@ -121,16 +121,3 @@ def catheter_for(request: Actuated, group: str) -> Catheter:
                        f"more than -{catheter.distal_length_m}, the length of the distal shaft")
     return catheter
 
-
-def check_stations(stations_m: list[float], outside_m: float) -> None:
-    """Refuses stations behind the sheath's exit. Raises BadInput."""
-    for index, station in enumerate(stations_m):
-        if station > outside_m + 1e-12:
-            raise BadInput(f"stations_m.{index}", station, f"at most {outside_m:.6g}, the length outside the sheath")
-
-
-def refused(error: ValueError) -> BadInput:
-    """A lower room's ValueError "key: found X, wanted Y" as bad input."""
-    key, _, rest = str(error).partition(": ")
-    found, _, wanted = rest.removeprefix("found ").partition(", wanted ")
-    return BadInput(key, found or "something else", wanted or str(error))

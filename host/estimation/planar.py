@@ -37,6 +37,10 @@ def tip_covariance(position_std_m: float = POSITION_STD_m, angle_std_rad: float 
     return np.diag([position_std_m**2, position_std_m**2, angle_std_rad**2])
 
 
+DEFAULT_COVARIANCE = tip_covariance()
+DEFAULT_WEIGHT = np.diag(1.0 / np.diag(DEFAULT_COVARIANCE))
+
+
 @dataclass(frozen=True)
 class SurfacePrior:
     """A frictionless-like surface: the force is along its normal but for a tangential part of that standard deviation.
@@ -80,7 +84,7 @@ def _prior_vector(prior: SurfacePrior | None) -> Array:
 
 def _checked_covariance(covariance: ArrayLike | None) -> tuple[Array, Array]:
     if covariance is None:
-        covariance = tip_covariance()
+        return DEFAULT_COVARIANCE, DEFAULT_WEIGHT
     matrix = np.ascontiguousarray(covariance, dtype=float)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
         raise ValueError("covariance: wanted a symmetric 3 x 3 matrix of finite numbers")

@@ -19,15 +19,15 @@ COLUMNS = 11
 STEP_LIMIT_rad = 0.8
 CURVATURE_TOLERANCE_rad = 1e-3    # the maximum-likelihood stage takes over from here
 EXACT_TOLERANCE_rad = 1e-10
-END_rad = 1e-9                    # turning of the last step
+END_rad = 1e-10                   # turning of the last step
 END_N = 1e-9                      # force of the last step
 FORCE_LIMIT_N = 10.0              # a pose that asks for more is one that no force explains
-CURVATURE_STEPS, LIKELIHOOD_STEPS = 30, 40
+CURVATURE_STEPS, LIKELIHOOD_STEPS = 50, 40
 # Keeps fewer than three arcs solvable: the pose is met up to this share of its covariance, 1e-4 m/N at 0.3 mm
 SOFTNESS_per_N_m = 1e-4
 # The first steps may miss the pose as freely as they bend: without that, three arcs fall into other solutions of
 # (2.12)-(2.14) in one case of ten
-FIRST_SOFTNESS_per_N_m, SOFTENING = 1e7, 0.1
+FIRST_SOFTNESS_per_N_m, SOFTENING = 1e8, 0.15
 SECOND_START_CHI_SQUARE = 6.0     # of one degree of freedom
 SCAN_DIRECTIONS, SCAN_FORCES_N, SCAN_BEST = 12, (0.08, 0.25), 3
 
@@ -206,6 +206,7 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
     """
     out = np.empty(9)
     row[ENDED] = 0.0
+    dx = dy = 0.0
     for count in range(1, LIKELIHOOD_STEPS + 1):
         sensitivities(length, EI, cubic, kappa0, kappa, fx, fy, drag, pose, work, out)
         gx, gy = normal_equations(out, weight, prior, fx, fy, row)
@@ -233,7 +234,10 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
             row[ENDED] = 1.0
             break
     row[FORCE_X], row[FORCE_Y] = fx, fy
-    row[ERROR_X], row[ERROR_Y], row[ERROR_ANGLE] = out[6], out[7], out[8]
+    # what the last step has left of the error
+    row[ERROR_X] = out[6] - out[0] * dx - out[1] * dy
+    row[ERROR_Y] = out[7] - out[2] * dx - out[3] * dy
+    row[ERROR_ANGLE] = out[8] - out[4] * dx - out[5] * dy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -35,7 +35,8 @@ class Knowledge:
     insertion_m: float = 0.4e-3
     curvature_per_m: float = 1.0
     roll_rad: float = 0.08
-    force_N: float = 1.0                # in the bending plane: weak, keeps an unseen direction finite
+    axial_force_N: float = 1.0          # weak: keeps an unseen direction finite
+    lateral_force_N: float = 1.0        # in the bending plane; less where the wall is known to face the sheath
     out_of_plane_force_N: float = 0.05  # planar poses do not show it
 
 
@@ -76,8 +77,9 @@ class PlanarRigEstimator:
     def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
         """For the catheter and the tracker of a rig file. Raises BadInput where the catheter is not known."""
         tracker = rig.tracker
+        # the rig's wall faces the sheath: its force is along e3 but for friction and for the wall's tilt
         return cls(load_catheter(rig.catheter.name), tracker.shaft_sensor_offset_m, tracker.position_noise_m,
-                   tracker.orientation_noise_rad)
+                   tracker.orientation_noise_rad, Knowledge(lateral_force_N=0.05))
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
@@ -124,7 +126,8 @@ class PlanarRigEstimator:
     def _fit(self, poses: dict[float, Array], actuation: Actuation, start: Array) -> _Fit:
         """Gauss-Newton on force, insertion error and curvature error, held by what is known of them."""
         known = self._known
-        held = np.diag([known.force_N**-2, known.force_N**-2, known.insertion_m**-2, known.curvature_per_m**-2])
+        held = np.diag([known.axial_force_N**-2, known.lateral_force_N**-2, known.insertion_m**-2,
+                        known.curvature_per_m**-2])
         parameters, ended, chi_square, residual = start.copy(), False, math.inf, math.inf
         information = held
         for _ in range(STEPS):

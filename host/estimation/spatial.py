@@ -33,12 +33,13 @@ Array = NDArray[np.float64]
 LARGEST_FORCE_N = 0.5
 GATE = 6.0  # root mean square of the weighted residuals above which no force is said to explain the poses
 FAIR_DEVIATIONS, ODD_DEVIATIONS = 4.0, 3.1  # chi square that ends the search for a better force; that draws a warning
+TINY = 1e-2  # weighted cost per residual that no noise leaves
 WEAK_STD_N = 0.02
 LARGEST_STD_N = 10.0  # what is said of a direction the poses tell nothing about
 ONE_TO_ONE = (2, 4, 6)
 MOST_SOLUTIONS = 8
 DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
-START_SHARES = (0.1, 0.3, 0.6)  # of the largest force
+START_SHARES = (0.3, 0.1, 0.02, 0.6)  # of the largest force, the most useful first
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class ForceEstimate:
 
 
 def start_grid(largest_N: float) -> Array:
-    """Forces (78, 3) to start from where the first try fails: 26 directions, three sizes."""
+    """Forces (104, 3) to start from where the first try fails: 26 directions, four sizes."""
     units = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     return np.vstack([share * largest_N * units for share in START_SHARES])
 
@@ -86,6 +87,7 @@ def estimate_cosserat(
     prior: SurfacePrior | None = None,
     roll_rad: float = 0.0,
     largest_force_N: float = LARGEST_FORCE_N,
+    thorough: bool = True,
 ) -> ForceEstimate:
     """Tip force, in the tip frame, that explains the poses of one sample best.
 
@@ -93,7 +95,8 @@ def estimate_cosserat(
     the first sensor, 2 and its orientation, 3 position of the second relative to the first, 4 and both orientations,
     5 orientation of the second relative to the first, 6 and of the third; sensors, from the tip backwards, as many as
     the case uses (more are left aside); previous_force_N (3,) of the last sample, tip frame: start there and stay on
-    its branch; prior: the surface's normal; largest_force_N: no force above it is considered.
+    its branch; prior: the surface's normal; largest_force_N: no force above it is considered; thorough: look for a
+    better force wherever the first one leaves any residual, not only more than noise would (some milliseconds more).
     Result: `converged` False where no force explains the poses; several `solutions_N` where cases 1, 3, 5 leave the
     choice open (then force_N is the smallest of them, unless previous_force_N is given).
     Raises: BadInput naming the key. Source: (5.3) to (5.11) with (5.5) put right, weighted by the sensors' noise.
@@ -106,7 +109,7 @@ def estimate_cosserat(
     x, notes = np.zeros(3), []
     rows = int(ROWS_OF_CASE[case]) + len(problem.prior)
     freedom = max(rows - 3, 0)
-    fair, believable = chi_square_limit(freedom, FAIR_DEVIATIONS), GATE**2 * rows
+    fair, believable = TINY * rows if thorough else chi_square_limit(freedom, FAIR_DEVIATIONS), GATE**2 * rows
     sweeps, solutions = 0, None
     if previous_force_N is not None:
         x[:] = finite("previous_force_N", previous_force_N, (3,), "three finite numbers in N")
@@ -158,12 +161,13 @@ def sample(catheter: Catheter, insertion_m: float, curvature_per_m: float, case:
 def pose_problem(rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array,
                  prior: Array) -> Problem:
     """`Problem` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
-    total = rod[6] + rod[7]
+    whole, total = rod, rod[6] + rod[7]
     if case >= 5 and len(prior) == 0:
         rod = rod.copy()
         last = min(offsets[-1], total)
         rod[6], rod[7] = min(rod[6], last), max(0.0, last - rod[6])
-    return Problem(rod, np.minimum(offsets, total), np.maximum(offsets - total, 0.0), case, positions, quaternions, W, prior)
+    return Problem(rod, whole, np.minimum(offsets, total), np.maximum(offsets - total, 0.0), case, positions, quaternions, W,
+                   prior)
 
 
 def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:

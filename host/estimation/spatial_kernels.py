@@ -10,12 +10,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, residuals
-from host.mechanics.cosserat_kernels import ALL_TANGENTS, COARSE, POSE, ROW, WORK, sweep
+from host.mechanics.base_force import solve_cold
+from host.mechanics.branch import CONVERGED
+from host.mechanics.cosserat_kernels import (
+    ALL_TANGENTS,
+    COARSE,
+    EXACT,
+    POSE,
+    POSE_AND_FORCE_TANGENTS,
+    ROW,
+    WORK,
+    sweep,
+)
 from host.mechanics.small_matrices import apply3, inverse3
-from host.mechanics.tip_shooting import length3
+from host.mechanics.tip_shooting import NO_STATIONS, length3, load_number, newton_matrix
 
 Array = NDArray[np.float64]
 
+ON_BRANCH = 0.0
 BEND = 0.5  # of the fine sweeps: 1e-9 m at the tip, 1e-7 N of force along the stiffest direction
 MOST_ITERATIONS = 40
 MOST_REFINEMENTS = 12
@@ -23,13 +35,17 @@ CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last on
 CLOSE_N = 2e-3
 GOAL_N = 5e-8  # expected error of the force at which the fine sweeps stop
 LARGEST_DAMPING = 1e9
+LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
+NEGLIGIBLE = 1e-3  # weighted cost, far below noise, that explains the poses even where the force still creeps
+SAME = 1e-2  # squared distance over its variance below which two forces are one
 
 
 class Problem(NamedTuple):
     """One sample: what was measured, where, and how sure."""
 
     rod: Array  # (9,) record of the rod, cut off behind the last sensor in cases 5 and 6 without a prior
+    whole_rod: Array  # (9,) the same, never cut off
     stations: Array  # (k,) arc lengths of the sensors back from the tip, ascending, exposed
     inside: Array  # (k,) how far each is inside the straight sheath, m
     case: int
@@ -53,7 +69,7 @@ class Scratch(NamedTuple):
     kept_A: Array
     information: Array  # (3, 3) 1/N^2
     inverse: Array  # (3, 3)
-    vectors: Array  # (3, 3): trial, slope, step
+    vectors: Array  # (4, 3): trial, slope, step, force in the tip frame
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -62,7 +78,7 @@ def new_scratch(sensors: int) -> Scratch:
     m = MOST_ROWS
     return Scratch(np.zeros(WORK), np.zeros(SCRATCH), np.zeros((sensors + 1, ROW)), np.zeros(m), np.zeros((m, 3)),
                    np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((3, 3)), np.zeros((3, 3)),
-                   np.zeros((3, 3)))
+                   np.zeros((4, 3)))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -89,6 +105,30 @@ def cost_at(p: Problem, x: Array, bend: float, tangents: bool, s: Scratch) -> fl
         if tangents:
             for c in range(3):
                 s.A[m + k, c] = t[0] * base[24 + c] + t[1] * base[28 + c] + t[2] * base[32 + c]
+    return cost
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cost_on_branch(p: Problem, force: Array, s: Scratch) -> float:
+    """`cost_at` with tangents by a force (3,) in the base frame, of the equilibrium that grows from the unloaded shape.
+
+    Leaves the force as the tip sees it in s.vectors[3]; 1e300 where the branch folds back. The pose is a far smoother
+    function of this force than of the one in the tip frame where the catheter is soft and pulled.
+    """
+    out, x = np.zeros((1, ROW)), s.vectors[3]
+    status, _, _, _, _ = solve_cold(p.whole_rod, force, NO_STATIONS, EXACT, x, out, s.sweep)
+    if status != CONVERGED:
+        return 1e300
+    sweep(p.whole_rod, x, NO_STATIONS, EXACT, POSE_AND_FORCE_TANGENTS, out, s.sweep)
+    G, inverse = np.empty((3, 3)), np.empty((3, 3))
+    newton_matrix(out[0], G)
+    inverse3(G, inverse)
+    cost = cost_at(p, x, EXACT, True, s)
+    for k in range(ROWS_OF_CASE[p.case] + p.prior.shape[0]):
+        for A in (s.A, s.raw_A):
+            a0, a1, a2 = A[k, 0], A[k, 1], A[k, 2]
+            for c in range(3):
+                A[k, c] = a0 * inverse[0, c] + a1 * inverse[1, c] + a2 * inverse[2, c]
     return cost
 
 
@@ -127,23 +167,26 @@ def descend(p: Problem, largest_N: float, bend: float, close: float, close_N: fl
             s: Scratch) -> tuple[bool, float, int]:
     """x (3,), in place, until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
 
-    A step that does not lower the cost is damped; forces above `largest_N` are not entered.
+    A step that does not lower the cost is damped; forces above `largest_N` are not entered. x is the force in the tip
+    frame, or with bend = ON_BRANCH the force in the base frame (`cost_on_branch`).
     """
     m = ROWS_OF_CASE[p.case] + p.prior.shape[0]
     damping, sweeps = 0.0, 1
-    cost = cost_at(p, x, bend, True, s)
+    longest = LONGEST_STEP / load_number(p.whole_rod, 1.0)
+    cost = cost_at(p, x, bend, True, s) if bend != ON_BRANCH else cost_on_branch(p, x, s)
     keep(m, s)
     trial, step = s.vectors[0], s.vectors[2]
     for _ in range(MOST_ITERATIONS):
         size = damped_step(damping, s)
+        shorter = min(1.0, longest / max(size, 1e-300))
         for i in range(3):
-            trial[i] = x[i] + step[i]
+            trial[i] = x[i] + shorter * step[i]
         if size < max(close_N, close * length3(x)) and damping < 1e-2:
             x[:] = trial
             return True, cost, sweeps
         new = 1e300
         if trial[0] ** 2 + trial[1] ** 2 + trial[2] ** 2 <= largest_N**2:
-            new = cost_at(p, trial, bend, True, s)
+            new = cost_at(p, trial, bend, True, s) if bend != ON_BRANCH else cost_on_branch(p, trial, s)
             sweeps += 1
         if new < cost:
             x[:] = trial
@@ -221,28 +264,35 @@ def estimate(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, 
     if not settled and length3(x) <= largest_N:
         settled, cost, more = descend(p, largest_N, BEND, 0.0, GOAL_N, x, s)
         sweeps += more
-    return settled and length3(x) <= 1.01 * largest_N, cost, sweeps
+    return (settled or cost < NEGLIGIBLE) and length3(x) <= 1.01 * largest_N, cost, sweeps
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def search(p: Problem, largest_N: float, starts: Array, believable: float, found: Array, s: Scratch) -> tuple[int, int]:
-    """All forces found from the starts (n, 3) that explain the sample: found (k, 3), written. Returns (count, sweeps).
+    """Forces that explain the sample, from the starts (n, 3) and on the unloaded branch: found (k, 3). (count, sweeps).
 
-    A force counts where its cost is below `believable` and it is not one found before; at most k are kept.
+    A force counts where its cost is below `believable` and the poses tell it from those found before; k are kept.
     """
     count = sweeps = 0
-    x = np.empty(3)
-    for i in range(starts.shape[0]):
-        x[:] = starts[i]
-        settled, cost, used = estimate(p, largest_N, x, s)
+    x, apart = np.empty(3), np.empty(3)
+    for i in range(-1, starts.shape[0]):
+        if i < 0:
+            settled, cost, used = estimate_on_branch(p, largest_N, x, s)
+        else:
+            x[:] = starts[i]
+            settled, cost, used = estimate(p, largest_N, x, s)
         sweeps += used
-        if not settled or cost > believable or count == found.shape[0]:
+        if not settled or not cost <= believable or count == found.shape[0]:
             continue
         new = True
         for j in range(count):
-            apart = (x[0] - found[j, 0]) ** 2 + (x[1] - found[j, 1]) ** 2 + (x[2] - found[j, 2]) ** 2
-            if apart < 1e-8 + 1e-6 * (x[0] ** 2 + x[1] ** 2 + x[2] ** 2):
-                new = False
+            for k in range(3):
+                apart[k] = x[k] - found[j, k]
+            distance = 1e-4 * (apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
+            for k in range(3):
+                for n in range(3):
+                    distance += apart[k] * s.information[k, n] * apart[n]
+            new = new and distance > SAME
         if new:
             found[count] = x
             count += 1
@@ -250,18 +300,38 @@ def search(p: Problem, largest_N: float, starts: Array, believable: float, found
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def best_of(p: Problem, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
-    """From x (3,) and, while the cost stays above `fair`, from the starts (n, 3): the cheapest force, left in x.
+def estimate_on_branch(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+    """`estimate` among the equilibria that grow from the unloaded shape, from no force; x (3,) written, tip frame.
 
-    Returns (settled, cost, sweeps); s holds the residuals and sensitivities that belong to x.
+    Slower by the equilibria it solves, but it arrives where the tip-frame force is too sensitive to search for.
+    """
+    force = np.zeros(3)
+    settled, cost, sweeps = descend(p, largest_N, ON_BRANCH, 1e-4, 1e-6, force, s)
+    if not settled and not cost < 1.0:
+        return False, cost, sweeps
+    x[:] = s.vectors[3]
+    settled, cost, more = estimate(p, largest_N, x, s)
+    return settled, cost, sweeps + more
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def best_of(p: Problem, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+    """From x (3,) and, while the cost stays above `fair`, from the starts (n, 3) and on the unloaded branch.
+
+    The branch is tried after the first 26 starts: it is the surer way, but as dear as all of them. Returns (settled,
+    cost, sweeps) of the cheapest force, left in x; s holds what belongs to it.
     """
     settled, cost, sweeps = estimate(p, largest_N, x, s)
-    if settled and cost <= fair:
-        return True, cost, sweeps
+    if cost <= fair and (settled or length3(x) > 0.9 * largest_N):
+        return settled, cost, sweeps
     trial = np.empty(3)
-    for i in range(starts.shape[0]):
-        trial[:] = starts[i]
-        ok, new, used = estimate(p, largest_N, trial, s)
+    turn = min(26, starts.shape[0])
+    for i in range(starts.shape[0] + 1):
+        if i == turn:
+            ok, new, used = estimate_on_branch(p, largest_N, trial, s)
+        else:
+            trial[:] = starts[i - 1 if i > turn else i]
+            ok, new, used = estimate(p, largest_N, trial, s)
         sweeps += used
         if ok and (not settled or new < cost):
             settled, cost, x[:] = True, new, trial

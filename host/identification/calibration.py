@@ -13,6 +13,7 @@ from host.identification.robust_fit import Fit, Objective, ShapeModel, gauss_new
 Array = NDArray[np.float64]
 
 UNTOLD_STD = 0.5        # relative standard deviation beyond which the data are said not to tell a parameter
+NOTHING_KNOWN_STD = 10.0    # relative standard deviation that stands for "nothing is known"
 ROUNDS = 4              # of scale and fit in turns
 
 
@@ -101,8 +102,10 @@ def _confidence(model: ShapeModel, objective: Objective, x: Array,
     _, _, matrix, parts = linear
     scale = model.scale()
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    floor = max(float(values.max()), 1e-300) * 1e-14
-    inverse = (vectors / np.maximum(values, floor)) @ vectors.T * np.outer(scale, scale)
+    # a direction without any effect gets the information of `NOTHING_KNOWN_STD`, however small the noise
+    values = np.where(values > 1e-12 * float(values.max()), values, 0.0)
+    known = np.maximum(values, NOTHING_KNOWN_STD**-2)
+    inverse = (vectors / known) @ vectors.T * np.outer(scale, scale)
     scores = np.array(parts)
     count, size = scores.shape
     sandwich = inverse @ (scores.T @ scores) @ inverse * (count / max(count - 1, 1))
@@ -112,9 +115,9 @@ def _confidence(model: ShapeModel, objective: Objective, x: Array,
     relative = np.sqrt(np.diag(inverse)) / scale
     fitted = [_interval(names[i], x[i], math.sqrt(variance[i]) * quantile, relative[i] < UNTOLD_STD) for i in range(size)]
     untold = [UntoldDirection({names[i][0]: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
-                              float(1.0 / math.sqrt(max(values[k], floor))))
-              for k in range(size) if 1.0 / math.sqrt(max(values[k], floor)) > UNTOLD_STD]
-    return fitted, np.sqrt(np.maximum(values[::-1], 0.0)), untold
+                              float(1.0 / math.sqrt(known[k])))
+              for k in range(size) if 1.0 / math.sqrt(known[k]) > UNTOLD_STD]
+    return fitted, np.sqrt(values[::-1]), untold
 
 
 def _interval(name: tuple[str, str, bool], x: float, half: float, told: bool) -> FittedParameter:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from host.cli.contract_io import BadInput
 from host.identification import planar_sensitivities as sensitivities
+from host.identification.parameters import Parameter, ParametricModel, curvature_name, curvature_parameters
 from host.identification.recorded_shapes import RecordedShape
 from host.mechanics import pcar_kernels as kernels
 from host.mechanics.catheter import Catheter, PcarParameters
@@ -18,63 +19,27 @@ Array = NDArray[np.float64]
 GROUPS = ("stiffness", "lengths", "curvature")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One number that is fitted: its place in the catheter, and how it is scaled inside the search."""
-
-    name: str
-    unit: str
-    start: float
-    logarithmic: bool
-
-
-class PlanarModel:
+class PlanarModel(ParametricModel):
     """Predicts marker positions from parameters: log EI of each arc, lengths of the distal arcs but the last, and the
     unloaded curvature of each group of recordings with the same nominal curvature."""
 
     def __init__(self, catheter: Catheter, recordings: list[RecordedShape], fit: tuple[str, ...]) -> None:
         if catheter.pcar is None:
             raise BadInput("catheter", catheter.name, "a start catheter with [pcar] parameters")
-        self.catheter, self.pcar, self.recordings = catheter, catheter.pcar, recordings
+        self.pcar = catheter.pcar
         self.arc_count = len(self.pcar.EI_N_m2)
-        self.curvatures = sorted({recording.curvature_per_m for recording in recordings})
-        self.parameters = self._parameters(fit)
-        self._group = [self.curvatures.index(recording.curvature_per_m) for recording in recordings]
-        for index, recording in enumerate(recordings):
-            outside = catheter.distal_length_m + recording.insertion_m
-            if not outside > 0.0:
-                raise BadInput(f"recordings.{index}.insertion_m", recording.insertion_m,
-                               f"more than -{catheter.distal_length_m}, the length of the distal shaft")
-            if recording.offset_m.max() > outside + 1e-9:
-                raise BadInput(f"recordings.{index}.markers", float(recording.offset_m.max()),
-                               f"offset_m of at most {outside:.6g}, the length outside the sheath")
-
-    def _parameters(self, fit: tuple[str, ...]) -> list[Parameter]:
         found = []
         if "stiffness" in fit:
             found += [Parameter(f"EI{i + 1}", "N m2", value, True) for i, value in enumerate(self.pcar.EI_N_m2)]
         if "lengths" in fit:
             found += [Parameter(f"l{i + 2}", "m", value, False) for i, value in enumerate(self.pcar.distal_arcs_m[:-1])]
         if "curvature" in fit:
-            found += [Parameter(f"kappa0[{value:g}]", "1/m", value, False) for value in self.curvatures]
-        return found
-
-    def start(self) -> Array:
-        """The search's start, in its own scale."""
-        return np.array([np.log(p.start) if p.logarithmic else p.start for p in self.parameters])
-
-    def scale(self) -> Array:
-        """Natural size of a step in each parameter: a relative one for stiffness, else a part of the value."""
-        floor = {"m": 0.1 * self.catheter.distal_length_m, "1/m": 5.0}
-        return np.array([1.0 if p.logarithmic else max(abs(p.start), floor[p.unit]) for p in self.parameters])
-
-    def values(self, x: Array) -> Array:
-        """Parameters in SI from the search's `x`."""
-        return np.array([np.exp(v) if p.logarithmic else v for p, v in zip(self.parameters, x, strict=True)])
+            found += curvature_parameters(recordings)
+        super().__init__(catheter, recordings, found)
 
     def catheter_at(self, x: Array) -> Catheter | None:
         """The catheter with parameters `x`; None where a length is not positive."""
-        values = dict(zip([p.name for p in self.parameters], self.values(x).tolist(), strict=True))
+        values = self.values(x)
         stiffness = tuple(values.get(f"EI{i + 1}", old) for i, old in enumerate(self.pcar.EI_N_m2))
         lengths = [values.get(f"l{i + 2}", old) for i, old in enumerate(self.pcar.distal_arcs_m[:-1])]
         lengths.append(self.catheter.distal_length_m - sum(lengths))
@@ -89,9 +54,7 @@ class PlanarModel:
         if catheter is None:
             return None
         recording = self.recordings[index]
-        values = dict(zip([p.name for p in self.parameters], self.values(x).tolist(), strict=True))
-        nominal = recording.curvature_per_m
-        arcs = arcs_of(catheter, recording.insertion_m, values.get(f"kappa0[{nominal:g}]", nominal))
+        arcs = arcs_of(catheter, recording.insertion_m, self.curvature(self.values(x), recording))
         n = arcs.length_m.size
         work, kappa = np.empty((kernels.ROWS, n)), np.empty(n)
         status, _, _ = kernels.load_path(arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2,
@@ -118,13 +81,14 @@ class PlanarModel:
                                          kappa, node, turn, work, response)
         sensitivities.marker_jacobian(arcs.length_m, kappa, station, length_by, response, node, turn, every)
         columns = []
-        for parameter, value in zip(self.parameters, self.values(x), strict=True):
+        values = self.values(x)
+        for parameter in self.parameters:
             if parameter.logarithmic:
-                columns.append(every[:, :, int(parameter.name[2:]) - 1] * value)
+                columns.append(every[:, :, int(parameter.name[2:]) - 1] * values[parameter.name])
             elif parameter.unit == "m":
                 columns.append(every[:, :, n + int(parameter.name[1:]) - 2])
             else:
-                same = parameter.name == f"kappa0[{recording.curvature_per_m:g}]"
+                same = parameter.name == curvature_name(recording.curvature_per_m)
                 columns.append(every[:, :, n + q] * same)
         return np.stack(columns, axis=2)
 

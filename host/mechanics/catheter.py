@@ -145,7 +145,7 @@ def _check_arcs(file: _CatheterFile) -> None:
 def catheter_toml(catheter: Catheter, notes: list[str]) -> str:
     """`catheter` as TOML text that `load_catheter` reads back to equal values; `notes` become its head comment."""
     lines = [f"# {line}" for note in notes for line in note.splitlines()]
-    lines += [f"name = {json.dumps(catheter.name, ensure_ascii=False)}"]
+    lines += [f"name = {json.dumps(catheter.name, ensure_ascii=False)}".replace("\x7f", "\\u007f")]
     scalars = ("distal_length_m", "diameter_m", "pull_wire_offset_m")
     lines += [f"{key} = {getattr(catheter, key)!r}" for key in scalars]
     if catheter.pcar is not None:

@@ -29,6 +29,14 @@ def quaternion_product(p: Array, q: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def normalized_into(q: Array, out: Array) -> None:
+    """out (4,) = q (4,) brought to unit length; out may be q."""
+    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for i in range(4):
+        out[i] = scale * q[i]
+
+
+@njit(cache=True, nogil=True)
 def conjugate(q: Array) -> Array:
     """Inverse of the unit quaternion q (4,)."""
     return np.array([q[0], -q[1], -q[2], -q[3]])

@@ -315,6 +315,7 @@ class AuroraClient:
                 text = f"frame counter went from {self._frame} to {newest}: times learnt anew"
                 self.event(EventKind.WARNING, text, now_ns)
                 self.clock.reset()
+                self._frame = None
                 self._tool_frames.clear()
         self._strange_in_row, self._frame_seen_ns = 0, now_ns
         return newest

@@ -123,7 +123,7 @@ static void expect_byte(void) {
 static avr_cycle_count_t byte_sent(avr_t *avr, avr_cycle_count_t when, void *param) {
     (void)param;
     transmitter_t *transmitter = &board.transmitter;
-    buffer_add(&board.produce.uart, &transmitter->shifting, 1);
+    produce_byte(&board.produce, board.base_cycle + when, transmitter->shifting);
     transmitter->busy = transmitter->has_waiting;
     if (!transmitter->busy) return 0;
     transmitter->shifting = transmitter->waiting;

@@ -78,6 +78,11 @@ uint8_t encoders_lines(const encoders_t *encoders) {
     return lines;
 }
 
+void produce_byte(produce_t *produce, uint64_t cycle, uint8_t byte) {
+    buffer_add(&produce->uart, &byte, 1);
+    buffer_add(&produce->uart_cycles, &cycle, sizeof cycle);
+}
+
 void produce_edge(produce_t *produce, uint64_t cycle, unsigned axis, bool backwards) {
     edge_t edge = {cycle, (uint8_t)axis, backwards ? -1 : 1};
     buffer_add(&produce->edges, &edge, sizeof edge);
@@ -128,7 +133,8 @@ bool reply_write(reply_t *reply, produce_t *produce) {
     out.used = 0;
     buffer_add(&out, reply, sizeof *reply);
     buffer_add(&out, produce->uart.data, produce->uart.used);
+    buffer_add(&out, produce->uart_cycles.data, produce->uart_cycles.used);
     buffer_add(&out, produce->edges.data, produce->edges.used);
-    produce->uart.used = produce->edges.used = 0;
+    produce->uart.used = produce->uart_cycles.used = produce->edges.used = 0;
     return write_all(out.data, out.used);
 }

@@ -39,7 +39,7 @@ typedef struct __attribute__((packed)) {
     uint32_t isr_max_cycles;
     uint32_t starts; /* of the processor */
     uint32_t rx_lost; /* bytes the receiver had no room for */
-    uint32_t uart_bytes, edges; /* follow: the bytes, then the edges */
+    uint32_t uart_bytes, edges; /* follow: the bytes, the u64 cycle each had left whole, then the edges */
 } reply_t;
 
 typedef struct __attribute__((packed)) {
@@ -84,9 +84,10 @@ uint8_t encoders_lines(const encoders_t *encoders);
 
 /* What the current slice has produced. */
 typedef struct {
-    buffer_t uart, edges;
+    buffer_t uart, uart_cycles, edges;
 } produce_t;
 
+void produce_byte(produce_t *produce, uint64_t cycle, uint8_t byte);
 void produce_edge(produce_t *produce, uint64_t cycle, unsigned axis, bool backwards);
 
 /* Keeps standard output for the replies: what libraries print goes to standard error. */

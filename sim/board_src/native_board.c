@@ -52,7 +52,7 @@ static void transmit(uint64_t now, produce_t *produce) {
     while (!board.tx_busy || board.tx_done_cycle <= now) {
         uint64_t begin = now;
         if (board.tx_busy) {
-            buffer_add(&produce->uart, &board.tx_byte, 1);
+            produce_byte(produce, board.tx_done_cycle, board.tx_byte);
             begin = board.tx_done_cycle;
         }
         board.tx_busy = link_next_byte(&byte);

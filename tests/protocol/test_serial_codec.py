@@ -1,5 +1,6 @@
 """Frames survive the line whole or not at all."""
 
+import re
 from itertools import pairwise
 
 import pytest
@@ -143,9 +144,8 @@ def test_a_restarted_sender_is_heard() -> None:
     ("SETPOINT", {"number": 1, "execute_us": 2, "expiry_us": 3, "position_steps": (1, 2)}, "wire types"),
 ])
 def test_bad_fields_are_refused(name: str, fields: dict, says: str) -> None:
-    with pytest.raises(ValueError, match=".") as error:
+    with pytest.raises(ValueError, match=re.escape(says)):
         encode(name, 0, **fields)
-    assert says in str(error.value)
 
 
 def test_every_frame_is_in_the_index() -> None:

@@ -6,6 +6,8 @@ judge the kernels' closed forms, and it follows the branch in tiny steps of arc 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
@@ -41,7 +43,7 @@ def work_of_drag(length: ArrayLike, kappa: NDArray, drag: NDArray) -> complex:
     return total
 
 
-def gradient(function, kappa: NDArray, step: float = 1e-30) -> NDArray:
+def gradient(function: Callable, kappa: NDArray, step: float = 1e-30) -> NDArray:
     """Derivatives of a real function of curvatures by the complex step: exact to rounding."""
     found = []
     for i in range(kappa.size):

@@ -1,4 +1,7 @@
-"""Makes tests/references/planar.json: planar equilibria at 1e-12 by an independent model. Run: python -m tests.references.make_planar"""
+"""Makes planar.json beside it: planar equilibria at 1e-12 by an independent model.
+
+Run: python -m tests.references.make_planar
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,12 @@ TABLE_2_2 = [                                       # x_b (m), kappa0 (1/m), alp
     (0.0485, 15.7, 270, 0.0125), (0.0485, 15.7, 270, 0.0484), (0.0485, 15.7, 270, 0.0895), (0.0485, 15.7, 270, 0.1197),
     (0.0485, 15.7, 270, 0.1578), (0.0413, 20.0, 240, 0.1230), (0.0413, 20.0, 193, 0.1578), (0.0413, 20.0, 222, 0.1578),
     (0.0413, 20.0, 157, 0.2220), (0.0413, 70.0, 270, 0.2220), (0.0413, 70.0, 61, 0.2866), (0.0413, 70.0, 116, 0.2866),
+]
+FOLDS = [                                           # x_b (m), kappa0 (1/m), F (N), stiffness divided by: rare, 1 in 400
+    (0.0445, 35.9, (-0.0373, -0.3504), 2.04), (0.0485, 52.0, (-0.1269, -0.2802), 6.19),
+    (0.0456, 48.0, (0.2006, -0.408), 3.37), (0.0402, 44.9, (0.046, -0.1208), 5.09),
+    (0.0032, 42.7, (0.1092, -0.2234), 14.24), (0.0372, 37.0, (-0.0013, -0.0765), 2.83),
+    (0.0388, 54.2, (-0.0357, -0.4042), 17.68), (0.0372, 37.3, (0.0011, -0.4519), 2.2),
 ]
 
 
@@ -50,6 +59,7 @@ def main() -> None:
                        for _ in range(200)]
     cases["soft"] = [case(rng.uniform(0.0, 0.05), rng.uniform(-60.0, 60.0), rng.uniform(0.1, 0.5) * angle(),
                           10.0 ** rng.uniform(0.7, 1.3)) for _ in range(100)]
+    cases["fold"] = [case(x_b, k, np.array(f), softer) for x_b, k, f, softer in FOLDS]
     folds = sum(entry["fold"] for group in cases.values() for entry in group)
     TARGET.write_text(json.dumps(cases, indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
     print(f"{TARGET}: {sum(map(len, cases.values()))} cases, {folds} with a fold")

@@ -49,13 +49,17 @@ class BoardRig:
         for array in (result.edge_cycle, result.edge_axis, result.edge_sign):
             self._digest.update(array.tobytes())
         self._digest.update(result.uart_out)
-        for event in self.link.feed(result.uart_out, self.now_ns):
+        for piece, done_us in result.timed_frames():
+            self._take(piece, done_us * 1000)
+        self.last = result
+        return result
+
+    def _take(self, piece: bytes, arrival_ns: int) -> None:
+        for event in self.link.feed(piece, arrival_ns):
             if event.kind is not EventKind.STATUS:
                 self.events.append(event.message)
             elif self.link.status is not None:
                 self.accepted.add(self.link.status.last_setpoint)
-        self.last = result
-        return result
 
     def run_ms(self, milliseconds: int, data: bytes = b"") -> None:
         for _ in range(milliseconds):

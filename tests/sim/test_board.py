@@ -98,7 +98,7 @@ def test_same_inputs_same_edges_to_the_cycle(params: tuple[str, str], request: p
 @pytest.mark.avr
 @pytest.mark.usefixtures("avr_tools")
 def test_native_and_avr_agree() -> None:
-    """The same core: the same steps in the same order on each axis, at the same board time to a few ticks."""
+    """The same core makes the same steps; they differ in time by what the links know of their board's clock."""
     rigs = [BoardRig("native"), BoardRig("avr"), BoardRig("avr", "atmega328p")]
     for rig in rigs:
         rig.bring_up()
@@ -110,26 +110,27 @@ def test_native_and_avr_agree() -> None:
             ours, native = np.array(rig.edge_us[axis]), np.array(rigs[0].edge_us[axis])
             assert len(ours) == len(native)
             lag = ours - native
-            assert np.ptp(lag) <= 400
+            assert np.ptp(lag) <= 600
     for rig in rigs:
         rig.close()
 
 
 # --- stopping -------------------------------------------------------------------------------------------------------
 
-def assert_stopped_on_a_ramp(rig: BoardRig, commanded: np.ndarray, since_us: int, within_us: int) -> None:
-    """At rest in time, past the last command by no more than the queue and a uniform deceleration, never faster."""
+def assert_stopped_on_a_ramp(rig: BoardRig, commanded: np.ndarray, steps_per_ms: tuple[int, int, int], since_us: int,
+                             within_us: int) -> None:
+    """At rest in time, off the last command by no more than the queue and a uniform deceleration, ever slower."""
     for axis, limits in enumerate(LIMITS):
-        edges = np.array(rig.edge_us[axis])
-        if len(edges) < 3:
+        speed = 1000 * abs(steps_per_ms[axis])
+        if speed == 0:
             continue
+        edges = np.array(rig.edge_us[axis])
         assert edges[-1] <= since_us + within_us
-        braking = edges[edges > since_us]
-        if len(braking) > 2:
-            assert (np.diff(braking)[1:] >= np.diff(braking)[:-1] - 110).all()
-        top = 1e6 / np.median(np.diff(edges)[-40:-25]) if len(edges) > 60 else 0.0
-        overrun = abs(int(rig.position[axis] - commanded[axis]))
-        assert overrun <= 1.2 * top**2 / (2 * limits.max_accel_steps_per_s2) + top * 0.004 + 2
+        gaps = np.diff(edges[edges > since_us])
+        assert len(gaps) > 10 and (gaps[1:] >= gaps[:-1] - 110).all(), "not a ramp down"
+        braking_steps = speed**2 / (2 * limits.max_accel_steps_per_s2)
+        off = abs(int(rig.position[axis] - commanded[axis]))
+        assert off <= braking_steps + 0.005 * speed + 2
 
 
 def test_deadman(armed: BoardRig) -> None:
@@ -137,7 +138,7 @@ def test_deadman(armed: BoardRig) -> None:
     last_sent_us = armed.time_us - 1000
     armed.run_ms(150)
     assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.DEADMAN)
-    assert_stopped_on_a_ramp(armed, commanded, last_sent_us + 4000, DEADMAN_US + STOP_US)
+    assert_stopped_on_a_ramp(armed, commanded, (15, 12, -12), last_sent_us + 4000, DEADMAN_US + STOP_US)
     assert tuple(armed.position) == armed.status.position_steps == armed.status.encoder_counts
     at_rest = armed.position.copy()
     for _ in range(20):
@@ -159,7 +160,7 @@ def test_emergency_stop(armed: BoardRig) -> None:
         armed.slice(armed.setpoint(commanded))
     assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.ESTOP)
     assert armed.status.inputs & 1 << InputBit.ESTOP
-    assert_stopped_on_a_ramp(armed, commanded, pressed_us + 3000, STOP_US)
+    assert_stopped_on_a_ramp(armed, commanded, (15, -12, 12), pressed_us + 3000, STOP_US)
     armed.run_ms(8, armed.link.clear_fault(Fault.ESTOP))
     assert armed.status.state == State.FAULT, "cleared with the button pressed"
     armed.inputs = {}
@@ -176,7 +177,7 @@ def test_limit_switch(armed: BoardRig) -> None:
         armed.slice(armed.setpoint(commanded))
     assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.LIMIT)
     assert armed.status.inputs == 1 << InputBit.LIMIT_1_MAX
-    assert_stopped_on_a_ramp(armed, commanded, opened_us + 3000, STOP_US)
+    assert_stopped_on_a_ramp(armed, commanded, (0, 8, 0), opened_us + 3000, STOP_US)
     armed.run_ms(8, armed.link.clear_fault(Fault.LIMIT))
     armed.arm()
     at_end = armed.position.copy()
@@ -217,11 +218,10 @@ def test_expired_setpoints_are_counted_and_not_executed(armed: BoardRig) -> None
 
 
 def test_overflow_and_underrun_are_counted(armed: BoardRig) -> None:
-    burst = b"".join(armed.setpoint(np.array([k, 0, 0]), lead_us=4000 + 1000 * k) for k in range(8))
-    armed.run_ms(20, burst)
-    assert armed.status.overflows + armed.status.rejected >= 3
-    assert armed.status.underruns == 1
-    assert 0 < armed.position[0] <= 7 and armed.position[0] == armed.status.position_steps[0]
+    """Eight at once, none due before all have come: one is loaded, four wait, three are refused."""
+    armed.run_ms(25, b"".join(armed.setpoint(np.array([k, 0, 0]), lead_us=6000 + 500 * k) for k in range(8)))
+    assert (armed.status.overflows, armed.status.underruns, armed.status.rejected) == (3, 1, 0)
+    assert armed.position[0] == armed.status.position_steps[0] and 4 <= armed.position[0] <= 8
 
 
 def test_too_fast_and_too_far_are_rejected(armed: BoardRig) -> None:
@@ -243,7 +243,7 @@ def damage(draw: st.DrawFn) -> list[tuple[str, int, int]]:
     return draw(st.lists(st.tuples(kinds, st.integers(0, 19), st.integers(0, 10_000)), min_size=1, max_size=8))
 
 
-def apply_damage(frames: list[bytes], faults: list[tuple[str, int, int]]) -> bytes:
+def apply_damage(frames: list[bytes], faults: list[tuple[str, int, int]]) -> list[bytes]:
     pieces = [bytearray(frame) for frame in frames]
     for kind, at, where in faults:
         piece = pieces[at % len(pieces)]
@@ -257,8 +257,8 @@ def apply_damage(frames: list[bytes], faults: list[tuple[str, int, int]]) -> byt
             other = where % len(pieces)
             pieces[at % len(pieces)], pieces[other] = pieces[other], piece
         elif kind == "drop" and len(pieces) > 1:
-            pieces.remove(piece)
-    return b"".join(pieces)
+            del pieces[at % len(pieces)]
+    return [bytes(piece) for piece in pieces]
 
 
 @settings(max_examples=60)
@@ -269,7 +269,7 @@ def test_nothing_is_executed_that_was_not_sent(faults: list[tuple[str, int, int]
     try:
         rig.bring_up()
         names = [1_000_000 + 7919 * k for k in range(20)]
-        rig.run_ms(20, apply_damage([rig.link.set_position(0, name) for name in names], faults))
+        rig.run_ms(20, b"".join(apply_damage([rig.link.set_position(0, name) for name in names], faults)))
         assert rig.status.position_steps[0] in (0, *names)
         assert rig.status.position_steps[1:] == (0, 0) and rig.status.state == State.DISARMED
     finally:
@@ -279,19 +279,25 @@ def test_nothing_is_executed_that_was_not_sent(faults: list[tuple[str, int, int]
 @settings(max_examples=40)
 @given(damage())
 def test_damaged_setpoints_are_not_executed(faults: list[tuple[str, int, int]]) -> None:
-    """A damaged stream among good ones: only sent numbers are accepted, and the path goes on to its end."""
+    """A slow path of which a part is damaged on the line: the axes stay close to it and come to its very end."""
     rig = BoardRig("native")
+    slope = np.array([1, 1, -1])
     try:
         rig.bring_up()
         rig.arm()
-        rig.follow(np.arange(20)[:, None] * np.array([2, 1, -1]))
-        first = rig.number
-        held = rig.position.copy()
-        rig.slice(apply_damage([rig.setpoint(held, lead_us=3000 + 50 * k) for k in range(20)], faults))
-        rig.follow(held + np.arange(20)[:, None] * np.array([2, 1, -1]))
+        rig.follow(np.arange(1, 11)[:, None] * slope)
+        frames = []
+        for k in range(20):
+            execute_us = rig.link.clock.to_mcu_us(rig.now_ns, rig.now_ns) + 1000 * k + 3000
+            frames.append(rig.link.setpoint(rig.number + 1 + k, execute_us, 2000, (11 + k) * slope))
+        rig.number += len(frames)
+        for piece in apply_damage(frames, faults):
+            rig.slice(piece)
+            assert (rig.position * slope >= 9).all() and (rig.position * slope <= 31).all()
+        rig.follow(np.arange(31, 51)[:, None] * slope)
         assert rig.accepted <= set(range(rig.number + 1))
-        assert tuple(rig.position) == tuple(held + np.array([38, 19, -19])) == rig.status.position_steps
-        assert rig.status.last_setpoint == rig.number > first
+        assert tuple(rig.position) == tuple(50 * slope) == rig.status.position_steps
+        assert rig.status.state == State.RUNNING and rig.number - 9 < rig.status.last_setpoint <= rig.number
     finally:
         rig.close()
 

@@ -1,0 +1,86 @@
+"""`seldinger flash --port PORT --mcu MCU`: builds the firmware and writes it to the stepper board through avrdude."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from host.cli.contract_io import BadInput
+from sim.board import BUILD_DIR, FIRMWARE_DIR
+
+
+class Programmer(NamedTuple):
+    """How avrdude reaches a board: its names for the part and the boot loader, and the loader's speed."""
+
+    part: str
+    protocol: str
+    baud: int
+
+
+PROGRAMMERS = {"atmega2560": Programmer("m2560", "wiring", 115200), "atmega328p": Programmer("m328p", "arduino", 115200)}
+TIMEOUT_S = 180
+
+
+def flash(
+    port: Annotated[str, typer.Option(help="Serial port of the board, as /dev/ttyACM0 or /dev/serial/by-id/...")],
+    mcu: Annotated[str, typer.Option(help="atmega2560 or atmega328p.")] = "atmega2560",
+    baud: Annotated[int, typer.Option(help="Of the boot loader; 0: the usual one of this board.")] = 0,
+    image: Annotated[Path | None, typer.Option(help="ELF file to write, instead of building one.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Build, and show the command only.")] = False,
+) -> None:
+    """Build the firmware and write it to the board. The stages must be free to stand still: the board resets."""
+    if mcu not in PROGRAMMERS:
+        raise BadInput("--mcu", mcu, " or ".join(PROGRAMMERS))
+    if shutil.which("avrdude") is None:
+        raise BadInput("avrdude", "no such program", "avrdude on the PATH (Debian: apt install avrdude)")
+    if not Path(port).exists() and not dry_run:
+        raise BadInput("--port", port, f"a serial port that is there; found {', '.join(ports()) or 'none on this machine'}")
+    elf = image or _built(mcu)
+    if not elf.is_file():
+        raise BadInput("--image", str(elf), "an ELF file of the firmware")
+    command = avrdude_command(mcu, port, elf, baud)
+    print("seldinger: " + " ".join(command), file=sys.stderr)
+    if dry_run:
+        return
+    try:
+        status = subprocess.run(command, timeout=TIMEOUT_S, check=False).returncode
+    except subprocess.TimeoutExpired:
+        print(f"seldinger: avrdude did not end within {TIMEOUT_S} s; is another program holding {port}?", file=sys.stderr)
+        raise typer.Exit(1) from None
+    if status:
+        print(f"seldinger: avrdude ended with status {status}: nothing else may hold {port}, and --mcu must be the board's",
+              file=sys.stderr)
+        raise typer.Exit(1)
+    print("seldinger: written and verified; now `seldinger check-device board`", file=sys.stderr)
+
+
+def ports() -> list[str]:
+    """Serial ports that are there, by their lasting names where they have one."""
+    named = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*")) if Path("/dev/serial/by-id").is_dir() else []
+    return named or sorted(str(path) for pattern in ("ttyACM*", "ttyUSB*") for path in Path("/dev").glob(pattern))
+
+
+def avrdude_command(mcu: str, port: str, elf: Path, baud: int = 0) -> list[str]:
+    """The call of avrdude that writes and verifies the flash memory of `mcu`; -D: boot loaders erase page by page."""
+    programmer = PROGRAMMERS[mcu]
+    return ["avrdude", "-p", programmer.part, "-c", programmer.protocol, "-P", port, "-b", str(baud or programmer.baud),
+            "-D", "-U", f"flash:w:{elf}:e"]
+
+
+def _built(mcu: str) -> Path:
+    """The firmware's ELF for `mcu`, built if stale. Raises BadInput where that cannot be."""
+    for tool in ("make", "avr-gcc"):
+        if shutil.which(tool) is None:
+            raise BadInput(tool, "no such program", "the AVR tool chain (Debian: gcc-avr avr-libc make), or --image FILE")
+    target = f"build/seldinger-{mcu}.elf"
+    command = ["make", "--silent", "-C", str(FIRMWARE_DIR), target]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        said = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]
+        raise BadInput("firmware", said[0], f"sources that build (`make -C firmware {target}`)")
+    return BUILD_DIR / f"seldinger-{mcu}.elf"

@@ -1,0 +1,74 @@
+"""`seldinger install-services`: the rig's processes as systemd services, and `--undo`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from host.cli.contract_io import BadInput
+from host.demo import SIMULATED_RIG
+from host.services.units import UnitSettings, install, undo, unit_texts
+from realtime.rig_file import load_rig
+
+_MANAGER = Path("/run/systemd/system")
+
+
+def install_services(
+    rig: Annotated[Path, typer.Option(help="Rig file.")] = SIMULATED_RIG,
+    simulated: Annotated[bool, typer.Option("--simulated", help="With the simulated rig as a service.")] = False,
+    cpu: Annotated[int, typer.Option(help="Processor of the control loop; -1: the last.")] = -1,
+    root: Annotated[Path, typer.Option(help="Write below this directory; systemd is then left alone.")] = Path("/"),
+    take_away: Annotated[bool, typer.Option("--undo", help="Stop the services and remove what was installed.")] = False,
+) -> None:
+    """Write unit files and the service user, tell systemd. Nothing is started or enabled: the command for that is shown."""
+    system = root == Path("/")
+    if system and os.geteuid() != 0:
+        raise BadInput("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
+    if take_away:
+        _undo(root, system)
+        return
+    count = os.cpu_count() or 1
+    if not -1 <= cpu < count:
+        raise BadInput("--cpu", cpu, f"-1 to {count - 1}")
+    settings = UnitSettings(rig.resolve(), count - 1 if cpu < 0 else cpu, simulated)
+    try:
+        written = install(root, unit_texts(settings, load_rig(rig)))
+    except ValueError as error:
+        key, _, rest = str(error).partition(": found ")
+        raise BadInput(key, *rest.split(", wanted ", 1)) from None
+    except FileExistsError as error:
+        raise BadInput("--root", str(error), "a place without files of that name") from None
+    for path in written:
+        print(f"seldinger: wrote {path}", file=sys.stderr)
+    if system and _MANAGER.is_dir():
+        _call("systemd-sysusers", "seldinger.conf")
+        _call("systemctl", "daemon-reload")
+    print(f"seldinger: now `systemctl enable --now {' '.join(settings.names)}`; the loop starts disarmed", file=sys.stderr)
+
+
+def _undo(root: Path, system: bool) -> None:
+    managed = system and _MANAGER.is_dir()
+    if managed:
+        _call("systemctl", "disable", "--now", *(f"seldinger-{name}.service" for name in ("realtime", "host", "rig")))
+    removed = undo(root)
+    for path in removed:
+        print(f"seldinger: removed {path}", file=sys.stderr)
+    if managed:
+        _call("systemctl", "daemon-reload")
+    print("seldinger: recordings in /var/lib/seldinger and the user stay; `userdel seldinger` removes the user"
+          if removed else "seldinger: nothing was installed here", file=sys.stderr)
+
+
+def _call(*command: str) -> None:
+    """Run one of systemd's tools; its complaint is told, and is no reason to stop."""
+    if shutil.which(command[0]) is None:
+        return
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        print(f"seldinger: {' '.join(command)}: {result.stderr.strip()}", file=sys.stderr)

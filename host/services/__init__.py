@@ -1,0 +1,1 @@
+"""The rig's processes as services: unit files, their installation, a supervisor with the same contract."""

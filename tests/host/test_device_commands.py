@@ -1,0 +1,91 @@
+"""`check-device` against the simulated rig's own ports, and `flash` up to the moment it would write."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from host.cli import flash as flash_module
+from host.cli.check_device import check_device
+from host.cli.contract_io import BadInput
+from host.cli.flash import avrdude_command, flash
+from tests.realtime.conftest import RIG_FILE
+
+# What a busy machine makes of a stream is not what is tested here.
+MACHINE = ("a second", "damaged", "lost", "status frames", "records", "missing in")
+
+
+@pytest.fixture(scope="module")
+def ports() -> Iterator[dict[str, Any]]:
+    """Ports of a simulated rig in a process of its own."""
+    server = subprocess.Popen([sys.executable, "-m", "sim.rig_server", "--rig", str(RIG_FILE), "--board", "native"],
+                              stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    yield json.loads(server.stdout.readline())
+    server.terminate()
+    server.communicate(timeout=20)
+
+
+def told(*arguments: str) -> tuple[int, Any]:
+    app = typer.Typer()
+    app.command()(check_device)
+    result = CliRunner().invoke(app, [*arguments, "--json", "--seconds", "1"])
+    return result.exit_code, json.loads(result.stdout)
+
+
+def real_problems(report: Any) -> list[str]:
+    return [problem for problem in report["problems"] if not any(words in problem for words in MACHINE)]
+
+
+def test_the_simulated_board_is_brought_up_and_read(ports: dict[str, Any]) -> None:
+    _, report = told("board", "--port", ports["board"])
+    assert real_problems(report) == []
+    assert report["figures"]["timer_hz"] == 20000 and report["figures"]["status_hz"] > 0
+
+
+def test_the_simulated_tracker_is_brought_up_and_read(ports: dict[str, Any]) -> None:
+    _, report = told("tracker", "--port", ports["tracker"])
+    assert real_problems(report) == []
+    assert "0A.noise_m" in report["figures"]
+
+
+def test_the_simulated_force_box_is_read(ports: dict[str, Any]) -> None:
+    where = ["--udp-port", str(ports["force_port"]), "--web-port", str(ports["page_port"])]
+    _, report = told("force", "--port", "127.0.0.1", *where)
+    assert real_problems(report) == []
+    assert 0.001 < report["figures"]["noise_z_N"] < 0.01
+
+
+def test_a_device_that_is_not_there_is_said_so() -> None:
+    status, report = told("board", "--port", "/dev/nothing-here")
+    assert status == 1 and not report["good"] and "/dev/nothing-here" in report["problems"][0]
+
+
+def test_an_unknown_device_is_refused() -> None:
+    with pytest.raises(BadInput, match="tracker or force or board"):
+        check_device("toaster")
+
+
+def test_flash_refuses_what_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(BadInput, match="atmega2560 or atmega328p"):
+        flash(port="/dev/ttyACM0", mcu="z80")
+    monkeypatch.setattr(flash_module.shutil, "which", lambda name: None)
+    with pytest.raises(BadInput, match="apt install avrdude"):
+        flash(port="/dev/ttyACM0")
+    monkeypatch.setattr(flash_module.shutil, "which", lambda name: f"/usr/bin/{name}")
+    with pytest.raises(BadInput, match="a serial port that is there"):
+        flash(port="/dev/nothing-here")
+    with pytest.raises(BadInput, match="an ELF file"):
+        flash(port="/dev/null", image=Path("/no/such.elf"))
+
+
+def test_the_call_of_avrdude_names_part_loader_and_file() -> None:
+    command = avrdude_command("atmega328p", "/dev/ttyUSB0", Path("f.elf"))
+    assert command[:3] == ["avrdude", "-p", "m328p"] and command[-1] == "flash:w:f.elf:e"
+    assert "57600" in avrdude_command("atmega328p", "/dev/ttyUSB0", Path("f.elf"), 57600)

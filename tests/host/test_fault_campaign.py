@@ -1,0 +1,112 @@
+"""The fault campaign: its plan, its rules, and a hundred runs that break none."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from host.cli.contract_io import BadInput
+from host.cli.faults import faults as command
+from host.fault_campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
+from host.reliability_page import write_section
+from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
+
+GOOD = {"detected_s": 0.03, "detected_by": "cause: board_silent", "action": "stop", "board_fault": "1", "causes": [],
+        "peak_force_N": 0.3, "moved_after_m": 0.0, "rest_s": 0.02, "rearmed": False, "final_phase": "stopped",
+        "poses_lost": 0, "counts": {}}
+
+
+def result(fault: str = "link_cut", readable: bool = True, unhandled: str = "", **outcome: object) -> RunResult:
+    plan = RunPlan(0, 0, fault, "hold", 1.0, 1.0, 0.0)
+    return RunResult(plan, {**GOOD, **outcome}, readable, 0.0, unhandled, ())
+
+
+def test_the_plan_covers_every_fault_in_every_phase_and_depends_on_the_seed_alone() -> None:
+    plans = plan_runs(len(FAULTS) * len(PHASES), 3)
+    assert {(plan.fault, plan.phase) for plan in plans} == {(fault.name, phase) for fault in FAULTS for phase in PHASES}
+    assert plans == plan_runs(len(plans), 3)
+    assert plans != plan_runs(len(plans), 4)
+
+
+def test_what_is_drawn_stays_in_the_tables_limits() -> None:
+    for plan in plan_runs(500, 9):
+        fault = BY_NAME[plan.fault]
+        assert fault.size[0] <= plan.size <= fault.size[1] * (1 + 1e-12)
+        assert fault.seconds[0] * (1 - 1e-12) <= plan.seconds <= fault.seconds[1] * (1 + 1e-12)
+
+
+def test_an_unknown_fault_is_refused() -> None:
+    with pytest.raises(ValueError, match="--fault: found 'gremlins'"):
+        plan_runs(1, 1, ("gremlins",))
+
+
+def test_a_good_outcome_breaks_no_rule() -> None:
+    assert list(violations(result())) == []
+
+
+@pytest.mark.parametrize(("fault", "outcome", "says"), [
+    ("link_cut", {"detected_s": None}, "not detected"),
+    ("link_cut", {"detected_s": 0.2}, "detected only after 0.200 s"),
+    ("link_cut", {"peak_force_N": PEAK_N + 0.001}, "peak force"),
+    ("link_cut", {"rest_s": 0.06}, "still moving 60 ms"),
+    ("link_cut", {"final_phase": "contact"}, "ended in phase contact"),
+    ("link_cut", {"rearmed": True}, "moved on by itself"),
+    ("none", {}, "false alarm"),
+])
+def test_each_rule_is_judged(fault: str, outcome: dict[str, object], says: str) -> None:
+    assert any(says in words for words in violations(result(fault, **outcome)))
+
+
+def test_an_exception_and_an_unreadable_recording_break_a_rule() -> None:
+    assert list(violations(result(unhandled="ValueError: x"))) == ["unhandled: ValueError: x"]
+    assert list(violations(result(readable=False))) == ["recording not readable"]
+
+
+def test_rows_have_the_contracts_keys() -> None:
+    row = by_fault([result(), result(detected_s=None)])[0]
+    for key in ("fault", "phase", "runs", "detected", "detection_ms_p99", "peak_force_N", "moved_after_m",
+                "recordings_unreadable", "unhandled"):
+        assert key in row
+    assert (row["runs"], row["detected"], row["missed"]) == (2, 1, 1)
+
+
+def test_a_section_of_the_page_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
+    page = tmp_path / "docs" / "reliability.md"
+    write_section(page, "faults", "old")
+    write_section(page, "soak", "kept")
+    write_section(page, "faults", r"new \1")
+    text = page.read_text(encoding="utf-8")
+    assert "old" not in text and r"new \1" in text and text.count("kept") == 1
+
+
+def test_bad_options_are_refused() -> None:
+    for arguments in ({"runs": 0}, {"jobs": 0}, {"seed": -1}, {"board": "paper"}, {"fault": ["gremlins"]}):
+        with pytest.raises(BadInput):
+            command(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_command_gives_json_a_page_and_the_same_figures_twice(tmp_path: Path) -> None:
+    import typer
+
+    app = typer.Typer()
+    app.command()(command)
+    arguments = ["--runs", "3", "--seed", "5", "--json", "--jobs", "1", "--fault", "mcu_reset",
+                 "--docs", str(tmp_path / "r.md")]
+    told = [CliRunner().invoke(app, arguments) for _ in range(2)]
+    assert [one.exit_code for one in told] == [0, 0]
+    objects = [json.loads(one.stdout) for one in told]
+    assert objects[0] == objects[1]
+    assert {row["phase"] for row in objects[0]["by_fault"]} == set(PHASES)
+    assert all(row["detected"] == row["runs"] == 1 and row["actions"] == {"stop": 1} for row in objects[0]["by_fault"])
+    assert "mcu_reset" in (tmp_path / "r.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_a_hundred_random_faults_break_no_rule() -> None:
+    results = run_campaign(100, 2026, jobs=2)
+    assert len(results) == 100
+    broken = [(dataclasses.astuple(one.plan), one.violations) for one in results if one.violations]
+    assert not broken
