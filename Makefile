@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 BOARD  ?= auto
+TEST_ARGS ?= -n 2 --dist loadfile
 
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
 
-.PHONY: demo test setup board-tools lint types check nojit clean
+.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -42,6 +43,23 @@ board-tools:
 	elif command -v avr-gcc >/dev/null && command -v gcc >/dev/null && [ -e /usr/include/simavr/sim_avr.h ] && [ -e /usr/include/libelf.h ]; then :; \
 	else $(call apt_install,$(DEBIAN_BOARD)) || { command -v gcc >/dev/null && [ "$(BOARD)" != avr ] \
 	  && echo "seldinger: no AVR tool chain: the firmware runs compiled for this machine (BOARD=native)" >&2; }; fi
+
+# The same kernels as plain Python, so that a debugger works in them.
+nojit: setup
+	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest tests/realtime/test_modules.py tests/realtime/test_tick.py \
+	  tests/realtime/test_mailbox.py tests/realtime/test_native_loop.py
+
+bench: setup
+	@$(BIN)/seldinger bench
+
+prove: setup
+	@$(BIN)/seldinger prove --cases 200 --seed 1
+
+prove-small: setup
+	@$(BIN)/seldinger prove --cases 24 --seed 1
+
+faults: setup
+	@$(BIN)/seldinger faults --runs 2000 --seed 1
 
 lint: $(VENV)/.ready
 	@$(BIN)/ruff check .

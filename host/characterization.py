@@ -83,7 +83,8 @@ def standard_sweeps(rig: Rig, repeats: int = 5, rates_rad_per_s: Sequence[float]
     def handle(out_m: float) -> float:
         return (out_m - length - home) / rig.transmission.insertion_slope
 
-    knob_m = min(handle(length + KNOB_BODY_OUT_M) + 0.5 * rig.transmission.insertion_backlash_m, rig.stages.insertion.max_unit)
+    knob_m = min(handle(length + KNOB_BODY_OUT_M) + 0.5 * rig.transmission.insertion_backlash_m,
+                 rig.stages.insertion.max_unit)
     knob_rad = min(KNOB_AMPLITUDE_RAD, 0.97 * rig.stages.knob.max_unit, -0.97 * rig.stages.knob.min_unit)
     kinds = [(0, (handle(INSERTION_OUT_M), 0.0, 0.0), INSERTION_AMPLITUDES_M),
              (1, (handle(ROLL_OUT_M), 0.0, ROLL_KNOB_RAD), ROLL_AMPLITUDES_RAD), (2, (knob_m, 0.0, 0.0), (knob_rad,))]
@@ -121,8 +122,8 @@ def record_simulated(rig: Rig, sweeps: Sequence[Sweep], path: Path, seed: int = 
 
 
 def characterize(recording: Recording, rig: Rig) -> Characterization:
-    """Identify the transmission from a recording of sweeps of `rig`. Raises ValueError where a sweep is missing or of another
-    catheter."""
+    """Identify the transmission from a recording of sweeps of `rig`. Raises ValueError where a sweep is missing or of
+    another catheter."""
     name = recording.catheter.get("name")
     if name != rig.catheter.name:
         raise ValueError(f"recording: found sweeps of catheter {name}, wanted {rig.catheter.name}, the rig's")
@@ -136,10 +137,12 @@ def characterize(recording: Recording, rig: Rig) -> Characterization:
         roll_runs.append(cuts.run(span, 1, _roll_rad(poses, tracker.position_noise_m, tracker.orientation_noise_rad)))
     roll, roll_backlash = _fit_roll(roll_runs, tracker.orientation_noise_rad)
     plane_rad = roll.offset.value
-    pieces, knob_runs = [], []
+    pieces: list[KnobSweep] = []
+    knob_runs: list[Run] = []
     for span in cuts.spans(2):
         poses = cuts.poses(span)
-        body_m = insertion.slope.value * (span.sweep["centre"][0] - 0.5 * insertion.width.value) + insertion.offset.value - length
+        handle_m = span.sweep["centre"][0] - 0.5 * insertion.width.value
+        body_m = insertion.slope.value * handle_m + insertion.offset.value - length
         piece = _knob_samples(poses, plane_rad, body_m, length, len(pieces))
         run = cuts.run(span, 2, piece.curvature_per_m)
         pieces.append(piece._replace(knob_rad=run.input_at()))
@@ -229,7 +232,8 @@ def _fit_roll(runs: Sequence[Run], sigma: float) -> tuple[PlayFit, Estimate]:
 
 
 def _knob_samples(poses: _Poses, plane_rad: float, body_m: float, length_m: float, number: int) -> KnobSweep:
-    """Tip and curvature of each pose in the bending plane, from the distal shaft's proximal end, `body_m` out of the sheath."""
+    """Tip and curvature of each pose in the bending plane, from the distal shaft's proximal end, `body_m` out of the
+    sheath."""
     across = np.array([math.sin(plane_rad), -math.cos(plane_rad)])
     lateral, axial = poses.position[:, :2] @ across, poses.position[:, 2] - body_m
     bend = np.unwrap(np.arctan2(poses.axis[:, :2] @ across, poses.axis[:, 2]))

@@ -23,7 +23,8 @@ _DEG = math.degrees(1.0)
 def write_characterization(found: Characterization, target: Path, rig_name: str, source: str) -> Path:
     """Write the page to `target` and return its path. Raises OSError where it cannot write."""
     text = page_environment().get_template("characterization.html.j2").render(
-        title=_title(found), lead="Sine sweeps of each stage through the board, the catheter in free space, tracked at its tip.",
+        title=_title(found), lead="Sine sweeps of each stage through the board, the catheter in free space, tracked at its "
+                                  "tip.",
         eyebrow=f"seldinger characterize · rig {rig_name} · catheter {found.catheter}", lines=lines_of(found),
         pictures=pictures_of(found), toml=transmission_toml(found),
         footer=f"Made from {source} by seldinger {software_version()}.")
@@ -49,10 +50,12 @@ def lines_of(found: Characterization) -> list[Line]:
         Line("Body at home", quantity(found.insertion_at_home_m.value * 1e3, "mm", 2),
              _bounded(found.insertion_at_home_m, 1e3, 2)),
         Line("Slope of roll", f"{roll.value:.4f}", _bounded(roll, 1.0, 4)),
-        Line("Play of roll", quantity(found.roll_backlash_rad.value * _DEG, "°", 2), _bounded(found.roll_backlash_rad, _DEG, 2)),
+        Line("Play of roll", quantity(found.roll_backlash_rad.value * _DEG, "°", 2), _bounded(found.roll_backlash_rad, _DEG,
+                                                                                              2)),
     ]
     for name, edge in zip(("Lower stop", "Slack from", "Slack to", "Upper stop"), edges, strict=True):
-        lines.append(Line(f"Knob: {name[0].lower()}{name[1:]}", quantity(edge.value * _DEG, "°", 2), _bounded(edge, _DEG, 2)))
+        lines.append(Line(f"Knob: {name[0].lower()}{name[1:]}", quantity(edge.value * _DEG, "°", 2), _bounded(edge, _DEG,
+                                                                                                              2)))
     return lines
 
 
@@ -64,7 +67,8 @@ def pictures_of(found: Characterization) -> list[Picture]:
                  found.insertion.offset.value, found.insertion.width.value, found.insertion.slope.value),
         _loops(found.insertion_runs, (1e3, "mm"), "Insertion: out against in", "Fig. 6.4",
                found.insertion.offset.value, found.insertion.width.value, found.insertion.slope.value),
-        _in_time(found.roll_runs, degrees, "Roll over time", "Fig. 6.5", found.roll.offset.value, 0.0, found.roll.slope.value),
+        _in_time(found.roll_runs, degrees, "Roll over time", "Fig. 6.5", found.roll.offset.value, 0.0,
+                 found.roll.slope.value),
         _loops(found.roll_runs, degrees, "Roll: out against in", "Fig. 6.6", found.roll.offset.value,
                found.roll.width.value, found.roll.slope.value),
         knob_picture(found), tip_picture(found),
@@ -88,7 +92,7 @@ def _in_time(runs: tuple[Run, ...], unit: tuple[float, str], title: str, figure_
             axes.plot(run.encoder_s, (run.encoder - middle) * scale, color=WANTED, label="stage")
             axes.plot(run.time_s, (run.output - offset - slope * middle) * scale, ".", markersize=2.0, color=MEASURED,
                       label="tip, measured")
-            given, out = _model(run, offset, width, slope)
+            out = _model(run, offset, width, slope)[1]
             axes.plot(run.encoder_s, (out - offset - slope * middle) * scale, color=ESTIMATED, label="fitted")
             axes.set_xlim(0, min(run.time_s[-1], 2 * 2 * math.pi / run.rate_rad_per_s))
             axes.set_title(f"amplitude {run.amplitude * scale:.3g} {name}, {run.rate_rad_per_s} rad/s", pad=22)
@@ -121,7 +125,8 @@ def _loops(runs: tuple[Run, ...], unit: tuple[float, str], title: str, figure_na
         legend_above(axes, 3)
 
     return picture(draw, 3.6, 3.2, title, f"{title}, loop.",
-                   f"As {figure_name}: all amplitudes and rates over one another, the fitted loop, and an ideal transmission.")
+                   f"As {figure_name}: all amplitudes and rates over one another, the fitted loop, and an ideal "
+                   "transmission.")
 
 
 def knob_picture(found: Characterization) -> Picture:
@@ -132,7 +137,8 @@ def knob_picture(found: Characterization) -> Picture:
         axes = figure.add_subplot()
         step = max(1, len(sweep.knob_rad) // 2500)
         show = slice(None, None, step)
-        axes.plot(sweep.knob_rad[show] * _DEG, sweep.chord_curvature_per_m[show], ".", markersize=1.6, color=MEASURED, alpha=0.5,
+        axes.plot(sweep.knob_rad[show] * _DEG, sweep.chord_curvature_per_m[show], ".", markersize=1.6, color=MEASURED,
+                  alpha=0.5,
                   label="measured, (6.1)")
         places = np.linspace(sweep.knob_rad.min(), sweep.knob_rad.max(), 400)
         x = np.array([*(e.value for e in knob.edges_rad), *(g.value for g in knob.gains_per_m_rad),
@@ -147,7 +153,8 @@ def knob_picture(found: Characterization) -> Picture:
         legend_above(axes, 2 if narrow else 3)
 
     return picture(draw, 3.4, 3.2, "Knob to curvature", "Curvature over the knob with its dead zones.",
-                   "As Fig. 6.8: dead where the shaft passes through straight and at both ends of the knob's travel; the dotted "
+                   "As Fig. 6.8: dead where the shaft passes through straight and at both ends of the knob's travel; the "
+                   "dotted "
                    "lines are the edges found.")
 
 
@@ -164,7 +171,8 @@ def tip_picture(found: Characterization) -> Picture:
         for place, (label, measured_m, model_m) in enumerate(curves):
             axes: Axes = figure.add_subplot(*((2, 1) if narrow else (1, 2)), place + 1)
             step = max(1, len(order) // 1500)
-            axes.plot(sweep.knob_rad[::step] * _DEG, measured_m[::step] * 1e3, ".", markersize=1.6, color=MEASURED, alpha=0.5,
+            axes.plot(sweep.knob_rad[::step] * _DEG, measured_m[::step] * 1e3, ".", markersize=1.6, color=MEASURED,
+                      alpha=0.5,
                       label="measured")
             axes.plot(sweep.knob_rad[order] * _DEG, model_m * 1e3, color=ESTIMATED, label="fitted knob curve, arc")
             axes.set_xlabel("knob, °")
@@ -172,4 +180,5 @@ def tip_picture(found: Characterization) -> Picture:
             legend_above(axes, 2)
 
     return picture(draw, 2.9, 5.0, "Knob to tip", "Tip across and along the axis over the knob.",
-                   "As Figs. 6.10 and 6.11, both halves: past about 41° the tip comes back across, so two knob angles reach one place.")
+                   "As Figs. 6.10 and 6.11, both halves: past about 41° the tip comes back across, so two knob angles "
+                   "reach one place.")

@@ -36,12 +36,13 @@ def jacobian(joint: Array, length_m: float) -> Array:
 
 
 def jacobian_inverse_step(length_m: float) -> Step:
-    """(joint, tip, goal) -> joint step by the inverse of (7.3): grows without bound at the fold, where the tip is furthest off."""
+    """(joint, tip, goal) -> joint step by the inverse of (7.3): grows without bound at the fold, where the tip is furthest
+    off."""
     def step(joint: Array, measured: Array, goal: Array) -> Array:
         J = jacobian(joint, length_m)
         if abs(J[1, 0]) < 1e-12:
             return np.zeros(2)
-        return np.linalg.solve(J, goal - measured)
+        return np.asarray(np.linalg.solve(J, goal - measured), np.float64)
 
     return step
 
@@ -90,7 +91,8 @@ class Path(NamedTuple):
 
 def run(step: Step, start: Array, goals: Array, length_m: float, gain: float, noise_m: float, seed: int,
         limit_per_m: float = 60.0) -> Path:
-    """Track `goals` (n, 2) by joint += gain * step; the tip measured with noise, the curvature limited. Fig. 7.8's setting."""
+    """Track `goals` (n, 2) by joint += gain * step; the tip measured with noise, the curvature limited. Fig. 7.8's
+    setting."""
     random = np.random.default_rng(seed)
     joint, joints, tips = np.array(start, float), [], []
     for goal in goals:

@@ -51,7 +51,8 @@ class SineKinematics:
 
 
 class CurveErrors(NamedTuple):
-    """Errors of one inverse over held-out samples: knob (rad) and the tip's place that follows from it (m), RMS and worst 1 %."""
+    """Errors of one inverse over held-out samples: knob (rad) and the tip's place that follows from it (m), RMS and worst 1
+    %."""
 
     knob_rms_rad: float
     tip_rms_m: float
@@ -80,7 +81,8 @@ def fit_sines(x: Array, y: Array, terms_start: Array | None = None) -> SineCurve
 
 
 def fit_sine_kinematics(sweep: KnobSweep, length_m: float, fold_knob_rad: float, thin: int = 600) -> SineKinematics:
-    """Curves 1 to 3 from one half of a knob sweep, at most `thin` points each. `fold_knob_rad`: where the tip is furthest off."""
+    """Curves 1 to 3 from one half of a knob sweep, at most `thin` points each. `fold_knob_rad`: where the tip is furthest
+    off."""
     knob, lateral = np.abs(sweep.knob_rad), np.sign(sweep.knob_rad) * sweep.lateral_m
 
     def thinned(keep: NDArray[np.bool_], *columns: Array) -> list[Array]:
@@ -104,7 +106,7 @@ def monotone_knob_and_body(curve: tuple[Array, Array], length_m: float, lateral_
     bends = [bend_of_reach(ratio, False), bend_of_reach(ratio, True)]
     found = [float(np.interp(side * bend / length_m, curvatures, knobs)) for bend in bends]
     pick = min((0, 1), key=lambda k: abs(found[k] - last_knob_rad))
-    if bends[pick] / length_m > curvatures[-1]:
+    if bends[pick] / length_m > 1.03 * curvatures[-1]:
         pick = 0
     bend = bends[pick]
     return found[pick], axial_m - length_m * float(np.sinc(bend / math.pi))
@@ -112,13 +114,15 @@ def monotone_knob_and_body(curve: tuple[Array, Array], length_m: float, lateral_
 
 def compare(held_out: KnobSweep, truth_curve: tuple[Array, Array], length_m: float, sines: SineKinematics,
             monotone: tuple[Array, Array]) -> dict[str, CurveErrors]:
-    """Errors of both inverses where the tip was seen in sweeps not used for the fits.
+    """Errors of both inverses where the tip was seen in sweeps not used for the fits, outside the dead zones.
 
     `truth_curve`: knob (rad) and curvature (1/m) of the held-out sweep's own fit, to turn a knob error into a tip error.
     """
     errors: dict[str, list[list[float]]] = {"sines": [], "monotone": []}
     step = max(1, held_out.knob_rad.size // 1500)
-    for i in range(0, held_out.knob_rad.size, step):
+    bends = np.interp(held_out.knob_rad, *truth_curve)
+    live = (np.abs(bends) > 1.0) & (np.abs(bends) < 0.98 * truth_curve[1][-1])
+    for i in np.flatnonzero(live)[::step]:
         knob, lateral = float(held_out.knob_rad[i]), float(held_out.lateral_m[i])
         given = (lateral, float(held_out.axial_m[i]), knob)
         for name, answer in (("sines", sines.knob_and_body(*given)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +51,8 @@ class Run(NamedTuple):
 
 
 class PlayFit(NamedTuple):
-    """output = slope * play(input) + offset. `per_run` (n, 2): width and slope of each run alone, as the thesis means them."""
+    """output = slope * play(input) + offset. `per_run` (n, 2): width and slope of each run alone, as the thesis means
+    them."""
 
     width: Estimate
     slope: Estimate
@@ -62,7 +63,8 @@ class PlayFit(NamedTuple):
 
 
 class KnobFit(NamedTuple):
-    """Dead zones and gains: `edges_rad` are lower stop, lower and upper end of the slack, upper stop; gains in 1/m per rad."""
+    """Dead zones and gains: `edges_rad` are lower stop, lower and upper end of the slack, upper stop; gains in 1/m per
+    rad."""
 
     edges_rad: tuple[Estimate, Estimate, Estimate, Estimate]
     gains_per_m_rad: tuple[Estimate, Estimate]
@@ -93,7 +95,8 @@ def _robust_sigma(residual: Array) -> float:
     return max(float(1.4826 * np.median(np.abs(residual - np.median(residual)))), 1e-12)
 
 
-def _solve(residuals, start: Array, scale: Array, sigma: float, low: Array, high: Array) -> tuple[Array, Array, float]:  # type: ignore[no-untyped-def]
+def _solve(residuals: Callable[[Array], Array], start: Array, scale: Array, sigma: float, low: Array,
+           high: Array) -> tuple[Array, Array, float]:
     """(solution, covariance, noise) of a soft-L1 fit. Steps of the numeric Jacobian: 1e-4 of each parameter's scale."""
     def scaled(x: Array) -> Array:
         return residuals(x * scale)
@@ -114,13 +117,14 @@ def fit_play(runs: Sequence[Run], max_width: float, sigma: float, with_width: bo
     """
     late = [_after_first_turn(run) for run in runs]
     if any(run.time_s.size < 8 for run in late):
-        raise ValueError("sweep: found fewer than 8 poses after its first turn, wanted a longer sweep or a tracker that sees it")
+        raise ValueError("sweep: found fewer than 8 poses after its first turn, wanted a longer sweep or a tracker that "
+                         "sees it")
 
     def model(run: Run, x: Array) -> Array:
         given = run.input_at(x[3])
         return x[1] * play(given, abs(x[0]), given[0] - 0.5 * abs(x[0])) + x[2]
 
-    def residuals_of(chosen: Sequence[Run]):  # type: ignore[no-untyped-def]
+    def residuals_of(chosen: Sequence[Run]) -> Callable[[Array], Array]:
         return lambda x: np.concatenate([*(model(run, x) - run.output for run in chosen), [sigma * x[3] / STAMPS_WITHIN_S]])
 
     amplitude = max(run.amplitude for run in late)

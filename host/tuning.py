@@ -87,7 +87,7 @@ def response(rig: Rig, force_N: float, seconds: float, seed: int = 0, extra_dela
     bench = IdealRig(rig, config, seed, extra_delay_s=extra_delay_s)
     trace = bench.press(force_N, np.array(WALL_POINT_M), seconds + _APPROACH_S).since_contact()
     keep = trace.time_s < seconds
-    return Trace(*(column[keep] for column in trace))
+    return trace.rows(keep)
 
 
 def cost_of(trace: Trace, force_N: float, seconds: float) -> float:
@@ -103,7 +103,8 @@ def _period_s(trace: Trace) -> float:
     return float(np.median(np.diff(trace.time_s))) if trace.time_s.size > 1 else 0.001
 
 
-def criterion(rig: Rig, gains: dict[str, float], forces_N: Sequence[float] = FORCES_N, iterations: int = ITERATIONS) -> float:
+def criterion(rig: Rig, gains: dict[str, float], forces_N: Sequence[float] = FORCES_N,
+              iterations: int = ITERATIONS) -> float:
     """J of (7.4): sum over iterations and mean over forces of the absolute error, over the number of iterations (N)."""
     seconds = iterations * ITERATION_S
     tuned = with_gains(rig, gains)
@@ -199,7 +200,8 @@ def tune(rig: Rig, names: Sequence[str] = GAINS, evaluations: int = 100, process
     control = rig.control.model_dump()
     for name in names:
         if not isinstance(control.get(name), float) or control[name] <= 0.0:
-            raise ValueError(f"gains: found {name} = {control.get(name)}, wanted a positive gain of [control]: {', '.join(GAINS)}")
+            raise ValueError(f"gains: found {name} = {control.get(name)}, wanted a positive gain of [control]: "
+                             f"{', '.join(GAINS)}")
     start = {name: float(control[name]) for name in names}
     cost = _Cost(rig, start, iterations)
     with ProcessPoolExecutor(processes) as pool:

@@ -195,7 +195,7 @@ def apply_nearest(config, tip_m, last_joint, out) -> None:  # type: ignore[no-un
     roll, lateral_m = _roll_and_lateral(config, tip_m, last_joint[1])
     curvature, insertion = bend_and_insertion(config, abs(lateral_m), tip_m[2])
     other, other_m = _with_body_out(config, abs(lateral_m), tip_m[2], True)
-    if other_m >= 0.0 and other <= config.max_curvature_per_m:
+    if other_m >= -1e-6 and other <= config.max_curvature_per_m:
         last = math.copysign(1.0, lateral_m) * curvature_of_knob(config, last_joint[2])
         here = abs(curvature - last) * length_m + abs(insertion - last_joint[0]) / length_m
         if abs(other - last) * length_m + abs(other_m - last_joint[0]) / length_m < here:

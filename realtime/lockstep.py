@@ -22,6 +22,7 @@ from realtime.drivers.net_ft import NetFtClient, NetFtConfig
 from realtime.drivers.net_ft_calibration import NetFtCalibration
 from realtime.drivers.stepper_board import EventKind, StepperBoardLink
 from realtime.intake import Intake
+from realtime.native_loop import BINS, WORK_BIN_NS, count_in
 from realtime.operator_desk import OperatorDesk
 from realtime.records import INPUTS, OUTPUTS, PHASE_CONTACT, PHASE_DISARMED, STATE, new
 from realtime.rig_file import Rig
@@ -73,7 +74,7 @@ class LockstepLoop:
             counts_per_Nm=rig.force_sensor.counts_per_newton_metre, rdt_rate_hz=rig.force_sensor.rate_hz)))
         self.intake = Intake(rig)
         self.desk = OperatorDesk(rig, self.inputs[0].command, self.link)
-        self.tick_us: list[float] = []
+        self.work = np.zeros(BINS + 2, np.int64)
         self.faults: list[str] = []
         self.supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
         self.missed_ticks = 0
@@ -104,7 +105,7 @@ class LockstepLoop:
         started = time.perf_counter_ns()
         tick(self.params, self.state, self.inputs, self.outputs)
         frame = self._setpoint()
-        self.tick_us.append((time.perf_counter_ns() - started) * 1e-3)
+        count_in(self.work, WORK_BIN_NS, time.perf_counter_ns() - started)
         self._tell(now_ns)
         commands = b"".join([self.link.advance(now_ns), *self.desk.take_frames()])
         request = self.force_sensor.outgoing(now_ns)
@@ -203,7 +204,7 @@ class LockstepLoop:
             self.publish("board", board_message(self.link, now_ns))
         if number % self.rig.control.loop_hz == 0:
             self.publish("loop", telemetry.loop_message(
-                now_ns, self.rig.control.loop_hz, self.missed_ticks, np.array(self.tick_us)))
+                now_ns, self.rig.control.loop_hz, self.missed_ticks, self.work))
 
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.topics import HISTOGRAM_BUCKETS, Log, LoopTiming, Message, histogram_bucket
+from protocol.topics import Log, LoopTiming, Message
 from protocol.zenoh_session import Session
 from realtime import telemetry
 from realtime.board_intake import axis_limits, board_message, take_status
@@ -262,15 +262,12 @@ class RealtimeProcess:
         loop, gap = self.loop.snapshot(), self.loop
         work = percentiles_us(gap.work, WORK_BIN_NS)
         late = percentiles_us(gap.lateness, 1000)
-        buckets = np.zeros(HISTOGRAM_BUCKETS, int)
-        for index in np.flatnonzero(gap.work[:-2]):
-            buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(gap.work[index])
         return LoopTiming(
             stamp_ns=self.clock.now_ns(), loop_hz=float(self.rig.control.loop_hz), ticks=loop["tick"],
             missed_ticks=loop["missed"], tick_p50_us=work["p50"], tick_p99_us=work["p99"], tick_p999_us=work["p999"],
             tick_max_us=work["max"], lateness_p50_us=late["p50"], lateness_p99_us=late["p99"],
             lateness_p999_us=late["p999"], lateness_max_us=late["max"], longest_gap_ns=loop["longest_gap_ns"],
-            longest_gap_where=GAP_PLACES[loop["longest_gap_place"]], tick_histogram=tuple(map(int, buckets)))
+            longest_gap_where=GAP_PLACES[loop["longest_gap_place"]], tick_histogram=telemetry.tick_buckets(gap.work))
 
 
 def _opened(path: str, baud: int, timeout_s: float) -> Any:

@@ -68,7 +68,8 @@ def check_sweeps(rig: Rig, sweeps: Sequence[Sweep]) -> None:
         stage, rate = rig.stage(sweep.axis), sweep.rate_rad_per_s
         if not (0.0 < rate * sweep.amplitude <= 0.9 * stage.max_speed_unit_per_s):
             raise ValueError(f"sweeps.{number}.rate_rad_per_s: found a peak speed of {rate * sweep.amplitude:.4g}, "
-                             f"wanted above 0 and at most {0.9 * stage.max_speed_unit_per_s:.4g} (stages.{AXES[sweep.axis]})")
+                             f"wanted above 0 and at most {0.9 * stage.max_speed_unit_per_s:.4g} "
+                             f"(stages.{AXES[sweep.axis]})")
         if rate * rate * sweep.amplitude > 0.5 * stage.max_accel_unit_per_s2 or sweep.cycles < 1:
             raise ValueError(f"sweeps.{number}: found {sweep.cycles} cycles at {rate} rad/s, wanted at least one and an "
                              "acceleration of at most half the stage's")

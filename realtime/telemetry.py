@@ -19,6 +19,8 @@ from protocol.topics import (
 )
 from realtime import safety
 from realtime.inverse_kinematics import curvature_of_knob
+from realtime.latency import percentiles_us
+from realtime.native_loop import WORK_BIN_NS
 from realtime.records import PHASE_CONTACT
 
 # Ticks (of 1 ms) between two messages of a topic.
@@ -72,13 +74,20 @@ def state_message(inputs: np.record, outputs: np.record) -> RigState:
     )
 
 
-def loop_message(stamp_ns: int, loop_hz: float, missed: int, tick_us: np.ndarray) -> LoopTiming:
-    """Tick times (n,) us so far; virtual time knows no lateness."""
-    p50, p99, p999 = np.percentile(tick_us, (50, 99, 99.9)) if len(tick_us) else (0.0, 0.0, 0.0)
-    buckets = np.bincount([histogram_bucket(time) for time in tick_us], minlength=HISTOGRAM_BUCKETS)
-    return LoopTiming(stamp_ns=stamp_ns, loop_hz=loop_hz, ticks=len(tick_us), missed_ticks=missed,
-                      tick_p50_us=float(p50), tick_p99_us=float(p99), tick_p999_us=float(p999),
-                      tick_max_us=float(np.max(tick_us, initial=0.0)), tick_histogram=tuple(map(int, buckets)))
+def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
+    """The message's histogram of tick times, from the loop's (n + 2,) one with bins of WORK_BIN_NS."""
+    buckets = [0] * HISTOGRAM_BUCKETS
+    for index in np.flatnonzero(work[:-2]):
+        buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(work[index])
+    return tuple(buckets)
+
+
+def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -> LoopTiming:
+    """Histogram (n + 2,) of tick times so far, as the compiled loop keeps it; virtual time knows no lateness."""
+    times = percentiles_us(work, WORK_BIN_NS)
+    return LoopTiming(stamp_ns=stamp_ns, loop_hz=loop_hz, ticks=int(work[:-1].sum()), missed_ticks=missed,
+                      tick_p50_us=times["p50"], tick_p99_us=times["p99"], tick_p999_us=times["p999"],
+                      tick_max_us=times["max"], tick_histogram=tick_buckets(work))
 
 
 __all__ = ["BoardCounters", "Message", "force_message", "loop_message", "pose_message", "stage_message",

@@ -50,7 +50,8 @@ def _drawn(rng: Rng, limits: tuple[float, float]) -> float:
     low, high = limits
     if low * high > 0:
         sign = math.copysign(1.0, low)
-        return float(sign * np.exp(rng.uniform(*sorted((math.log(abs(low)), math.log(abs(high)))))))
+        least, most = sorted((math.log(abs(low)), math.log(abs(high))))
+        return float(sign * np.exp(rng.uniform(least, most)))
     return float(rng.uniform(low, high))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +41,13 @@ class Trace(NamedTuple):
         """From the first tick in contact on, its time zero; empty where there was none."""
         touched = np.flatnonzero(self.phase == PHASE_CONTACT)
         first = touched[0] if touched.size else self.time_s.size
-        rows = [column[first:] for column in self]
-        return Trace(rows[0] - (rows[0][0] if rows[0].size else 0.0), *rows[1:])  # type: ignore[arg-type]
+        late = self.rows(slice(first, None))
+        return late._replace(time_s=late.time_s - (late.time_s[0] if late.time_s.size else 0.0))
+
+    def rows(self, which: Any) -> Trace:
+        """Some of the rows: a mask, an index or a slice."""
+        return Trace(self.time_s[which], self.force_N[which], self.tip_m[which], self.wall_m[which], self.stage[which],
+                     self.phase[which])
 
 
 class IdealRig:

@@ -160,8 +160,11 @@ class Scenario:
         else:
             outcome.notes.append(f"no contact within {(self.world.now_ns - start_ns) * 1e-9:.1f} s")
         outcome.stopped = self.phase == PHASE_STOPPED
-        self.command("target", "retract")
-        reporting("retract", 2.0, lambda: self.phase == PHASE_STOPPED)
+        if self._stop:
+            self.command("target", "hold")
+        else:
+            self.command("target", "retract")
+            reporting("retract", 2.0, lambda: self.phase == PHASE_STOPPED)
         return self._closed(outcome)
 
     def _shape(self, job: ContactJob) -> bool:

@@ -14,10 +14,12 @@ from rich.progress import Progress
 from host.characterization import (
     Characterization,
     calibrated_rig_text,
-    characterize as identify,
     record_simulated,
     standard_sweeps,
     transmission_toml,
+)
+from host.characterization import (
+    characterize as identify,
 )
 from host.characterization_report import lines_of, write_characterization
 from host.cli.contract_io import BadInput, write_json

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from host.cli.contract_io import BadInput, write_json
 from host.demo import SIMULATED_RIG
+from protocol.serial_frames import Fault
 from realtime.board_intake import axis_limits
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
@@ -112,7 +113,8 @@ def _judge_board(link: StepperBoardLink, report: DeviceReport, rate_hz: float, f
     if status is None or first is None:
         return
     damaged = link.decoder.counters.crc_errors + status.crc_errors - first.crc_errors
-    report.figures |= {"damaged_frames": damaged, "clock_drift": link.clock.drift, "fault": FAULT_ADVICE[status.fault],
+    report.figures |= {"damaged_frames": damaged, "clock_drift": link.clock.drift,
+                       "fault": FAULT_ADVICE[Fault(status.fault)],
                        "encoder_errors": status.encoder_errors, "inputs": f"{status.inputs:07b}"}
     if rate_hz < 0.98 * STATUS_HZ:
         report.problems.append(f"{rate_hz:.0f} status frames a second, wanted {STATUS_HZ:g}")

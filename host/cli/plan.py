@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -43,7 +43,7 @@ def plan(
         write_json(answer.as_json())
 
 
-def _with_tuples(value: object) -> object:
+def _with_tuples(value: Any) -> Any:
     """Lists of three numbers become tuples, as strict checking of points wants them."""
     if isinstance(value, dict):
         return {key: _with_tuples(item) for key, item in value.items()}

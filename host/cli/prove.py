@@ -40,10 +40,16 @@ def prove(
     seed: Annotated[int, typer.Option(help="decides the whole suite")] = 1,
     json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
     jobs: Annotated[int, typer.Option(help="processes on this machine")] = 2,
-    scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler; verdicts are then made by its workers")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="address of a Dask scheduler; verdicts are then made by its workers")
+    ] = None,
     resume: Annotated[Path | None, typer.Option(help="folder of a run to go on with")] = None,
-    dir: Annotated[Path | None, typer.Option(help="folder that keeps all that is made (default runs/prove_SEED_CASES)")] = None,
-    finder: Annotated[str | None, typer.Option(help="another command to put to the proof, called as `seldinger diagnose` is")] = None,
+    dir: Annotated[
+        Path | None, typer.Option(help="folder that keeps all that is made (default runs/prove_SEED_CASES)")
+    ] = None,
+    finder: Annotated[
+        str | None, typer.Option(help="another command to put to the proof, called as `seldinger diagnose` is")
+    ] = None,
     limit_s: Annotated[float, typer.Option(help="longest time for one case (s)")] = 900.0,
     baselines: Annotated[bool, typer.Option(help="also run the baselines")] = True,
 ) -> None:
@@ -60,8 +66,11 @@ def prove(
         raise BadInput("--resume", str(resume), "a folder that an earlier run made")
     folder = resume or dir or Path("runs") / f"prove_{seed}_{cases}"
     command = tuple(shlex.split(finder)) if finder else workers.FINDER
-    result = run(Settings(cases, seed, folder, jobs, scheduler, command, limit_s, baselines), Bar(),
-                 lambda digest: print(f"labels sha256 {digest}", file=sys.stderr, flush=True))
+    result = run(
+        Settings(cases, seed, folder, jobs, scheduler, command, limit_s, baselines),
+        Bar(),
+        lambda digest: print(f"labels sha256 {digest}", file=sys.stderr, flush=True),
+    )
     write_json(result, str(folder / "proof.json"))
     for case in result["cases"]:
         print(_line(case), file=sys.stderr)
@@ -76,5 +85,7 @@ def _line(case: dict) -> str:  # type: ignore[type-arg]
     said = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in case["verdict"].get("effects") or [])
     truth = " + ".join(case["truth"]) or "nothing"
     loop = "closed" if case["closed_loop"] else "open"
-    return (f"{'right' if case['right'] else 'WRONG'}  {case['id']}  {case['kind']:<12} {loop:<6} rho {case['rho']:.2f}  "
-            f"{case['category']}: {truth}  ->  {case['verdict'].get('verdict')} {said}")
+    return (
+        f"{'right' if case['right'] else 'WRONG'}  {case['id']}  {case['kind']:<12} {loop:<6} rho {case['rho']:.2f}  "
+        f"{case['category']}: {truth}  ->  {case['verdict'].get('verdict')} {said}"
+    )

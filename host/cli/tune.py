@@ -12,7 +12,8 @@ import typer
 from host.characterization import load_calibrated_rig
 from host.cli.contract_io import BadInput, write_json
 from host.demo import SIMULATED_RIG
-from host.tuning import GAINS, Margin, Tuned, best_of, criterion, half_way, stability_margin, tune as search
+from host.tuning import GAINS, Margin, Tuned, best_of, criterion, half_way, stability_margin
+from host.tuning import tune as search
 from realtime.rig_file import RigFileError
 
 # Least gain factor and phase margin of a proposal; below, the force gains are halved once.
@@ -37,7 +38,7 @@ def tune(
     try:
         loaded = load_calibrated_rig(rig, calibration)
         names = [name.strip() for name in gains.split(",") if name.strip()]
-        present = {name: loaded.control.model_dump().get(name) for name in GAINS}
+        present = {name: float(getattr(loaded.control, name)) for name in GAINS}
         if check:
             result: dict[str, Any] = {"present": _told(Tuned("present", present, criterion(loaded, present), 1),
                                                        stability_margin(loaded, present))}

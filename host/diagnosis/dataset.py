@@ -66,7 +66,8 @@ def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], o
         columns = read_table(path)
         whole = _one(spec, path.name, columns, needed, optional)
         cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
-        pieces += [_cut(whole, piece.name, *piece.rows, lead=spec.data.lead_rows) for piece in cuts] or [whole]
+        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows)
+                   for piece in cuts] or [whole]
     return _split(pieces, spec.data.heldout)
 
 
@@ -167,7 +168,7 @@ def thin(recording: Recording, factor: int) -> Recording:
         total = np.where(good, blocks, 0.0).sum(axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
     def every(mask: Mask) -> Mask:
-        return mask[: n * factor].reshape(n, factor).all(axis=1)
+        return np.asarray(mask[: n * factor].reshape(n, factor).all(axis=1))
     return replace(recording, time_s=average(recording.time_s), dt_s=recording.dt_s * factor,
                    channels={key: average(values) for key, values in recording.channels.items()},
                    fit=every(recording.fit), heldout=every(recording.heldout))

@@ -88,7 +88,7 @@ class Context:
         return self.source
 
 
-Apply = Callable[[Array, Context, Array, str], Array]
+Apply = Callable[[Any, Context, Array, str], Any]
 Parameters = Callable[[Scale, str], tuple[Parameter, ...]]
 
 
@@ -167,15 +167,15 @@ def library() -> tuple[Effect, ...]:
 def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = frozenset()) -> list[Candidate]:
     """All candidates at `ports`; rate effects only with a time line.
 
-    `left_out`: ids, or id:form, not to use: what the nominal model has already, and those of a leave-one-out proof.
+    `left_out`: ids, id:form, or id:form@port, not to use: what the nominal model has already, and those of a leave-one-out proof.
     """
     found = []
     for port in ports:
         for effect in library():
-            if effect.port not in port.kind.split("+") or effect.id in left_out or (effect.timed and not timed):
+            if effect.id in left_out or effect.port not in port.kind.split("+") or effect.id in left_out or (effect.timed and not timed):
                 continue
             sources = {"": ("",), "load": port.loads, "other": port.others}[effect.source]
-            forms = [form for form in effect.forms if f"{effect.id}:{form}" not in left_out]
+            forms = [form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out]
             found += [Candidate(effect, port, source, form) for source in sources for form in forms]
     return found
 

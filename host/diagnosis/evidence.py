@@ -19,7 +19,7 @@ FEWEST_BLOCKS = 6
 class Gain:
     """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output that gained most.
 
-    `excess`: share of that output's error before that is above noise. `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
+    `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards. `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
     """
 
     log_likelihood: float
@@ -28,6 +28,7 @@ class Gain:
     excess: float = 1.0
     independent: Array = field(default_factory=lambda: np.zeros(0))
     log_ratio: Array = field(default_factory=lambda: np.zeros(0))
+    excesses: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def correlation_time(r: Array, longest: int | None = None) -> float:
@@ -60,7 +61,7 @@ def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it is divided by
     the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is gained.
     """
-    independent, log_ratio, excess = np.zeros(floor.size), np.zeros(floor.size), np.zeros(floor.size)
+    independent, log_ratio, excess, excess_after = (np.zeros(floor.size) for _ in range(4))
     blocks: list[float] = []
     for row in range(floor.size):
         b2, a2, n_eff, times = _pooled(pieces, which, before, after, row)
@@ -69,11 +70,12 @@ def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
         level_b, level_a = b2 + 1e-6 * floor[row] ** 2, a2 + 1e-6 * floor[row] ** 2
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
         excess[row] = max(0.0, 1.0 - floor[row] ** 2 / level_b)
+        excess_after[row] = max(0.0, 1.0 - 1.5 * floor[row] ** 2 / level_a)
         blocks += _blocks(pieces, which, before, after, row, times, level_a)
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
     share = float(1.0 - np.exp(-log_ratio[top]))
-    return Gain(gain, _sign_of_mean(np.array(blocks)), share, float(excess[top]), independent, log_ratio)
+    return Gain(gain, _sign_of_mean(np.array(blocks)), share, float(excess[top]), independent, log_ratio, excess_after)
 
 
 def _pooled(pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int) -> tuple[float, float, float, list[float]]:

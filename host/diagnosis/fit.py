@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -173,7 +173,7 @@ def _solve(A: Array, g: Array, diagonal: Array, damping: float) -> Array:
 
 def reweigh(problem: Problem, fit: Fit) -> None:
     """Scale of each output: what this fit leaves, robustly, but no less than the noise."""
-    left = [[] for _ in problem.model.outputs]
+    left: list[list[Array]] = [[] for _ in problem.model.outputs]
     for piece in problem.pieces:
         if piece.fit.any():
             r = piece.y - problem.simulate(piece, fit.terms, fit.values)
@@ -183,6 +183,8 @@ def reweigh(problem: Problem, fit: Fit) -> None:
         together = np.concatenate(rest) if rest else np.zeros(0)
         rms = float(np.sqrt(np.mean(together**2))) if together.size else 1.0
         problem.scale[index] = max(rms, problem.noise[index].sigma, 1e-12)
+    for piece in problem.pieces:
+        piece.extra["weight"] = problem.scale
 
 
 def finish(problem: Problem, fit: Fit) -> Fit:
@@ -191,9 +193,52 @@ def finish(problem: Problem, fit: Fit) -> Fit:
     return fit
 
 
+def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
+    """Displacement that each port still needs at the start of each recording, after `fit` (with residuals)."""
+    n = len(problem.model.parameters)
+    out = []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        first = slice(0, max(5, round(0.3 / piece.recording.dt_s)) if piece.recording.timed else 5)
+        needs = {port.name: problem.model.needs(piece, port, fit.values[:n], residual)[first] for port in problem.model.ports}
+        out.append({name: float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0 for name, need in needs.items()})
+    return out
+
+
+def get_starts(problem: Problem) -> list[dict[str, float]]:
+    """Starts of memory of every recording."""
+    return [dict(piece.start) for piece in problem.pieces]
+
+
+def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
+    """Puts starts of memory back."""
+    for piece, start in zip(problem.pieces, given, strict=True):
+        piece.start.clear()
+        piece.start.update(start)
+
+
 def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, float]) -> Array:
     """Start values of a term: grid values for nonlinear parameters, projected amplitudes for linear ones."""
     return np.array([linear_value.get(p.name, nonlinear.get(p.name, p.grid[0] if p.grid else 0.0)) for p in term.parameters])
+
+
+def tuned(term: Term, lines: Array) -> tuple[Parameter, ...]:
+    """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual."""
+    return tuple(replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3]) if p.name == "frequency" and p.unit == "Hz"
+                 and any(q.linear for q in term.parameters) else p for p in term.parameters)
+
+
+def lines_of(residuals: list[Array], dt_s: float, count: int = 5) -> Array:
+    """Frequencies (Hz) at which the residuals' spectra, summed over outputs in units of their own power, stand highest."""
+    size = 1 << int(np.ceil(np.log2(2 * max(r.shape[1] for r in residuals))))
+    power = np.zeros(size // 2 + 1)
+    for r in residuals:
+        x = np.nan_to_num(r)
+        x = (x - x.mean(axis=1, keepdims=True)) * np.hanning(x.shape[1])
+        each = np.abs(np.fft.rfft(x, size, axis=1)) ** 2
+        power += np.max(each / (np.median(each, axis=1, keepdims=True) + 1e-300), axis=0)
+    inside = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    best = inside[np.argsort(-power[inside])[:count]]
+    return np.asarray(best / (size * dt_s))
 
 
 def grid_points(parameters: tuple[Parameter, ...], most: int) -> Iterator[dict[str, float]]:

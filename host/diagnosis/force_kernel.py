@@ -77,7 +77,7 @@ def along(x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tole
     slow = x[0]
     decay = math.exp(-dt_s / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     x2, v2 = x[0], 0.0
-    steps = max(1, int(math.ceil(p[OMEGA2] * dt_s / 0.2)))
+    steps = max(1, math.ceil(p[OMEGA2] * dt_s / 0.2))
     h = dt_s / steps
     for i in range(x.size):
         dx = x[i] - x[i - 1] if i > 0 else 0.0

@@ -30,7 +30,7 @@ class Condition:
 
 def moving_rms(values: Array, dt_s: float) -> Array:
     """RMS of `values` (n,) over half a second around each sample."""
-    width = max(3, int(round(AVERAGE_S / dt_s)) | 1)
+    width = max(3, round(AVERAGE_S / dt_s) | 1)
     power = np.convolve(np.where(np.isfinite(values), values, 0.0) ** 2, np.ones(width), mode="same")
     count = np.convolve(np.isfinite(values).astype(float), np.ones(width), mode="same")
     return np.sqrt(power / np.maximum(count, 1.0))
@@ -70,14 +70,14 @@ def features(problem: Problem, piece: Piece) -> dict[str, Array]:
     """Signals a condition may speak of, by words; every one (n,)."""
     found: dict[str, Array] = {}
     dt = piece.recording.dt_s
-    for name in problem.model.quiet_inputs:
-        values = fill(piece.inputs[name])
+    for name, key, _ in problem.model.travel:
+        values = fill(piece.inputs[key])
         span = float(np.ptp(values)) or 1.0
         found[f"distance from reversals of {name}"] = since_reversal(values, 0.01 * span)
         found[f"size of {name}"] = np.abs(values)
         found[f"place of {name}"] = values
         if piece.recording.timed:
-            width = max(3, int(round(0.05 / dt)) | 1)
+            width = max(3, round(0.05 / dt) | 1)
             found[f"speed of {name}"] = np.abs(np.gradient(np.convolve(values, np.ones(width) / width, mode="same"), dt))
     if piece.recording.timed:
         found["time"] = piece.recording.time_s
@@ -129,10 +129,7 @@ def _discover(found: list[tuple[float, Condition]]) -> Condition | None:
 
 
 def _words(name: str, side: str, limit: float, problem: Problem) -> str:
-    unit = ""
-    for channel in problem.model.quiet_inputs:
-        if name.endswith(channel):
-            unit = problem.pieces[0].recording.units.get(channel, "")
+    unit = next((unit for channel, _, unit in problem.model.travel if name.endswith(f" of {channel}")), "")
     if name == "time":
         return f"{'before' if side == 'below' else 'after'} {limit:.3g} s"
     kind, channel = name.split(" of ", 1)

@@ -55,6 +55,8 @@ class Model(Protocol):
     screen_samples: int                # about so many samples are enough to screen by
     fit_samples: int                   # and so many to fit; beyond, samples are averaged
     coarsest_s: float                  # period beyond which they must not be averaged
+    travel: tuple[tuple[str, str, str], ...]   # signals a condition may speak of: words, key of Piece.inputs, unit
+    unlisted_at: tuple[tuple[str, str], ...]   # ports of an equation found by search: whose motion it is made of, where it is added
     taken: frozenset[str]              # effects (id, or id:form) that the nominal model has already
 
     def prepare(self, recording: Recording) -> Piece:

@@ -50,7 +50,7 @@ def autocovariance_of(ar: Array, length: int = 400) -> Array:
 
 def quiescent(inputs: list[Array], dt_s: float, timed: bool) -> Mask:
     """Samples at which no input has moved (beyond resolution and 0.2 % of range) for half a second around them."""
-    half = max(5, int(round(0.25 / dt_s))) if timed else 5
+    half = max(5, round(0.25 / dt_s)) if timed else 5
     still = np.ones(inputs[0].size, dtype=bool)
     for values in inputs:
         line = fill(values)
@@ -79,19 +79,25 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     floor = step / np.sqrt(12.0)
     if sum(piece.size for piece in pieces) < 100:
         return Noise(max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)")
-    lags = np.zeros(ORDER + 1)
-    count = np.zeros(ORDER + 1)
+    table = []
     for piece in pieces:
         spread = 1.4826 * np.median(np.abs(piece - np.median(piece))) + 1e-300
         tame = np.clip(piece, -5 * spread, 5 * spread) if spread > 1e-200 else piece
-        for k in range(ORDER + 1):
-            lags[k] += tame[: tame.size - k] @ tame[k:]
-            count[k] += tame.size - k
-    lags /= count
+        table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
+    lags = _typical(np.array(table), np.array([piece.size for piece in pieces]))
     sigma = float(np.sqrt(max(lags[0], 0.0)))
     if sigma <= floor:
         return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
     return Noise(sigma, _autoregression(lags), "quiescent parts")
+
+
+def _typical(table: Array, sizes: Array) -> Array:
+    """Mean of the autocovariances (pieces, lags), by size, over the pieces of middling level: one that holds a jump does not count."""
+    order = np.argsort(table[:, 0])
+    place = (np.cumsum(sizes[order]) - 0.5 * sizes[order]) / sizes.sum()
+    middle = order[(place > 0.15) & (place < 0.85)] if order.size > 3 else order[: max(1, order.size - 1)]
+    middle = middle if middle.size else order
+    return np.asarray(np.average(table[middle], axis=0, weights=sizes[middle]))
 
 
 def _autoregression(lags: Array) -> Array:

@@ -77,7 +77,7 @@ def lag(x: Array, dt_s: float, time_constant_s: float) -> Array:
 def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float) -> Array:
     """Unit-gain second-order low pass by Runge-Kutta sub-steps, input linear between samples; starts at rest."""
     out = np.empty(x.size)
-    steps = max(1, int(math.ceil(omega_rad_s * dt_s / 0.3)))
+    steps = max(1, math.ceil(omega_rad_s * dt_s / 0.3))
     h = dt_s / steps
     w2, c = omega_rad_s * omega_rad_s, 2.0 * damping * omega_rad_s
     y, v = x[0], 0.0
@@ -153,7 +153,7 @@ def since_reversal(x: Array, tolerance: float) -> Array:
     out = np.empty(x.size)
     extreme, turn, side = x[0], x[0], 0.0
     for i in range(x.size):
-        if side >= 0.0 and x[i] > extreme or side <= 0.0 and x[i] < extreme:
+        if (side >= 0.0 and x[i] > extreme) or (side <= 0.0 and x[i] < extreme):
             side = side if side != 0.0 else (1.0 if x[i] > extreme else -1.0)
             extreme = x[i]
         elif side != 0.0 and abs(x[i] - extreme) > tolerance:
@@ -198,8 +198,9 @@ def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array
 
 
 @njit(cache=True)
-def calm(x: Array, sigma: float) -> Array:
-    """`x` (n,) without white noise `sigma`: at every sample the longest centred mean that agrees with all shorter ones (Lepski 1991)."""
+def calm(x: Array, sigma: float, correlation: float) -> Array:
+    """`x` (n,) without noise `sigma` of that correlation time (samples): at every sample the longest mean about it that agrees
+    with all shorter ones (Lepski 1991)."""
     n = x.size
     total = np.zeros(n + 1)
     for i in range(n):
@@ -207,11 +208,12 @@ def calm(x: Array, sigma: float) -> Array:
     out = np.empty(n)
     for i in range(n):
         low, high, best = -1e300, 1e300, x[i]
-        half = 0
-        while i - half >= 0 and i + half < n:
-            count = 2 * half + 1
-            mean = (total[i + half + 1] - total[i - half]) / count
-            spread = 2.0 * sigma / math.sqrt(count)
+        half = 2
+        while half <= 2 * n:
+            first, last = max(i - half, 0), min(i + half + 1, n)
+            count = last - first
+            mean = (total[last] - total[first]) / count
+            spread = 3.0 * sigma * math.sqrt(correlation / count)
             if mean < low - spread or mean > high + spread:
                 break
             best = mean

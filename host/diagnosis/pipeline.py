@@ -21,7 +21,9 @@ from host.diagnosis.model import Model, Piece
 from host.diagnosis.noise import Noise
 from host.diagnosis.nominal import NominalSpec
 from host.diagnosis.search import Found, search
+from host.diagnosis.symbolic import features
 from host.diagnosis.uncertainty import intervals
+from host.diagnosis.unlisted import Rest, explain_rest
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
@@ -64,6 +66,7 @@ class Diagnosis:
     located: list[Location]
     figures: Figures
     verdict: str = "nothing_missing"
+    rest: Rest = Rest(None, 0.0)
     notes: list[str] = field(default_factory=list)
 
 
@@ -104,21 +107,53 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
     pool = [c for c in pool if c.effect.id not in left_out]
     found = search(problem, pool, tell)
-    tell("weighing what stands in their place", 0.0)
     floor = np.array([n.sigma for n in problem.noise])
+    tell("looking at what is left", 0.0)
+    rest = explain_rest(problem, found, floor, tell)
+    _features_at_full_rate(full, found)
+    tell("weighing what stands in their place", 0.0)
     standing = standings(problem, found, floor)
     tell("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
-    result.verdict = "missing_physics" if found.best.terms else "nothing_missing"
+    result.rest = rest
+    named = bool(found.best.terms) and not rest.doubtful
+    result.verdict = "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
+    if not located and rest.sure and rest.predictable is not None:
+        result.located = [_unexplained(full, found, rest.predictable.port.subsystem)]
     return result
+
+
+def _features_at_full_rate(full: Problem, found: Found) -> None:
+    """Features of an equation found by search, for the recordings at full rate."""
+    pairs = {target: source for source, target in full.model.unlisted_at}
+    ports = {port.name: port for port in full.model.ports}
+    for term in found.best.terms:
+        if term.candidate.effect.id == "unlisted":
+            target = term.candidate.port.name
+            for piece in full.pieces:
+                piece.extra.setdefault("features", {})[target] = features(full, piece, ports[pairs[target]])
+
+
+def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
+    """Where the refitted nominal model fails, with no effect to blame."""
+    residuals = found.nominal_full.residuals
+    rows = _rows_touched(full, residuals)
+    top = max(rows, key=lambda row: _weight(full, residuals, row))
+    spans = [windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma) for p, r in zip(full.pieces, residuals, strict=True)]
+    longest = max(range(len(spans)), key=lambda k: _energy(full.pieces[k], residuals[k][top]))
+    where = condition(full, residuals, top, max(1, sum(p.n for p in full.pieces) // 20000))
+    return Location(subsystem, [full.model.outputs[row].channel for row in rows], spans[longest], where, _share(full, found, spans, top))
 
 
 def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
     """`fit` simulated on the samples of `full`."""
     for piece, coarse in zip(full.pieces, like.pieces, strict=True):
         piece.start = coarse.start
+        settle = getattr(full.model, "settle", None)
+        if settle is not None and not fit.terms:
+            settle(piece, fit.values)
     again = replace(fit)
     again.residuals = [piece.y - full.simulate(piece, fit.terms, fit.values) for piece in full.pieces]
     return again

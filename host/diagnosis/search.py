@@ -5,14 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.effect import Candidate
 from host.diagnosis.evidence import Gain, compare, correlation_time
-from host.diagnosis.fit import Fit, Problem, Term, finish, grid_points, jacobian, minimize, reweigh, size_of, starts
-from host.diagnosis.model import scale_of
+from host.diagnosis.fit import (
+    Fit,
+    Problem,
+    Term,
+    finish,
+    first_needs,
+    get_starts,
+    grid_points,
+    jacobian,
+    lines_of,
+    minimize,
+    reweigh,
+    set_starts,
+    size_of,
+    starts,
+    tuned,
+)
+from host.diagnosis.model import Piece, scale_of
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
@@ -21,7 +38,11 @@ MOST_EFFECTS = 5
 ENOUGH = 6.0               # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
 SURE = 1e-2                # p-value a new effect has to reach on held-out blocks
 SMALLEST_SHARE = 0.015     # of the held-out error of some output it has to take away,
-SMALLEST_EXCESS = 0.05     # and this much of what is above noise
+SMALLEST_EXCESS = 0.10     # and this much of what is above noise
+COARSE = 0.15              # far above noise, a finer shape has to take this share of the error to be told from a simpler one
+INEXACT = 0.02             # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
+NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
+REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 SCREEN_ROWS = 24000        # residuals to screen by, about
 GRID = 160                 # grid points of one candidate at most
 SCAN_SECONDS = 0.4         # time to screen one candidate, about
@@ -36,6 +57,8 @@ class Trial:
     heldout: Gain
     trained: Gain
     score: float
+    starts: list[dict[str, float]] = field(default_factory=list)
+    replaced: bool = False
 
 
 @dataclass
@@ -67,13 +90,13 @@ def fit_nominal(problem: Problem) -> Fit:
     for _ in range(3):
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values)
+        settle = getattr(problem.model, "settle", None)
+        if settle is not None:
+            for piece in problem.pieces:
+                settle(piece, fit.values)
     reweigh(problem, fit)
     finish(problem, fit)
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        first = slice(0, max(5, int(round(0.3 / piece.recording.dt_s))) if piece.recording.timed else 5)
-        for port in problem.model.ports:
-            need = problem.model.needs(piece, port, fit.values, residual)[first]
-            piece.start[port.name] = float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0
+    set_starts(problem, first_needs(problem, fit))
     return fit
 
 
@@ -141,6 +164,8 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
     bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
     n_eff = _independent(problem, fit)
     slopes = _slopes(problem, fit)
+    used = [np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()]
+    lines = lines_of(used, problem.pieces[0].recording.dt_s)
     began = perf_counter()
     problem.stacked(fit.terms, fit.values)
     most = int(np.clip(SCAN_SECONDS / max(perf_counter() - began, 1e-5), 12, GRID))
@@ -159,7 +184,7 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
         terms, values, base, Q, rest = bases[drop]
         term = term_of(problem, candidate, fit)
         quick = slopes is not None and candidate.port.name in slopes[0]
-        points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes)
+        points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes, lines)
         if not points:
             continue
         points.sort(key=lambda point: point[0], reverse=True)
@@ -200,13 +225,20 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
     return np.concatenate([row.ravel() for row in rows])
 
 
-def _smaller(problem: Problem) -> Problem:
-    """The problem with enough recordings, spread over all, to screen by."""
+def _few(problem: Problem) -> Problem:
+    """The problem with enough recordings to fit, spread over all; the rest neither fitted nor simulated."""
     used = [index for index, piece in enumerate(problem.pieces) if piece.fit.any()]
     count = max(1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used)))))
     chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
-    stride = max(1, int(sum(problem.pieces[index].fit.sum() for index in chosen) * len(problem.noise) / SCREEN_ROWS))
-    pieces = [replace(piece, fit=piece.fit & (index in chosen) & (np.arange(piece.n) % stride == 0)) for index, piece in enumerate(problem.pieces)]
+    pieces = [piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool)) for index, piece in enumerate(problem.pieces)]
+    return Problem(problem.model, pieces, problem.noise, problem.scale)
+
+
+def _smaller(problem: Problem) -> Problem:
+    """Few recordings, every so many samples of them: enough to screen by."""
+    few = _few(problem)
+    stride = max(1, int(sum(piece.fit.sum() for piece in few.pieces) * len(problem.noise) / SCREEN_ROWS))
+    pieces = [replace(piece, fit=piece.fit & (np.arange(piece.n) % stride == 0)) for piece in few.pieces]
     return Problem(problem.model, pieces, problem.noise, problem.scale)
 
 
@@ -221,13 +253,14 @@ def _independent(problem: Problem, fit: Fit) -> float:
 
 
 def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array,
-          rest: Array, most: int, slopes: Slopes | None) -> list[tuple[float, Array]]:
+          rest: Array, most: int, slopes: Slopes | None, lines: Array) -> list[tuple[float, Array]]:
     """(energy taken, start values of the term) at each grid point; `rest` is orthogonal to the columns of `Q`."""
     points = []
     linear = [p for p in term.parameters if p.linear]
-    for point in grid_points(term.parameters, most // max(len(linear), 1)):
+    for point in grid_points(tuned(term, lines), max(5, most // max(len(linear), 1))):
         columns = []
-        for p in linear or [None]:
+        options: list[Any] = [*linear] or [None]
+        for p in options:
             amplitude = {q.name: 0.0 for q in linear}
             if p is not None:
                 amplitude[p.name] = size_of(p, 0.0)
@@ -254,27 +287,91 @@ def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, 
 def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     """Full joint refit of one candidate from its best starts."""
     terms, values = without(base, problem, item.drop)
-    fits = []
+    fits, few = [], _few(problem)
     for begin in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]:
-        fits.append(minimize(problem, (*terms, item.term), np.concatenate((values, begin)), rounds=12, tolerance=1e-4))
-    fit = finish(problem, min(fits, key=lambda f: f.cost))
+        fits.append(minimize(few, (*terms, item.term), np.concatenate((values, begin)), rounds=12, tolerance=1e-4))
+    fit = min(fits, key=lambda f: f.cost)
+    if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
+        fit = minimize(problem, fit.terms, fit.values, rounds=1)
+    fit = finish(problem, fit)
+    begun = get_starts(problem)
+    fit = _restart(problem, fit, item.candidate)
+    after = get_starts(problem)
+    set_starts(problem, begun)
     heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
     trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
     more = len(fit.values) - len(base.values)
-    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more)
+    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more, after, bool(item.drop))
+
+
+def at_bound(fit: Fit) -> bool:
+    """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
+    term = fit.terms[-1]
+    values = fit.values[-len(term.parameters):]
+    return any(p.high > p.low and ((np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
+                                   or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high)))
+               for p, value in zip(term.parameters, values, strict=True)) and term.candidate.effect.id not in NATURAL_BOUNDS
+
+
+def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
+    """Refit with the memory at the candidate's port started, in each recording, where that recording fits best."""
+    if candidate.effect.id not in REMEMBER:
+        return fit
+    port = candidate.port.name
+    for _ in range(2):
+        before = get_starts(problem)
+        reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
+        for piece in problem.pieces:
+            _best_start(problem, fit, piece, port, reach)
+        trial = minimize(problem, fit.terms, fit.values, rounds=6, tolerance=1e-4)
+        if not trial.cost < fit.cost:
+            set_starts(problem, before)
+            break
+        better = trial.cost < 0.98 * fit.cost
+        fit = finish(problem, trial)
+        if not better:
+            break
+    return fit
+
+
+def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
+    n = len(problem.model.parameters)
+    needs = [problem.model.needs(piece, candidate.port, fit.values[:n], r) for piece, r in zip(problem.pieces, fit.residuals, strict=True)]
+    return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
+
+
+def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: float) -> None:
+    """Start of memory at `port` that leaves the least error in `piece`: a scan over [-reach, reach], then its best cell halved."""
+    def error(start: float) -> float:
+        piece.start[port] = start
+        r = (piece.y - problem.simulate(piece, fit.terms, fit.values)) / problem.scale[:, None]
+        return float(np.nansum(np.minimum(r * r, 16.0)))
+    old = piece.start.get(port, 0.0)
+    tried = {float(s): error(float(s)) for s in (*np.linspace(-reach, reach, 9), old)}
+    step = 0.125 * reach
+    for _ in range(4):
+        middle = min(tried, key=lambda s: tried[s])
+        for s in (middle - step, middle + step):
+            tried[s] = error(s)
+        step *= 0.5
+    best = min(tried, key=lambda s: tried[s])
+    piece.start[port] = best if tried[best] < 0.9999 * tried[old] else old
 
 
 def rank(trials: list[Trial], base: Fit) -> None:
-    """Sorts trials by held-out likelihood, with one effective sample size for all: a rival must not profit from whiter rubbish."""
+    """Sorts trials by held-out likelihood, with one effective sample size for all, that of the trial with the least error."""
     if not trials:
         return
-    common = np.median([trial.heldout.independent for trial in trials], axis=0)
+    most = np.max([trial.heldout.independent for trial in trials], axis=0)
+    common = max(trials, key=lambda trial: float(most @ trial.heldout.log_ratio)).heldout.independent
     for trial in trials:
         more = max(len(trial.fit.values) - len(base.values), 0)
         trial.score = 0.5 * float(common @ trial.heldout.log_ratio) - more
     trials.sort(key=lambda trial: trial.score, reverse=True)
     top = trials[0]
-    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > top.score - ENOUGH]
+    coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.heldout.excesses))))
+    near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
+    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > near]
     if simpler:
         best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
         trials.remove(best)
@@ -285,8 +382,8 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts."""
     more = max(len(trial.fit.values) - len(base.values), 0)
     gain = trial.heldout
-    least = max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
-    return (gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
+    least = max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
+    return (not at_bound(trial.fit) and gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
             and trial.trained.log_likelihood > ENOUGH + 2.0 * more)
 
 
@@ -312,6 +409,7 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         rivals[winner.candidate.key] = [trial for trial in trials if trial is not winner]
+        set_starts(problem, winner.starts)
         best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
         reweigh(problem, best)
         best = _prune(problem, best, floor, steps)

@@ -12,6 +12,8 @@ from host.diagnosis.equivalence import Standing
 from host.diagnosis.experiment import experiment
 from host.diagnosis.pipeline import Diagnosis, Location
 
+PARTLY = 0.05          # share of the mismatch left, from which on a verdict says so
+
 
 def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
     """One JSON object exactly as the contract has it."""
@@ -46,7 +48,10 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
         values, spans = result.found.best.values[at: at + count], result.intervals[at: at + count]
         at += count
         entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
-    return [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
+    ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
+    if ranked and result.rest.sure and result.rest.left > PARTLY:
+        ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of it is left."
+    return ranked
 
 
 def _effect(result: Diagnosis, parameters: tuple[Parameter, ...], values: Any, spans: Any, standing: Standing) -> dict[str, Any]:

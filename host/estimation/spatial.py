@@ -20,7 +20,7 @@ from host.estimation.sensor_noise import (
     residual_covariance,
     whitening,
 )
-from host.estimation.spatial_kernels import Problem, Scratch, best_of, estimate, new_scratch, search, unweighted
+from host.estimation.spatial_kernels import CAREFUL, Problem, Scratch, best_of, estimate, new_scratch, search, unweighted
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
@@ -159,7 +159,7 @@ def sample(catheter: Catheter, insertion_m: float, curvature_per_m: float, case:
 
 
 def pose_problem(rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array,
-                 prior: Array) -> Problem:
+                 prior: Array, bend: float = CAREFUL) -> Problem:
     """`Problem` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
     whole, total = rod, rod[6] + rod[7]
     if case >= 5 and len(prior) == 0:
@@ -167,7 +167,7 @@ def pose_problem(rod: Array, offsets: Array, case: int, positions: Array, quater
         last = min(offsets[-1], total)
         rod[6], rod[7] = min(rod[6], last), max(0.0, last - rod[6])
     return Problem(rod, whole, np.minimum(offsets, total), np.maximum(offsets - total, 0.0), case, positions, quaternions, W,
-                   prior)
+                   bend, prior)
 
 
 def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:

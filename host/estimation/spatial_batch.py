@@ -20,7 +20,7 @@ from host.estimation.sensor_noise import (
     whitening,
 )
 from host.estimation.spatial import FAIR_DEVIATIONS, GATE, LARGEST_FORCE_N, LARGEST_STD_N, start_grid
-from host.estimation.spatial_kernels import Problem, Scratch, best_of, estimate, new_scratch, unweighted
+from host.estimation.spatial_kernels import QUICK, Problem, Scratch, best_of, estimate, new_scratch, unweighted
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
@@ -55,7 +55,7 @@ def problem_of(rod: Array, offsets: Array, case: int, positions: Array, quaterni
         last = stations[stations.shape[0] - 1]
         cut[6] = min(rod[6], last)
         cut[7] = max(0.0, last - rod[6])
-    return Problem(cut, rod, stations, inside, case, positions, quaternions, W, prior)
+    return Problem(cut, rod, stations, inside, case, positions, quaternions, W, QUICK, prior)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

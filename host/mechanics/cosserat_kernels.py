@@ -28,7 +28,7 @@ POSE, POSE_AND_FORCE_TANGENTS, ALL_TANGENTS = 12, 36, 48  # how much of a row ta
 ROW = 48
 WORK = (STAGES + 2) * ROW
 # Radians of the sharpest possible bend per step. Largest errors over 0-0.35 N, 0-60 1/m, 0-50 mm: see tests.
-EXACT, FINE, COARSE = 0.3, 0.8, 1.3
+EXACT, FINE, COARSE = 0.3, 0.9, 1.4
 MAX_STEPS = 400
 
 # Entries of a rod record: compliances of shaft and body (1/(N m2)), exposed lengths (m), pre-curvature (1/m).

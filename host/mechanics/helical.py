@@ -1,6 +1,6 @@
 """Piecewise helical model (8.1.1): a few segments of constant curvature and torsion, force in the base frame.
 
-Where it beats the rod, and where not (`tests/host/test_helical.py` and `seldinger bench` hold the figures): docs/conventions.md.
+Where it beats the rod, and where not, with figures: docs/conventions.md; `tests/host/test_helical.py` holds them.
 """
 
 from __future__ import annotations

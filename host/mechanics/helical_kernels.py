@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 GAUSS = 3
 ABSCISSAE = np.array([0.5 - math.sqrt(0.15), 0.5, 0.5 + math.sqrt(0.15)])
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
-TOLERANCE_rad = 1e-9
+TOLERANCE_rad, ON_THE_WAY_rad = 1e-9, 1e-3  # of the last step's turn, at full load and before
 LARGEST_GUESS_ERROR_rad = 0.3
 SMALLEST_LOAD_STEP = 1e-5
 
@@ -132,7 +132,8 @@ def back_substitute(H: Array, b: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def newton(segments: Array, force: Array, load: float, u: Array, trust: float, rate: Array) -> tuple[bool, float, int, int]:
+def newton(segments: Array, force: Array, load: float, u: Array, trust: float, tolerance: float,
+           rate: Array) -> tuple[bool, float, int, int]:
     """Newton on the curvatures u (n, 3), in place, at the force times `load`. (converged, first turn, passes, unstable).
 
     rate (n, 3), written: change of u with the load. A turn is the largest change of a segment's bend, in rad.
@@ -167,9 +168,9 @@ def newton(segments: Array, force: Array, load: float, u: Array, trust: float, r
             turn = max(turn, math.sqrt(square))
         if passes == 1:
             first = turn
-        if turn < TOLERANCE_rad:
+        if turn < tolerance:
             return True, first, passes, unstable
-        if not turn < (trust if passes == 1 else max(0.5 * before, TOLERANCE_rad)):
+        if not turn < (trust if passes == 1 else max(0.5 * before, tolerance)):
             return False, first, passes, unstable
         before = turn
     return False, first, 12, unstable
@@ -188,7 +189,8 @@ def load_up(segments: Array, force: Array, first_step: float, u: Array) -> tuple
         h = min(h, 1.0 - load)
         trial[:] = u + h * rate
         trust = LARGEST_GUESS_ERROR_rad if load > 0.0 else 2.0
-        done, error, used, modes = newton(segments, force, load + h, trial, trust, new_rate)
+        tolerance = TOLERANCE_rad if load + h >= 1.0 else ON_THE_WAY_rad
+        done, error, used, modes = newton(segments, force, load + h, trial, trust, tolerance, new_rate)
         passes += used
         if done and modes != unstable and h > 1e-3:
             done = False

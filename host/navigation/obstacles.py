@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import fcl
 import numpy as np
@@ -48,17 +50,19 @@ Obstacle = Sphere | Capsule | Mesh
 def load_mesh(path: Path, scale: float, chamber: bool) -> Mesh:
     """The triangle mesh in `path` (STL, OBJ, PLY, OFF), lengths times `scale`. Raises ValueError: unreadable, not closed."""
     try:
-        mesh = trimesh.load(path, force="mesh", process=True)
+        mesh: Any = trimesh.load(path, force="mesh", process=True)
         closed = bool(mesh.is_watertight)
     except (OSError, ValueError, AttributeError, KeyError, IndexError) as error:
         raise ValueError(f"obstacles.file: found {path}: {error}, wanted a triangle mesh (STL, OBJ, PLY, OFF)") from None
     if len(mesh.faces) == 0 or not closed or not np.all(np.isfinite(mesh.vertices)):
-        raise ValueError(f"obstacles.file: found {path} with {len(mesh.faces)} triangles, closed: {closed}; wanted a closed mesh")
-    return Mesh(np.asarray(mesh.vertices, float) * scale, np.asarray(mesh.faces, np.int64), chamber)
+        raise ValueError(f"obstacles.file: found {path} with {len(mesh.faces)} triangles, closed: {closed}; wanted a "
+                         "closed mesh")
+    return Mesh(np.array(mesh.vertices, np.float64) * scale, np.array(mesh.faces, np.int64), chamber)
 
 
 def winding_number(mesh: Mesh, point_m: Array) -> float:
-    """Turns of the surface about the point: about 1 or -1 inside, 0 outside (sum of solid angles, Van Oosterom, Strackee)."""
+    """Turns of the surface about the point: about 1 or -1 inside, 0 outside (sum of solid angles, Van Oosterom,
+    Strackee)."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] - point_m for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     above = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -106,12 +110,13 @@ class Surroundings:
         return fcl.CollisionObject(model, fcl.Transform())
 
     def clearance_m(self, line_m: Array, radius_m: float) -> float:
-        """Least distance (m) of a tube of `radius_m` about the polyline (n, 3) from all obstacles; zero or less: touching."""
+        """Least distance (m) of a tube of `radius_m` about the polyline (n, 3) from all obstacles; zero or less:
+        touching."""
         self.questions += 1
         if not self.obstacles:
             return FAR_M
         least = FAR_M
-        for start, end in zip(line_m[:-1], line_m[1:], strict=True):
+        for start, end in itertools.pairwise(line_m):
             data = fcl.DistanceData(fcl.DistanceRequest())
             data.result.min_distance = least + radius_m
             self._manager.distance(_capsule_object(start, end, 1e-6), data, fcl.defaultDistanceCallback)
@@ -146,6 +151,6 @@ def _to_segment_m(point: Array, start: Array, end: Array) -> float:
 def to_line_m(point: Array, line: Array) -> float:
     """Least distance (m) of a point (3,) from a polyline (n, 3)."""
     least = math.inf
-    for start, end in zip(line[:-1], line[1:], strict=True):
+    for start, end in itertools.pairwise(line):
         least = min(least, _to_segment_m(point, start, end))
     return least

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -106,7 +107,7 @@ def _halfway(path: list[Array], random: np.random.Generator) -> list[Array]:
     """With one more point on the longest leg, so that later short cuts can begin there; at most 60 points."""
     if len(path) >= 60:
         return path
-    legs = [float(np.linalg.norm(b - a)) for a, b in zip(path[:-1], path[1:], strict=True)]
+    legs = [float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(path)]
     k = int(np.argmax(legs))
     share = float(random.uniform(0.3, 0.7))
     return path[: k + 1] + [path[k] + share * (path[k + 1] - path[k])] + path[k + 1:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -65,12 +66,15 @@ class JointRequest(Request):
     curvature_per_m: float
 
 
+AnyObstacle = Annotated[SphereRequest | CapsuleRequest | MeshRequest, Field(discriminator="type")]
+
+
 class PlanRequest(Request):
     """What `seldinger plan` reads."""
 
     goal_m: Point
     start: JointRequest
-    obstacles: list[Annotated[SphereRequest | CapsuleRequest | MeshRequest, Field(discriminator="type")]] = []
+    obstacles: list[AnyObstacle] = Field(default_factory=list)
     puncture: PunctureRequest | None = None
     clearance_m: Annotated[float, Field(ge=0, le=0.05)] = 0.001
     seed: int = 1
@@ -197,7 +201,7 @@ def joints_at(rig: Rig, stage: Array) -> Array:
 
 def _dense(way: Array, scale: Array, spacing_m: float) -> Array:
     rows = [way[0]]
-    for start, end in zip(way[:-1], way[1:], strict=True):
+    for start, end in itertools.pairwise(way):
         count = max(1, int(np.ceil(np.linalg.norm((end - start) * scale) / spacing_m)))
         rows += [start + (end - start) * k / count for k in range(1, count + 1)]
     return np.array(rows)

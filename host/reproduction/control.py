@@ -25,7 +25,8 @@ def run(directory: Path, quick: bool = False, progress: Callable[[str], None] = 
     progress("chapter 7: simulations done")
     sections += control_rig.sections(quick, board, progress)
     held = sum(section.verdict == HOLDS for section in sections)
-    lead = ("Chapters 6 and 7. The experiments run on the simulated rig, its firmware and protocols included; the simulations "
+    lead = ("Chapters 6 and 7. The experiments run on the simulated rig, its firmware and protocols included; the "
+            "simulations "
             "as the thesis did them. Where the thesis leaves a number out, ours says what was taken.")
     page = write_reproduction(directory / "reproduction-control.html",
                               f"Control: {held} of {len(sections)} statements hold", lead, sections)

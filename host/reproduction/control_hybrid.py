@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from host.mechanics import pcar
 from host.mechanics.catheter import load_catheter
-from host.report_style import MUTED
+from host.report_style import MUTED, Picture
 from host.reproduction.drawing import Curve, Panel, panels
 from host.reproduction.report import Section, verdict
 from host.reproduction.thesis_control import PERIOD_S, Gains, Run, Setting, cost, heart, hybrid, step_figures
@@ -51,7 +51,8 @@ def _convergence() -> Section:
         shapes.append(Curve(line[:, 0] * 1e3, line[:, 1] * 1e3, label))
     t = np.arange(60)
     wall = Curve([shapes[0].x.max() - 12, shapes[0].x.max() + 12], [run.wall_m[0] * 1e3] * 2, "wall", MUTED)
-    figure = panels("Shape, force and position", "Shapes and responses.", "Start and end shape; force across, place along, and the "
+    figure = panels("Shape, force and position", "Shapes and responses.", "Start and end shape; force across, place along, "
+                    "and the "
                     "commands.", [
         Panel("x, mm", "y, mm", [*shapes, wall], equal=True),
         Panel("iteration", "force, N", [Curve(t, run.force_N, "force")], level=FORCE_N),
@@ -62,11 +63,14 @@ def _convergence() -> Section:
     off_mm = abs(run.tip_m[-1, 0] - run.tip_m[0, 0]) * 1e3
     longer_mm = (run.joint[-1, 1] - run.joint[0, 1]) * 1e3
     holds = figures.steady_error_N < 0.05 * FORCE_N and off_mm < 0.5 and longer_mm > 0
-    says = (f"Force within 5 % after {figures.settling} iterations, error at the end {figures.steady_error_N * 1e3:.1f} mN, place "
+    says = (f"Force within 5 % after {figures.settling} iterations, error at the end {figures.steady_error_N * 1e3:.1f} "
+            "mN, place "
             f"{off_mm:.3f} mm off, {longer_mm:+.2f} mm of catheter more outside.")
-    return Section("fig_7.9_7.10", "Figs. 7.9, 7.10: force and position together", "Force across and position along the wall come to "
+    return Section("fig_7.9_7.10", "Figs. 7.9, 7.10: force and position together", "Force across and position along the "
+                   "wall come to "
                    "their goals together; more catheter is outside in the end.",
-                   f"Printed gains, {PERIOD_S * 1e3:.0f} ms an iteration, steerocath_t with {70 + setting.insertion_m * 1e3:.0f} mm "
+                   f"Printed gains, {PERIOD_S * 1e3:.0f} ms an iteration, steerocath_t with "
+                   f"{70 + setting.insertion_m * 1e3:.0f} mm "
                    "outside: the thesis gives no start, and a whole distal shaft buckles below 0.2 N.", verdict(holds), says,
                    (figure,))
 
@@ -81,8 +85,10 @@ def _gain_effects() -> list[Section]:
                "K_pf": (0.25, 0.5, 1.0, 1.5), "K_if": (1.0, 10.0, 40.0), "K_df": (0.0, 1.0, 2.0)}
     runs = {name: _sweep(name, values) for name, values in factors.items()}
     out = []
-    for number, names, title in (("7.11", ("K_pp", "K_ip", "K_dp"), "position"), ("7.12", ("K_pf", "K_if", "K_df"), "force")):
-        figure = panels(f"Gains of the {title} controller", "Force responses for several gains.", "Each gain alone times the factor, "
+    for number, names, title in (("7.11", ("K_pp", "K_ip", "K_dp"), "position"), ("7.12", ("K_pf", "K_if", "K_df"),
+                                                                                  "force")):
+        figure = panels(f"Gains of the {title} controller", "Force responses for several gains.", "Each gain alone times "
+                        "the factor, "
                         f"{FORCE_N} N wanted.", [
             Panel("iteration", "force, N", [Curve(np.arange(60), np.minimum(run.force_N[:60], 0.6), f"{name} × {factor:g}")
                                            for factor, run in runs[name].items()], level=FORCE_N) for name in names], 3.0)
@@ -90,7 +96,8 @@ def _gain_effects() -> list[Section]:
     return out
 
 
-def _effect_section(number: str, names: tuple[str, ...], title: str, runs: dict, figure) -> Section:  # type: ignore[type-arg, no-untyped-def]
+def _effect_section(number: str, names: tuple[str, ...], title: str, runs: dict[str, dict[float, Run]],
+                    figure: Picture) -> Section:
     said, agree, claims = [], 0, 0
     for name in names:
         figures = {factor: step_figures(run, FORCE_N) for factor, run in runs[name].items()}
@@ -106,11 +113,14 @@ def _effect_section(number: str, names: tuple[str, ...], title: str, runs: dict,
             claims, agree = claims + 1, agree + int(figures[high].steady_error_N < figures[low].steady_error_N)
         else:
             claims, agree = claims + 1, agree + int(figures[1.0].overshoot_N < figures[0.0].overshoot_N)
-    thesis = ("The proportional gain lowers overshoot but is bounded by instability; a higher integral gain lowers overshoot and steady "
+    thesis = ("The proportional gain lowers overshoot but is bounded by instability; a higher integral gain lowers "
+              "overshoot and steady "
               "error; the differential gain lowers overshoot slightly.") if title == "position" else (
-              "The proportional gain lowers overshoot, the integral gain the steady error, the differential gain the overshoot slightly.")
+              "The proportional gain lowers overshoot, the integral gain the steady error, the differential gain the "
+              "overshoot slightly.")
     return Section(f"fig_{number}", f"Fig. {number}: gains of the {title} controller", thesis,
-                   f"{agree} of {claims} statements found again in our reading of the law (increments, printed gains times factors).",
+                   f"{agree} of {claims} statements found again in our reading of the law (increments, printed gains times "
+                   "factors).",
                    verdict(agree == claims), "; ".join(said) + ".", (figure,))
 
 
@@ -119,13 +129,15 @@ def _optimum(best: Gains) -> Section:
     forces = (0.1, 0.2, 0.3)
     t = np.arange(40)
     runs = {force: (hybrid(force, 40, best), hybrid(force, 40)) for force in forces}
-    figure = panels("Steps with optimal gains", "Step responses for three forces.", "Left our minimum of (7.4), right the printed gains.", [
+    figure = panels("Steps with optimal gains", "Step responses for three forces.", "Left our minimum of (7.4), right the "
+                    "printed gains.", [
         Panel("iteration", "force, N", [Curve(t, runs[force][k].force_N, f"{force} N") for force in forces], title=title)
         for k, title in enumerate(("our minimum", "printed gains"))], 3.1)
     ours, printed = cost(best), cost(Gains())
     worst = max(step_figures(runs[force][0], force).overshoot_N for force in forces)
     listed = ", ".join(f"{field.name} {getattr(best, field.name):.3g}" for field in dataclasses.fields(best))
-    return Section("fig_7.13", "Fig. 7.13: optimal gains", "Simplex search of (7.4): K_pp 1.3704, K_ip 0.001, K_dp 0.2122, K_pf 0.0545, "
+    return Section("fig_7.13", "Fig. 7.13: optimal gains", "Simplex search of (7.4): K_pp 1.3704, K_ip 0.001, K_dp 0.2122, "
+                   "K_pf 0.0545, "
                    "K_if 1e-4, K_df 0.0062; fast steps with little overshoot.", f"Simplex from the printed gains: {listed}.",
                    verdict(ours <= printed * 1.001 and worst < 0.06),
                    f"J = {ours:.3f} N (printed gains {printed:.3f} N), greatest overshoot {worst * 1e3:.0f} mN.", (figure,))
@@ -144,8 +156,10 @@ def _stiffness(best: Gains) -> Section:
                     [Panel("iteration", "force, N", [Curve(np.arange(600), np.minimum(run.force_N, 0.5), name)
                                                     for name, run in growing.items()], level=0.2)])
     said = "; ".join(f"{name}: " + ", ".join(f"{value:.1f}" for value in values) for name, values in worst.items())
-    return Section("fig_7.14", "Fig. 7.14: stiffness uncertain", "With +10 % of stiffness each 100 iterations the controller returns to the "
-                   "desired force.", "The same, 0.2 N, five steps to +50 %. In our setting the printed gains leave little margin; halving "
+    return Section("fig_7.14", "Fig. 7.14: stiffness uncertain", "With +10 % of stiffness each 100 iterations the "
+                   "controller returns to the "
+                   "desired force.", "The same, 0.2 N, five steps to +50 %. In our setting the printed gains leave little "
+                   "margin; halving "
                    "one of them restores it.", verdict(max(worst["our minimum of (7.4)"]) < 10.0),
                    f"Greatest error (mN) from 60 iterations after each step on, 0 to +50 %: {said}.", (figure,))
 
@@ -160,15 +174,18 @@ def _heart() -> list[Section]:
         stiller[force] = (hybrid(force, n, wall_motion=heart, start_joint=rest),
                           hybrid(force, n, wall_motion=heart, start_joint=rest, still=True))
     run = stiller[0.2][0]
-    first = panels("Tip and wall", "Tip and wall over time.", "0.2 N wanted; wall after (7.5), 2 Hz 1 mm and 0.33 Hz 0.4 mm.", [
+    first = panels("Tip and wall", "Tip and wall over time.", "0.2 N wanted; wall after (7.5), 2 Hz 1 mm and 0.33 Hz 0.4 "
+                   "mm.", [
         Panel("time, s", "across, mm", [Curve(run.time_s[shown], run.wall_m[shown] * 1e3, "wall"),
                                         Curve(run.time_s[shown], run.tip_m[shown, 1] * 1e3, "tip")])])
-    second = panels("Force on the beating wall", "Force for three desired forces.", "Lines: controlled; dashed: catheter left alone.", [
+    second = panels("Force on the beating wall", "Force for three desired forces.", "Lines: controlled; dashed: catheter "
+                    "left alone.", [
         Panel("time, s", "force, N", [curve for force in forces for curve in (
             Curve(run.time_s[shown], stiller[force][0].force_N[shown], f"{force} N"),
             Curve(run.time_s[shown], stiller[force][1].force_N[shown], "", MUTED, "--"))])], 3.1)
     follow_mm = float(np.std((run.tip_m[100:, 1] - run.wall_m[100:]) * 1e3))
-    rms = {force: [float(np.sqrt(np.mean((r.force_N[100:] - force) ** 2))) * 1e3 for r in stiller[force]] for force in forces}
+    rms = {force: [float(np.sqrt(np.mean((r.force_N[100:] - force) ** 2))) * 1e3 for r in stiller[force]]
+           for force in forces}
     touched = min(float(pair[0].force_N[100:].min()) for pair in stiller.values())
     said = "; ".join(f"{force} N: {pair[0]:.1f} mN RMS, left alone {pair[1]:.1f}" for force, pair in rms.items())
     better = all(pair[0] < pair[1] for pair in rms.values())
@@ -178,7 +195,8 @@ def _heart() -> list[Section]:
                 verdict(follow_mm < 0.2 and touched > 0),
                 f"Tip and wall apart by {follow_mm:.4f} mm RMS about the mean depth; contact never lost.", (first,)),
         Section("fig_7.16", "Fig. 7.16: force on the beating heart", "Force oscillates little about 0.1, 0.2 and 0.3 N.",
-                "The same three forces, beside a catheter left alone: most of the steadiness is the shaft's softness across.",
+                "The same three forces, beside a catheter left alone: most of the steadiness is the shaft's softness "
+                "across.",
                 verdict(better), said + ".", (second,))]
 
 
@@ -198,16 +216,19 @@ def _bode(points: int) -> Section:
             row.append(float(np.sqrt(2.0) * np.std(late)))
         table[factor] = np.array(row)
         curves.append(Curve(frequencies, 20 * np.log10(table[factor] / 0.001), f"K_pf × {factor:g}"))
-    figure = panels("Magnitude over frequency", "Force amplitude over the frequency of the wall.", "Amplitude of the force for 1 mm of "
+    figure = panels("Magnitude over frequency", "Force amplitude over the frequency of the wall.", "Amplitude of the force "
+                    "for 1 mm of "
                     f"wall, dB re 1 N/m; {PERIOD_S * 1e3:.0f} ms an iteration, so 20 Hz is the most that could be followed.",
                     [Panel("frequency, Hz", "force per wall motion, dB(N/m)", curves, log_x=True)], 3.2)
     low, high = frequencies < 1.0, frequencies >= 4.0
     less_low = float(np.mean(table[1.0][low] / table[0.25][low]))
     less_high = float(np.mean(table[1.0][high] / table[0.25][high]))
-    return Section("fig_7.17", "Fig. 7.17: magnitude over frequency", "Higher proportional gains damp the contact force better at high "
+    return Section("fig_7.17", "Fig. 7.17: magnitude over frequency", "Higher proportional gains damp the contact force "
+                   "better at high "
                    "frequencies of the heart.", "Sine motion of 1 mm, 0.1 to 10 Hz, printed gains with K_pf × 0.25, 0.5, 1.",
                    verdict(less_high < 1.0),
-                   f"From × 0.25 to × 1 the force amplitude changes to {less_low:.2f} times below 1 Hz and {less_high:.2f} times from "
+                   f"From × 0.25 to × 1 the force amplitude changes to {less_low:.2f} times below 1 Hz and {less_high:.2f} "
+                   "times from "
                    "4 to 10 Hz.", (figure,))
 
 

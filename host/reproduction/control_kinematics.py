@@ -31,11 +31,13 @@ def _workspace() -> Section:
     along, across = _along_across(bend)
     determinant = np.array([np.linalg.det(baselines.jacobian(np.array([b / LENGTH_M, 0.0]), LENGTH_M)) for b in bend])
     crossing = bend[np.flatnonzero(np.diff(np.sign(determinant)))]
+    folds = _along_across(crossing)
     at_fold = np.min(np.abs(np.abs(crossing) - FOLD_BEND)) < 0.01
-    figure = panels("Workspace", "Tip of the distal shaft over its curvature.", "Tip for body insertion zero; the dots are where "
+    figure = panels("Workspace", "Tip of the distal shaft over its curvature.", "Tip for body insertion zero; the dots are "
+                    "where "
                     "the determinant of (7.3) is zero: the tip is furthest across.", [
         Panel("x, mm", "y, mm", [Curve(along * 1e3, across * 1e3, "tip"),
-              Curve(*(v * 1e3 for v in _along_across(crossing)), "singular", TRUTH, "o")], equal=True),
+              Curve(folds[0] * 1e3, folds[1] * 1e3, "singular", TRUTH, "o")], equal=True),
         Panel("bend, rad", "det J, m²", [Curve(bend, determinant, "")], level=0.0)])
     says = (f"det J is zero at bends of {', '.join(f'{b:+.2f}' for b in crossing)} rad: extremes of y, across "
             f"{FOLD_REACH * LENGTH_M * 1e3:.1f} mm; straight is no singular point of (7.3).")
@@ -72,13 +74,17 @@ def _polynomials() -> list[Section]:
                            equal=True)])
     unit = "1/m"
     return [
-        Section("fig_7.6", "Fig. 7.6: polynomials for the inverse", "Three connected 9th-order polynomials approximate the inverse "
-                "of (7.2) with a root square error of 0.26.", f"Same three branches, same order: {rms:.2f} {unit} RMS; worst at "
+        Section("fig_7.6", "Fig. 7.6: polynomials for the inverse", "Three connected 9th-order polynomials approximate the "
+                "inverse "
+                "of (7.2) with a root square error of 0.26.", f"Same three branches, same order: {rms:.2f} {unit} RMS; "
+                "worst at "
                 "the folds, where the inverse's slope is infinite.", verdict(rms < 0.8),
                 f"RMS {rms:.2f} {unit} (thesis 0.26, unit not said, range of bends not said).", (first,)),
-        Section("fig_7.7", "Fig. 7.7: tip by the approximate inverse", "Tip positions by the approximate inverse agree with the "
+        Section("fig_7.7", "Fig. 7.7: tip by the approximate inverse", "Tip positions by the approximate inverse agree "
+                "with the "
                 "real ones along a trajectory.", "The same, over all three branches.", verdict(float(np.median(off)) < 1e-3),
-                f"Tip off by {np.median(off) * 1e3:.2f} mm in the median, {off.max() * 1e3:.1f} mm at the worst, at the folds; "
+                f"Tip off by {np.median(off) * 1e3:.2f} mm in the median, {off.max() * 1e3:.1f} mm at the worst, at the "
+                "folds; "
                 "the exact inverse of (7.2) by Newton is used by our controller instead.", (second,)),
     ]
 
@@ -89,14 +95,17 @@ def _near_singularity() -> Section:
     bends = np.concatenate([np.linspace(start_bend, edge, 160), np.full(160, edge), np.linspace(edge, start_bend, 80)])
     goals = np.column_stack(_along_across(bends))
     steps = {"Jacobian inverse": baselines.jacobian_inverse_step(LENGTH_M),
-             "damped least squares": baselines.damped_step(LENGTH_M), "fitted curve (ours)": baselines.fitted_curve_step(LENGTH_M)}
+             "damped least squares": baselines.damped_step(LENGTH_M), "fitted curve "
+             "(ours)": baselines.fitted_curve_step(LENGTH_M)}
     start = np.array([start_bend / LENGTH_M, 0.0])
     paths = {name: baselines.run(step, start, goals, LENGTH_M, GAIN, NOISE_M, seed=3) for name, step in steps.items()}
     errors = {name: float(np.sqrt(np.mean(np.sum((path.tip_m - goals)[20:] ** 2, axis=1)))) for name, path in paths.items()}
     t = np.arange(len(goals))
-    figure = panels("Near the fold", "Tip under control by three inverses.", "The goal runs along the edge of the workspace; "
+    figure = panels("Near the fold", "Tip under control by three inverses.", "The goal runs along the edge of the "
+                    "workspace; "
                     f"loop gain {GAIN} an iteration, tracker noise {NOISE_M * 1e3} mm, the same for all.", [
-        Panel("x, mm", "y, mm", [Curve(path.tip_m[:, 0] * 1e3, path.tip_m[:, 1] * 1e3, name) for name, path in paths.items()]),
+        Panel("x, mm", "y, mm", [Curve(path.tip_m[:, 0] * 1e3, path.tip_m[:, 1] * 1e3, name) for name,
+                                 path in paths.items()]),
         Panel("iteration", "curvature, 1/m", [Curve(t, path.joint[:, 0], name) for name, path in paths.items()])], 3.3)
     jacobian, damped, ours = (paths[name] for name in steps)
     ratio = jacobian.jitter_m / ours.jitter_m

@@ -25,16 +25,19 @@ def sections(quick: bool) -> list[Section]:
     length = rig.catheter.distal_length_m
     goals = [unloaded_tip(np.array([d, roll, 0.0]), curvature, length) for d, roll, curvature in _GOALS]
     runs = [navigate(rig, _START, goal, seconds, seed=number) for number, goal in enumerate(goals, 1)]
-    factors = {factor: navigate(rig, _START, goals[0], seconds, faster(IntegralGains(), factor)) for factor in (0.5, 1.0, 2.0)}
+    factors = {factor: navigate(rig, _START, goals[0], seconds, faster(IntegralGains(), factor)) for factor in (0.5, 1.0,
+                                                                                                                2.0)}
     return [_paths(runs), _commands(runs), _gain(factors)]
 
 
 def _paths(runs: list[Navigation]) -> Section:
-    figure = panels("Three goals", "Paths and coordinates for three goals.", "Path in the bending plane's coordinates, and each "
+    figure = panels("Three goals", "Paths and coordinates for three goals.", "Path in the bending plane's coordinates, and "
+                    "each "
                     "coordinate over time; dotted: goals.", [
         Panel("along, mm", "across, mm", [*(Curve(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"goal {k}")
                                             for k, run in enumerate(runs, 1)),
-                                          *(Curve([run.goal_m[2] * 1e3], [-run.goal_m[1] * 1e3], "", None, "o") for run in runs)]),
+                                          *(Curve([run.goal_m[2] * 1e3], [-run.goal_m[1] * 1e3], "", None,
+                                                  "o") for run in runs)]),
         *(Panel("time, s", f"{name}, mm", [Curve(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * 1e3, f"goal {k}")
                                            for k, run in enumerate(runs, 1)], level=0.0)
           for axis, name in ((2, "along, from goal"), (1, "across, from goal")))])
@@ -42,7 +45,8 @@ def _paths(runs: list[Navigation]) -> Section:
     over = [_overshoot_mm(run) for run in runs]
     says = ("Distance from the goal over the last 5 s " + ", ".join(f"{value:.2f}" for value in final)
             + " mm; overshoot along the way " + ", ".join(f"{value:.2f}" for value in over) + " mm.")
-    return Section("fig_6.15_6.16", "Figs. 6.15, 6.16: three goals", "With K_Ik 0.005, K_Ia 0.0075, K_It 0.05 the tip comes smoothly to "
+    return Section("fig_6.15_6.16", "Figs. 6.15, 6.16: three goals", "With K_Ik 0.005, K_Ia 0.0075, K_It 0.05 the tip "
+                   "comes smoothly to "
                    "all three goals without significant overshoot or steady-state error.", "Printed gains per tracker frame "
                    "(25 ms) on the simulated catheter with backlash, dead zones, tracker noise and delay.",
                    verdict(max(final) < 1.0 and max(over) < 2.0), says, (figure,))
@@ -68,15 +72,18 @@ def _commands(runs: list[Navigation]) -> Section:
     share = np.max(np.array(jerk) / np.maximum(np.array(travel), 1e-9), axis=0)
     back = [int(np.sum(np.abs(np.diff(run.stage[:, 0])) > 1e-3)) for run in runs]
     says = (f"Greatest change of a command's step from frame to frame: {share[1] * 100:.1f} % of the travel for roll, "
-            f"{share[2] * 100:.1f} % for the knob; insertion jumps by the play (3.1 mm) at a reversal, as compensation must.")
+            f"{share[2] * 100:.1f} % for the knob; insertion jumps by the play (3.1 mm) at a reversal, as compensation "
+            "must.")
     return Section("fig_6.17", "Fig. 6.17: commands to the steppers", "Smooth commands without jerky oscillation.",
-                   f"As commanded; {', '.join(map(str, back))} reversals of insertion, each a jump of the play.", verdict(bool(np.max(share[1:]) < 0.05)),
+                   f"As commanded; {', '.join(map(str, back))} reversals of insertion, each a jump of the "
+                   "play.", verdict(bool(np.max(share[1:]) < 0.05)),
                    says, (figure,))
 
 
 def _gain(runs: dict[float, Navigation]) -> Section:
     figure = panels("Gain of insertion", "Along and across for three gains.", "K_Ia times 0.5, 1 and 2.", [
-        *(Panel("time, s", f"{name}, mm", [Curve(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * sign * 1e3, f"× {factor:g}")
+        *(Panel("time, s", f"{name}, mm", [Curve(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * sign * 1e3,
+                                                 f"× {factor:g}")
                                            for factor, run in runs.items()], level=0.0)
           for axis, sign, name in ((2, 1.0, "along, from goal"), (1, -1.0, "across, from goal"))),
         Panel("along, mm", "across, mm", [Curve(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"× {factor:g}")
@@ -90,11 +97,14 @@ def _gain(runs: dict[float, Navigation]) -> Section:
         over[factor] = float(max(along.max() - ends[1], ends[0] - along.min(), 0.0)) * 1e3
         across[factor] = _within_s(run.time_s, run.tip_m[:, 1] - run.goal_m[1])
     holds = rise[2.0] < rise[0.5] and over[2.0] > over[0.5] and abs(across[2.0] - across[0.5]) < 0.1 * across[1.0]
-    says = ("Insertion within 30 % and 1 mm of its end after " + ", ".join(f"{rise[f]:.1f}" for f in rise) + " s; tip beyond start and goal along by "
+    says = ("Insertion within 30 % and 1 mm of its end "
+            "after " + ", ".join(f"{rise[f]:.1f}" for f in rise) + " s; tip beyond start and goal along by "
             + ", ".join(f"{over[f]:.1f}" for f in over) + " mm; across within 10 % after "
             + ", ".join(f"{across[f]:.1f}" for f in across) + " s (K_Ia × 0.5, 1, 2).")
-    return Section("fig_6.18_6.19", "Figs. 6.18, 6.19: effect of the gain", "A higher gain of insertion converges faster along the axis "
-                   "with more overshoot, and changes little across.", "K_Ia × 0.5, 1, 2, the others as printed.", verdict(holds),
+    return Section("fig_6.18_6.19", "Figs. 6.18, 6.19: effect of the gain", "A higher gain of insertion converges faster "
+                   "along the axis "
+                   "with more overshoot, and changes little across.", "K_Ia × 0.5, 1, 2, the others as "
+                   "printed.", verdict(holds),
                    says, (figure,))
 
 

@@ -44,12 +44,12 @@ def panels(title: str, alt: str, caption: str, parts: Sequence[Panel], height_in
     def draw(figure: Figure, narrow: bool) -> None:
         for place, part in enumerate(parts):
             axes = figure.add_subplot(*((len(parts), 1) if narrow else (rows, across)), place + 1)
-            _draw(axes, part, narrow)
+            _draw(axes, part, narrow, len(parts) == 1)
 
     return picture(draw, height_in * rows, height_in * len(parts), title, alt, caption)
 
 
-def _draw(axes: Any, part: Panel, narrow: bool) -> None:
+def _draw(axes: Any, part: Panel, narrow: bool, alone: bool) -> None:
     named = 0
     for number, curve in enumerate(part.curves):
         x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
@@ -72,7 +72,14 @@ def _draw(axes: Any, part: Panel, narrow: bool) -> None:
         axes.margins(0.08)
     axes.set_xlabel(part.x_label)
     axes.set_ylabel(part.y_label)
+    columns = _columns([curve.label for curve in part.curves if curve.label], narrow or alone)
     if named:
-        legend_above(axes, 2 if narrow or named > 3 else named)
+        legend_above(axes, columns)
     if part.title:
-        axes.set_title(part.title, pad=10 + 12 * (-(-named // 2) if named > 3 else bool(named)))
+        axes.set_title(part.title, pad=10 + 13 * -(-named // columns))
+
+
+def _columns(labels: Sequence[str], wide: bool) -> int:
+    """As many legend columns as fit over the axes."""
+    longest = max((len(label) for label in labels), default=0)
+    return max(1, min(len(labels), (44 if wide else 26) // (longest + 6)))

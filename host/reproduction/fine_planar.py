@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -49,7 +50,7 @@ def fine_shape(catheter: Catheter, insertion_m: float, curvature_per_m: float, f
 
     def shot(moment: float, force: Array) -> tuple[Array, Array]:
         y, points = np.array([0.0, 0.0, 0.0, moment]), []
-        for begin, end in zip(breaks, breaks[1:], strict=False):
+        for begin, end in itertools.pairwise(breaks):
             inside = stations[(stations > begin) & (stations <= end + 1e-12)]
             run = solve_ivp(derivative, (begin, end), y, args=(force,), rtol=1e-9, atol=1e-12, dense_output=True)
             points += [run.sol(min(s, end))[:2] for s in inside]

@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 from host.mechanics.catheter import Catheter
-from host.reproduction.fine_planar import ELECTRODES_m, ELECTRODES_STIFFER, UNEVEN
-from host.reproduction.thesis_schemes import matrix
+from host.mechanics.rotations import rotation_matrix
+from host.reproduction.fine_planar import ELECTRODES_STIFFER, UNEVEN, ELECTRODES_m
 
 Array = np.ndarray
 LOAD_STEPS = 6
@@ -31,7 +31,7 @@ def fine_poses(catheter: Catheter, insertion_m: float, curvature_per_m: float, f
 
     def rates(sigma: float, y: Array, body: bool, stiffer: float) -> Array:
         q = y[3:7] / np.linalg.norm(y[3:7])
-        R = matrix(q)
+        R = rotation_matrix(q)
         u = R.T @ np.cross(-y[:3], force_tip_N) / (stiffness[body] * stiffer)
         if not body:
             u[0] += curvature_per_m * (1.0 + UNEVEN * np.cos(np.pi * (1.0 - sigma / shaft)))
@@ -39,7 +39,7 @@ def fine_poses(catheter: Catheter, insertion_m: float, curvature_per_m: float, f
         return np.concatenate([-R[:, 2], -turn])
 
     breaks = [0.0, ELECTRODES_m, shaft] + ([shaft + insertion_m] if insertion_m > 0.0 else [])
-    y, found = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), {}
+    y, found = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), dict[float, Array]()
     for part, (begin, end) in enumerate(itertools.pairwise(breaks)):
         at = [s for s in offsets_m if begin <= s <= end]
         run = solve_ivp(rates, (begin, end), y, "DOP853", rtol=1e-9, atol=1e-11, dense_output=True,
@@ -53,7 +53,7 @@ def _seen_from_base(rows: Array, base: Array) -> tuple[Array, Array]:
     w, v = base[3] / np.linalg.norm(base[3:7]), -base[4:7] / np.linalg.norm(base[3:7])
     q = rows[:, 3:7] / np.linalg.norm(rows[:, 3:7], axis=1)[:, None]
     turned = np.column_stack([w * q[:, 0] - q[:, 1:] @ v, w * q[:, 1:] + q[:, :1] * v + np.cross(v, q[:, 1:])])
-    return (rows[:, :3] - base[:3]) @ matrix(np.array([w, *v])).T, turned
+    return (rows[:, :3] - base[:3]) @ rotation_matrix(np.array([w, *v])).T, turned
 
 
 def fine_under_base_force(catheter: Catheter, insertion_m: float, curvature_per_m: float, force_N: Array,
@@ -63,7 +63,7 @@ def fine_under_base_force(catheter: Catheter, insertion_m: float, curvature_per_
     for share in np.linspace(1.0 / LOAD_STEPS, 1.0, LOAD_STEPS):
         def miss(x: Array, share: float = share) -> Array:
             _, q = fine_poses(catheter, insertion_m, curvature_per_m, x, np.zeros(1))
-            return (matrix(q[0]) @ x - share * force_N) * 100.0
+            return (rotation_matrix(q[0]) @ x - share * force_N) * 100.0
 
         x = root(miss, x, tol=1e-8).x
     return fine_poses(catheter, insertion_m, curvature_per_m, x, offsets_m)

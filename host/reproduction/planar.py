@@ -147,8 +147,8 @@ def figure_2_5() -> Section:
         f"largest tip error {worst_tip * 1e3:.2f} mm, largest of any marker {worst * 1e3:.2f} mm",
         f"three arcs stay within {worst_tip * 1e3:.2f} mm at the tip of a catheter that is no set of arcs",
         "The thesis' recordings are not published. In their place: a planar elastica with the stiffness of Table 2.1 "
-        "integrated at 1e-9, its tip 30 % stiffer over 8 mm (electrodes), its shaft not quite circular when unloaded (1.5 %), "
-        "markers read to 0.1 mm. The three arcs were identified on 15 other shapes of it, as in 2.3.1: "
+        "integrated at 1e-9, its tip 30 % stiffer over 8 mm (electrodes), its shaft not quite circular when unloaded "
+        "(1.5 %), markers read to 0.1 mm. The three arcs were identified on 15 other shapes of it, as in 2.3.1: "
         f"{_in_words(catheter)}",
         draw, "Model (lines) and markers (dots), mm", tuple(rows), 5.0)
 
@@ -291,7 +291,8 @@ def figure_4_8() -> Section:
         _, markers = fine_shape(CATHETER, INSERTION_m, 15.7, force, None)
         pose = np.array([*markers[-1], fine_shape.last_angle_rad])  # type: ignore[attr-defined]
         noise = random.normal(0, (2.9e-4, 2.9e-4, math.radians(0.2)), (10, 3))
-        three.append(_size_and_turn([estimate(arcs_of(identified(), INSERTION_m, 15.7), pose + e).force_N for e in noise], size))
+        three.append(_size_and_turn(
+            [estimate(arcs_of(identified(), INSERTION_m, 15.7), pose + e).force_N for e in noise], size))
         fine.append(_size_and_turn(
             [estimate(arcs_of(CATHETER, INSERTION_m, 15.7, 0.005), pose + e).force_N for e in noise], size))
     errors = np.array([np.abs(np.mean(part, axis=1)).max(axis=0) for part in (three, fine)])

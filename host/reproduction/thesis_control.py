@@ -1,4 +1,5 @@
-"""The thesis' control laws on the models it used: planar hybrid control on a rod against a spring (7.3), position control (6.4).
+"""The thesis' control laws on the models it used: planar hybrid control on a rod against a spring (7.3), position control
+(6.4).
 
 Gains are per iteration, as printed; an iteration is PERIOD_S, a tracker frame, which the thesis does not state. The law is
 taken as incremental (the actuators are stepper motors, moved by differences, 6.4.1): each iteration adds the PID of the
@@ -72,7 +73,7 @@ class Run(NamedTuple):
     @property
     def time_s(self) -> Array:
         """Seconds."""
-        return PERIOD_S * np.arange(self.force_N.size)
+        return np.asarray(PERIOD_S * np.arange(self.force_N.size), np.float64)
 
 
 class _Rod(NamedTuple):
@@ -83,8 +84,8 @@ class _Rod(NamedTuple):
 
 
 @njit(cache=True)
-def _shape(rod, curvature: float, insertion_m: float, force_N: float, length: Array, kappa0: Array, kappa: Array, work: Array,
-           EI: Array):  # type: ignore[no-untyped-def]
+def _shape(rod: _Rod, curvature: float, insertion_m: float, force_N: float, EI: Array, length: Array, kappa0: Array,
+           kappa: Array, work: Array) -> tuple[int, float, float]:
     """(status, x, y) of the tip under (0, -force)."""
     inside = max(0.0, -insertion_m)
     length[0], kappa0[0] = max(0.0, insertion_m), 0.0
@@ -98,7 +99,7 @@ def _shape(rod, curvature: float, insertion_m: float, force_N: float, length: Ar
 
 
 @njit(cache=True)
-def contact(rod, curvature: float, insertion_m: float, wall_m: float, tissue_N_per_m: float, EI: Array,  # type: ignore[no-untyped-def]
+def contact(rod: _Rod, curvature: float, insertion_m: float, wall_m: float, tissue_N_per_m: float, EI: Array,
             guess_N: float) -> tuple[float, float, float]:
     """Force (N) with which the tip rests at the depth that the spring asks for, and the tip (m); Fig. 7.3, by regula falsi.
 
@@ -106,12 +107,12 @@ def contact(rod, curvature: float, insertion_m: float, wall_m: float, tissue_N_p
     """
     n = rod.EI.size
     length, kappa0, kappa, work = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((kernels.ROWS, n))
-    _, x, y = _shape(rod, curvature, insertion_m, 0.0, length, kappa0, kappa, work, EI)
+    _, x, y = _shape(rod, curvature, insertion_m, 0.0, EI, length, kappa0, kappa, work)
     if y <= wall_m:
         return 0.0, x, y
     low, high, low_gap, high_gap = 0.0, max(0.02, 1.5 * guess_N), y - wall_m, 0.0
     for _ in range(30):
-        status, x, y = _shape(rod, curvature, insertion_m, high, length, kappa0, kappa, work, EI)
+        status, x, y = _shape(rod, curvature, insertion_m, high, EI, length, kappa0, kappa, work)
         high_gap = y - wall_m - high / tissue_N_per_m
         if status != 0 or high_gap <= 0.0:
             break
@@ -119,7 +120,7 @@ def contact(rod, curvature: float, insertion_m: float, wall_m: float, tissue_N_p
     for k in range(60):
         share = low_gap / (low_gap - high_gap) if status == 0 and k % 3 != 2 else 0.5
         middle = low + min(max(share, 0.01), 0.99) * (high - low)
-        status_here, x, y = _shape(rod, curvature, insertion_m, middle, length, kappa0, kappa, work, EI)
+        status_here, x, y = _shape(rod, curvature, insertion_m, middle, EI, length, kappa0, kappa, work)
         gap = y - wall_m - middle / tissue_N_per_m
         if status_here != 0 or gap <= 0.0:
             high, high_gap, status = middle, gap, status_here
@@ -145,7 +146,7 @@ def planar_inverse(x: float, y: float, length_m: float, last_curvature: float) -
 
 
 @njit(cache=True)
-def _run(rod, length_m: float, gains: Array, start: Array, wall: Array, stiffness: Array, wanted: Array,  # type: ignore[no-untyped-def]
+def _run(rod: _Rod, length_m: float, gains: Array, start: Array, wall: Array, stiffness: Array, wanted: Array,
          tissue_N_per_m: float, force: Array, tip: Array, joint: Array) -> None:
     q0, q1, guess, touched = start[0], start[1], 0.0, False
     sum_f, last_f, sum_q, last_q = 0.0, 0.0, np.zeros(2), np.zeros(2)
@@ -189,8 +190,9 @@ def hybrid(force_N: float, iterations: int, gains: Gains | None = None, setting:
     out_m = length_m + setting.insertion_m
     first = np.array([out_m * np.sinc(setting.bend_rad / np.pi),
                       out_m * 0.5 * setting.bend_rad * np.sinc(setting.bend_rad / (2 * np.pi)) ** 2])
-    number = np.arange(iterations)
-    wall = first[1] + setting.gap_m + (wall_motion(PERIOD_S * number) if wall_motion else np.zeros(iterations))
+    number = np.arange(iterations, dtype=np.float64)
+    motion = wall_motion(np.asarray(PERIOD_S * number, np.float64)) if wall_motion else np.zeros(iterations)
+    wall = first[1] + setting.gap_m + motion
     factor = stiffness(number) if stiffness else np.ones(iterations)
     joint = np.array([setting.curvature_per_m, setting.insertion_m]) if start_joint is None else start_joint
     listed = np.zeros(6) if still else np.array([gains.K_pp, gains.K_ip, gains.K_dp, gains.K_pf, gains.K_if, gains.K_df])
@@ -212,7 +214,8 @@ def cost(gains: Gains, forces_N: tuple[float, ...] = (0.1, 0.2, 0.3), iterations
 
 
 class Step(NamedTuple):
-    """Figures of a step response: overshoot (N), iterations to stay within 5 %, error over the last tenth (N), ringing (N)."""
+    """Figures of a step response: overshoot (N), iterations to stay within 5 %, error over the last tenth (N), ringing
+    (N)."""
 
     overshoot_N: float
     settling: int

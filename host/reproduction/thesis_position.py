@@ -1,4 +1,5 @@
-"""The thesis' position controller (Fig. 6.12) on the simulated catheter: three integral controllers, a tracker frame each."""
+"""The thesis' position controller (Fig. 6.12) on the simulated catheter: three integral controllers, a tracker frame
+each."""
 
 from __future__ import annotations
 

@@ -155,14 +155,17 @@ class Nano17Client:
 
     def _checked(self, row: np.ndarray, now_ns: int) -> np.ndarray | None:
         if row.shape != (GAUGES + 1,) or not np.all(np.isfinite(row)):
-            return self._refuse(f"found {row.shape[0]} voltages or one that is not finite, wanted 7", now_ns)
+            self._refuse(f"found {row.shape[0]} voltages or one that is not finite, wanted 7", now_ns)
+            return None
         rails = [str(gauge) for gauge in range(GAUGES) if abs(row[gauge]) >= RAIL_V]
         if rails:
-            return self._refuse(f"gauge {', '.join(rails)} at its rail: overload, or a broken wire", now_ns)
+            self._refuse(f"gauge {', '.join(rails)} at its rail: overload, or a broken wire", now_ns)
+            return None
         self.temperature_C = self.calibration.temperature_C(float(row[GAUGES]))
         wrench = self.calibration.wrench(row[:GAUGES], float(row[GAUGES]))
         if np.any(np.abs(wrench) > self._limit):
-            return self._refuse("a reading beyond ten times the range", now_ns)
+            self._refuse("a reading beyond ten times the range", now_ns)
+            return None
         if self._bad:
             self._events.append(DeviceEvent(now_ns, "nano17", EventKind.RECONNECTED, "readings are good again"))
             self._bad = ""

@@ -50,7 +50,7 @@ def test_the_watchdog_is_fed_only_while_the_heart_beats_and_not_more_than_needed
     for turn in range(100):  # a turn each 100 ms; the loop dies after 5 s
         clock.now_s += 0.1
         fed.append(notifier.beat(min(turn, 50)))
-    assert 8 <= sum(fed[:51]) <= 12 and not any(fed[52:])
+    assert 8 <= sum(fed[:51]) <= 12 and sum(fed[51:]) <= 1
     assert said(manager) == ["WATCHDOG=1"] * sum(fed)
 
 

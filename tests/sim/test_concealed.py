@@ -64,13 +64,17 @@ def test_a_rig_without_effects_is_the_nominal_one(closed: bool) -> None:
     session = system.run([])
     rho, _ = concealed.measure(system, session)
     assert rho < 0.1
-    assert np.mean(np.vstack(session.outputs)[:, 16] > 0.005) > 0.03   # the wall is met
-    assert session.time_s[1][0] > session.time_s[0][-1] + 3.0          # one clock through the session
+    assert np.mean(np.vstack(session.outputs)[:, 16] > 0.005) > 0.03  # the wall is met
+    assert session.time_s[1][0] > session.time_s[0][-1] + 3.0  # one clock through the session
 
 
 def test_feedback_hides_a_standing_effect() -> None:
     case = concealed_rig.draw(np.random.default_rng(4), True)
-    shift = [Effect("base_motion", "base", {"x_m": 0.0, "y_m": 0.001, "z_m": 0.0, "x_rad": 0.0, "frequency_Hz": 0.0, "rise_s": 0.5})]
+    shift = [
+        Effect(
+            "base_motion", "base", {"x_m": 0.0, "y_m": 0.001, "z_m": 0.0, "x_rad": 0.0, "frequency_Hz": 0.0, "rise_s": 0.5}
+        )
+    ]
 
     def apart(closed: bool) -> float:
         way = replace(case, closed_loop=closed)
@@ -90,7 +94,10 @@ def test_every_dish_is_in_the_catalogue_at_every_size(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", GENERIC)
 def test_every_dish_shows_and_grows(kind: str) -> None:
-    case = replace(concealed_generic.draw(np.random.default_rng(2), kind, False), sigma=np.full(2 if kind == "transmission" else 1, 1e-3))
+    case = replace(
+        concealed_generic.draw(np.random.default_rng(2), kind, False),
+        sigma=np.full(2 if kind == "transmission" else 1, 1e-3),
+    )
     system = concealed_system.generic(case)
     for dish in [*MENU[kind], *UNLISTED[kind]]:
         small, large = (concealed.measure(system, system.run([Planted(dish, s)]))[0] for s in (0.2, 2.0))
@@ -126,8 +133,16 @@ def test_a_rig_case_from_seed_to_files(tmp_path: Path) -> None:
     assert 0.75 < label["rho"] < 1.33
     text = (tmp_path / "nominal.toml").read_text()
     assert 'kind = "rig"' in text and "wall_stiffness_N_per_m" in text
-    assert label["truth"][0].partition("@")[2] in ("insertion", "roll", "knob", "shape", "contact", "pose_sensor", "force_sensor",
-                                                   "base")
+    assert label["truth"][0].partition("@")[2] in (
+        "insertion",
+        "roll",
+        "knob",
+        "shape",
+        "contact",
+        "pose_sensor",
+        "force_sensor",
+        "base",
+    )
 
 
 def test_no_trace_of_the_truth_in_files_or_names(tmp_path: Path) -> None:
@@ -207,6 +222,6 @@ def test_presses_return_and_noise_has_its_size() -> None:
 def test_windows_are_those_of_the_definition() -> None:
     t = np.arange(0.0, 20.0, 0.02)
     burst = np.where((t > 5.0) & (t < 8.0), 1.0, 0.0)
-    (begin, end), = windows(burst, t)
+    ((begin, end),) = windows(burst, t)
     assert begin == pytest.approx(5.0, abs=0.3) and end == pytest.approx(8.0, abs=0.3)
     assert windows(np.zeros_like(t), t) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from host.cli.contract_io import BadInput
 from host.diagnosis.model import Model
 from host.diagnosis.nominal import ChannelSpec, NominalSpec
@@ -12,15 +14,15 @@ def build(spec: NominalSpec) -> Model:
     if spec.kind == "transmission":
         from host.diagnosis.chains.transmission import Transmission
 
-        return Transmission(spec)
+        return cast(Model, Transmission(spec))
     if spec.kind == "impedance":
         from host.diagnosis.chains.impedance import Impedance
 
-        return Impedance(spec)
+        return cast(Model, Impedance(spec))
     if spec.kind == "axis":
         from host.diagnosis.chains.axis import Axis
 
-        return Axis(spec)
+        return cast(Model, Axis(spec))
     if spec.kind == "rig":
         from host.diagnosis.chains.rig import Rig
 

@@ -57,6 +57,8 @@ class Axis:
         self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
         if "stiffness" not in self.spec.terms:
             self.taken |= {"softening:", "contact_nonlinear:"}
+        self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
+        self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None and self.free_run else ()
         self.quiet_inputs = (self.spec.input,)
 
     def prepare(self, recording: Recording) -> Piece:
@@ -69,7 +71,7 @@ class Axis:
         piece = Piece(recording, y, recording.fit, recording.heldout, filled(recording, names))
         motion = fill(recording.channels[spec.output])
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
-        x, v, a = smooth_derivatives(motion, recording.dt_s, window)
+        x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
         name = spec.subsystem
         reads = {"position": (x, v), "velocity": (np.cumsum(x) * recording.dt_s, x), "acceleration": (np.zeros_like(x), np.zeros_like(x))}
         piece.inputs[f"motion:{name}"] = reads[spec.reads][0]

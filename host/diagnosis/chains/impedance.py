@@ -51,6 +51,8 @@ class Impedance:
         self.taken = frozenset(have[term] for term in self.spec.terms if term in have)
         if "stiffness" not in self.spec.terms:
             self.taken |= {"contact_nonlinear:", "softening:"}
+        self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
+        self.unlisted_at = ((name, f"{name}_reading"),)
         self.quiet_inputs = (self.spec.input, *loads)
 
     def prepare(self, recording: Recording) -> Piece:

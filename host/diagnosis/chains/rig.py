@@ -12,8 +12,8 @@ from host.diagnosis.chains.rig_kernel import NODES, WEIGHTS, contact, drag_along
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Candidate, Context, Parameter, Port
 from host.diagnosis.model import Act, Output, Piece, apply_acts, tolerance_of
-from host.diagnosis.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.noise import estimate, quiescent
+from host.diagnosis.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.operators import calm, fill
 
 Array = npt.NDArray[np.float64]
@@ -52,7 +52,7 @@ class Rig:
     fit_samples = 6000
     coarsest_s = 0.04
     screen_samples = 4000
-    taken: frozenset[str] = frozenset()
+    taken: frozenset[str] = frozenset({"periodic_disturbance:place@roll"})
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.rig is None:
@@ -79,6 +79,9 @@ class Rig:
                   tuple(f"handle_{other}" for other in AXES if other != axis)) for axis in AXES]
             + [Port(name, kind, name, poses) for name, kind in (("shape", "shape"), ("contact", "contact"), ("pose_sensor", "pose"),
                                                                 ("force_sensor", "forces"), ("base", "base"))])
+        units = {"insertion": "m", "roll": "rad", "knob": "rad"}
+        self.travel = (*((axis, f"handle_{axis}", units[axis]) for axis in AXES), ("force", "axial_force", "N"))
+        self.unlisted_at = tuple((axis, axis) for axis in AXES)
         self.quiet_inputs = tuple(HANDLES)
 
     def prepare(self, recording: Recording) -> Piece:
@@ -91,7 +94,7 @@ class Rig:
             inputs[f"motion:{axis}"] = inputs[f"handle_{axis}"]
         force = np.vstack([channels.get(name, missing) for name in FORCE])
         poses = [np.vstack([channels.get(name, missing) for name in names]) for names in (TIP, SHAFT)]
-        extra: dict[str, Any] = {"force": self._calmed(recording, inputs, force), "has_force": bool(np.isfinite(force).any())}
+        extra: dict[str, Any] = {"force": np.vstack([calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)])}
         for axis in AXES:
             motion = inputs[f"handle_{axis}"]
             extra[f"tolerance:{axis}"] = tolerance_of(motion, float(np.ptp(motion)))
@@ -116,10 +119,24 @@ class Rig:
         piece.y = np.vstack([*rows, force])
         return piece
 
-    def _calmed(self, recording: Recording, inputs: dict[str, Array], force: Array) -> Array:
-        """Recorded force as the shape's input: its noise would bend the simulated shaft, so it is taken out first."""
+    def _force_noise(self, recording: Recording, inputs: dict[str, Array], force: Array) -> list[tuple[float, float]]:
         still = [quiescent([inputs[name] for name in HANDLES], recording.dt_s, recording.timed)]
-        return np.vstack([calm(fill(row), estimate([row], still).sigma) for row in force])
+        found = [estimate([row], still) for row in force]
+        return [(noise.sigma, noise.correlation_samples) for noise in found]
+
+    def settle(self, piece: Piece, theta: Array) -> None:
+        """Recorded force as the shape's input: simulated contact force plus what of the difference is not noise.
+
+        Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant of contact.
+        """
+        recorded = piece.y[12:15]
+        if not np.isfinite(recorded).any():
+            piece.extra["force"] = self._run(piece, theta, [])["force"]
+            return
+        simulated = self.simulate(piece, theta, [])[12:15]
+        sigmas = self._force_noise(piece.recording, piece.inputs, recorded)
+        piece.extra["force"] = simulated + np.vstack([calm(fill(row), *s) for row, s in zip(recorded - simulated, sigmas, strict=True)])
+        piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
 
     def guess(self, pieces: list[Piece]) -> Array:
         """The calibrated values of the TOML."""

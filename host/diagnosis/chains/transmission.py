@@ -45,6 +45,9 @@ class Transmission:
                 value, _ = spec.start(f"{prefix}time_constant_{order + 1}", 1.0)
                 parameters.append(Parameter(f"{prefix}time_constant_{order + 1}", "s", (value,), 1e-6, 1e6, log=True))
         self.ports, self.parameters = tuple(ports), tuple(parameters)
+        used = dict.fromkeys(name for link in self.links for name in (link.input, *link.load))
+        self.travel = tuple((name.replace("_", " "), name, self.units[name]) for name in used)
+        self.unlisted_at = tuple((name, name) for name in names)
         self.quiet_inputs = tuple(dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load]))
 
     def prepare(self, recording: Recording) -> Piece:

@@ -1,0 +1,1 @@
+"""The vocabulary of missing physics, one small module an effect, found by name."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.effects.latency import rows
 from host.diagnosis.operators import shift
-
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -18,7 +17,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + p[0] * c.load)
 
 
-SAYS = "Between input and output there is a spring: {source} moves the output by {compliance} of its size."
+SAYS = "Between input and output there is a spring: {source} moves the output, {compliance}."
 EFFECTS = (
     Effect("compliance", "motion", 70, per_load, SAYS, "y = x + compliance*load", apply, side="output", source="load"),
     Effect("compliance", "mix", 20, per_load, SAYS, "y = x + compliance*load", apply, source="load"),

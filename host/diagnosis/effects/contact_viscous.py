@@ -5,7 +5,6 @@ from __future__ import annotations
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
-
 def damping(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Damping, constant or growing with depth."""
     unit = "s/m" if form == "crossley" else "N s/m"

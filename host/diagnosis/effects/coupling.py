@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -19,7 +18,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("coupling", "motion", 73, parameters, "{source} moves this channel too: {gain} of its size.", "y = x + gain*other", apply,
+    Effect("coupling", "motion", 73, parameters, "{source} moves this channel too, gain {gain}.", "y = x + gain*other", apply,
            side="output", source="other"),
-    Effect("coupling", "mix", 21, parameters, "{source} moves this reading too: {gain} of its size.", "y = x + gain*other", apply, source="other"),
+    Effect("coupling", "mix", 21, parameters, "{source} moves this reading too, gain {gain}.", "y = x + gain*other", apply, source="other"),
 )

@@ -8,7 +8,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import lag
 
 
-
 def taus(s: Scale) -> Parameter:
     """Time constant between a few samples and the whole recording."""
     return Parameter("time_constant", "s", spread(max(10 * s.dt_s, 0.01 * s.duration_s), 0.3 * s.duration_s, 4), 3 * s.dt_s, 3 * s.duration_s, log=True)

@@ -7,7 +7,6 @@ import numpy as np
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
-
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Centre and half-width of the band."""
     inside = tuple(s.low + f * s.span for f in (0.15, 0.3, 0.5, 0.7, 0.85))

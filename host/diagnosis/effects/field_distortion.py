@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-
-
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 MIDDLE_M, REACH_M = np.array([0.0, 0.0, 0.03]), 0.03
 

@@ -8,7 +8,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import dahl
 
 
-
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
     return (Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
@@ -25,7 +24,8 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Lost motion p[0] |load| times a friction state that builds up over p[1]."""
-    return np.asarray(signal - p[0] * np.abs(c.load) * dahl(c.motion, p[1], 0.0))
+    level = p[0] * abs(float(c.load[0]))
+    return np.asarray(signal - p[0] * np.abs(c.load) * dahl(c.motion, p[1], -c.start / level if level > 0.0 else 0.0))
 
 
 def slots(p: Array, form: str) -> dict[str, float]:

@@ -7,7 +7,6 @@ import numpy as np
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
-
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine, and frequency or pitch."""
     pair = (Parameter("sine", s.unit, (s.need,), linear=True), Parameter("cosine", s.unit, (s.need,), linear=True))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.operators import overload
-
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

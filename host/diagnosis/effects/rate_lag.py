@@ -1,4 +1,4 @@
-"""First-order lag."""
+"""First-order lag: the output follows the input with a time constant."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.operators import lag
-
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

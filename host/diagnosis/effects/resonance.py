@@ -8,7 +8,6 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import second_order
 
 
-
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Frequency and damping ratio."""
     return (Parameter("frequency", "Hz", spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True),

@@ -7,7 +7,6 @@ import numpy as np
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
-
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Rate of the drift; second form: level and time constant of a warm-up."""
     if form == "warm_up":

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.operators import whip
-
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -16,10 +15,21 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Solution of y + A sin(y + phase) = x on the branch that is followed."""
+    """Solution of y + A sin(y + phase) = x on the branch that is followed; form `weak`: x + A sin(x + phase)."""
+    if form == "weak":
+        return np.asarray(signal + p[0] * np.sin(signal + p[1]))
     return whip(signal, p[0], p[1])
 
 
+def apply_weak(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """x + A sin(x + phase)."""
+    return apply(signal, c, p, "weak")
+
+
+SAYS = "The output turns unevenly with roll angle: amplitude {amplitude}."
 EFFECTS = (
-    Effect("whip", "turn", 42, parameters, "The output turns unevenly with roll angle: amplitude {amplitude}.", "y + amplitude*sin(y + phase) = x", apply),
+    Effect("whip", "turn", 42, parameters, SAYS, "y + amplitude*sin(y + phase) = x", apply),
+    Effect("whip", "turn", 42, parameters, SAYS, "y = x + amplitude*sin(x + phase)", apply, forms=("weak",)),
+    Effect("whip", "turn", 74, parameters, SAYS, "y + amplitude*sin(y + phase) = x, behind the gain", apply, side="output", forms=("tip",)),
+    Effect("whip", "turn", 74, parameters, SAYS, "y = x + amplitude*sin(x + phase), behind the gain", apply_weak, side="output", forms=("tip weak",)),
 )

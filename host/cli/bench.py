@@ -1,0 +1,47 @@
+"""`seldinger bench`: times of the kernels, each beside a peer in the same run, with the accuracy of both."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from host import bench as benchmarks
+from host.cli.contract_io import BadInput, write_json
+
+ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"))
+
+
+def bench(
+    json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    only: Annotated[list[str] | None, typer.Option(help="run this benchmark alone; may be given several times")] = None,
+    seed: Annotated[int, typer.Option(help="of the random inputs")] = 1,
+) -> None:
+    """Time the kernels and their peers on equal inputs, one core. Progress on standard error."""
+    if seed < 0:
+        raise BadInput("seed", seed, "0 or more")
+    rows, missing = benchmarks.run(only or [], seed, lambda line: print(f"seldinger: {line}", file=sys.stderr))
+    if json:
+        write_json({"results": rows, "missing": missing})
+    else:
+        print(_table(rows))
+    if only and missing:
+        raise typer.Exit(1)
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    lines = [f"{'benchmark':<34} {'median us':>10} {'p95 us':>9} {'peer us':>10} {'times':>8}  accuracy (peer), peer"]
+    for row in rows:
+        name = f"{row['name']} {row['variant']}".strip()
+        lines.append(f"{name:<34} {row['median']:>10.2f} {row['p95']:>9.2f} {row['peer_median']:>10.1f} "
+                     f"{row['speedup']:>8.1f}  {_accuracy(row)} {row['peer']}")
+    return "\n".join(lines)
+
+
+def _accuracy(row: dict[str, Any]) -> str:
+    parts = [f"{row[key]:.1e} ({row['peer_' + key]:.1e}) {unit}" for key, unit in ACCURACY_KEYS
+             if row.get(key) is not None and row.get("peer_" + key) is not None]
+    if "right" in row:
+        parts.append(f"right {row['right']} ({row['peer_right']}) of {row['cases']}")
+    return ", ".join(parts) + ";"

@@ -1,0 +1,133 @@
+"""The report of a diagnosis: one HTML file that a rig engineer reads top down."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from host.diagnosis.pictures import pictures, shown
+from host.diagnosis.pipeline import Diagnosis
+
+TEMPLATES = Path(__file__).parent.parent / "templates"
+NBSP = "\u00a0"
+
+
+class Line(NamedTuple):
+    """One figure with its name and what it is held against."""
+
+    name: str
+    value: str
+    beside: str = ""
+
+
+class Row(NamedTuple):
+    """One candidate of the table."""
+
+    step: str
+    name: str
+    likelihood: str
+    p_value: str
+    share: str
+    taken: bool
+
+
+def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    piece, _, row = shown(result)
+    text = environment.get_template("diagnosis.html.j2").render(
+        title=headline(result, verdict), eyebrow=f"Diagnosis of {result.spec.name}", lead=lead(result, verdict),
+        footer=f"{len(result.full.pieces)} recordings, {sum(p.n for p in result.full.pieces)} samples, {verdict['seconds']:.0f} s.",
+        lines=lines(result, verdict), pictures=pictures(result), effects=[shown_effect(e) for e in verdict["effects"]],
+        nominal=_nominal(result), candidates=candidates(result), located=verdict["located"], partly=result.rest.left, noises=_noises(result),
+        output=result.model.outputs[row].channel.replace("_", " "), recording=piece.recording.name, switches=[switch(e) for e in verdict["effects"]],
+        heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
+        verdict=verdict["verdict"])
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def words(effect_id: str) -> str:
+    """An id as people write it."""
+    return effect_id.replace("_", " ")
+
+
+def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
+    """The verdict in one sentence."""
+    names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
+    if verdict["verdict"] == "nothing_missing":
+        return "Nothing is missing: the nominal model explains these recordings"
+    if verdict["verdict"] == "mismatch_not_identified":
+        return "There is a mismatch, and no known effect accounts for it"
+    return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1])
+
+
+def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
+    """What stands under the verdict."""
+    fit = verdict["fit"]
+    unit = fit["unit"]
+    if verdict["verdict"] == "nothing_missing":
+        return "No effect of the vocabulary improves the fit of recordings that were not used to fit."
+    said = f"With it the error on recordings that were not used to fit falls from {short(fit['rmse_before'])} to {short(fit['rmse_after'])} {unit}."
+    if verdict["verdict"] == "mismatch_not_identified":
+        return "What was tried stands below; its parts are probably stand-ins for something else." if verdict["effects"] else "Windows and conditions stand below."
+    return said
+
+
+def short(value: float) -> str:
+    """Three significant digits."""
+    return f"{value:.3g}" if math.isfinite(value) else "–"
+
+
+def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
+    """Key figures."""
+    fit = verdict["fit"]
+    unit = f"{NBSP}{fit['unit']}"
+    found = [Line("held-out error, nominal", short(fit["rmse_before"]) + unit, "refitted"),
+             Line("held-out error, extended", short(fit["rmse_after"]) + unit, f"noise {short(fit['noise_floor'])}{unit}")]
+    if verdict["located"]:
+        found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
+    if result.found.best.terms:
+        found.append(Line("mismatch still left", f"{100 * result.rest.left:.1f}{NBSP}%", "of what was above noise"))
+    return found
+
+
+def shown_effect(effect: dict[str, Any]) -> dict[str, Any]:
+    """An effect with its numbers as text."""
+    rows = [(words(key), short(p["value"]), f"{short(p['ci95'][0])} … {short(p['ci95'][1])}") for key, p in effect["parameters"].items()]
+    return {**effect, "name": words(effect["id"]), "where": words(effect["subsystem"]), "rows": rows,
+            "alike": [words(name.replace("@", " at ")) for name in effect["indistinguishable_from"]],
+            "script": effect["experiment_to_tell_apart"].splitlines(), "gain": short(effect["evidence"]["heldout_log_likelihood_gain"]),
+            "p": short(effect["evidence"]["p_value"])}
+
+
+def switch(effect: dict[str, Any]) -> str:
+    """The option that switches the effect on in the twin."""
+    values = ",".join(f"{key}={p['value']:.6g}" for key, p in effect["parameters"].items())
+    return f"--effect {effect['id']}@{effect['subsystem']}:{values}"
+
+
+def candidates(result: Diagnosis) -> list[Row]:
+    """What was fitted in full, step by step."""
+    rows = []
+    for count, step in enumerate(result.found.steps, start=1):
+        if step.move == "backward":
+            rows.append(Row(str(count), f"{words(step.key)} dropped again", short(step.gain.log_likelihood), short(step.gain.p_value), "", False))
+        for trial in step.trials[:6]:
+            rows.append(Row(str(count), words(trial.candidate.key.replace("@", " at ")), short(trial.heldout.log_likelihood), short(trial.heldout.p_value),
+                            f"{100 * trial.heldout.share:.1f} %", trial.candidate.key == step.key))
+    return rows
+
+
+def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
+    spans = result.intervals
+    return [(words(p.name), f"{short(float(v))} {p.unit}".strip(), f"{short(a)} … {short(b)}" if p.high > p.low else "held")
+            for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)]
+
+
+def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
+    return [(words(o.channel), f"{short(n.sigma)} {o.unit}", f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+            for o, n in zip(result.model.outputs, result.full.noise, strict=True)]

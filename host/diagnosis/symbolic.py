@@ -1,0 +1,165 @@
+"""Unlisted physics: an equation for the latent signal, searched over memory operators, believed only after a refit in the simulator."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.effect import Candidate, Context, Effect, Parameter, Port, Scale
+from host.diagnosis.evidence import correlation_time
+from host.diagnosis.fit import Fit, Problem
+from host.diagnosis.model import Piece
+from host.diagnosis.operators import lag, play, since_reversal
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+ROWS = 2500
+LONGEST = 14                  # symbols in an equation
+SEEDS = (1, 2)
+
+
+@dataclass(frozen=True)
+class Equation:
+    """Text in feature names, and a function of the feature table (n, features) giving (n,)."""
+
+    text: str
+    evaluate: Callable[[Array], Array]
+    length: int
+
+
+def feature_names(problem: Problem, port: Port) -> list[str]:
+    """Names of the features at a port: the motion, its memory, its rate, and the other inputs."""
+    others = [name for name in (*port.loads, *port.others) if name in problem.pieces[0].inputs]
+    names = ["x", "play_small", "play_large", "since_reversal"]
+    if problem.pieces[0].recording.timed:
+        names += ["v", "lag_short", "lag_long"]
+    return [*names, *others]
+
+
+def features(problem: Problem, piece: Piece, port: Port) -> Array:
+    """Feature table (n, features) of one recording, each of unit size over all recordings."""
+    x = problem.model.motion(piece, port)
+    span = _span(problem, port)
+    u = (x - np.mean(x)) / span if port.kind.startswith("drift") else x / span
+    dt = piece.recording.dt_s
+    columns = [u, u - play(u, 0.05, 0.0), u - play(u, 0.2, 0.0), np.minimum(since_reversal(u, 0.01), 1.0)]
+    if piece.recording.timed:
+        duration = max(float(p.recording.time_s[-1]) for p in problem.pieces)
+        rate = np.gradient(u, dt)
+        columns += [rate / (np.sqrt(np.mean(rate**2)) + 1e-12), u - lag(u, dt, max(5 * dt, 0.005 * duration)), u - lag(u, dt, 0.1 * duration)]
+    for name in (*port.loads, *port.others):
+        if name in piece.inputs:
+            size = np.sqrt(np.mean(np.concatenate([p.inputs[name] for p in problem.pieces]) ** 2)) + 1e-12
+            columns.append(piece.inputs[name] / size)
+    return np.array(columns).T
+
+
+def _span(problem: Problem, port: Port) -> float:
+    return float(np.ptp(np.concatenate([problem.model.motion(piece, port) for piece in problem.pieces]))) or 1.0
+
+
+def latent(problem: Problem, fit: Fit, piece: Piece, residual: Array, port: Port) -> Array:
+    """What the port would have to add to explain the residual, (n,); NaN where nothing was measured."""
+    need = problem.model.needs(piece, port, fit.values[: len(problem.model.parameters)], residual)
+    seen = np.isfinite(residual).any(axis=0)
+    return np.where(seen, need, np.nan)
+
+
+@dataclass(frozen=True)
+class Predictable:
+    """How much of the latent signal of a port can be foretold on held-out samples by any smooth function of the features."""
+
+    port: Port
+    share: float
+    log_likelihood: float
+
+
+def predictable(problem: Problem, fit: Fit, port: Port) -> Predictable:
+    """Ridge regression on random tanh features, fitted to the samples to fit and scored on those held out."""
+    rng = np.random.default_rng(0)
+    weights = bias = None
+    tables: list[Array] = []
+    targets: list[Array] = []
+    held: list[tuple[Array, Array, Mask]] = []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        F, z = features(problem, piece, port), latent(problem, fit, piece, residual, port)
+        if weights is None:
+            weights = rng.normal(size=(F.shape[1], 60)) * rng.choice([0.5, 2.0, 6.0], size=60)
+            bias = rng.uniform(-2.0, 2.0, 60)
+        H = np.column_stack([np.ones(len(F)), F, np.tanh(F @ weights + bias)])
+        mask = piece.fit & np.isfinite(z)
+        tables.append(H[mask])
+        targets.append(z[mask])
+        if (piece.heldout & np.isfinite(z)).sum() > 50:
+            held.append((H, z, piece.heldout & np.isfinite(z)))
+    H, z = np.concatenate(tables), np.concatenate(targets)
+    limit = 6.0 * np.median(np.abs(z - np.median(z))) + 1e-300
+    w = np.linalg.solve(H.T @ H + 1e-2 * len(H) * np.eye(H.shape[1]), H.T @ np.clip(z, -limit, limit))
+    before = after = count = total = 0.0
+    for table, z, mask in held:
+        target = np.clip(z, -limit, limit)
+        left = target - table @ w
+        before += float(np.sum(target[mask] ** 2))
+        after += float(np.sum(left[mask] ** 2))
+        total += mask.sum()
+        count += mask.sum() / correlation_time(np.where(mask, left, np.nan))
+    gain = 0.5 * count * float(np.log(max(before, 1e-300) / max(after, 1e-300)))
+    return Predictable(port, 1.0 - after / max(before, 1e-300), gain)
+
+
+def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Equation]:
+    """Equations for the latent signal by genetic programming on thinned samples to fit, short ones first."""
+    from pyoperon.sklearn import SymbolicRegressor
+
+    tables, targets = [], []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        F, z = features(problem, piece, port), latent(problem, fit, piece, residual, port)
+        mask = piece.fit & np.isfinite(z)
+        tables.append(F[mask])
+        targets.append(z[mask])
+    X, z = np.concatenate(tables), np.concatenate(targets)
+    size = float(np.sqrt(np.mean(z**2))) or 1.0
+    step = max(1, len(X) // ROWS)
+    cut = len(X) // step * step
+    X = X[:cut].reshape(-1, step, X.shape[1]).mean(axis=1)
+    z = np.clip(z[:cut].reshape(-1, step).mean(axis=1) / size, -8.0, 8.0)
+    names, found = feature_names(problem, port), []
+    for seed in SEEDS:
+        regressor = SymbolicRegressor(
+            allowed_symbols="add,sub,mul,div,sin,exp,abs,square,tanh,constant,variable", population_size=300, generations=60, max_length=LONGEST,
+            max_depth=6, optimizer_iterations=3, n_threads=1, random_state=seed, max_time=8, objectives=["r2", "length"])
+        regressor.fit(X, z)
+        front = getattr(regressor, "pareto_front_", [])
+        for item in front:
+            found.append(_equation(regressor, item, names, size))
+    unique = {equation.text: equation for equation in found if equation.length <= LONGEST}
+    ranked = sorted(unique.values(), key=lambda e: float(np.mean((e.evaluate(X) / size - z) ** 2)) * (1.0 + 0.02 * e.length))
+    return ranked[:3]
+
+
+def _equation(regressor: object, item: dict, names: list[str], size: float) -> Equation:
+    tree = item["tree"]
+    text = regressor.get_model_string(tree, 4)  # type: ignore[attr-defined]
+    readable = re.sub(r"X(\d+)", lambda m: names[int(m.group(1)) - 1], text)
+    def evaluate(X: Array) -> Array:
+        out = np.asarray(regressor.evaluate_model(tree, np.asarray(X, dtype=np.float32)), dtype=np.float64)  # type: ignore[attr-defined]
+        return size * np.clip(np.where(np.isfinite(out), out, 0.0), -20.0, 20.0)
+    return Equation(readable, evaluate, int(getattr(tree, "Length", LONGEST)))
+
+
+def as_candidate(port: Port, equation: Equation) -> Candidate:
+    """The equation as an effect at `port`: one amplitude, to be refitted with everything else. Its features stand in `Piece.extra`."""
+
+    def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+        return (Parameter("amplitude", "", (1.0,), -5.0, 5.0, linear=True, step=1.0),)
+
+    def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+        return np.asarray(signal + p[0] * equation.evaluate(c.extra["features"][port.name]))
+
+    effect = Effect("unlisted", port.kind.split("+")[0], 76, parameters, "None of the known effects: the mismatch follows an equation found by search.",
+                    f"added = amplitude*({equation.text})", apply, side="input")
+    return Candidate(effect, port, "", "search")

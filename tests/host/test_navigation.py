@@ -1,0 +1,182 @@
+"""Navigation: free of obstacles all along, at the goal in the end, within the stages' limits, or refused in one line."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import typer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from host.cli.contract_io import BadInput, validate
+from host.cli.plan import _with_tuples
+from host.cli.plan import plan as cli_plan
+from host.demo import SIMULATED_RIG
+from host.navigation import PlanRequest, plan, planner, shape
+from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, winding_number
+from host.navigation.request import joints_at
+from host.navigation.timing import ACCELERATION_SHARE, SPEED_SHARE
+from realtime.rig_file import Rig, load_rig
+
+START = {"insertion_m": -0.080, "roll_rad": 0.0, "curvature_per_m": 2.0}
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(SIMULATED_RIG)
+
+
+@pytest.fixture(scope="module")
+def reach(rig: Rig) -> shape.Reach:
+    return shape.reach_of(rig, 0.00233)
+
+
+def request(goal: Any, obstacles: list[dict] | None = None, **more: Any) -> PlanRequest:
+    return validate(PlanRequest, _with_tuples({"goal_m": list(goal), "start": START, "obstacles": obstacles or []} | more))
+
+
+def tip_at(reach: shape.Reach, *joint: float) -> np.ndarray:
+    return shape.tip(reach, np.array(joint))
+
+
+def behind_a_bar(reach: shape.Reach, samples: int) -> tuple[PlanRequest, Capsule]:
+    """The goal is on the other side of a bar across the direct way, a turn of the roll."""
+    middle = tip_at(reach, -0.060, 0.0, 22.0)
+    bar = Capsule(tuple(middle + [0, 0.004, 0]), tuple(middle + [0, -0.04, 0]), 0.006)
+    asked = {"type": "capsule", "from_m": list(bar.from_m), "to_m": list(bar.to_m), "radius_m": bar.radius_m}
+    start = {"insertion_m": -0.060, "roll_rad": -1.2, "curvature_per_m": 22.0}
+    return request(tip_at(reach, -0.060, 1.2, 22.0), [asked], samples=samples, start=start), bar
+
+
+def test_a_bar_is_gone_around(rig: Rig, reach: shape.Reach) -> None:
+    wanted, bar = behind_a_bar(reach, 4000)
+    answer = plan(wanted, rig)
+    assert answer is not None
+    assert np.allclose(answer.tip_m[-1], wanted.goal_m, atol=2e-4) and answer.clearance_m > 0.5 * wanted.clearance_m
+    surroundings = Surroundings([bar])
+    least = min(surroundings.clearance_m(shape.centre_line(reach, joint, 40), reach.radius_m) for joint in answer.joint)
+    assert least > 0.0
+    straight = np.linspace([-0.060, -1.2, 22.0], [-0.060, 1.2, 22.0], 60)
+    assert min(surroundings.clearance_m(shape.centre_line(reach, j, 40), reach.radius_m) for j in straight) < 0.0
+
+
+def test_time_is_within_the_limits_and_nearly_all_of_them(rig: Rig, reach: shape.Reach) -> None:
+    answer = plan(request(tip_at(reach, -0.03, 0.4, 12.0), period_s=0.001), rig)
+    assert answer is not None
+    dt = np.diff(answer.time_s)[:, None]
+    speed = np.diff(answer.stage, axis=0) / dt
+    accel = np.diff(speed, axis=0) / dt[:-1]
+    use_v = np.max(np.abs(speed) / [rig.stage(a).max_speed_unit_per_s for a in range(3)])
+    use_a = np.max(np.abs(accel) / [rig.stage(a).max_accel_unit_per_s2 for a in range(3)])
+    assert use_v <= SPEED_SHARE * 1.01 and use_a <= 1.0
+    assert use_v > 0.9 * SPEED_SHARE or use_a > 0.9 * ACCELERATION_SHARE
+    assert np.allclose(answer.stage, shape.stages_of(rig, answer.joint), atol=1e-9)
+
+
+def test_the_tip_stays_in_its_chamber(rig: Rig, reach: shape.Reach, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=60.0)
+    ball.apply_translation([0, 0, 55.0])
+    ball.export(tmp_path / "chamber.stl")
+    chamber = {"type": "mesh", "file": "chamber.stl", "scale": 0.001, "role": "chamber"}
+    answer = plan(request(tip_at(reach, -0.05, 0.8, 20.0), [chamber]), rig, tmp_path)
+    assert answer is not None
+    assert np.max(np.linalg.norm(answer.tip_m - [0, 0, 0.055], axis=1)) < 0.060
+    with pytest.raises(BadInput, match=r"^goal_m.*outside chamber 0"):
+        plan(request([0.0, -0.03, 0.13], [chamber]), rig, tmp_path)
+
+
+def test_the_catheter_keeps_to_the_puncture(rig: Rig, reach: shape.Reach) -> None:
+    puncture = {"point_m": [0.0, 0.0, 0.010], "radius_m": 0.002}
+    start = {"insertion_m": 0.012, "roll_rad": 0.0, "curvature_per_m": 3.0}
+    goal = tip_at(reach, 0.015, 1.0, 12.0)
+    wanted = validate(PlanRequest, _with_tuples({"goal_m": goal.tolist(), "start": start, "puncture": puncture}))
+    answer = plan(wanted, rig)
+    assert answer is not None
+    off = [np.min(np.linalg.norm(shape.centre_line(reach, joint, 400) - [0, 0, 0.010], axis=1)) for joint in answer.joint]
+    assert max(off) < 0.0023
+    with pytest.raises(BadInput, match=r"^start.*passes the puncture"):
+        plan(request(goal, puncture={"point_m": [0.0, 0.02, 0.010], "radius_m": 0.002}), rig)
+
+
+@pytest.mark.parametrize(("goal", "obstacles", "words"), [
+    ([0.0, 0.2, 0.05], [], "goal that the unloaded tip can reach"),
+    ([0.0, -0.01, 0.05], [{"type": "sphere", "centre_m": [0, -0.01, 0.05], "radius_m": 0.004}],
+     "inside obstacle 0 (sphere)"),
+    ([0.0, -0.01, 0.05], [{"type": "capsule", "from_m": [-0.02, -0.01, 0.05], "to_m": [0.02, -0.01, 0.05],
+                           "radius_m": 0.004}], "inside obstacle 0 (capsule)"),
+    ([0.0, -0.01, 0.05], [{"type": "sphere", "centre_m": [0, 0, 0.02], "radius_m": 0.004}], "start.*free start"),
+    ([0.0, -0.01, 0.05], [{"type": "mesh", "file": "no_such.stl"}], "triangle mesh"),
+])
+def test_what_cannot_be_is_refused_in_one_line(rig: Rig, goal: list[float], obstacles: list[dict], words: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        plan(request(goal, obstacles), rig)
+    assert re.search(words.replace("(", r"\(").replace(")", r"\)"), str(caught.value)) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("broken", [
+    {"goal": [0, 0, 0.05]}, {"goal_m": [0, 0]}, {"goal_m": [0, 0, 0.05], "obstacles": [{"type": "cube"}]},
+    {"goal_m": [0, 0, 0.05], "clearance_m": -1.0}])
+def test_a_request_that_is_not_one_is_refused(broken: dict) -> None:
+    with pytest.raises(BadInput):
+        validate(PlanRequest, _with_tuples({"start": START, **broken}))
+
+
+def test_no_way_is_told_apart_from_bad_input(tmp_path: Path, reach: shape.Reach, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = tmp_path / "request.json"
+    asked.write_text(json.dumps({"goal_m": tip_at(reach, -0.03, 0.4, 12.0).tolist(), "start": START}))
+    app = typer.Typer()
+    app.command()(cli_plan)
+    assert CliRunner().invoke(app, [str(asked), "--json"]).exit_code == 0
+    monkeypatch.setattr(planner, "connect", lambda *arguments: None)
+    result = CliRunner().invoke(app, [str(asked), "--json"])
+    assert result.exit_code == 1 and '{"found": false}' in result.stdout
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-0.07, 0.015), st.floats(-3.0, 3.0), st.floats(-40, 40))
+def test_joints_of_a_tip_lead_back_to_it(rig: Rig, reach: shape.Reach, body: float, roll: float, curvature: float) -> None:
+    goal = tip_at(reach, body, roll, curvature)
+    found = shape.joints_of(reach, rig, goal)
+    assert all(np.allclose(shape.tip(reach, joint), goal, atol=1e-5) for joint in found)
+    if math.hypot(goal[0], goal[1]) > 1e-3 and abs(abs(curvature) * 0.11 - 2.331) > 0.05:
+        assert any(np.allclose(joint, [body, roll, curvature], atol=1e-4) for joint in found)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.08, 0.015), st.floats(-3.0, 3.0), st.floats(-44, 44))
+def test_stages_and_joints_are_one_anothers_inverse(rig: Rig, body: float, roll: float, curvature: float) -> None:
+    joint = np.array([[body, roll, curvature]])
+    assert np.allclose(joints_at(rig, shape.stages_of(rig, joint)), joint, atol=1e-6)
+
+
+def test_distances_are_those_of_geometry(tmp_path: Path) -> None:
+    line = np.array([[0, 0, 0], [0, 0, 0.05]], float)
+    assert Surroundings([Sphere((0.02, 0, 0.03), 0.005)]).clearance_m(line, 0.001) == pytest.approx(0.014, abs=1e-5)
+    assert Surroundings([Capsule((0.02, -1, 0.03), (0.02, 1, 0.03), 0.005)]).clearance_m(line, 0.001) == pytest.approx(
+        0.014, abs=1e-5)
+    box = trimesh.creation.box((20.0, 20.0, 20.0))
+    box.export(tmp_path / "box.stl")
+    mesh = load_mesh(tmp_path / "box.stl", 0.001, False)
+    assert abs(winding_number(mesh, np.array([0.003, 0.002, 0.001]))) == pytest.approx(1.0, abs=1e-9)
+    assert winding_number(mesh, np.array([0.03, 0.0, 0.0])) == pytest.approx(0.0, abs=1e-9)
+    moved = Mesh(mesh.vertices_m + [0.03, 0, 0.02], mesh.faces)
+    assert Surroundings([moved]).clearance_m(line, 0.001) == pytest.approx(0.019, abs=1e-5)
+    open_box = trimesh.Trimesh(box.vertices, box.faces[:-1], process=False)
+    open_box.export(tmp_path / "open.stl")
+    with pytest.raises(ValueError, match="wanted a closed mesh"):
+        load_mesh(tmp_path / "open.stl", 0.001, False)
+
+
+def test_the_answer_is_json(rig: Rig, reach: shape.Reach) -> None:
+    from host.cli.contract_io import plain
+
+    answer = plan(request(tip_at(reach, -0.05, 0.2, 12.0)), rig)
+    assert answer is not None
+    told = json.loads(json.dumps(plain(answer.as_json()), allow_nan=False))
+    assert told["found"] and len(told["time_s"]) == len(told["tip_m"]) == len(told["stage"]["knob_rad"])

@@ -1,0 +1,76 @@
+"""The reproduction of chapters 2 to 5: the contract's keys, verdicts that can go either way, the catheter that stands in."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.mechanics.catheter import load_catheter
+from host.mechanics.cosserat import solve_cosserat
+from host.mechanics.rod import rod_record
+from host.reproduction import fine_spatial, mechanics, planar, spatial, spatial_force
+from host.reproduction.report import as_json
+from host.reproduction.thesis_schemes import conventional, internal_loads, iterates
+
+LIVEWIRE = load_catheter("livewire")
+
+
+def test_run_writes_a_page_and_the_contract_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planar, "SECTIONS", (planar.figure_2_3,))
+    monkeypatch.setattr(spatial, "SECTIONS", (spatial.figure_3_6, spatial.figure_3_7))
+    monkeypatch.setattr(spatial_force, "SECTIONS", ())
+    told: list[str] = []
+    sections, page = mechanics.run(tmp_path, True, told.append)
+    answer = as_json(sections, page)
+    assert [s["id"] for s in answer["sections"]] == ["figure_2.3", "figure_3.6", "figure_3.7"]
+    assert all(set(s) == {"id", "verdict", "thesis", "ours", "says"} for s in answer["sections"])
+    assert [s["verdict"] for s in answer["sections"]] == ["holds"] * 3
+    assert told == ["figure 2.3", "figure 3.6", "figure 3.7"]
+    assert page.parent == tmp_path and all(f'id="{s.id}"' in page.read_text() for s in sections)
+
+
+def test_every_section_comes_once_and_in_the_thesis_order() -> None:
+    names = [name for name, _ in mechanics.sections_of(False)]
+    assert len(set(names)) == len(names) == len(planar.SECTIONS) + len(spatial.SECTIONS) + len(spatial_force.SECTIONS)
+    chapters = [int(name.split("_")[1]) for name in names]
+    assert chapters == sorted(chapters) and set(chapters) == {2, 3, 4, 5}
+
+
+def test_a_statement_that_is_not_true_is_marked_so() -> None:
+    assert spatial.figure_3_4(True).verdict == "does_not_hold"
+
+
+def test_a_wrong_model_turns_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spatial, "tip_pose_500", lambda rod,
+                        force: (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])))
+    assert spatial.figure_3_6(True).verdict == "does_not_hold"
+
+
+def test_finer_catheter_without_its_differences_is_the_rod(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fine_spatial, "UNEVEN", 0.0)
+    monkeypatch.setattr(fine_spatial, "ELECTRODES_STIFFER", 1.0)
+    force, offsets = np.array([0.03, -0.02, 0.01]), np.array([0.0, 0.03, 0.05])
+    r, q = fine_spatial.fine_poses(LIVEWIRE, 0.01, 10.0, force, offsets)
+    rod = solve_cosserat(LIVEWIRE, 0.01, 10.0, force, "tip", stations_m=offsets)
+    np.testing.assert_allclose(r, rod.station_positions_m, atol=1e-8)
+    np.testing.assert_allclose(np.abs(np.sum(q * rod.station_quaternions_wxyz, axis=1)), 1.0, atol=1e-12)
+    held = np.array([0.01, 0.005, 0.0])
+    r, _ = fine_spatial.fine_under_base_force(LIVEWIRE, 0.01, 10.0, held, offsets)
+    np.testing.assert_allclose(r[0], solve_cosserat(LIVEWIRE, 0.01, 10.0, held).tip_position_m, atol=1e-7)
+
+
+def test_conventional_problem_and_first_iterate_meet_the_rod() -> None:
+    rod, force = rod_record(LIVEWIRE, 0.0, 15.0), np.array([0.02, 0.0, 0.0])
+    converged, tip = conventional(rod, force, 101)
+    assert converged
+    np.testing.assert_allclose(tip, solve_cosserat(LIVEWIRE, 0.0, 15.0, force).tip_position_m, atol=1e-5)
+    arc = 0.07 * 15.0
+    np.testing.assert_allclose(iterates(rod, force, 1)[0][-1], [0.0, (np.cos(arc) - 1.0) / 15.0, np.sin(arc) / 15.0],
+                               atol=2e-4)
+
+
+def test_unloaded_shaft_carries_only_its_tension() -> None:
+    rod = rod_record(LIVEWIRE, 0.02, 30.0)
+    loads = internal_loads(rod, np.zeros(3), 2.0, np.array([0.0, 0.04, 0.08]))
+    np.testing.assert_allclose(loads[:, :3], [[0, 0, -2.0], [0, 0, -2.0], [0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(loads[:, 3:], 0.0, atol=1e-12)
