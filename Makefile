@@ -8,7 +8,7 @@ TEST_ARGS ?= -n 2 --dist loadfile
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
 
-.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults clean
+.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults fuzz soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -59,7 +59,13 @@ prove-small: setup
 	@$(BIN)/seldinger prove --cases 24 --seed 1
 
 faults: setup
-	@$(BIN)/seldinger faults --runs 2000 --seed 1
+	@$(BIN)/seldinger faults --runs 2000 --seed 1 --jobs 2 --docs docs/reliability.md
+
+fuzz: setup
+	@$(MAKE) -C firmware/fuzz run
+
+soak: setup
+	@$(BIN)/seldinger soak --minutes 30 --docs docs/reliability.md
 
 lint: $(VENV)/.ready
 	@$(BIN)/ruff check .

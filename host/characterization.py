@@ -285,4 +285,8 @@ def load_calibrated_rig(rig_file: str | Path, calibration_file: str | Path | Non
         raise RigFileError(f"{calibration_file}: found {error}, wanted a readable TOML file") from None
     if set(found) != {"transmission"}:
         raise RigFileError(f"{calibration_file}: found sections {', '.join(found) or 'none'}, wanted [transmission] alone")
+    of, wanted = found["transmission"].get("catheter"), data["catheter"]["name"]
+    if of != wanted:
+        raise RigFileError(f"{calibration_file}: transmission.catheter: found {of!r}, wanted {wanted!r}, the rig's: "
+                           "it was calibrated with another catheter")
     return parse_rig({**data, **found}, str(calibration_file))

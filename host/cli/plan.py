@@ -28,7 +28,8 @@ def plan(
         loaded = load_calibrated_rig(rig, calibration)
     except RigFileError as error:
         key, _, rest = str(error).partition(": found ")
-        raise BadInput(key, *(rest.rsplit("wanted ", 1) if "wanted " in rest else (rest, "a rig file that fits"))) from None
+        found, _, wanted = rest.partition(", wanted ")
+        raise BadInput(key, found, wanted) from None
     checked = validate(PlanRequest, _with_tuples(read_json(request)))
     answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:

@@ -148,7 +148,8 @@ def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> Answer | None
         world = _World(request, rig, folder)
     except ValueError as error:
         key, _, rest = str(error).partition(": found ")
-        raise BadInput(key, *rest.rsplit("wanted ", 1)) from None
+        found, _, wanted = rest.rpartition(", wanted ")
+        raise BadInput(key, found or rest, wanted) from None
     start = np.array([request.start.insertion_m, request.start.roll_rad, request.start.curvature_per_m])
     why = world.refused(start)
     if why:

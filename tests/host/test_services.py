@@ -99,6 +99,12 @@ while True:
 """
 
 
+def killed(supervisor: Supervisor) -> None:
+    """SIGKILL for the service, and only for it."""
+    assert supervisor.pid > 0
+    os.kill(supervisor.pid, signal.SIGKILL)
+
+
 def service(hangs: bool) -> list[str]:
     return [sys.executable, "-c", textwrap.dedent(SERVICE.format(hangs=hangs))]
 
@@ -112,7 +118,7 @@ def test_a_service_whose_heart_stands_still_is_ended_and_started_anew_then_given
 def test_a_killed_service_starts_anew_and_a_stopped_one_does_not() -> None:
     with Supervisor(ServiceSettings(service(hangs=False), watchdog_s=30.0, restart_s=0.05)) as supervisor:
         assert supervisor.run_until(lambda: supervisor.ready, 60.0)
-        os.kill(supervisor.pid, signal.SIGKILL)
+        killed(supervisor)
         assert supervisor.run_until(lambda: supervisor.starts == 2 and supervisor.ready, 60.0)
         assert supervisor.status == "disarmed"
         assert supervisor.stop() == -signal.SIGTERM
@@ -130,7 +136,7 @@ def test_the_simulated_rig_and_the_control_loop_run_as_services_and_come_back_di
                 named["TRACKER_PORT"], "--force-port", named["FORCE_PORT"]]
         with Supervisor(ServiceSettings([sys.executable, *loop], watchdog_s=60.0, restart_s=0.05)) as control:
             assert control.run_until(lambda: control.ready, 120.0)
-            os.kill(control.pid, signal.SIGKILL)
+            killed(control)
             assert control.run_until(lambda: control.starts == 2 and control.ready, 120.0)
             assert control.status.startswith("disarmed")
             assert control.stop() == 0 and control.history[-1] == "stopping"
