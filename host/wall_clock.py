@@ -140,6 +140,21 @@ class Operator:
             time.sleep(0.01)
         return False
 
+    def arm(self, each: Callable[[float], None] = lambda share: None) -> bool:
+        """Arm when the devices are there. What was latched before anything moved (a stall at the start) is cleared once seen."""
+
+        def armed() -> bool:
+            time.sleep(0.1)
+            reply = self.ask("arm")
+            if reply is None or reply.result != "accepted":
+                return False
+            if self.wait(3.0, lambda: self.mode() == "hold"):
+                return True
+            self.ask("clear_fault")
+            return False
+
+        return self.wait(_START_TIMEOUT_S, armed, each)
+
     def mode(self) -> str:
         """The loop's phase, empty before it was heard of."""
         return self.state.mode if self.state else ""
@@ -175,12 +190,7 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     def force() -> float:
         return operator.state.force_N or 0.0 if operator.state else 0.0
 
-    def armed() -> bool:
-        time.sleep(0.1)
-        reply = operator.ask("arm")
-        return reply is not None and reply.result == "accepted" and operator.wait(1.0, lambda: operator.mode() == "hold")
-
-    if not operator.wait(_START_TIMEOUT_S, armed, lambda share: progress("start", share, 0.0)):
+    if not operator.arm(lambda share: progress("start", share, 0.0)):
         outcome.notes.append(f"devices not ready after {_START_TIMEOUT_S} s")
         return
     before = np.array(job.target_m) - job.clearance_m * np.array(job.into)

@@ -38,6 +38,7 @@ WEAK_STD_N = 0.02
 LARGEST_STD_N = 10.0  # what is said of a direction the poses tell nothing about
 ONE_TO_ONE = (2, 4, 6)
 MOST_SOLUTIONS = 8
+CONTRADICTING_RESIDUAL = 0.2  # dimensionless; the tracker's noise leaves about 0.005
 DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 START_SHARES = (0.3, 0.1, 0.02, 0.6)  # of the largest force, the most useful first
 
@@ -206,6 +207,8 @@ def _report(problem: Problem, scratch: Scratch, x: Array, cost: float, freedom: 
     values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     weakest, direction = float(np.sqrt(values[-1])), directions[:, -1]
     residual = unweighted(problem.case, length, scratch)
+    if converged and cost < 1.0 and not residual <= CONTRADICTING_RESIDUAL:
+        converged, solutions = False, None  # a cost that the residual at the answer contradicts: no force to believe
     if not converged:
         notes.append(f"no force explains these poses: residual {residual:.3g}, weighted cost {cost:.3g}")
     elif cost > chi_square_limit(freedom, ODD_DEVIATIONS):

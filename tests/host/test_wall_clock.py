@@ -17,16 +17,12 @@ pytestmark = pytest.mark.slow
 
 
 def in_contact(operator: Operator) -> bool:
-    def armed() -> bool:
-        reply = operator.ask("arm")
-        return reply is not None and reply.result == "accepted" and operator.wait(1.0, lambda: operator.mode() == "hold")
-
-    if not operator.wait(60.0, armed):
+    if not operator.arm():
         return False
     operator.ask("target", "position", target_m=(0.0, -0.0107, 0.021))
     operator.wait(4.0, lambda: False)
     operator.ask("target", "contact", target_m=TARGET_M, normal=(0.0, 0.0, 1.0), force_N=0.15)
-    return operator.wait(15.0, lambda: operator.mode() in ("contact", "stopped"))
+    return operator.wait(30.0, lambda: operator.mode() in ("contact", "stopped"))
 
 
 @pytest.mark.parametrize("victim", ["realtime", "host", "rig"])
