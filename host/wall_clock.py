@@ -141,7 +141,7 @@ class Operator:
         return False
 
     def arm(self, each: Callable[[float], None] = lambda share: None) -> bool:
-        """Arm when the devices are there. What was latched before anything moved (a stall at the start) is cleared once seen."""
+        """Arm when the devices are there. What a stall latched before anything moved is cleared, and arming tried again."""
 
         def armed() -> bool:
             time.sleep(0.1)
