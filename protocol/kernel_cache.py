@@ -4,23 +4,40 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 _ROOMS = ("protocol", "realtime", "sim", "host")
-_KEPT_STATES = 6
+_KEPT_STATES = 12
+_IMPORT = re.compile(r"^\s*(?:from\s+([\w.]+)\s+import\s+(\([^)]*\)|[\w, ]*)|import\s+([\w.]+))", re.MULTILINE)
 
 
 def sources_state(root: Path) -> str:
-    """A short hash of name, size and time of change of every Python file in the rooms below `root`."""
+    """A short hash of the sources below `root` that a kernel can depend on: files with kernels, and all that they import."""
+    texts = {path: path.read_bytes() for room in _ROOMS for path in (root / room).rglob("*.py")}
+    wanted = {path for path, text in texts.items() if b"njit" in text}
+    new = set(wanted)
+    while new:
+        new = {found for path in new for found in _imported(root, texts[path].decode()) if found in texts} - wanted
+        wanted |= new
     digest = hashlib.sha256(str(root).encode())
-    for room in _ROOMS:
-        for path in sorted((root / room).rglob("*.py")):
-            status = path.stat()
-            digest.update(f"{path.relative_to(root)} {status.st_size} {status.st_mtime_ns}\n".encode())
+    for path in sorted(wanted):
+        digest.update(f"{path.relative_to(root)} {len(texts[path])}\n".encode() + texts[path])
     return digest.hexdigest()[:16]
+
+
+def _imported(root: Path, text: str) -> Iterator[Path]:
+    """Files that the imports of a source could mean."""
+    for match in _IMPORT.finditer(text):
+        module, names, plain = match.groups()
+        folder = root.joinpath(*(module or plain).split("."))
+        yield folder.with_suffix(".py")
+        for name in re.findall(r"\w+", names or ""):
+            yield folder / f"{name}.py"
 
 
 def _base() -> Path:
