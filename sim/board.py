@@ -18,9 +18,10 @@ KINDS = ("avr", "native", "auto")
 MCUS = ("atmega2560", "atmega328p")
 CPU_HZ = 16_000_000
 CYCLES_PER_US = CPU_HZ // 1_000_000
+STEP_TIMER_CYCLES = CPU_HZ // 20_000
 
 _REQUEST = struct.Struct("<cBHIQ3i")
-_REPLY = struct.Struct("<QQQQIIIII")
+_REPLY = struct.Struct("<QQQQIIIIII")
 _EDGE = np.dtype([("cycle", "<u8"), ("axis", "i1"), ("sign", "i1")])
 _SIMAVR_HEADERS = (Path("/usr/include/simavr/sim_avr.h"), Path("/usr/local/include/simavr/sim_avr.h"))
 
@@ -36,6 +37,7 @@ class CpuStats(NamedTuple):
     idle_share: float
     starts: int  # of the processor: 1, and one more for each reset
     rx_lost_bytes: int  # for want of room in the receiver
+    stack_free_bytes: int  # between the variables and the deepest stack of all starts; 0 on the native board
 
 
 class BoardSlice(NamedTuple):
@@ -195,7 +197,7 @@ class Board:
         try:
             os.write(self._to_child, request)
             head = _REPLY.unpack(self._read(_REPLY.size))
-            cycle, isr_cycles, isr_count, idle_cycles, isr_max, starts, rx_lost, n_uart, n_edges = head
+            cycle, isr_cycles, isr_count, idle_cycles, isr_max, starts, rx_lost, stack_free, n_uart, n_edges = head
             body = self._read(9 * n_uart + n_edges * _EDGE.itemsize)
         except (OSError, struct.error) as error:
             raise BoardUnavailable(f"board {self.kind}: the child process {self.pid} died ({error})") from error
@@ -203,7 +205,7 @@ class Board:
         uart_cycle = np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64)
         cycles = edges["cycle"].astype(np.int64)
         mean = isr_cycles / isr_count if isr_count else 0.0
-        cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost)
+        cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
         return BoardSlice(body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(),
                           cycles, cpu, uart_cycle)
 

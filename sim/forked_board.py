@@ -49,11 +49,11 @@ class LibraryBoard(Board):
         assert answer.value is not None
         data = ctypes.string_at(answer.value, length)
         head = _REPLY.unpack_from(data)
-        cycle, _, _, idle_cycles, isr_max, starts, rx_lost, n_uart, n_edges = head
+        cycle, _, _, idle_cycles, isr_max, starts, rx_lost, stack_free, n_uart, n_edges = head
         body = data[_REPLY.size:]
         edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
         cycles = edges["cycle"].astype(np.int64)
-        cpu = CpuStats(isr_max, 0.0, idle_cycles / cycle if cycle else 0.0, starts, rx_lost)
+        cpu = CpuStats(isr_max, 0.0, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
         return BoardSlice(body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(), cycles, cpu,
                           np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64))
 

@@ -115,7 +115,8 @@ class Plant:
     @property
     def contact_torque_Nm(self) -> Array:
         """Torque (3,) of that force about the wall's point, base frame (Nm)."""
-        return np.cross(self._parts.chain_state.tip - self._parts.tissue.point, self.contact_force_N)
+        (x, y, z), (fx, fy, fz) = self._parts.chain_state.tip - self._parts.tissue.point, self.contact_force_N
+        return np.array((y * fz - z * fy, z * fx - x * fz, x * fy - y * fx))
 
     def truth(self) -> dict[str, Any]:
         """What no device shows, for reports and tests: SI scalars and arrays by name, and the planted effects."""

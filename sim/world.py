@@ -10,7 +10,7 @@ from realtime.intake import quaternion_product, rotation
 from realtime.lockstep import Arriving, Leaving
 from realtime.rig_file import Rig
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
-from sim.board import Board, BoardSlice
+from sim.board import CPU_HZ, STEP_TIMER_CYCLES, Board, BoardSlice
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
 from sim.plant import Plant
 from sim.stages import Stages, StagesConfig
@@ -29,6 +29,7 @@ class World:
         self.rig, self.plant, self.board = rig, plant, board
         self.now_ns = 0
         self.edges = np.zeros(3, np.int64)
+        self.edge_phases = np.zeros(STEP_TIMER_CYCLES, np.int64)   # edges by processor cycle within the step timer's period
         self.slice: BoardSlice | None = None
         self.peak_force_N = 0.0
         self.limit_bits, self.estop = 0, False
@@ -59,6 +60,15 @@ class World:
         return self._digest.hexdigest()
 
     @property
+    def edge_jitter_s(self) -> float:
+        """Shortest span of the step timer's period that holds all edges on the pins: how unevenly they come."""
+        held = np.flatnonzero(self.edge_phases)
+        if len(held) < 2:
+            return 0.0
+        longest_gap = int(np.diff(held, append=held[0] + STEP_TIMER_CYCLES).max())
+        return (STEP_TIMER_CYCLES - longest_gap) / CPU_HZ
+
+    @property
     def steps(self) -> np.ndarray:
         """Steps (3,) counted on the pins since the start."""
         return self.stages.step_counts
@@ -84,6 +94,7 @@ class World:
         part = self.board.exchange(until_ns // 1000, to_board, self.limit_bits, self.estop, self.stages.encoder_counts)
         self.slice = part
         np.add.at(self.edges, part.edge_axis, 1)
+        np.add.at(self.edge_phases, part.edge_cycle % STEP_TIMER_CYCLES, 1)
         dt_s = (until_ns - self.now_ns) * 1e-9
         self.plant.step(dt_s, self.stages.advance(dt_s, part.edge_axis, part.edge_sign))
         self._sample(until_ns)

@@ -26,6 +26,7 @@
 #define LETTER(x) LETTER_(x)
 #define RECEIVER_BYTES 3 /* two in the FIFO, one in the shift register */
 #define RJMP_SELF 0xCFFFU
+#define STACK_PAINT 0xC5
 #define CYCLES_LIMIT 1000000U /* between two looks at simavr's timers; its own default of 1 is five times slower */
 
 typedef struct {
@@ -75,6 +76,7 @@ static struct {
     avr_flashaddr_t frozen_pc;
     uint16_t frozen_code;
     bool frozen;
+    uint16_t variables_end; /* data address */
 } board;
 
 static uint64_t now(void) { return board.base_cycle + board.avr->cycle; }
@@ -252,6 +254,18 @@ static void on_reset(avr_t *avr) {
     if (board.core_reset) board.core_reset(avr);
 }
 
+/* Bytes above the variables that no push has reached since the paint. */
+static uint32_t stack_free(void) {
+    uint32_t address = board.variables_end;
+    while (address <= board.avr->ramend && board.avr->data[address] == STACK_PAINT) address++;
+    return address - board.variables_end;
+}
+
+static void note_stack(void) {
+    uint32_t free_bytes = stack_free();
+    if (free_bytes < board.count.stack_free) board.count.stack_free = free_bytes;
+}
+
 /* A low level on an external interrupt's pin makes simavr poll it every cycle, enabled or not. */
 static void stop_level_polling(void) {
     for (uint8_t i = 0; i < EXTINT_COUNT; i++)
@@ -261,6 +275,7 @@ static void stop_level_polling(void) {
 /* simavr forgets its timers, the pins and its settings with a reset. */
 static void after_reset(void) {
     board.was_reset = false;
+    memset(board.avr->data + board.variables_end, STACK_PAINT, board.avr->ramend + 1U - board.variables_end);
     board.base_cycle = board.reset_cycle - board.avr->cycle;
     board.avr->run_cycle_limit = CYCLES_LIMIT;
     stop_level_polling();
@@ -356,6 +371,10 @@ static bool start(const char *name, const char *elf) {
     avr_t *avr = board.avr = avr_make_mcu_by_name(name);
     if (!avr || avr_init(avr) != 0) return false;
     firmware.frequency = BOARD_CPU_HZ;
+    board.count.stack_free = UINT32_MAX;
+    for (uint32_t i = 0; i < firmware.symbolcount; i++)
+        if (strcmp(firmware.symbol[i]->symbol, "_end") == 0) board.variables_end = (uint16_t)firmware.symbol[i]->addr;
+    if (!board.variables_end) return false;
     avr_load_firmware(avr, &firmware);
     avr->log = LOG_ERROR;
     avr->sleep = sleep_free;
@@ -377,6 +396,7 @@ int main(int argc, char **argv) {
     static buffer_t uart;
     while (request_read(&request, &uart)) {
         serve(&request, &uart);
+        note_stack();
         reply_t reply = board.count;
         reply.cycle = now();
         if (!reply_write(&reply, &board.produce)) return 1;

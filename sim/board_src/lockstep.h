@@ -39,6 +39,7 @@ typedef struct __attribute__((packed)) {
     uint32_t isr_max_cycles;
     uint32_t starts; /* of the processor */
     uint32_t rx_lost; /* bytes the receiver had no room for */
+    uint32_t stack_free; /* bytes between the variables and the deepest stack so far; native: 0 */
     uint32_t uart_bytes, edges; /* follow: the bytes, the u64 cycle each had left whole, then the edges */
 } reply_t;
 
