@@ -50,6 +50,7 @@ class DemoRun:
     board_kind: str
     counts: dict[str, Any] = field(default_factory=dict)
     interrupted: str = ""
+    recording_failure: str = ""
 
 
 def new_recording_path(directory: Path, name: str) -> Path:
@@ -93,6 +94,9 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
                     ContactJob(target_m=TARGET_M, force_N=settings.force_N, hold_s=settings.hold_s),
                     lambda phase, share: progress(phase, share, float(scenario.loop.outputs[0].normal_force_N)))
             run.counts = _counts(scenario, world, run.outcome)
+        if recording.failure:
+            run.recording_failure = recording.failure
+            run.outcome.notes.append(recording.failure)
     return run
 
 
@@ -129,10 +133,10 @@ class _stopping:
 
 
 def exit_status(run: DemoRun, reached: bool) -> int:
-    """0 when the job was done; 130 or 143 when a signal ended it; 1 otherwise."""
+    """0 when the job was done and recorded; 130 or 143 when a signal ended it; 1 otherwise."""
     if run.interrupted:
         return 128 + int(getattr(signal, run.interrupted))
-    return 0 if reached and not run.outcome.stopped else 1
+    return 0 if reached and not run.outcome.stopped and not run.recording_failure else 1
 
 
 __all__ = ["DemoRun", "DemoSettings", "exit_status", "new_recording_path", "run_lockstep", "simulated_plant"]

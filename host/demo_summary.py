@@ -75,6 +75,8 @@ def print_summary(result: dict[str, Any], run: Run, console: Console | None = No
     console.print(f"\n[bold {colour}]{verdict.sentence}[/]", markup=True)
     for remark in verdict.remarks:
         console.print(f"  {remark}", markup=False)
+    for note in run.outcome.notes:
+        console.print(f"  {note}", markup=False, soft_wrap=True)
     if run.interrupted:
         console.print(f"  Ended early by {run.interrupted}.")
     console.print(_table(result, summary))

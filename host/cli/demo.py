@@ -47,7 +47,11 @@ def demo(
         found, _, wanted = rest.partition(", wanted ")
         raise BadInput(key, found, wanted) from None
     recording = Recording(run.recording)
-    report = write_report(recording, run.recording.with_suffix(".html"))
+    try:
+        report = write_report(recording, run.recording.with_suffix(".html"))
+    except OSError as error:
+        print(f"seldinger: report {run.recording.with_suffix('.html')}: {error.strerror or error}", file=sys.stderr)
+        raise typer.Exit(1) from None
     result = demo_result(recording, run, report)
     print_summary(result, run)
     if json:
