@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
+import orjson
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, Metadata, Schema
@@ -23,7 +24,8 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
-from protocol.topics import TOPICS, Message, encode, json_schema
+from host.foxglove import PREFIX, SCHEMAS, FoxgloveChannels, plain_schema
+from protocol.topics import TOPICS, Message, encode
 
 PROFILE = "seldinger"
 CHUNK_BYTES = 256 * 1024
@@ -116,6 +118,15 @@ class _GuardedFile:
         os.close(self._fd)
 
 
+def _description(topic: str) -> tuple[str, str, dict[str, str]]:
+    """Name and text of a channel's schema, and its metadata."""
+    if topic in SCHEMAS:
+        return SCHEMAS[topic]["title"], json.dumps(SCHEMAS[topic]), {}
+    row = TOPICS[topic]
+    metadata = {"rate_hz": f"{row.rate_hz:g}", "direction": row.direction, "description": row.doc}
+    return row.message.__name__, plain_schema(row.message), metadata
+
+
 class RecordingWriter:
     """Writes one recording. Not thread-safe: one thread records.
 
@@ -131,7 +142,8 @@ class RecordingWriter:
         # The library never ends a chunk by itself: `_due` does, by size and by time, so that each chunk is also synced.
         self._writer = Writer(self._file, chunk_size=1 << 40)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
-        self._schemas: dict[type[Message], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._foxglove = FoxgloveChannels(header.configuration, header.catheter)
         self._sequence: dict[str, int] = {}
         self._chunk_bytes, self._chunk_start_ns = 0, 0
         self._closed = False
@@ -144,12 +156,10 @@ class RecordingWriter:
         known = self._channels.get(topic)
         if known is not None:
             return known
-        row = TOPICS[topic]
-        if row.message not in self._schemas:
-            self._schemas[row.message] = self._writer.register_schema(
-                row.message.__name__, "jsonschema", json_schema(row.message).encode())
-        metadata = {"rate_hz": f"{row.rate_hz:g}", "direction": row.direction, "description": row.doc}
-        self._channels[topic] = self._writer.register_channel(topic, "msgpack", self._schemas[row.message], metadata)
+        name, schema, metadata = _description(topic)
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema.encode())
+        self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name], metadata)
         return self._channels[topic]
 
     def write(self, topic: str, message: Message, recorded_ns: int | None = None) -> None:
@@ -169,13 +179,20 @@ class RecordingWriter:
         if self._closed or self.failure:
             return
         now_ns = stamp_ns if recorded_ns is None else recorded_ns
-        self._writer.add_message(self._channel(topic), log_time=now_ns, publish_time=stamp_ns, data=payload,
+        body = {name: value for name, value in msgpack.unpackb(payload).items() if value is not None}
+        self._add(topic, body, stamp_ns, sequence, now_ns)
+        for derived in self._foxglove.hear(topic, body):
+            self._add(derived.topic, derived.body, derived.stamp_ns, 0, now_ns)
+        if self._chunk_bytes >= CHUNK_BYTES or abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
+            self._sync()
+
+    def _add(self, topic: str, body: dict[str, Any], stamp_ns: int, sequence: int, now_ns: int) -> None:
+        data = orjson.dumps(body)
+        self._writer.add_message(self._channel(topic), log_time=now_ns, publish_time=stamp_ns, data=data,
                                  sequence=sequence & 0xFFFFFFFF)
         if self._chunk_bytes == 0:
             self._chunk_start_ns = now_ns
-        self._chunk_bytes += len(payload) + 31
-        if self._chunk_bytes >= CHUNK_BYTES or abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
-            self._sync()
+        self._chunk_bytes += len(data) + 31
 
     def _sync(self) -> None:
         self._writer.flush()
@@ -242,7 +259,7 @@ class Recording:
         except OSError as error:
             raise ValueError(f"{path}: found {error.strerror or error}, wanted a readable recording") from None
         for number, rows in self._of_channel.items():
-            if number in self._channels:
+            if number in self._channels and not self._channels[number].topic.startswith(PREFIX):
                 self._rows.setdefault(self._channels[number].topic, []).extend(rows)
 
     def _read(self, stream: Any) -> None:
@@ -320,9 +337,15 @@ class Recording:
         return {**units, "recorded_ns": "ns"}
 
     def messages(self, topic: str) -> Iterator[dict[str, Any]]:
-        """The messages of `topic` as dicts, in the order of recording; none for a topic that is not there."""
-        for row in self._rows.get(topic, []):
-            yield msgpack.unpackb(row.data)
+        """The messages of `topic` as dicts, in the order of recording, nil as None; none for a topic that is not there.
+
+        Older recordings hold msgpack, whose maps never begin with the byte of `{`.
+        """
+        if topic in self._rows:
+            names = list(self.schema(topic)["properties"])
+            for row in self._rows[topic]:
+                body = orjson.loads(row.data) if row.data[:1] == b"{" else msgpack.unpackb(row.data)
+                yield {name: body.get(name) for name in names}
 
     def table(self, topic: str) -> dict[str, np.ndarray]:
         """The messages of `topic` as columns, one array of shape (n,) each; vectors are spread over named columns.
