@@ -10,10 +10,9 @@ from typing import Any
 
 import zenoh
 
-from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, topic_of
+from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
 
 RECORDER_DEPTH = 4096
-LONGEST_LIFE_NS = 10_000_000_000
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
@@ -128,43 +127,23 @@ class Everything:
         return taken
 
 
-class CommandServer:
-    """Answers commands. Malformed, expired and repeated ones never reach `decide`, but a late stop still stops.
+class RequestServer:
+    """Answers requests: answer(name, payload) -> Reply, None for no reply at all; called on zenoh's threads.
 
-    decide(command) -> Reply is called on a thread of zenoh's, one command at a time; now_ns is the rig's clock.
+    `name` is the last part of the key that a request came on. Across machines the access control of the session that
+    listens there lets a certificate ask under its own name only.
     """
 
-    def __init__(self, session: zenoh.Session, rig: str, now_ns: Callable[[], int],
-                 decide: Callable[[Command], Reply]) -> None:
-        self._now_ns, self._decide = now_ns, decide
-        self._seen: dict[str, int] = {}
-        self._queryable = session.declare_queryable(key(rig, "command"), self._answer, complete=True)
+    def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
+        self._prefix, self._give = f"{key(rig, 'request')}/", answer
+        self._queryable = session.declare_queryable(request_key(rig, "*"), self._answer, complete=True)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            payload = bytes(query.payload) if query.payload is not None else b""
-            query.reply(query.key_expr, encode(self.judge(payload)))
-
-    def judge(self, payload: bytes) -> Reply:
-        """The reply to the command in `payload`: refused here, or what `decide` says of it."""
-        now_ns = self._now_ns()
-        try:
-            command = decode(Command, payload)
-        except ValueError as error:
-            return Reply(stamp_ns=now_ns, id="", result="malformed", text=str(error))
-        if command.action == "stop":
-            return self._decide(command)
-        if now_ns > command.expires_ns:
-            late_s = (now_ns - command.expires_ns) * 1e-9
-            return Reply(stamp_ns=now_ns, id=command.id, result="expired", text=f"came {late_s:.3f} s after its expiry")
-        if max(command.stamp_ns, command.expires_ns) > now_ns + LONGEST_LIFE_NS:
-            return Reply(stamp_ns=now_ns, id=command.id, result="refused",
-                         text=f"issued or valid more than {LONGEST_LIFE_NS * 1e-9:g} s ahead of the rig's clock")
-        self._seen = {name: expires_ns for name, expires_ns in self._seen.items() if expires_ns >= now_ns}
-        if command.id in self._seen:
-            return Reply(stamp_ns=now_ns, id=command.id, result="replayed", text="this id was answered before")
-        self._seen[command.id] = command.expires_ns
-        return self._decide(command)
+            name = str(query.key_expr).removeprefix(self._prefix)
+            reply = self._give(name, b"" if query.payload is None else bytes(query.payload))
+            if reply is not None and "*" not in name:
+                query.reply(query.key_expr, encode(reply))
 
 
 class Session:
@@ -198,14 +177,18 @@ class Session:
         """All topics, for who records."""
         return Everything(self.zenoh, self.rig)
 
-    def serve_commands(self, now_ns: Callable[[], int], decide: Callable[[Command], Reply]) -> CommandServer:
-        """Answer commands with `decide`; see CommandServer."""
-        return CommandServer(self.zenoh, self.rig, now_ns, decide)
+    def serve_requests(self, answer: Callable[[str, bytes], Reply | None]) -> RequestServer:
+        """Answer requests with `answer`; see RequestServer."""
+        return RequestServer(self.zenoh, self.rig, answer)
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
         """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
-        for reply in self.zenoh.get(key(self.rig, "command"), payload=encode(command), timeout=timeout_s,
-                                    congestion_control=zenoh.CongestionControl.DROP):
+        try:
+            replies = self.zenoh.get(request_key(self.rig, command.commander), payload=encode(command), timeout=timeout_s,
+                                     congestion_control=zenoh.CongestionControl.DROP)
+        except zenoh.ZError:
+            return None
+        for reply in replies:
             if reply.ok is not None:
                 return decode(Reply, bytes(reply.ok.payload))
         return None
