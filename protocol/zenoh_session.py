@@ -6,13 +6,37 @@ import ipaddress
 import json
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
+from protocol.zenoh_access import Network, check_network_endpoint, client_settings, network_settings
 
 RECORDER_DEPTH = 4096
+_SETTINGS: dict[str, Any] = {
+    # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
+    # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
+    "mode": "router",
+    "listen/exit_on_failure": True,
+    # -1: keep trying for ever, so that either side may start later or restart; and do not wait for it to open.
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": False,
+    "transport/shared_memory/enabled": False,
+    # Zenoh would let each put wait 1 ms for a reader that has stopped: at 1 kHz that is all the time there is.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    # With 16 batches (and messages sharing them) a burst of thousands to a live reader loses none; with 2, half.
+    "transport/link/tx/queue/size/data": 16,
+    "transport/link/tx/lease": 2000,
+    "transport/link/tx/keep_alive": 4,
+    # Zenoh would gather a message of 1 GiB before anyone can refuse it.
+    "transport/link/rx/max_message_size": 1_048_576,
+}
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
@@ -33,31 +57,23 @@ def check_endpoint(endpoint: str) -> str:
     return endpoint
 
 
-def configuration(listen: list[str], connect: list[str]) -> zenoh.Config:
-    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints."""
-    config = zenoh.Config()
-    settings: dict[str, Any] = {
-        # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
-        # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
-        "mode": "router",
+def configuration(listen: list[str], connect: list[str], network: Network | None = None) -> zenoh.Config:
+    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints.
+
+    network: what it listens on for other machines besides; without it nothing leaves this one.
+    """
+    settings = _SETTINGS | {
         "listen/endpoints": [check_endpoint(endpoint) for endpoint in listen],
-        "listen/exit_on_failure": True,
         "connect/endpoints": [check_endpoint(endpoint) for endpoint in connect],
-        # -1: keep trying for ever, so that either side may start later or restart; and do not wait for it to open.
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "adminspace/enabled": False,
-        "transport/shared_memory/enabled": False,
-        # Zenoh would let each put wait 1 ms for a reader that has stopped: at 1 kHz that is all the time there is.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-        # With 16 batches (and messages sharing them) a burst of thousands to a live reader loses none; with 2, half.
-        "transport/link/tx/queue/size/data": 16,
-        "transport/link/tx/lease": 2000,
-        "transport/link/tx/keep_alive": 4,
     }
+    if network is not None:
+        settings["listen/endpoints"] += [check_network_endpoint(endpoint) for endpoint in network.listen]
+        settings |= network_settings(network)
+    return _config(settings)
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config
@@ -146,24 +162,40 @@ class RequestServer:
                 query.reply(query.key_expr, encode(reply))
 
 
+def _open(config: zenoh.Config, listen: list[str]) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        found = str(error).split(" at /")[0]
+        wanted = f"to listen on {', '.join(listen)}" if listen else "a rig that listens there and takes this certificate"
+        raise OSError(f"zenoh: found {found}, wanted {wanted}") from None
+
+
 class Session:
     """One open session of a rig. Use as a context, or `close` it.
 
-    listen, connect: endpoints, as in `check_endpoint`. Normally one process listens and the others connect to it; those
-    also reach each other through it. Who starts first does not matter.
+    listen, connect: endpoints, as in `check_endpoint`; network: for other machines, besides. Normally one process
+    listens and the others connect to it; those also reach each other through it. Who starts first does not matter.
     Raises ValueError for an endpoint that leaves this machine, OSError where it cannot listen.
     """
 
-    def __init__(self, rig: str, listen: list[str], connect: list[str]) -> None:
+    def __init__(self, rig: str, listen: list[str], connect: list[str], network: Network | None = None) -> None:
         key(rig, "state")
         self.rig = rig
-        config = configuration(listen, connect)
-        try:
-            self.zenoh = zenoh.open(config)
-        except zenoh.ZError as error:
-            where = ", ".join(listen) or "nothing"
-            found = str(error).split(" at /")[0]
-            raise OSError(f"zenoh: found {found}, wanted to listen on {where}") from None
+        self.zenoh = _open(configuration(listen, connect, network),
+                           listen + list(network.listen if network is not None else ()))
+
+    @classmethod
+    def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
+        """A session to a rig on another machine, with the certificate in folder `keys`.
+
+        Raises ValueError for an endpoint that is not TLS, OSError where nobody answers or the certificate is refused.
+        """
+        key(rig, "state")
+        session = cls.__new__(cls)
+        session.rig = rig
+        session.zenoh = _open(zenoh.Config.from_json5(json.dumps(client_settings(endpoint, keys))), [])
+        return session
 
     def publisher(self, topic: str) -> Publisher:
         """A publisher of `topic`."""

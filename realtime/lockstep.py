@@ -76,7 +76,8 @@ class LockstepLoop:
         self.intake = Intake(rig)
         self.desk = OperatorDesk(rig, self.inputs[0].command, self.link)
         self._leases = 0
-        self.gate = CommandGate(lambda: self._last_ns, self._obey, new_lease=self._next_lease)
+        self.gate = CommandGate(lambda: self._last_ns, self._obey, new_lease=self._next_lease,
+                                roles=rig.access.roles if rig.access else {})
         self.work = np.zeros(BINS + 2, np.int64)
         self.faults: list[str] = []
         self.supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]

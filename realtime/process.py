@@ -58,7 +58,7 @@ class RealtimeProcess:
         self._link = StepperBoardLink(axis_limits(rig))
         self._link_lock = threading.Lock()
         self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
-        self._gate = CommandGate(self.clock.now_ns, self._obey)
+        self._gate = CommandGate(self.clock.now_ns, self._obey, roles=rig.access.roles if rig.access else {})
         self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
         self._phase = PHASE_DISARMED
         self._params = tick_parameters(rig, force_source)
