@@ -10,22 +10,21 @@ import subprocess
 import sys
 import tempfile
 import time
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from host.commander import Commander
 from host.demo import TARGET_M, DemoRun, DemoSettings, Progress, new_recording_path
-from protocol.topics import Command, LoopTiming, Reply, RigState
+from protocol.topics import LoopTiming, RigState
 from protocol.zenoh_session import Session
 from realtime.rig_file import load_rig
 from sim.scenario import ContactJob, Outcome
 
 _START_TIMEOUT_S = 60.0
 _STOP_TIMEOUT_S = 2.0
-_LIFE_NS = 500_000_000
 
 
 class Fleet:
@@ -108,6 +107,7 @@ class Operator:
     def __init__(self, fleet: Fleet) -> None:
         rig = load_rig(fleet.rig_file)
         self._fleet, self.session = fleet, Session(rig.name, [], rig.zenoh.connect)
+        self.commander = Commander(self.session, "demo")
         self._states, self._loops = self.session.latest("state"), self.session.latest("loop")
         self.state: RigState | None = None
         self.timing: LoopTiming | None = None
@@ -122,12 +122,6 @@ class Operator:
                 self.causes.append(state.cause)
         if isinstance(timing, LoopTiming):
             self.timing = timing
-
-    def ask(self, action: str, target: str = "none", **fields: Any) -> Reply | None:
-        """Send a command; None where nobody answers."""
-        now_ns = time.monotonic_ns()
-        return self.session.ask(Command(stamp_ns=now_ns, id=uuid.uuid4().hex, expires_ns=now_ns + _LIFE_NS,
-                                        action=action, target=target, **fields))
 
     def wait(self, seconds: float, done: Callable[[], bool], each: Callable[[float], None] = lambda share: None) -> bool:
         """Look every 10 ms until `done`, a process has died, or `seconds` are over."""
@@ -145,12 +139,11 @@ class Operator:
 
         def armed() -> bool:
             time.sleep(0.1)
-            reply = self.ask("arm")
-            if reply is None or reply.result != "accepted":
+            if not self.commander.take().accepted or not self.commander.arm().accepted:
                 return False
             if self.wait(3.0, lambda: self.mode() == "hold"):
                 return True
-            self.ask("clear_fault")
+            self.commander.clear_fault()
             return False
 
         return self.wait(_START_TIMEOUT_S, armed, each)
@@ -173,6 +166,7 @@ def run_wall_clock(settings: DemoSettings, progress: Progress) -> DemoRun:
         operator.look()
         timing = operator.timing
         run.outcome.notes += [f"{name} ended: {fleet.last_words(name)}" for name in fleet.dead()] + operator.causes
+        operator.commander.close()
         operator.session.close()
     run.counts = {
         "tick_us": None if timing is None else
@@ -194,18 +188,18 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
         outcome.notes.append(f"devices not ready after {_START_TIMEOUT_S} s")
         return
     before = np.array(job.target_m) - job.clearance_m * np.array(job.into)
-    operator.ask("target", "position", target_m=tuple(map(float, before)))
+    operator.commander.target(tuple(map(float, before)))
     operator.wait(6.0, lambda: bool(operator.state and operator.state.tip_m and
                                     np.linalg.norm(np.array(operator.state.tip_m) - before) < 5e-4))
-    operator.ask("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+    operator.commander.press(job.target_m, job.into, job.force_N)
     outcome.contact = operator.wait(job.approach_s, lambda: operator.mode() in ("contact", "stopped"),
                                     lambda share: progress("approach", share, force())) and operator.mode() == "contact"
     if outcome.contact:
         operator.wait(job.hold_s, lambda: operator.mode() == "stopped", lambda share: progress("hold", share, force()))
     outcome.stopped = operator.mode() == "stopped"
-    operator.ask("target", "retract")
+    operator.commander.retract()
     operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))
-    operator.ask("disarm")
+    operator.commander.disarm()
 
 
 def _free_port() -> int:

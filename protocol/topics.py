@@ -27,16 +27,16 @@ from protocol.messages import (
 )
 
 __all__ = [
-    "MAX_PAYLOAD_BYTES", "SCHEMA_VERSION", "TOPICS", "BoardCounters", "Command", "ForceEstimate", "ForceSensor", "Log",
-    "LoopTiming", "Message", "Pose", "Reply", "RigState", "SimulatedTruth", "Stage", "Topic", "columns", "decode",
-    "encode", "histogram_bucket", "json_schema", "key", "topic_of",
+    "MAX_PAYLOAD_BYTES", "SCHEMA_VERSION", "TOPICS", "BoardCounters", "Command", "CommandCounts", "ForceEstimate",
+    "ForceSensor", "Log", "LoopTiming", "Message", "Pose", "Reply", "RigState", "SimulatedTruth", "Stage", "Topic",
+    "check_name", "columns", "decode", "encode", "histogram_bucket", "json_schema", "key", "request_key", "topic_of",
 ]
 
 MODES = ("disarmed", "hold", "position", "approach", "contact", "retract", "stopped")
 SAFETY_ACTIONS = ("none", "warn", "hold", "retract", "stop")
 FRAMES = ("base", "tip")
 LOG_LEVELS = ("info", "warning", "error")
-ACTIONS = ("arm", "disarm", "target", "stop", "clear_fault")
+ACTIONS = ("clock", "take", "release", "arm", "disarm", "target", "force", "hold", "stop", "clear_fault")
 TARGETS = ("none", "hold", "position", "contact", "retract")
 RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
@@ -209,9 +209,14 @@ class Log(Message):
 
 @message
 class Command(Message):
-    """What an operator asks of the rig. Judged by `id`, `stamp_ns` (when issued) and `expires_ns`; always answered."""
+    """What a commander asks of the rig, always answered. Judged by who gives it, under which lease, and how fresh it is.
+
+    `stamp_ns` is when it was issued, on the rig's clock; `sequence` grows with each command of one lease.
+    """
 
     id: str = text("unique to this command; the same id twice is refused")
+    commander: str = text("who gives it; must be the name in the key that it came on")
+    lease: str = text("the lease under which it is given; clock, take, hold and stop need none", default="")
     expires_ns: int = integer("ns", "not to be executed after this time, on the rig's clock")
     action: str = choice("what to do", ACTIONS)
     target: str = choice("kind of the target; none unless action is target", TARGETS)
@@ -225,11 +230,14 @@ class Command(Message):
         """Each action carries what it needs; expiry comes after issue."""
         if not 0 < len(self.id) <= 64:
             raise ValueError(f"Command.id: found {len(self.id)} characters, wanted 1 to 64")
+        check_name(self.commander)
         if self.expires_ns < self.stamp_ns:
             raise ValueError("Command.expires_ns: found a time before stamp_ns, wanted a later one")
         if (self.action == "target") == (self.target == "none"):
             raise ValueError(f"Command.target: found {self.target} with action {self.action}, "
                              "wanted a kind with action target, none without")
+        if self.action == "force" and self.force_N is None:
+            raise ValueError("Command.force_N: found nil, wanted a force for action force")
         if self.target in ("position", "contact") and self.target_m is None:
             raise ValueError(f"Command.target_m: found nil, wanted a position for {self.target}")
         if self.target == "contact" and (
@@ -239,11 +247,27 @@ class Command(Message):
 
 @message
 class Reply(Message):
-    """The answer to a command."""
+    """The answer to a command. `stamp_ns` is the rig's clock when it was answered."""
 
     id: str = text("id of the command that it answers")
     result: str = choice("what became of it", RESULTS)
+    lease: str = text("the lease that a take has given, empty otherwise", default="")
+    lease_expires_ns: int = integer("ns", "when that lease ends if it is not renewed", default=0)
     text: str = text("why, in words", default="")
+
+
+@message
+class CommandCounts(Message):
+    """Who holds the lease, and what became of all commands since the start."""
+
+    holder: str = text("commander that holds the lease, empty when nobody does", default="")
+    lease_expires_ns: int = integer("ns", "when the lease ends if it is not renewed", default=0)
+    accepted: int = integer("", "commands carried out")
+    refused: int = integer("", "refused: no lease, wrong role, or not possible now")
+    expired: int = integer("", "came after their expiry")
+    replayed: int = integer("", "came a second time, or out of sequence")
+    malformed: int = integer("", "no command at all, or larger than a command may be")
+    flooded: int = integer("", "not even read, because their sender sends too many")
 
 
 @message
@@ -279,13 +303,16 @@ _TABLE = (
     Topic("board", BoardCounters, 20, "state", "realtime -> host, tools", "counters of the stepper board"),
     Topic("loop", LoopTiming, 2, "state", "realtime -> host, tools", "timing of the control loop"),
     Topic("log", Log, 0, "event", "all -> host, tools", "log lines"),
-    Topic("command", Command, 0, "query", "operator -> realtime", "arm, disarm, target, stop, clear_fault; answered"),
-    Topic("reply", Reply, 0, "event", "realtime -> operator, host", "answers to commands"),
+    Topic("request", Command, 0, "query", "commander -> realtime", "commands, on request/NAME; each is answered by a Reply"),
+    Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as they came, for the record"),
+    Topic("reply", Reply, 0, "event", "realtime -> host, tools", "what became of them"),
+    Topic("commander", CommandCounts, 1, "state", "realtime -> host, tools", "who holds the lease; counts of commands"),
     Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
 )
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 
 _RIG = re.compile(r"[a-z0-9_]{1,32}")
+_NAME = re.compile(r"[a-z0-9_-]{1,32}")
 _KEY = re.compile(r"seldinger/v(\d+)/([a-z0-9_]{1,32})/(.+)")
 
 
@@ -296,6 +323,18 @@ def key(rig: str, name: str) -> str:
     if not _RIG.fullmatch(rig):
         raise ValueError(f"rig: found {rig!r}, wanted 1 to 32 of a-z, 0-9 and _")
     return f"seldinger/v{SCHEMA_VERSION}/{rig}/{name}"
+
+
+def check_name(name: str) -> str:
+    """`name` if a commander or reader may bear it. Raises ValueError."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"commander: found {name[:40]!r}, wanted 1 to 32 of a-z, 0-9, - and _")
+    return name
+
+
+def request_key(rig: str, name: str) -> str:
+    """The zenoh key on which commander `name` of rig `rig` asks; `*` for all of them. Raises ValueError."""
+    return f"{key(rig, 'request')}/{name if name == '*' else check_name(name)}"
 
 
 def topic_of(key_expression: str) -> tuple[str, Topic]:

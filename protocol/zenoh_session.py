@@ -6,14 +6,37 @@ import ipaddress
 import json
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, topic_of
+from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
+from protocol.zenoh_access import Network, check_network_endpoint, client_settings, network_settings
 
 RECORDER_DEPTH = 4096
-LONGEST_LIFE_NS = 10_000_000_000
+_SETTINGS: dict[str, Any] = {
+    # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
+    # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
+    "mode": "router",
+    "listen/exit_on_failure": True,
+    # -1: keep trying for ever, so that either side may start later or restart; and do not wait for it to open.
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": False,
+    "transport/shared_memory/enabled": False,
+    # Zenoh would let each put wait 1 ms for a reader that has stopped: at 1 kHz that is all the time there is.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    # With 16 batches (and messages sharing them) a burst of thousands to a live reader loses none; with 2, half.
+    "transport/link/tx/queue/size/data": 16,
+    "transport/link/tx/lease": 2000,
+    "transport/link/tx/keep_alive": 4,
+    # Zenoh would gather a message of 1 GiB before anyone can refuse it.
+    "transport/link/rx/max_message_size": 1_048_576,
+}
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
@@ -34,31 +57,23 @@ def check_endpoint(endpoint: str) -> str:
     return endpoint
 
 
-def configuration(listen: list[str], connect: list[str]) -> zenoh.Config:
-    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints."""
-    config = zenoh.Config()
-    settings: dict[str, Any] = {
-        # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
-        # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
-        "mode": "router",
+def configuration(listen: list[str], connect: list[str], network: Network | None = None) -> zenoh.Config:
+    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints.
+
+    network: what it listens on for other machines besides; without it nothing leaves this one.
+    """
+    settings = _SETTINGS | {
         "listen/endpoints": [check_endpoint(endpoint) for endpoint in listen],
-        "listen/exit_on_failure": True,
         "connect/endpoints": [check_endpoint(endpoint) for endpoint in connect],
-        # -1: keep trying for ever, so that either side may start later or restart; and do not wait for it to open.
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "adminspace/enabled": False,
-        "transport/shared_memory/enabled": False,
-        # Zenoh would let each put wait 1 ms for a reader that has stopped: at 1 kHz that is all the time there is.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-        # With 16 batches (and messages sharing them) a burst of thousands to a live reader loses none; with 2, half.
-        "transport/link/tx/queue/size/data": 16,
-        "transport/link/tx/lease": 2000,
-        "transport/link/tx/keep_alive": 4,
     }
+    if network is not None:
+        settings["listen/endpoints"] += [check_network_endpoint(endpoint) for endpoint in network.listen]
+        settings |= network_settings(network)
+    return _config(settings)
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config
@@ -128,63 +143,59 @@ class Everything:
         return taken
 
 
-class CommandServer:
-    """Answers commands. Malformed, expired and repeated ones never reach `decide`, but a late stop still stops.
+class RequestServer:
+    """Answers requests: answer(name, payload) -> Reply, None for no reply at all; called on zenoh's threads.
 
-    decide(command) -> Reply is called on a thread of zenoh's, one command at a time; now_ns is the rig's clock.
+    `name` is the last part of the key that a request came on. Across machines the access control of the session that
+    listens there lets a certificate ask under its own name only.
     """
 
-    def __init__(self, session: zenoh.Session, rig: str, now_ns: Callable[[], int],
-                 decide: Callable[[Command], Reply]) -> None:
-        self._now_ns, self._decide = now_ns, decide
-        self._seen: dict[str, int] = {}
-        self._queryable = session.declare_queryable(key(rig, "command"), self._answer, complete=True)
+    def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
+        self._prefix, self._give = f"{key(rig, 'request')}/", answer
+        self._queryable = session.declare_queryable(request_key(rig, "*"), self._answer, complete=True)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            payload = bytes(query.payload) if query.payload is not None else b""
-            query.reply(query.key_expr, encode(self.judge(payload)))
+            name = str(query.key_expr).removeprefix(self._prefix)
+            reply = self._give(name, b"" if query.payload is None else bytes(query.payload))
+            if reply is not None and "*" not in name:
+                query.reply(query.key_expr, encode(reply))
 
-    def judge(self, payload: bytes) -> Reply:
-        """The reply to the command in `payload`: refused here, or what `decide` says of it."""
-        now_ns = self._now_ns()
-        try:
-            command = decode(Command, payload)
-        except ValueError as error:
-            return Reply(stamp_ns=now_ns, id="", result="malformed", text=str(error))
-        if command.action == "stop":
-            return self._decide(command)
-        if now_ns > command.expires_ns:
-            late_s = (now_ns - command.expires_ns) * 1e-9
-            return Reply(stamp_ns=now_ns, id=command.id, result="expired", text=f"came {late_s:.3f} s after its expiry")
-        if max(command.stamp_ns, command.expires_ns) > now_ns + LONGEST_LIFE_NS:
-            return Reply(stamp_ns=now_ns, id=command.id, result="refused",
-                         text=f"issued or valid more than {LONGEST_LIFE_NS * 1e-9:g} s ahead of the rig's clock")
-        self._seen = {name: expires_ns for name, expires_ns in self._seen.items() if expires_ns >= now_ns}
-        if command.id in self._seen:
-            return Reply(stamp_ns=now_ns, id=command.id, result="replayed", text="this id was answered before")
-        self._seen[command.id] = command.expires_ns
-        return self._decide(command)
+
+def _open(config: zenoh.Config, listen: list[str]) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        found = str(error).split(" at /")[0]
+        wanted = f"to listen on {', '.join(listen)}" if listen else "a rig that listens there and takes this certificate"
+        raise OSError(f"zenoh: found {found}, wanted {wanted}") from None
 
 
 class Session:
     """One open session of a rig. Use as a context, or `close` it.
 
-    listen, connect: endpoints, as in `check_endpoint`. Normally one process listens and the others connect to it; those
-    also reach each other through it. Who starts first does not matter.
+    listen, connect: endpoints, as in `check_endpoint`; network: for other machines, besides. Normally one process
+    listens and the others connect to it; those also reach each other through it. Who starts first does not matter.
     Raises ValueError for an endpoint that leaves this machine, OSError where it cannot listen.
     """
 
-    def __init__(self, rig: str, listen: list[str], connect: list[str]) -> None:
+    def __init__(self, rig: str, listen: list[str], connect: list[str], network: Network | None = None) -> None:
         key(rig, "state")
         self.rig = rig
-        config = configuration(listen, connect)
-        try:
-            self.zenoh = zenoh.open(config)
-        except zenoh.ZError as error:
-            where = ", ".join(listen) or "nothing"
-            found = str(error).split(" at /")[0]
-            raise OSError(f"zenoh: found {found}, wanted to listen on {where}") from None
+        self.zenoh = _open(configuration(listen, connect, network),
+                           listen + list(network.listen if network is not None else ()))
+
+    @classmethod
+    def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
+        """A session to a rig on another machine, with the certificate in folder `keys`.
+
+        Raises ValueError for an endpoint that is not TLS, OSError where nobody answers or the certificate is refused.
+        """
+        key(rig, "state")
+        session = cls.__new__(cls)
+        session.rig = rig
+        session.zenoh = _open(zenoh.Config.from_json5(json.dumps(client_settings(endpoint, keys))), [])
+        return session
 
     def publisher(self, topic: str) -> Publisher:
         """A publisher of `topic`."""
@@ -198,14 +209,18 @@ class Session:
         """All topics, for who records."""
         return Everything(self.zenoh, self.rig)
 
-    def serve_commands(self, now_ns: Callable[[], int], decide: Callable[[Command], Reply]) -> CommandServer:
-        """Answer commands with `decide`; see CommandServer."""
-        return CommandServer(self.zenoh, self.rig, now_ns, decide)
+    def serve_requests(self, answer: Callable[[str, bytes], Reply | None]) -> RequestServer:
+        """Answer requests with `answer`; see RequestServer."""
+        return RequestServer(self.zenoh, self.rig, answer)
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
         """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
-        for reply in self.zenoh.get(key(self.rig, "command"), payload=encode(command), timeout=timeout_s,
-                                    congestion_control=zenoh.CongestionControl.DROP):
+        try:
+            replies = self.zenoh.get(request_key(self.rig, command.commander), payload=encode(command), timeout=timeout_s,
+                                     congestion_control=zenoh.CongestionControl.DROP)
+        except zenoh.ZError:
+            return None
+        for reply in replies:
             if reply.ok is not None:
                 return decode(Reply, bytes(reply.ok.payload))
         return None

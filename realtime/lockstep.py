@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from protocol.setpoint_encoder import BUFFER_BYTES, encode_setpoint
-from protocol.topics import Command, ForceEstimate, Log, Message
+from protocol.topics import Command, ForceEstimate, Log, Message, Reply
 from realtime import telemetry
 from realtime.board_intake import axis_limits, board_message, take_status
+from realtime.command_gate import CommandGate, for_the_record
 from realtime.configure import tick_parameters
 from realtime.drivers.aurora import AuroraClient, AuroraConfig
 from realtime.drivers.aurora_session import LineAction
@@ -74,6 +75,9 @@ class LockstepLoop:
             counts_per_Nm=rig.force_sensor.counts_per_newton_metre, rdt_rate_hz=rig.force_sensor.rate_hz)))
         self.intake = Intake(rig)
         self.desk = OperatorDesk(rig, self.inputs[0].command, self.link)
+        self._leases = 0
+        self.gate = CommandGate(lambda: self._last_ns, self._obey, new_lease=self._next_lease,
+                                roles=rig.access.roles if rig.access else {})
         self.work = np.zeros(BINS + 2, np.int64)
         self.faults: list[str] = []
         self.supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
@@ -83,12 +87,28 @@ class LockstepLoop:
         self._estimates: deque[ForceEstimate] = deque()
         tick(self.params, self.state.copy(), self.inputs.copy(), self.outputs.copy())  # compiles; changes nothing
 
-    def command(self, command: Command, now_ns: int) -> None:
-        """An operator's command; its reply is published."""
-        self.publish("command", command)
+    def request(self, name: str, payload: bytes) -> Reply | None:
+        """What comes from commander `name`; a command and its reply are published."""
+        command, reply = self.gate.answer(name, payload)
+        for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
+            self.publish(topic, message)
+        if reply is not None and command is None:
+            self.log(self._last_ns, "warning", "commander", f"{name}: {reply.result}: {reply.text}")
+        return reply
+
+    def _obey(self, command: Command, now_ns: int) -> Reply:
         if command.action in ("arm", "clear_fault"):
             self._supervised("", now_ns, restart=True)
-        self.publish("reply", self.desk.obey(command, now_ns))
+        return self.desk.obey(command, now_ns)
+
+    def _next_lease(self) -> str:
+        self._leases += 1
+        return f"lease-{self._leases}"
+
+    @property
+    def now_ns(self) -> int:
+        """The computer's clock at the newest period."""
+        return self._last_ns
 
     def estimate_at(self, estimate: ForceEstimate) -> None:
         """A force estimate that arrives at its `published_ns`."""
@@ -205,6 +225,7 @@ class LockstepLoop:
         if number % self.rig.control.loop_hz == 0:
             self.publish("loop", telemetry.loop_message(
                 now_ns, self.rig.control.loop_hz, self.missed_ticks, self.work))
+            self.publish("commander", self.gate.state())
 
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")

@@ -1,6 +1,6 @@
 """Commands in, replies out: arms the board and the loop, sets targets, stops, clears. Nothing arms by itself.
 
-Expiry and repetition of commands are judged where they arrive (`protocol.zenoh_session.CommandServer`).
+Who may command, and whether a command is fresh, has been judged before (`realtime.command_gate`).
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ class OperatorDesk:
     def obey(self, command: Command, now_ns: int) -> Reply:
         """Carry out `command` at `now_ns` or refuse it; a refused command changes nothing."""
         actions = {"arm": self._arm, "disarm": self._disarm, "stop": self._stop, "clear_fault": self._clear_fault,
-                   "target": self._target}
+                   "target": self._target,
+                   "hold": self._hold, "force": self._force}
         problem = actions[command.action](command)
         return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
 
@@ -90,15 +91,27 @@ class OperatorDesk:
             self._frames.append(self._link.clear_fault(command.fault or self._link.status.fault))
         return ""
 
+    def _hold(self, command: Command) -> str:
+        if not self._record.armed:
+            return "hold: found the rig disarmed, wanted armed"
+        self._set(COMMAND_HOLD)
+        return ""
+
+    def _force(self, command: Command) -> str:
+        """Another force on the target that there is; nothing else changes."""
+        if not self._record.armed or self._record.kind != COMMAND_CONTACT:
+            return "force: found no contact asked for, wanted target contact before"
+        problem = self._too_much(command)
+        if not problem and command.force_N is not None:
+            self._record.force_N = command.force_N
+        return problem
+
     def _target(self, command: Command) -> str:
         if not self._record.armed:
             return "target: found the rig disarmed, wanted armed"
-        if command.target_m is not None:
-            problem = self._outside(command.target_m)
-            if problem:
-                return problem
-        if command.force_N is not None and command.force_N >= self._rig.safety.over_force_N:
-            return f"force_N: found {command.force_N}, wanted below safety.over_force_N {self._rig.safety.over_force_N}"
+        problem = self._too_much(command) or ("" if command.target_m is None else self._outside(command.target_m))
+        if problem:
+            return problem
         if command.target_m is not None:
             self._record.target_m[:] = command.target_m
         if command.normal is not None:
@@ -106,6 +119,12 @@ class OperatorDesk:
         if command.force_N is not None:
             self._record.force_N = command.force_N
         self._set(_KINDS[command.target])
+        return ""
+
+    def _too_much(self, command: Command) -> str:
+        limit_N = self._rig.safety.over_force_N
+        if command.force_N is not None and command.force_N >= limit_N:
+            return f"force_N: found {command.force_N}, wanted below safety.over_force_N {limit_N}"
         return ""
 
     def _outside(self, target_m: Vector) -> str:

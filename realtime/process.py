@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from protocol.topics import Log, LoopTiming, Message
+from protocol.topics import Command, Log, LoopTiming, Message, Reply
 from protocol.zenoh_session import Session
 from realtime import telemetry
 from realtime.board_intake import axis_limits, board_message, take_status
 from realtime.clock import Clock
+from realtime.command_gate import CommandGate, for_the_record
 from realtime.configure import tick_parameters
 from realtime.drivers.aurora import AuroraConfig, PoseSample
 from realtime.drivers.device_events import DeviceEvent
@@ -57,6 +58,7 @@ class RealtimeProcess:
         self._link = StepperBoardLink(axis_limits(rig))
         self._link_lock = threading.Lock()
         self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
+        self._gate = CommandGate(self.clock.now_ns, self._obey, roles=rig.access.roles if rig.access else {})
         self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
         self._phase = PHASE_DISARMED
         self._params = tick_parameters(rig, force_source)
@@ -64,7 +66,8 @@ class RealtimeProcess:
         os.set_blocking(self._port.fileno(), False)
         self._session = Session(rig.name, [], rig.zenoh.connect)
         self._publishers = {name: self._session.publisher(name) for name in (
-            "stage", "pose/tip", "pose/shaft", "force/sensor", "state", "board", "loop", "log")}
+            "stage", "pose/tip", "pose/shaft", "force/sensor", "state", "board", "loop", "log", "command", "reply",
+            "commander")}
         self._publish_lock = threading.Lock()
         self._estimates = self._session.latest("force/estimate")
         self.loop = NativeLoop(
@@ -92,7 +95,7 @@ class RealtimeProcess:
             thread.start()
         self._tracker.start()
         self._force.start()
-        self._commands = self._session.serve_commands(self.clock.now_ns, self._obey)
+        self._requests = self._session.serve_requests(self._request)
         self._log("info", "realtime", f"loop at {self.rig.control.loop_hz} Hz, disarmed")
 
     def stop(self) -> None:
@@ -213,16 +216,26 @@ class RealtimeProcess:
             with self._link_lock:
                 self._supervised(self._supervision.estimate(sensor_N, box.record[0].force_N, now_ns))
 
-    def _obey(self, command: Any) -> Any:
+    def _request(self, name: str, payload: bytes) -> Reply | None:
+        """What a commander asks; on a thread of zenoh's. The command and its reply are published and logged."""
+        command, reply = self._gate.answer(name, payload)
+        told = for_the_record(command, reply)
+        for topic, message in zip(("command", "reply"), told or (), strict=False):
+            self._publish(topic, message)
+        if reply is not None and (told or command is None):
+            what = f"{command.action} {command.target}".removesuffix(" none") if command else "request"
+            self._log("info" if reply.result == "accepted" else "warning", "commander",
+                      f"{name[:40]}: {what}: {reply.result} {reply.text}".strip())
+        return reply
+
+    def _obey(self, command: Command, now_ns: int) -> Reply:
         with self._link_lock:
             if command.action in ("arm", "clear_fault"):
                 self._supervision.restart()
                 self._desk.watch(0)
-            reply = self._desk.obey(command, self.clock.now_ns())
+            reply = self._desk.obey(command, now_ns)
             self._mailboxes["command"].publish()
             self._send(self._desk.take_frames())
-        self._log("info" if reply.result == "accepted" else "warning", "operator",
-                  f"{command.action} {command.target}: {reply.result} {reply.text}".strip())
         return reply
 
     # Telling.
@@ -256,6 +269,7 @@ class RealtimeProcess:
             if self.clock.now_ns() > due_ns:
                 due_ns = self.clock.now_ns() + 500_000_000
                 self._publish("loop", self.timing())
+                self._publish("commander", self._gate.state())
 
     def timing(self) -> LoopTiming:
         """Tick time, lateness, missed ticks and the longest gap since the start."""

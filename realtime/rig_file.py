@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from protocol.topics import check_name
+from protocol.zenoh_access import Network, check_network_endpoint
 
 AXES = ("insertion", "roll", "knob")
 
@@ -176,6 +180,30 @@ class Zenoh(_Section):
     connect: list[str]
 
 
+class NetworkAccess(_Section):
+    """Other machines: where they reach the rig, with whose keys, who may read and who command. Nothing: nobody."""
+
+    listen: list[str] = []
+    keys: str = ""
+    peers: list[str] = []
+    readers: list[str] = []
+    commanders: list[str] = []
+
+    @model_validator(mode="after")
+    def _sound(self) -> NetworkAccess:
+        for endpoint in self.listen:
+            check_network_endpoint(endpoint)
+        for name in self.readers + self.commanders:
+            check_name(name)
+        for peer in self.peers:
+            ipaddress.ip_network(peer)
+        if len({*self.readers, *self.commanders}) < len(self.readers + self.commanders):
+            raise ValueError("every name once in readers and commanders (a commander reads too)")
+        if self.listen and not Path(self.keys).is_absolute():
+            raise ValueError("keys: an absolute path, of the folder that `seldinger keys issue RIG --role rig` made")
+        return self
+
+
 class Rig(_Section):
     """All of it. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
 
@@ -189,6 +217,7 @@ class Rig(_Section):
     control: Control
     safety: Safety
     zenoh: Zenoh
+    network: NetworkAccess = NetworkAccess()
 
     @model_validator(mode="after")
     def _calibration_fits(self) -> Rig:
@@ -200,6 +229,12 @@ class Rig(_Section):
     def stage(self, axis: int) -> Stage:
         """The stage of axis 0 insertion, 1 roll or 2 knob."""
         return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
+
+    @property
+    def access(self) -> Network | None:
+        """What other machines may do here; None where nothing leaves this one."""
+        n = self.network
+        return Network(self.name, tuple(n.listen), Path(n.keys), tuple(n.readers), tuple(n.commanders)) if n.listen else None
 
     def effective(self) -> dict[str, Any]:
         """The whole effective configuration, for the recording's header."""

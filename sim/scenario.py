@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from protocol.topics import Command, ForceEstimate, Message, SimulatedTruth
+from protocol.commander import Acknowledgement, Commander
+from protocol.topics import Command, ForceEstimate, Message, Reply, SimulatedTruth, encode
 from realtime.drivers.stepper_board import LinkPhase
 from realtime.lockstep import Arriving, LockstepLoop, Publish
 from realtime.records import PHASE_CONTACT, PHASE_STOPPED
@@ -21,7 +22,6 @@ Estimator = Callable[[Message, Message | None, Message], ForceEstimate | None]
 SETTLE_S = 3.0
 START_TIMEOUT_S = 10.0
 TRUTH_EVERY = 10
-COMMAND_LIFE_NS = 100_000_000
 
 
 @dataclass
@@ -65,6 +65,7 @@ class Scenario:
         self._leaving = self.loop.step(0, Arriving())
         self._latest: dict[str, Message] = {}
         self._commands = 0
+        self.commander = Commander(self, "scenario", clock_ns=lambda: self.loop.now_ns, new_id=self._next_id)
         self._started = time.monotonic()
         self._stop = False
 
@@ -109,13 +110,19 @@ class Scenario:
                 return True
         return False
 
-    def command(self, action: str, target: str = "none", **fields: object) -> None:
-        """An operator's command, now."""
+    def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
+        """Carry `command` to the loop, as its bytes, and the reply back."""
+        return self.loop.request(command.commander, encode(command))
+
+    def command(self, action: str, target: str = "none", **fields: object) -> Acknowledgement:
+        """An operator's command, now, under the lease, which is taken first if it must be."""
+        if not self.commander.lease_left_s:
+            self.commander.take()
+        return self.commander.give(action, target, **fields)
+
+    def _next_id(self) -> str:
         self._commands += 1
-        now_ns = self.world.now_ns
-        self.loop.command(Command(
-            stamp_ns=now_ns, id=f"scenario-{self._commands}", expires_ns=now_ns + COMMAND_LIFE_NS, action=action,
-            target=target, **fields), now_ns)  # type: ignore[arg-type]
+        return f"scenario-{self._commands}"
 
     @property
     def phase(self) -> int:

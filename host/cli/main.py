@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "check-device": ("host.cli.check_device", "check_device", "Talk to one device of a rig and say what it answers."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
     "install-services": ("host.cli.install_services", "install_services", "systemd units of the rig, and their undo."),
+    "keys": ("host.cli.keys", "keys", "Certificates for readers and commanders on other machines."),
     "soak": ("host.cli.soak", "soak", "Hours of virtual operation: memory, clocks, steps."),
     "export": ("host.cli.export", "export", "Tables of a recording as parquet or csv."),
     "latency-check": ("host.cli.latency_check", "latency_check", "How punctual the loop is here, beside cyclictest."),

@@ -50,7 +50,9 @@ def unit_texts(settings: UnitSettings, rig: Rig) -> dict[str, str]:
     texts = {}
     for name in settings.names:
         # Only the control loop speaks to the force box; where its address is a name, the network filter cannot know it.
-        allowed = _addresses([rig.force_sensor.address]) if "realtime" in name else ""
+        # The model process is the one that other machines reach.
+        peers = " ".join(rig.network.peers) if "host" in name else ""
+        allowed = _addresses([rig.force_sensor.address]) if "realtime" in name else peers
         common = (HERE / "common.service.in").read_text(encoding="utf-8").strip().replace("@allow@", allowed)
         text = (HERE / f"{name}.in").read_text(encoding="utf-8").replace("@common@", common)
         for key, value in fields.items():

@@ -107,8 +107,8 @@ class Story:
         writer.write("log", Log(stamp_ns=time_ns, level="info", source="test", text=self.log))
         if time_ns == 2000 * MS:
             writer.write("command", Command(
-                stamp_ns=time_ns, id="c1", expires_ns=time_ns + 1, action="target", target="contact", force_N=0.2,
-                target_m=(0.0, -0.01, 0.025), normal=(0.0, 0.0, 1.0)))
+                stamp_ns=time_ns, id="c1", commander="console", expires_ns=time_ns + 1, action="target", target="contact",
+                force_N=0.2, target_m=(0.0, -0.01, 0.025), normal=(0.0, 0.0, 1.0)))
             writer.write("reply", Reply(stamp_ns=time_ns, id="c1", result="accepted"))
 
 

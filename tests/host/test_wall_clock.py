@@ -19,9 +19,9 @@ pytestmark = pytest.mark.slow
 def in_contact(operator: Operator) -> bool:
     if not operator.arm():
         return False
-    operator.ask("target", "position", target_m=(0.0, -0.0107, 0.021))
+    operator.commander.target((0.0, -0.0107, 0.021))
     operator.wait(4.0, lambda: False)
-    operator.ask("target", "contact", target_m=TARGET_M, normal=(0.0, 0.0, 1.0), force_N=0.15)
+    operator.commander.press(TARGET_M, (0.0, 0.0, 1.0), 0.15)
     return operator.wait(30.0, lambda: operator.mode() in ("contact", "stopped"))
 
 

@@ -30,6 +30,7 @@ from protocol.topics import (
     histogram_bucket,
     json_schema,
     key,
+    request_key,
     topic_of,
 )
 
@@ -63,7 +64,8 @@ def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
     if cls is ForceEstimate:
         return values | {"converged": False}
     if cls is Command:
-        return values | {"id": "c1", "expires_ns": values["stamp_ns"], "action": "arm", "target": "none"}
+        return values | {"id": "c1", "commander": "console", "expires_ns": values["stamp_ns"], "action": "arm",
+                         "target": "none"}
     return values
 
 
@@ -198,11 +200,16 @@ def test_long_texts_are_cut_when_sent_and_refused_when_received() -> None:
     ({"force_N": 1.5}, "Command.force_N"),
     ({"force_N": -0.1}, "Command.force_N"),
     ({"expires_ns": 5}, "before stamp_ns"),
+    ({"action": "force"}, "Command.force_N"),
+    ({"commander": ""}, "commander: found"),
+    ({"commander": "Console"}, "commander: found"),
+    ({"commander": "a/b"}, "commander: found"),
     ({"id": ""}, "Command.id"),
     ({"id": "x" * 65}, "Command.id"),
 ])
 def test_incomplete_commands_are_refused(changes: dict[str, Any], says: str) -> None:
-    good: dict[str, Any] = {"stamp_ns": 10, "id": "c1", "expires_ns": 20, "action": "arm", "target": "none"}
+    good: dict[str, Any] = {"stamp_ns": 10, "id": "c1", "commander": "console", "expires_ns": 20, "action": "arm",
+                            "target": "none"}
     assert decode(Command, encode(Command(**good))).action == "arm"
     with pytest.raises(ValueError, match=says):
         encode(Command(**(good | changes)))
@@ -219,6 +226,13 @@ def test_keys_go_both_ways(name: str) -> None:
 def test_other_keys_are_refused(bad: str) -> None:
     with pytest.raises(ValueError, match="key: found"):
         topic_of(bad)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "**", "a*", "$*", "Console", "x" * 33, "a\n"])
+def test_names_of_commanders_cannot_widen_a_key(name: str) -> None:
+    assert request_key("simulated", "console") == "seldinger/v1/simulated/request/console"
+    with pytest.raises(ValueError, match="commander: found"):
+        request_key("simulated", name)
 
 
 @pytest.mark.parametrize("rig", ["", "a/b", "**", "Rig", "x" * 33])

@@ -15,11 +15,9 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from protocol.topics import Command, ForceSensor, Reply, encode, key
-from protocol.zenoh_session import LONGEST_LIFE_NS, CommandServer, Session, check_endpoint, configuration
+from protocol.topics import Command, ForceSensor, Reply, decode, encode, key
+from protocol.zenoh_session import Session, check_endpoint, configuration
 
 PATIENCE_S = 30.0
 
@@ -140,75 +138,50 @@ def test_those_that_connect_to_one_listener_reach_each_other(endpoint: str) -> N
         assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
 
 
-def arm(now_ns: int, name: str = "c1", life_ns: int = 1_000_000_000) -> Command:
-    return Command(stamp_ns=now_ns, id=name, expires_ns=now_ns + life_ns, action="arm", target="none")
+def command(name: str = "console", number: int = 1) -> Command:
+    return Command(stamp_ns=5, id=f"c{number}", commander=name, expires_ns=6, action="arm", target="none")
 
 
-def test_a_command_is_answered_once_and_its_replay_refused(endpoint: str) -> None:
-    done: list[str] = []
+def test_a_request_is_answered_and_comes_with_the_name_in_its_key(endpoint: str) -> None:
+    asked: list[tuple[str, str]] = []
 
-    def decide(command: Command) -> Reply:
-        done.append(command.id)
-        return Reply(stamp_ns=5, id=command.id, result="accepted")
+    def answer(name: str, payload: bytes) -> Reply:
+        asked.append((name, decode(Command, payload).id))
+        return Reply(stamp_ns=5, id=asked[-1][1], result="refused", text="because")
 
-    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as operator:
-        server = rig.serve_commands(lambda: 5, decide)
+    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
+        server = rig.serve_requests(answer)
         replies: list[Reply] = []
-        assert until(lambda: (reply := operator.ask(arm(5))) is not None and (replies.append(reply) is None))
-        again = operator.ask(arm(5))
-        assert replies[0].result == "accepted" and again is not None and again.result == "replayed"
-        assert done == ["c1"] and server is not None
+        assert until(lambda: (reply := console.ask(command())) is not None and (replies.append(reply) is None))
+        assert (replies[0].id, replies[0].result, replies[0].text) == ("c1", "refused", "because")
+        assert console.ask(command("other", 2)) is not None
+        assert set(asked) == {("console", "c1"), ("other", "c2")} and server is not None
+
+
+def test_what_gets_no_reply_leaves_the_asker_without_one_at_once(endpoint: str) -> None:
+    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
+        heard: list[bytes] = []
+        server = rig.serve_requests(lambda name, payload: heard.append(payload))
+        assert until(lambda: console.ask(command(), timeout_s=60.0) is None and bool(heard)) and server is not None
+
+
+def test_a_request_to_all_names_at_once_is_no_command(endpoint: str) -> None:
+    heard: list[str] = []
+
+    def answer(name: str, payload: bytes) -> Reply:
+        heard.append(name)
+        return Reply(stamp_ns=0, id="", result="refused")
+
+    with Session("simulated", [endpoint], []) as rig:
+        server = rig.serve_requests(answer)
+        for pattern in ("request/*", "request/**", "**"):
+            assert list(rig.zenoh.get(f"seldinger/v1/simulated/{pattern}", payload=encode(command()), timeout=2.0)) == []
+        assert all("*" in name for name in heard) and server is not None
 
 
 def test_nobody_to_answer_is_no_answer(endpoint: str) -> None:
-    with Session("simulated", [], [endpoint]) as operator:
-        assert operator.ask(arm(5), timeout_s=0.2) is None
-
-
-class Judged:
-    """A command server without zenoh under it, and what it let through."""
-
-    def __init__(self, now_ns: int = 10_000_000_000) -> None:
-        self.now_ns = now_ns
-        self.done: list[Command] = []
-        self.server = CommandServer.__new__(CommandServer)
-        self.server._now_ns, self.server._seen = lambda: self.now_ns, {}
-        self.server._decide = self.decide
-
-    def decide(self, command: Command) -> Reply:
-        self.done.append(command)
-        return Reply(stamp_ns=self.now_ns, id=command.id, result="accepted")
-
-
-def test_stale_and_far_future_commands_do_nothing() -> None:
-    judged = Judged()
-    now_ns = judged.now_ns
-    assert judged.server.judge(encode(arm(now_ns - 2_000_000_000))).result == "expired"
-    assert judged.server.judge(encode(arm(now_ns, "c2", LONGEST_LIFE_NS + 1))).result == "refused"
-    assert judged.server.judge(encode(arm(now_ns + LONGEST_LIFE_NS + 1, "c3"))).result == "refused"
-    assert judged.done == []
-    assert judged.server.judge(encode(arm(now_ns, "c4"))).result == "accepted"
-
-
-def test_a_late_stop_still_stops() -> None:
-    judged = Judged()
-    stop = Command(stamp_ns=0, id="s", expires_ns=1, action="stop", target="none")
-    assert judged.server.judge(encode(stop)).result == "accepted"
-    assert judged.server.judge(encode(stop)).result == "accepted"
-
-
-def test_ids_are_forgotten_when_they_could_not_be_replayed_anyway() -> None:
-    judged = Judged()
-    for number in range(100):
-        judged.server.judge(encode(arm(judged.now_ns, f"c{number}")))
-        judged.now_ns += 500_000_000
-    assert len(judged.done) == 100 and len(judged.server._seen) < 5
-
-
-@given(st.binary(max_size=5000))
-def test_noise_is_never_a_command(payload: bytes) -> None:
-    judged = Judged()
-    assert judged.server.judge(payload).result == "malformed" and judged.done == []
+    with Session("simulated", [], [endpoint]) as console:
+        assert console.ask(command(), timeout_s=0.2) is None
 
 
 @pytest.mark.parametrize("bad", [

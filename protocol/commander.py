@@ -1,0 +1,157 @@
+"""Whoever commands a rig: takes the lease, keeps it, gives commands under it, and hears what became of each."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from protocol.topics import Command, Reply, check_name
+
+LIFE_NS = 500_000_000
+_RENEW_BEFORE_NS = 2_000_000_000
+# A round trip longer than this says too little about the rig's clock.
+_PROMPT_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Acknowledgement:
+    """What became of a command. `reason`: why not, in words; empty when it was accepted.
+
+    result: as in Reply, or `unanswered`: it may or may not have been carried out.
+    """
+
+    accepted: bool
+    reason: str
+    result: str
+
+
+class Asker(Protocol):
+    """Whatever carries a command to a rig and its reply back: a zenoh session, or a rig in the same process."""
+
+    def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
+        """The reply, None where nobody answers in time."""
+
+
+class Commander:
+    """Commands one rig as `name`. Each method sends one command and returns its Acknowledgement; none raises.
+
+    session: as in Asker. clock_ns: this side's clock; the rig's is learnt from its replies. new_id: unique texts.
+    Raises ValueError for a bad name.
+    """
+
+    def __init__(self, session: Asker, name: str, *, timeout_s: float = 1.0,
+                 clock_ns: Callable[[], int] = time.monotonic_ns,
+                 new_id: Callable[[], str] = lambda: uuid.uuid4().hex) -> None:
+        self.name = check_name(name)
+        self._session, self._timeout_s, self._clock_ns, self._new_id = session, timeout_s, clock_ns, new_id
+        self._ahead_ns: int | None = None
+        self._lease, self._lease_expires_ns, self._sequence = "", 0, 0
+        self._lock = threading.RLock()
+
+    def take(self) -> Acknowledgement:
+        """Take the lease, or keep it for longer. Refused while another commander holds it."""
+        with self._lock:
+            reply = self._ask("take")
+            if reply is not None and reply.result == "accepted":
+                self._lease, self._lease_expires_ns = reply.lease, reply.lease_expires_ns
+            return _said(reply)
+
+    def release(self) -> Acknowledgement:
+        """Give the lease back. What moves goes on as commanded."""
+        with self._lock:
+            answer = self.give("release")
+            self._lease, self._lease_expires_ns = "", 0
+            return answer
+
+    def arm(self) -> Acknowledgement:
+        """Arm the board and the loop; they hold."""
+        return self.give("arm")
+
+    def disarm(self) -> Acknowledgement:
+        """Stages at rest, board disarmed."""
+        return self.give("disarm")
+
+    def hold(self) -> Acknowledgement:
+        """Stay where it is. Needs no lease."""
+        return self.give("hold")
+
+    def stop(self) -> Acknowledgement:
+        """Stop; only disarming and arming lead out of it. Needs no lease, is obeyed late too."""
+        return self.give("stop")
+
+    def clear_fault(self) -> Acknowledgement:
+        """Clear what is latched, and leave the rig disarmed."""
+        return self.give("clear_fault")
+
+    def target(self, position_m: Sequence[float]) -> Acknowledgement:
+        """Bring the tip to `position_m` (3, m, base frame)."""
+        return self.give("target", "position", target_m=position_m)
+
+    def press(self, position_m: Sequence[float], normal: Sequence[float], force_N: float) -> Acknowledgement:
+        """Approach the tissue at `position_m` along `normal` (3, unit, into it) and hold `force_N` on it."""
+        return self.give("target", "contact", target_m=position_m, normal=normal, force_N=force_N)
+
+    def force(self, force_N: float) -> Acknowledgement:
+        """Another force (N) on the tissue that is pressed on."""
+        return self.give("force", force_N=force_N)
+
+    def retract(self) -> Acknowledgement:
+        """Away from the tissue, then stop."""
+        return self.give("target", "retract")
+
+    def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
+        """Any command (fields as in `protocol.topics.Command`), under the lease, which is renewed before it ends."""
+        try:
+            if action == "stop":  # waits for no lock and no other command
+                return _said(self._send(action, target, 0, **fields))
+            with self._lock:
+                if self._lease and action not in ("hold", "release"):
+                    self._renew()
+                return _said(self._ask(action, target, **fields))
+        except ValueError as error:
+            return Acknowledgement(False, str(error), "malformed")
+
+    @property
+    def lease_left_s(self) -> float:
+        """How long the lease lasts if it is not renewed; 0 without one."""
+        with self._lock:
+            return (self._lease_expires_ns - self._now_ns()) * 1e-9 if self._holding() else 0.0
+
+    def _holding(self) -> bool:
+        return bool(self._lease) and self._now_ns() <= self._lease_expires_ns
+
+    def _renew(self) -> None:
+        left_ns = self._lease_expires_ns - self._now_ns()
+        if not _RENEW_BEFORE_NS < left_ns < 2 * _RENEW_BEFORE_NS:
+            self.take()
+
+    def _now_ns(self) -> int:
+        return max(self._clock_ns() + (self._ahead_ns or 0), 0)
+
+    def _ask(self, action: str, target: str = "none", **fields: Any) -> Reply | None:
+        if self._ahead_ns is None:
+            self._send("clock", "none", 0)
+        self._sequence += 1
+        return self._send(action, target, self._sequence, **fields)
+
+    def _send(self, action: str, target: str, sequence: int, **fields: Any) -> Reply | None:
+        issued_ns, sent_ns = self._now_ns(), self._clock_ns()
+        reply = self._session.ask(
+            Command(stamp_ns=issued_ns, sequence=sequence, id=self._new_id(), commander=self.name,
+                    lease=self._lease, expires_ns=issued_ns + LIFE_NS, action=action, target=target, **fields),
+            self._timeout_s)
+        came_ns = self._clock_ns()
+        if reply is not None and (came_ns - sent_ns < _PROMPT_NS or self._ahead_ns is None):
+            self._ahead_ns = reply.stamp_ns - (sent_ns + came_ns) // 2
+        return reply
+
+
+def _said(reply: Reply | None) -> Acknowledgement:
+    if reply is None:
+        return Acknowledgement(False, "no answer: the rig may or may not have heard the command", "unanswered")
+    accepted = reply.result == "accepted"
+    return Acknowledgement(accepted, "" if accepted else f"{reply.result}: {reply.text}", reply.result)
