@@ -25,6 +25,7 @@ from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
 from host.mechanics.rotations import conjugate, quaternion_of_vector, quaternion_product, rotation_matrix
+from host.mechanics.tip_shooting import load_number
 
 __all__ = ["ForceEstimate", "PoseSensor", "SurfacePrior", "estimate_cosserat"]
 
@@ -33,7 +34,8 @@ Array = NDArray[np.float64]
 LARGEST_FORCE_N = 0.5
 GATE = 6.0  # root mean square of the weighted residuals above which no force is said to explain the poses
 FAIR_DEVIATIONS, ODD_DEVIATIONS = 4.0, 3.1  # chi square that ends the search for a better force; that draws a warning
-TINY = 1e-2  # weighted cost per residual that no noise leaves
+TINY = 1e-4  # weighted cost per residual that no noise leaves
+SOFT = 25.0  # load number of the largest force above which the search is made denser; of the force found, warned of
 WEAK_STD_N = 0.02
 LARGEST_STD_N = 10.0  # what is said of a direction the poses tell nothing about
 ONE_TO_ONE = (2, 4, 6)
@@ -77,6 +79,14 @@ def start_grid(largest_N: float) -> Array:
     return np.vstack([share * largest_N * units for share in START_SHARES])
 
 
+def dense_grid(largest_N: float) -> Array:
+    """Forces (200, 3) between those of `start_grid`: 50 directions on a spiral, four sizes."""
+    z = 1.0 - (2.0 * np.arange(50) + 1.0) / 50.0
+    turn = np.arange(50) * np.pi * (3.0 - np.sqrt(5.0))
+    units = np.column_stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn), z])
+    return np.vstack([share * largest_N * units for share in (0.6, 0.9, 0.3, 0.1)])
+
+
 def estimate_cosserat(
     catheter: Catheter,
     insertion_m: float,
@@ -118,6 +128,11 @@ def estimate_cosserat(
     if case in ONE_TO_ONE or previous_force_N is not None:
         grid = start_grid(largest) if case in ONE_TO_ONE else np.zeros((0, 3))
         settled, cost, sweeps = best_of(problem, largest, grid, fair, x, scratch)
+        if case in ONE_TO_ONE and thorough and cost > believable and load_number(problem.whole_rod, largest) > SOFT:
+            settled, cost, more = best_of(problem, largest, dense_grid(largest), fair, x, scratch)
+            sweeps += more
+        if cost > fair and load_number(problem.whole_rod, float(np.linalg.norm(x))) > SOFT:
+            notes.append("large load number: another force may explain these poses as well")
         if case not in ONE_TO_ONE:
             notes.append(f"case {case} is not one to one: taken the branch next to the previous force")
     else:

@@ -23,7 +23,7 @@ from host.mechanics.cosserat_kernels import (
     sweep,
 )
 from host.mechanics.small_matrices import apply3, inverse3
-from host.mechanics.tip_shooting import NO_STATIONS, length3, load_number, newton_matrix
+from host.mechanics.tip_shooting import NO_STATIONS, length3, load_number, newton_matrix, scale_to
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ MOST_ITERATIONS = 40
 MOST_REFINEMENTS = 12
 CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last one of the coarse sweeps
 CLOSE_N = 2e-3
-GOAL_N = 2e-7  # expected error of the force at which the fine sweeps stop
+GOAL_N, CAREFUL_GOAL_N = 2e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
 LARGEST_DAMPING = 1e9
 LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
@@ -202,17 +202,24 @@ def descend(p: Problem, largest_N: float, bend: float, close: float, close_N: fl
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def goal_of(p: Problem) -> float:
+    """Expected error of the force, N, at which the search stops."""
+    return GOAL_N if p.bend >= QUICK else CAREFUL_GOAL_N
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """Fine phase: chord steps of x (3,), in place, with the kept sensitivities. Returns (settled, cost, sweeps).
 
-    Stops where the error left, guessed from how fast the steps shrink, is below GOAL_N; the residuals s.raw and s.z
+    Stops where the error left, guessed from how fast the steps shrink, is below `goal_of`; the residuals s.raw and s.z
     are carried over the last step by their sensitivities.
     """
     m = ROWS_OF_CASE[p.case] + p.prior.shape[0]
     slope, step = s.vectors[1], s.vectors[2]
     before, settled, cost, sweeps = damped_step(0.0, s), False, 0.0, 0
+    goal = goal_of(p)
     while sweeps < MOST_REFINEMENTS and not settled:
-        cost_at(p, x, p.bend, False, s)
+        cost = cost_at(p, x, p.bend, False, s)
         sweeps += 1
         for i in range(3):
             slope[i] = 0.0
@@ -225,10 +232,12 @@ def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
         for i in range(3):
             x[i] += step[i]
         shrink = size / max(before, 1e-300)
-        if shrink > 0.9 and size > 10.0 * GOAL_N and sweeps > 1:
+        if shrink > 0.9 and size > 10.0 * goal and sweeps > 1:
             break
-        settled = size * min(shrink, 0.9) < GOAL_N
+        shrink = min(shrink, 0.9)
+        settled = size * shrink / (1.0 - shrink) < goal
         before = size
+    cost = 0.0
     for k in range(m):
         move = move_raw = 0.0
         for i in range(3):
@@ -255,15 +264,17 @@ def unweighted(case: int, length_m: float, s: Scratch) -> float:
 def estimate(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """From the guess x (3,), in place, to the force that explains the sample best nearby. (settled, cost, sweeps).
 
-    Where the chord steps do not shrink (poses that hardly tell the force), fine damped steps go on in their place.
+    Where the chord steps do not shrink (poses that hardly tell the force, or a force beyond `largest_N`, which is
+    brought back to it first), fine damped steps go on in their place, so that the cost is always that of x itself.
     """
     settled, cost, sweeps = descend(p, largest_N, COARSE, CLOSE, CLOSE_N, x, s)
     if not settled:
         return False, cost, sweeps
     settled, cost, more = refine(p, x, s)
     sweeps += more
-    if not settled and length3(x) <= largest_N:
-        settled, cost, more = descend(p, largest_N, p.bend, 0.0, GOAL_N, x, s)
+    if not settled:
+        scale_to(x, min(length3(x), largest_N))
+        settled, cost, more = descend(p, largest_N, p.bend, 0.0, goal_of(p), x, s)
         sweeps += more
     return (settled or cost < NEGLIGIBLE) and length3(x) <= 1.01 * largest_N, cost, sweeps
 

@@ -1,0 +1,78 @@
+"""The benchmark's registry and rows; never how fast anything is."""
+
+from __future__ import annotations
+
+import sys
+import time
+import types
+
+import pytest
+
+from host import bench
+from host.bench import Timed, alternate, find, row_of, run
+from host.cli.contract_io import BadInput
+
+CONTRACT_NAMES = ["pcar_direct", "pcar_inverse", "cosserat_tip", "cosserat_global",
+                  *(f"estimate_case_{i}" for i in range(1, 7)), "control_tick", "kalman_predict", "diagnose"]
+CONTRACT_KEYS = ("name", "unit", "median", "p95", "seed", "peer", "peer_median", "speedup")
+
+
+def quiet(_line: str) -> None:
+    return None
+
+
+def test_every_name_of_the_contract_is_registered() -> None:
+    assert set(CONTRACT_NAMES) <= set(bench.BENCHMARKS)
+
+
+def test_both_sides_run_in_turn_on_each_input() -> None:
+    calls: list[str] = []
+
+    def ours(name: str) -> object:
+        return lambda repeats: (calls.append(name), time.sleep(2e-4))
+
+    def peer(name: str) -> object:
+        return lambda: calls.append("peer " + name)
+
+    timed = alternate([ours("a"), ours("b")], [peer("a"), peer("b")])  # type: ignore[list-item]
+    assert calls == (["a"] + ["a", "peer a"] * bench.BLOCKS + ["b"] + ["b", "peer b"] * bench.BLOCKS)
+    assert len(timed.ours_s) == len(timed.peer_s) == 2 and min(timed.ours_s) > 1e-4
+
+
+def test_a_row_has_the_contracts_keys() -> None:
+    row = row_of("x", "cold", "some peer", Timed([1e-6, 2e-6, 3e-6], [1e-3] * 3), 5, tip_error_m=1e-9, peer_tip_error_m=1e-4)
+    assert all(key in row for key in CONTRACT_KEYS)
+    assert row["unit"] == "us" and row["median"] == pytest.approx(2.0) and row["speedup"] == pytest.approx(500.0)
+    assert row["tip_error_m"] == 1e-9 and row["seed"] == 5 and row["cases"] == 3
+
+
+def test_an_unknown_name_is_bad_input() -> None:
+    with pytest.raises(BadInput, match="cosserat_tip"):
+        run(["cosserat_tipp"], 1, quiet)
+
+
+def test_a_benchmark_can_be_added_and_one_whose_module_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = types.ModuleType("a_new_benchmark")
+    module.added = lambda seed, report: [{"name": "added", "seed": seed}]  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "a_new_benchmark", module)
+    monkeypatch.setattr(bench, "BENCHMARKS", {"added": "a_new_benchmark:added", "absent": "host.benchmarks.absent:absent"})
+    rows, missing = run([], 3, quiet)
+    assert rows == [{"name": "added", "seed": 3}] and missing == ["absent"]
+
+
+def test_a_module_that_is_there_but_broken_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "broken_benchmark.py").write_text("import no_such_library\n")  # type: ignore[operator]
+    monkeypatch.setattr(bench, "BENCHMARKS", {"broken": "broken_benchmark:run"})
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        find("broken")
+
+
+@pytest.mark.parametrize("name", ["cosserat_tip", "pcar_direct"])
+def test_a_real_benchmark_holds_its_accuracy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from host.benchmarks import planar, statics
+    monkeypatch.setattr(statics, "CASES", 4)
+    monkeypatch.setattr(planar, "CASES", 4)
+    (row,), missing = run([name], 1, quiet)
+    assert not missing and all(key in row for key in CONTRACT_KEYS)
+    assert row["name"] == name and row["right"] == row["cases"] == 4 and row["tip_error_m"] < 1e-6
