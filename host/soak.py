@@ -69,8 +69,11 @@ def _board(kind: str) -> Board:
 
 
 def soak(minutes: float, seed: int = 1, board_kind: str = "native",
-         progress: Callable[[float], None] = lambda share: None) -> SoakResult:
-    """Press on the beating wall for `minutes` of virtual time. Raises BoardUnavailable where there is no board."""
+         progress: Callable[[float], None] = lambda share: None, record_all: bool = True) -> SoakResult:
+    """Press on the beating wall for `minutes` of virtual time; without `record_all` the recording stays empty.
+
+    Raises BoardUnavailable where there is no board.
+    """
     rig, result = load_rig(SIMULATED_RIG), SoakResult()
     with _board(board_kind) as board, tempfile.TemporaryDirectory(prefix="seldinger-soak-") as folder:
         world = World(rig, simulated_plant(rig, seed), board, seed)
@@ -78,7 +81,8 @@ def soak(minutes: float, seed: int = 1, board_kind: str = "native",
         with RecordingWriter(path, header_of(rig, "virtual", seed, {"job": "soak"})) as recording:
 
             def record(topic: str, message: Message) -> None:
-                recording.write(topic, message, world.now_ns)
+                if record_all:
+                    recording.write(topic, message, world.now_ns)
 
             run = Scenario(rig, world, record, estimator=EstimationService(load_estimator(DEFAULT_ESTIMATOR, rig)))
             if not run.arm():

@@ -21,6 +21,7 @@ def soak(
     minutes: Annotated[float, typer.Option(help="Of virtual time.")] = 30.0,
     seed: Annotated[int, typer.Option(help="Of all noise.")] = 1,
     board: Annotated[str, typer.Option(help="avr (the ELF in simavr), native, or auto.")] = "native",
+    record: Annotated[bool, typer.Option(help="Record it; a recording's index grows by about 1 kB a second.")] = True,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
     docs: Annotated[Path | None, typer.Option(help="Page whose section on the soak is to be written anew.")] = None,
 ) -> None:
@@ -33,11 +34,11 @@ def soak(
                   transient=True) as bar:
         task = bar.add_task("soak", total=1.0)
         try:
-            result = run_soak(minutes, seed, board, lambda share: bar.update(task, completed=share))
+            result = run_soak(minutes, seed, board, lambda share: bar.update(task, completed=share), record)
         except BoardUnavailable as error:
             print(f"seldinger: {error}", file=sys.stderr)
             raise typer.Exit(1) from None
-    section = page_section(result, minutes, seed, board)
+    section = page_section(result, minutes, seed, board + ("" if record else " --no-record"))
     print(section, file=sys.stderr)
     if docs is not None:
         write_section(docs, "soak", section)

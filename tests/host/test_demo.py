@@ -25,7 +25,8 @@ def test_a_disk_that_fills_up_is_told_and_the_job_is_still_done(tmp_path: Path, 
         return real(fd, data[:taken])
 
     monkeypatch.setattr(recording_module.os, "write", small_disk)
-    told = CliRunner().invoke(build(["demo"]), ["demo", "--fast", "--board", "native", "--hold", "3", "--json", "--dir", str(tmp_path)])
+    words = ["demo", "--fast", "--board", "native", "--hold", "3", "--json", "--dir", str(tmp_path)]
+    told = CliRunner().invoke(build(words), words)
     monkeypatch.undo()
     assert told.exit_code == 1 and "the disk is full" in told.stderr
     steps = json.loads(told.stdout)["steps"]
