@@ -337,15 +337,20 @@ class Recording:
         return {**units, "recorded_ns": "ns"}
 
     def messages(self, topic: str) -> Iterator[dict[str, Any]]:
-        """The messages of `topic` as dicts, in the order of recording, nil as None; none for a topic that is not there.
-
-        Older recordings hold msgpack, whose maps never begin with the byte of `{`.
-        """
+        """The messages of `topic` as dicts, in the order of recording, nil as None; none for a topic that is not there."""
         if topic in self._rows:
             names = list(self.schema(topic)["properties"])
             for row in self._rows[topic]:
-                body = orjson.loads(row.data) if row.data[:1] == b"{" else msgpack.unpackb(row.data)
+                body = _body(row.data)
                 yield {name: body.get(name) for name in names}
+
+    def message(self, topic: str, index: int) -> dict[str, Any]:
+        """Message number `index` of `topic`, in the order of recording; nil is absent. Raises KeyError, IndexError."""
+        return _body(self._rows[topic][index].data)
+
+    def times_ns(self, topic: str) -> np.ndarray:
+        """When each message of `topic` was recorded, (n,), not falling; empty for a topic that is not there."""
+        return np.maximum.accumulate(np.array([row.recorded_ns for row in self._rows.get(topic, [])], dtype=np.int64))
 
     def table(self, topic: str) -> dict[str, np.ndarray]:
         """The messages of `topic` as columns, one array of shape (n,) each; vectors are spread over named columns.
@@ -361,6 +366,12 @@ class Recording:
             table["recorded_ns"] = np.array([row.recorded_ns for row in self._rows.get(topic, [])], dtype=np.int64)
             self._tables[topic] = table
         return self._tables[topic]
+
+
+def _body(data: bytes) -> dict[str, Any]:
+    # Older recordings hold msgpack, whose maps never begin with the byte of `{`.
+    body = orjson.loads(data) if data[:1] == b"{" else msgpack.unpackb(data)
+    return {name: value for name, value in body.items() if value is not None}
 
 
 _DTYPES: dict[str, Any] = {"number": np.float64, "integer": np.int64, "boolean": np.bool_, "string": np.str_}

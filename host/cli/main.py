@@ -30,6 +30,8 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "install-services": ("host.cli.install_services", "install_services", "systemd units of the rig, and their undo."),
     "keys": ("host.cli.keys", "keys", "Certificates for readers and commanders on other machines."),
     "soak": ("host.cli.soak", "soak", "Hours of virtual operation: memory, clocks, steps."),
+    "view": ("host.cli.view", "view", "The running rig on a page: shape, force, safety; arm, hold, stop."),
+    "play": ("host.cli.play", "play", "A recording on the same page, with the windows of its diagnosis."),
     "export": ("host.cli.export", "export", "Tables of a recording as parquet or csv."),
     "latency-check": ("host.cli.latency_check", "latency_check", "How punctual the loop is here, beside cyclictest."),
 }

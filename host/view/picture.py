@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-# Samples of a trace that wait for the next frame; a frame is a thirtieth of a second, a state comes every 10 ms.
-WAITING = 64
+# Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
+WAITING = 512
 LOG_LINES = 6
+# Kept for a page that is opened later: every third sample of the last half minute.
+KEPT, KEEP_EVERY = 1000, 3
 # An estimate older than this says nothing of the force now.
 ESTIMATE_LASTS_NS = 200_000_000
 # A pose this old is not drawn as where the sensor is.
@@ -33,14 +35,18 @@ class Picture:
         self._newest: dict[str, Body] = {}
         self._force_rows: deque[list[float | None]] = deque(maxlen=WAITING)
         self._estimate_rows: deque[list[float | None]] = deque(maxlen=WAITING)
+        self._kept: dict[str, deque[list[float | None]]] = {name: deque(maxlen=KEPT) for name in ("rows", "estimates")}
+        self._heard = 0
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._log_new = False
         self.now_ns = 0
 
     def clear(self) -> None:
         """Forget everything heard, for a jump in time."""
-        for store in (self._newest, self._force_rows, self._estimate_rows, self._log):
-            store.clear()
+        self._newest.clear()
+        self._log.clear()
+        for rows in (self._force_rows, self._estimate_rows, *self._kept.values()):
+            rows.clear()
         self.now_ns, self._log_new = 0, True
 
     def hear(self, topic: str, body: Body) -> None:
@@ -52,11 +58,19 @@ class Picture:
             self._force_rows.append([
                 _seconds(body["stamp_ns"]), _rounded(body.get("force_N"), 5), _rounded(body.get("target_force_N"), 5),
                 *(_rounded(value, 6) for value in (*tip, *target))])
+            self._heard += 1
+            if self._heard % KEEP_EVERY == 0:
+                self._kept["rows"].append(self._force_rows[-1])
         elif topic == "force/estimate":
             self._estimate_rows.append([_seconds(body["stamp_ns"]), *self._along(body)])
+            self._kept["estimates"].append(self._estimate_rows[-1])
         elif topic == "log":
             self._log.append({"t": _seconds(body["stamp_ns"]), **{key: body[key] for key in ("level", "source", "text")}})
             self._log_new = True
+
+    def past(self) -> dict[str, Any]:
+        """Samples and log of the last half minute, for a page that has just been opened."""
+        return {**{name: list(rows) for name, rows in self._kept.items()}, "log": list(self._log)}
 
     def _along(self, estimate: Body) -> tuple[float | None, float | None]:
         """The estimate along the direction in which force is controlled, and its standard deviation; N."""

@@ -22,7 +22,8 @@ from protocol.messages import json_schema
 from protocol.topics import TOPICS, ForceSensor, Log, Pose, RigState, Stage, encode
 from realtime.rig_file import load_rig
 
-PLAIN = {"boolean": (bool,), "string": (str,), "number": (int, float), "integer": (int,), "object": (dict,), "array": (list,)}
+PLAIN = {"boolean": (bool,), "string": (str,), "number": (int, float), "integer": (int,), "object": (dict,),
+         "array": (list,)}
 MS = 1_000_000
 
 

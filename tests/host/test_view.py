@@ -1,0 +1,437 @@
+"""The view's picture, player and server: what a page is told, and who is told nothing and can move nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+import websockets.asyncio.client
+import websockets.sync.client
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.cli.contract_io import BadInput
+from host.demo import SIMULATED_RIG
+from host.mechanics.catheter import load_catheter
+from host.recording import Recording
+from host.view.live import LiveRig, Press
+from host.view.picture import Picture
+from host.view.replay import Replay, read_findings
+from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, three_js
+from host.view.shape import through, twin
+from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
+from protocol.zenoh_session import Session
+from realtime.rig_file import Rig, load_rig
+from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
+
+MS = 1_000_000
+PORT = 8447
+
+
+# The shape and the picture.
+
+def test_the_twin_starts_at_the_exit_and_bends_as_positive_curvature_does() -> None:
+    catheter = load_catheter("blazer_prime_xp")
+    points = twin(catheter, -0.08, 0.0, 18.0, None)
+    assert points is not None
+    np.testing.assert_allclose(points[0], 0.0, atol=1e-12)
+    assert points[-1][1] < -0.003 and abs(points[-1][0]) < 1e-9
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    assert lengths == pytest.approx(catheter.distal_length_m - 0.08, rel=1e-2)
+    turned = twin(catheter, -0.08, np.pi / 2, 18.0, None)
+    assert turned is not None and turned[-1][0] > 0.003
+    assert twin(catheter, -0.2, 0.0, 18.0, None) is None
+
+
+def test_a_force_pushes_the_twin_back_and_the_tracked_tip_ends_it() -> None:
+    catheter = load_catheter("blazer_prime_xp")
+    free, pressed = (twin(catheter, -0.08, 0.0, 18.0, force) for force in (None, (0.0, 0.0, 0.2)))
+    assert free is not None and pressed is not None and pressed[-1][2] < free[-1][2]
+    near = free[-1] + [0.0, 0.0, 0.002]
+    shape = through(free, near)
+    np.testing.assert_allclose(shape.points_m[-1], near)
+    np.testing.assert_allclose(shape.points_m[0], 0.0, atol=1e-12)
+    assert shape.gap_m == pytest.approx(0.002)
+    far = through(free, free[-1] + 0.05)
+    assert far.gap_m is not None and far.gap_m > 0.08
+    np.testing.assert_array_equal(far.points_m, free)
+
+
+def test_a_picture_of_nothing_and_of_old_poses_shows_neither_tip_nor_force() -> None:
+    picture = Picture({}, {})
+    frame = picture.frame()
+    assert frame["mode"] == "" and frame["scene"]["shape"] is None and frame["loop"] is None
+    picture.hear("pose/tip", {"stamp_ns": 0, "position_m": [0.0, 0.0, 0.02], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]})
+    picture.hear("force/sensor", {"stamp_ns": 0, "force_N": [0.0, 0.0, 0.1]})
+    state = {"mode": "hold", "safety_action": "hold", "cause": "no fresh pose", "tip_m": [0.0, 0.0, 0.02]}
+    picture.hear("state", {**state, "stamp_ns": 100 * MS})
+    fresh = picture.frame()
+    assert fresh["scene"]["tip"] == [0.0, 0.0, 0.02] and fresh["scene"]["force"] == [0.0, 0.0, 0.1]
+    picture.hear("state", {**state, "stamp_ns": 900 * MS})
+    old = picture.frame()
+    assert old["scene"]["tip"] == [] and old["scene"]["force"] == [] and old["cause"] == "no fresh pose"
+    assert len(old["rows"]) == 1, "each sample is handed out once"
+    json.dumps(old, allow_nan=False)
+
+
+# The player.
+
+def player(path: Path, **options: Any) -> tuple[Replay, list[float]]:
+    now = [100.0]
+    replay = Replay(Recording(path), clock_s=lambda: now[0], **options)
+    replay.hello()
+    return replay, now
+
+
+def test_it_plays_at_its_speed_pauses_and_ends(recording: Path) -> None:  # noqa: F811
+    replay, now = player(recording, speed=2.0)
+    now[0] += 0.2
+    frame = replay.frame()
+    assert frame["play"]["at"] == pytest.approx(0.4) and frame["play"]["playing"]
+    assert [row[0] for row in frame["rows"]] == pytest.approx(np.arange(0.0, 0.401, 0.01))
+    replay.act('{"play": false}')
+    now[0] += 5.0
+    assert replay.frame()["play"] == {"at": pytest.approx(0.4), "playing": False, "speed": 2.0}
+    replay.act('{"play": true, "speed": 1.0}')
+    now[0] += 0.1
+    assert replay.frame()["play"]["at"] == pytest.approx(0.5)
+    now[0] += 50.0
+    assert replay.frame()["play"] == {"at": pytest.approx(0.99), "playing": False, "speed": 1.0}
+
+
+def test_a_jump_back_shows_that_time_with_its_past(recording: Path) -> None:  # noqa: F811
+    replay, now = player(recording)
+    now[0] += 50.0
+    replay.frame()
+    replay.act('{"seek_s": 0.3}')
+    frame = replay.frame()
+    assert frame["jumps"] == 1 and frame["t"] == pytest.approx(0.3)
+    assert frame["rows"][0][0] == 0.0 and frame["rows"][-1][0] == pytest.approx(0.3)
+    assert frame["scene"]["tip"] == [0.0, -0.008, 0.027]
+    assert replay.hello()["past"]["rows"]
+
+
+@given(text=st.one_of(st.text(max_size=60), st.builds(json.dumps, st.recursive(
+    st.none() | st.booleans() | st.floats(allow_nan=True) | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["play", "seek_s", "speed", "x"]), inner)))))
+def test_nothing_that_a_page_sends_breaks_the_player(text: str, recording: Path) -> None:  # noqa: F811
+    replay, _ = player(recording)
+    assert replay.act(text)["result"] in ("accepted", "malformed")
+    at = replay.frame()["play"]["at"]
+    assert 0.0 <= at <= 0.99
+
+
+def test_windows_of_a_diagnosis_are_placed_on_the_recordings_time(recording: Path, tmp_path: Path) -> None:  # noqa: F811
+    report = tmp_path / "report.json"
+    report.write_text(json.dumps({
+        "verdict": "missing_physics", "fit": {}, "seconds": 1.0, "effects": [{"id": "backlash", "says": "Play of 3 mm."}],
+        "located": [{"subsystem": "insertion", "windows_s": [[0.1, 0.2], [0.4, 0.5]], "condition": "after reversals"}]}))
+    replay, _ = player(recording, findings=read_findings(str(report)))
+    hello = replay.hello()
+    assert [(window["from"], window["to"]) for window in hello["windows"]] == [(0.1, 0.2), (0.4, 0.5)]
+    assert hello["says"] == ["Play of 3 mm."] and hello["verdict"] == "missing_physics"
+    report.write_text('{"verdict": "nothing_missing"}')
+    with pytest.raises(BadInput, match="seldinger diagnose"):
+        read_findings(str(report))
+    with pytest.raises(BadInput, match="--speed"):
+        player(recording, speed=0.0)
+
+
+# The server: who may read, who may ask.
+
+@pytest.fixture(scope="module")
+def port(recording: Path) -> Iterator[int]:  # noqa: F811
+    with running(ViewServer(Replay(Recording(recording)), free_port())) as server:
+        yield server.port
+
+
+def shake_hands(port: int, host: str, *origins: str) -> str:
+    """The first line of the answer to the opening of a web socket."""
+    with open_socket(port, host, *origins) as page:
+        page.settimeout(5.0)
+        return page.recv(4096).split(b"\r\n")[0].decode()
+
+
+def open_socket(port: int, host: str, *origins: str) -> socket.socket:
+    page = socket.socket()
+    page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    page.connect((ADDRESS, port))
+    lines = ["GET /rig HTTP/1.1", f"Host: {host}", *(f"Origin: {origin}" for origin in origins), "Upgrade: websocket",
+             "Connection: Upgrade", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13", "", ""]
+    page.sendall("\r\n".join(lines).encode())
+    return page
+
+
+def test_the_page_and_all_it_needs_come_from_the_installed_packages(port: int) -> None:
+    base = f"http://{ADDRESS}:{port}"
+    page = httpx.get(base)
+    assert page.status_code == 200 and "frame-ancestors 'none'" in page.headers["content-security-policy"]
+    assert "http://" not in page.text and "https://" not in page.text
+    for path in ("/static/view.js", "/static/scene.js", "/static/view.css", "/lib/three.js"):
+        assert httpx.get(base + path).status_code == 200, path
+    assert b"OrbitControls" in httpx.get(base + "/lib/three.js").content and three_js().stat().st_size > 100_000
+    assert httpx.get(base + "/static/%2e%2e/server.py").status_code == 404
+
+
+def test_other_names_and_other_sites_read_nothing_and_ask_nothing(port: int) -> None:
+    here, own = f"{ADDRESS}:{port}", f"http://{ADDRESS}:{port}"
+    assert "101" in shake_hands(port, here, own)
+    for host in ("evil.example", f"evil.example:{port}", f"{ADDRESS}:9", ADDRESS, ""):
+        assert httpx.get(own, headers={"host": host}).status_code in (400, 403)
+        assert "101" not in shake_hands(port, host, f"http://{host}")
+    for origin in ("http://evil.example", "null", f"https://{here}", f"http://evil.example:{port}", ""):
+        assert httpx.get(own, headers={"origin": origin}).status_code == 403
+        assert "403" in shake_hands(port, here, origin)
+    assert "403" in shake_hands(port, here), "a web socket without an origin"
+    assert "101" not in shake_hands(port, here, own, "http://evil.example"), "two origins"
+    for method in ("POST", "PUT", "DELETE", "OPTIONS"):
+        assert httpx.request(method, own).status_code == 403
+
+
+def test_pages_get_frames_and_answers(port: int) -> None:
+    results = []
+    with websockets.sync.client.connect(f"ws://{ADDRESS}:{port}/rig", origin=f"http://{ADDRESS}:{port}",  # type: ignore[arg-type]
+                                        proxy=None) as page:
+        assert json.loads(page.recv())["hello"]["kind"] == "play"
+        for message in ('{"play": false}', "nonsense", b"\x00\x01", '{"x": 1}', '{"play": 1}', " " * 2000):
+            page.send(message)
+            while "answer" not in (received := json.loads(page.recv())):
+                assert "frame" in received
+            results.append(received["answer"]["result"])
+    assert results == ["accepted"] + 5 * ["malformed"]
+
+
+def test_it_listens_on_loopback_only(port: int) -> None:
+    assert ViewServer(Slow(), port).configuration().host == "127.0.0.1"
+    for address in addresses_of_this_machine():
+        with socket.socket() as probe, pytest.raises(OSError):
+            probe.settimeout(1.0)
+            probe.connect((address, port))
+
+
+def addresses_of_this_machine() -> list[str]:
+    found = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    return sorted(str(address) for address in found if not str(address).startswith("127."))
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((ADDRESS, 0))
+        return int(probe.getsockname()[1])
+
+
+class running:
+    """A server in a thread of this process, until the context is left."""
+
+    def __init__(self, server: ViewServer) -> None:
+        self.server = server
+        self._uvicorn = uvicorn.Server(server.configuration())
+        self._thread = threading.Thread(target=self._uvicorn.run, daemon=True)
+
+    def __enter__(self) -> ViewServer:
+        self._thread.start()
+        while not self._uvicorn.started:
+            assert self._thread.is_alive()
+            time.sleep(0.01)
+        return self.server
+
+    def __exit__(self, *_: object) -> None:
+        self._uvicorn.should_exit = True
+        self._thread.join(10.0)
+        assert not self._thread.is_alive()
+
+
+class Slow:
+    """A source whose frames are large, so that a page that does not read fills every buffer on the way."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+
+    def hello(self) -> dict[str, Any]:
+        return {}
+
+    def frame(self) -> dict[str, Any]:
+        self.frames += 1
+        return {"number": self.frames, "ballast": "x" * 200_000}
+
+    def act(self, text: str) -> dict[str, Any]:
+        return {}
+
+
+def test_a_page_that_stops_reading_loses_frames_and_holds_up_nobody() -> None:
+    source = Slow()
+
+    async def read_beside_a_stuck_page(port: int) -> list[int]:
+        numbers: list[int] = []
+        with open_socket(port, f"{ADDRESS}:{port}", f"http://{ADDRESS}:{port}"):
+            async with websockets.asyncio.client.connect(f"ws://{ADDRESS}:{port}/rig", proxy=None, max_size=None,
+                                          origin=f"http://{ADDRESS}:{port}") as reader:  # type: ignore[arg-type]
+                while len(numbers) < 60:
+                    message = json.loads(await reader.recv())
+                    if "frame" in message:
+                        numbers.append(message["frame"]["number"])
+        return numbers
+
+    with running(ViewServer(source, port := free_port())) as server:
+        pages: list[Page] = []
+        watch = threading.Thread(target=lambda: [pages.extend(server.pages) or time.sleep(0.02) for _ in range(100)])
+        watch.start()
+        numbers = asyncio.run(read_beside_a_stuck_page(port))
+        watch.join()
+    assert numbers == sorted(set(numbers)) and numbers[-1] - numbers[0] < 120, "the reader was served all the while"
+    dropped = sorted(page.dropped for page in set(pages))
+    assert len(dropped) == 2 and dropped[1] > 10 > dropped[0]
+
+
+def test_a_queue_keeps_the_newest() -> None:
+    class Socket:
+        def __init__(self) -> None:
+            self.sent: list[str] = []
+
+        async def send_text(self, text: str) -> None:
+            self.sent.append(text)
+
+    async def run() -> list[str]:
+        socket = Socket()
+        page = Page(socket)  # type: ignore[arg-type]
+        for number in range(10):
+            page.offer(str(number).encode())
+        page.answer({"text": "first"})
+        task = asyncio.create_task(page.send_on())
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0.01)
+        task.cancel()
+        assert page.dropped == 10 - WAITING_FRAMES
+        return socket.sent
+
+    sent = asyncio.run(run())
+    assert sent[1:] == ["6", "7", "8", "9"] and "first" in sent[0]
+
+
+def test_the_guard_names_what_it_refuses() -> None:
+    guard = Guard(None, PORT)  # type: ignore[arg-type]
+
+    def problem(**scope: Any) -> str:
+        return guard._problem({"type": "http", "method": "GET", "headers": [(b"host", b"127.0.0.1:8447")], **scope})
+
+    assert problem() == "" and "reading" in problem(method="POST")
+    assert "Host" in problem(headers=[]) and "Host" in problem(headers=[(b"host", b"localhost:8447")] * 2)
+
+
+# The live rig, over zenoh.
+
+def loopback(rig: Rig) -> tuple[Session, Session]:
+    endpoint = f"tcp/{ADDRESS}:{free_port()}"
+    return Session(rig.name, [endpoint], []), Session(rig.name, [], [endpoint])
+
+
+@pytest.fixture
+def live() -> Iterator[tuple[Session, LiveRig, list[Command]]]:
+    rig = load_rig(SIMULATED_RIG)
+    there, here = loopback(rig)
+    obeyed: list[Command] = []
+
+    def decide(command: Command) -> Reply:
+        obeyed.append(command)
+        return Reply(stamp_ns=time.monotonic_ns(), id=command.id, result="refused", text="no board")
+
+    with there, here:
+        server = there.serve_commands(time.monotonic_ns, decide)
+        yield there, LiveRig(rig, here), obeyed
+        del server
+
+
+def publish_until_seen(there: Session, view: LiveRig) -> dict[str, Any]:
+    rig_time = [1_000_000_000]
+    messages = {"stage": Stage, "pose/tip": Pose, "force/sensor": ForceSensor, "force/estimate": ForceEstimate,
+                "state": RigState}
+    publishers = {topic: there.publisher(topic) for topic in messages}
+    contents: dict[str, dict[str, Any]] = {
+        "stage": {"command_insertion_m": 0.0, "command_roll_rad": 0.0, "command_knob_rad": 0.0, "joint_insertion_m": -0.08,
+                  "joint_roll_rad": 0.0, "joint_curvature_per_m": 18.0},
+        "pose/tip": {"arrival_ns": 0, "frame": 1, "missing": False, "position_m": (0.0, -0.007, 0.028),
+                     "quaternion_wxyz": (1.0, 0.0, 0.0, 0.0)},
+        "force/sensor": {"arrival_ns": 0, "force_N": (0.0, 0.0, 0.15)},
+        "force/estimate": {"frame": "base", "converged": True, "force_N": (0.0, 0.0, 0.14), "published_ns": 0,
+                           "compute_us": 1.0, "covariance_N2": (4e-4, 0, 0, 0, 4e-4, 0, 0, 0, 4e-4)},
+        "state": {"mode": "contact", "safety_action": "warn", "cause": "a pose was not used", "tip_m": (0.0, -0.007, 0.028),
+                  "force_direction": (0.0, 0.0, 1.0), "target_m": (0.0, -0.01, 0.025), "target_force_N": 0.2,
+                  "force_N": 0.15}}
+    for _ in range(500):
+        rig_time[0] += 10 * MS
+        for topic, message in messages.items():
+            publishers[topic].put(message(stamp_ns=rig_time[0], **contents[topic]))
+        time.sleep(0.01)
+        frame = view.frame()
+        if frame["scene"]["shape"] and frame["estimates"] and frame["scene"]["force"]:
+            return frame
+    raise AssertionError("the view heard nothing")
+
+
+def test_what_the_rig_publishes_is_on_the_page(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, _ = live
+    before = view.frame()
+    assert before["silent_s"] is None and before["mode"] == ""
+    frame = publish_until_seen(there, view)
+    assert frame["mode"] == "contact" and frame["cause"] == "a pose was not used" and frame["silent_s"] < 1.0
+    np.testing.assert_allclose(frame["scene"]["shape"][-1], [0.0, -0.007, 0.028], atol=1e-5)
+    assert frame["estimates"][-1][1:] == [0.14, 0.02] and frame["rows"][-1][1:3] == [0.15, 0.2]
+
+
+def test_garbage_on_the_topics_is_counted_and_not_shown(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, _ = live
+    publish_until_seen(there, view)
+    for payload in (b"", b"\xff" * 20, encode(RigState(stamp_ns=1, mode="hold", safety_action="none"))[:-3]):
+        there.zenoh.put(key(there.rig, "state"), payload)
+    for _ in range(300):
+        frame = view.frame()
+        if frame["malformed"] == 3:
+            break
+        time.sleep(0.01)
+    assert frame["malformed"] == 3 and frame["mode"] == "contact"
+
+
+def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, obeyed = live
+    publish_until_seen(there, view)
+    for text, action, target in (('{"button": "arm", "confirmed": true}', "arm", "none"),
+                                 ('{"button": "hold", "confirmed": true}', "target", "hold"),
+                                 ('{"button": "stop"}', "stop", "none")):
+        answer = view.act(text)
+        assert answer["result"] == "refused" and answer["text"] == "no board"
+        assert (obeyed[-1].action, obeyed[-1].target) == (action, target)
+    assert len(obeyed) == 3
+
+
+@given(text=st.one_of(st.text(max_size=80), st.builds(json.dumps, st.dictionaries(
+    st.sampled_from(["button", "confirmed", "action", "target"]),
+    st.sampled_from(["arm", "stop ", "hold", "ARM", "true"]) | st.booleans() | st.none() | st.integers()))))
+def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
+    sent: list[str] = []
+    view = LiveRig.__new__(LiveRig)
+    view._session, view._send = None, lambda session, button: sent.append(button)  # type: ignore[assignment]
+    answer = view.act(text)
+    try:
+        press = Press.model_validate_json(text)
+        allowed = press.confirmed or press.button == "stop"
+    except ValueError:
+        allowed = False
+    assert bool(sent) == allowed
+    assert allowed or answer["result"] in ("malformed", "refused")
+
+
+def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    _, view, _ = live
+    view._send = lambda session, button: None
+    assert view.act('{"button": "stop"}')["result"] == "unanswered"
