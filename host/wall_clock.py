@@ -28,10 +28,14 @@ _STOP_TIMEOUT_S = 2.0
 
 
 class Fleet:
-    """The three processes. Use as a context: leaving it stops everything in order, within two seconds."""
+    """The three processes. Use as a context: leaving it stops everything in order, within two seconds.
 
-    def __init__(self, settings: DemoSettings, recording: Path) -> None:
-        self._settings, self._recording = settings, recording
+    loop: with the realtime process; without it whoever asks runs the loop, on `ports`.
+    """
+
+    def __init__(self, settings: DemoSettings, recording: Path, loop: bool = True) -> None:
+        self._settings, self._recording, self._loop = settings, recording, loop
+        self.ports: dict[str, Any] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
         self.rig_file = Path(self._folder.name) / "rig.toml"
         self.processes: dict[str, subprocess.Popen[str]] = {}
@@ -53,13 +57,15 @@ class Fleet:
         self.rig_file.write_text(_with_endpoint(text, f"tcp/127.0.0.1:{_free_port()}"), encoding="utf-8")
         load_rig(self.rig_file)
         rig = str(self.rig_file)
-        ports = json.loads(self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
-                                       "--seed", str(self._settings.seed)))
+        self.ports = ports = json.loads(
+            self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
+                        "--seed", str(self._settings.seed)))
         self._spawn("host", "host.estimator_process", rig, "--record", str(self._recording),
                     "--estimator", self._settings.estimator, "--seed", str(self._settings.seed))
-        self._spawn("realtime", "realtime", "--rig", rig, "--board-port", ports["board"],
-                    "--tracker-port", ports["tracker"], "--force-port", str(ports["force_port"]),
-                    "--force-source", self._settings.force_source, answers=False)
+        if self._loop:
+            self._spawn("realtime", "realtime", "--rig", rig, "--board-port", ports["board"],
+                        "--tracker-port", ports["tracker"], "--force-port", str(ports["force_port"]),
+                        "--force-source", self._settings.force_source, answers=False)
 
     def _spawn(self, name: str, module: str, *arguments: str, answers: bool = True) -> str:
         log = open(Path(self._folder.name) / f"{name}.log", "w", encoding="utf-8")

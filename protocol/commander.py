@@ -13,6 +13,7 @@ from protocol.topics import Command, Reply, check_name
 
 LIFE_NS = 500_000_000
 _RENEW_BEFORE_NS = 2_000_000_000
+_STOP_TRIES = 3
 # A round trip longer than this says too little about the rig's clock.
 _PROMPT_NS = 100_000_000
 
@@ -106,14 +107,22 @@ class Commander:
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
         """Any command (fields as in `protocol.topics.Command`), under the lease, which is renewed before it ends."""
         try:
-            if action == "stop":  # waits for no lock and no other command
-                return _said(self._send(action, target, 0, **fields))
+            if action == "stop":
+                return self._stop()
             with self._lock:
                 if self._lease and action not in ("hold", "release"):
                     self._renew()
                 return _said(self._ask(action, target, **fields))
         except ValueError as error:
             return Acknowledgement(False, str(error), "malformed")
+
+    def _stop(self) -> Acknowledgement:
+        """Waits for no lock and no other command; asks again where nobody answers."""
+        for _ in range(_STOP_TRIES):
+            reply = self._send("stop", "none", 0)
+            if reply is not None:
+                break
+        return _said(reply)
 
     @property
     def lease_left_s(self) -> float:

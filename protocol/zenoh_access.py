@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from protocol.topics import SCHEMA_VERSION, TOPICS, check_name, key, request_key
+from protocol.topics import TOPICS, check_name, key, request_key
 
 ROLES = ("rig", "reader", "commander")
 CA_FILE, CERTIFICATE_FILE, KEY_FILE = "ca.pem", "certificate.pem", "key.pem"
@@ -96,11 +96,11 @@ def access_control(network: Network) -> dict[str, Any]:
     """
     for name in network.readers + network.commanders:
         check_name(name)
-    topics = readable(network.rig) + [f"seldinger/v{SCHEMA_VERSION}/{network.rig}/**"]
     rules: list[dict[str, Any]] = [
         _rule("local", ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
                         "declare_liveliness_subscriber", "liveliness_query"], ["ingress", "egress"], ["**"]),
-        _rule("subscribe", ["declare_subscriber"], ["ingress"], topics),
+        # To subscribe is to wish: what is sent is decided by the next rule, key by key.
+        _rule("subscribe", ["declare_subscriber"], ["ingress"], ["seldinger/**"]),
         _rule("receive", ["put"], ["egress"], readable(network.rig)),
     ]
     subjects: list[dict[str, Any]] = [{"id": "local", "link_protocols": ["tcp", "unixsock-stream"]}]

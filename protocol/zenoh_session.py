@@ -5,16 +5,19 @@ from __future__ import annotations
 import ipaddress
 import json
 import re
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from protocol.topics import TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
+from protocol.topics import MAX_PAYLOAD_BYTES, TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
 from protocol.zenoh_access import Network, check_network_endpoint, client_settings, network_settings
 
 RECORDER_DEPTH = 4096
+_REQUESTS_WAITING, _REQUESTS_A_TURN, _TURN_S = 256, 32, 0.002
 _SETTINGS: dict[str, Any] = {
     # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
     # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
@@ -34,8 +37,10 @@ _SETTINGS: dict[str, Any] = {
     "transport/link/tx/queue/size/data": 16,
     "transport/link/tx/lease": 2000,
     "transport/link/tx/keep_alive": 4,
-    # Zenoh would gather a message of 1 GiB before anyone can refuse it.
+    # Zenoh would gather a message of 1 GiB before anyone can refuse it; and what no reader takes is not passed on.
     "transport/link/rx/max_message_size": 1_048_576,
+    "low_pass_filter": [{"id": "longest", "flows": ["ingress"], "messages": ["put", "query", "reply"],
+                         "key_exprs": ["**"], "size_limit": 4 * MAX_PAYLOAD_BYTES}],
 }
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
@@ -144,15 +149,33 @@ class Everything:
 
 
 class RequestServer:
-    """Answers requests: answer(name, payload) -> Reply, None for no reply at all; called on zenoh's threads.
+    """Answers requests, one at a time: answer(name, payload) -> Reply, None for no reply at all.
 
     `name` is the last part of the key that a request came on. Across machines the access control of the session that
-    listens there lets a certificate ask under its own name only.
+    listens there lets a certificate ask under its own name only. Requests wait in a ring of zenoh's: what a flood puts
+    there beyond what one thread takes in its turns is dropped, and costs the other threads of this process nothing.
     """
 
     def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
         self._prefix, self._give = f"{key(rig, 'request')}/", answer
-        self._queryable = session.declare_queryable(request_key(rig, "*"), self._answer, complete=True)
+        self._queryable = session.declare_queryable(request_key(rig, "*"), zenoh.handlers.RingChannel(_REQUESTS_WAITING),
+                                                    complete=True)
+        self._thread = threading.Thread(target=self._serve, name="requests", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        try:
+            while True:
+                self._answer(self._queryable.recv())
+                for _ in range(_REQUESTS_A_TURN):
+                    query = self._queryable.try_recv()
+                    if query is None:
+                        break
+                    self._answer(query)
+                else:
+                    time.sleep(_TURN_S)
+        except zenoh.ZError:
+            return
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:

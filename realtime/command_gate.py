@@ -18,6 +18,8 @@ AHEAD_NS = 100_000_000
 BURST, RATE_PER_S = 50, 50.0
 REMEMBERED = 2000
 _SENDERS = 200
+# Of refusals, one is told in so long, with the number of the others.
+_TOLD_EVERY_NS = 500_000_000
 _NEEDS_NO_LEASE = ("clock", "take", "hold", "stop")
 
 
@@ -68,6 +70,7 @@ class CommandGate:
         self._lease = Lease()
         self._seen: dict[str, int] = {}
         self._buckets: dict[str, _Bucket] = {}
+        self._told_ns, self._untold = 0, 0
         self.counts = {"accepted": 0, "refused": 0, "expired": 0, "replayed": 0, "malformed": 0, "flooded": 0}
 
     def state(self) -> CommandCounts:
@@ -97,6 +100,20 @@ class CommandGate:
             if command.action != "clock":
                 self.counts[reply.result] += 1
             return command, reply
+
+    def in_words(self, name: str, command: Command | None, reply: Reply | None) -> str:
+        """The line for the log: what `name` asked and got; empty where nothing is to be told, or too much was already."""
+        what = f"{command.action} {command.target}".removesuffix(" none") if command else "request"
+        if reply is not None and reply.result == "accepted":
+            return f"{name}: {what}: accepted" if for_the_record(command, reply) else ""
+        with self._lock:
+            now_ns = self._now_ns()
+            if 0 <= now_ns - self._told_ns < _TOLD_EVERY_NS:
+                self._untold += 1
+                return ""
+            more, self._untold, self._told_ns = self._untold, 0, now_ns
+        said = "not read, there are too many" if reply is None else f"{what}: {reply.result}: {reply.text}"
+        return f"{name[:40]}: {said}" + (f" (and {more} more not told)" if more else "")
 
     def _let(self, name: str, now_ns: int) -> bool:
         if name not in self._buckets and len(self._buckets) >= _SENDERS:

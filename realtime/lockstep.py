@@ -92,8 +92,9 @@ class LockstepLoop:
         command, reply = self.gate.answer(name, payload)
         for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
             self.publish(topic, message)
-        if reply is not None and command is None:
-            self.log(self._last_ns, "warning", "commander", f"{name}: {reply.result}: {reply.text}")
+        words = self.gate.in_words(name, command, reply)
+        if words and (reply is None or reply.result != "accepted"):
+            self.log(self._last_ns, "warning", "commander", words)
         return reply
 
     def _obey(self, command: Command, now_ns: int) -> Reply:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.topics import Command, Log, LoopTiming, Message, Reply
+from protocol.topics import Command, CommandCounts, Log, LoopTiming, Message, Reply
 from protocol.zenoh_session import Session
 from realtime import telemetry
 from realtime.board_intake import axis_limits, board_message, take_status
@@ -219,13 +219,11 @@ class RealtimeProcess:
     def _request(self, name: str, payload: bytes) -> Reply | None:
         """What a commander asks; on a thread of zenoh's. The command and its reply are published and logged."""
         command, reply = self._gate.answer(name, payload)
-        told = for_the_record(command, reply)
-        for topic, message in zip(("command", "reply"), told or (), strict=False):
+        for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
             self._publish(topic, message)
-        if reply is not None and (told or command is None):
-            what = f"{command.action} {command.target}".removesuffix(" none") if command else "request"
-            self._log("info" if reply.result == "accepted" else "warning", "commander",
-                      f"{name[:40]}: {what}: {reply.result} {reply.text}".strip())
+        words = self._gate.in_words(name, command, reply)
+        if words:
+            self._log("info" if reply is not None and reply.result == "accepted" else "warning", "commander", words)
         return reply
 
     def _obey(self, command: Command, now_ns: int) -> Reply:
@@ -269,7 +267,11 @@ class RealtimeProcess:
             if self.clock.now_ns() > due_ns:
                 due_ns = self.clock.now_ns() + 500_000_000
                 self._publish("loop", self.timing())
-                self._publish("commander", self._gate.state())
+                self._publish("commander", self.counts())
+
+    def counts(self) -> CommandCounts:
+        """Who holds the lease, and what became of the commands so far."""
+        return self._gate.state()
 
     def timing(self) -> LoopTiming:
         """Tick time, lateness, missed ticks and the longest gap since the start."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import socket
@@ -39,8 +40,8 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def reading() -> ForceSensor:
-    return ForceSensor(stamp_ns=0, arrival_ns=0, force_N=(0.0, 0.0, 0.2))
+def reading(force_N: float = 0.2) -> ForceSensor:
+    return ForceSensor(stamp_ns=0, arrival_ns=0, force_N=(0.0, 0.0, force_N))
 
 
 class Laboratory:
@@ -142,16 +143,18 @@ def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory,
         taken = session.declare_queryable(request_key("simulated", "*"), hijacked.append, complete=True)
         heard = session.declare_subscriber(key("simulated", "force/sensor"), zenoh.handlers.RingChannel(1))
         assert until(lambda: laboratory.publisher.put(reading()) is None and heard.try_recv() is not None)
-        for everything in inside:
-            everything.take()
+        forged = reading(77.0)
         for topic in ("force/sensor", "force/estimate", "state", "request", "log"):
-            session.put(key("simulated", topic), encode(reading()))
+            session.put(key("simulated", topic), encode(forged))
             session.delete(key("simulated", topic))
         session.put(request_key("simulated", "console"), b"x")
         local = Commander(laboratory.host, "local", timeout_s=2.0)
         assert local.hold().accepted
         time.sleep(0.3)
-        assert [everything.take() for everything in inside] == [[], []] and not any(e.malformed for e in inside)
+        messages = [message for everything in inside for _, message, _ in everything.take()]
+        assert len(messages) >= 2 and set(messages) == {dataclasses.replace(reading(), sequence=message.sequence)
+                                                        for message in messages}
+        assert not any(everything.malformed for everything in inside)
         assert not hijacked and taken is not None
 
 

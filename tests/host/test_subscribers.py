@@ -1,0 +1,128 @@
+"""Bad subscribers beside a rig in virtual time: every step edge where it was without them; a stop gets through a flood."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from host import keys
+from host.bad_subscriber import KINDS, bad_subscriber
+from host.commander import Commander
+from protocol.topics import TOPICS, Command, Message, Reply, RigState
+from protocol.zenoh_access import Network
+from protocol.zenoh_session import Session
+from realtime.command_gate import CommandGate
+from realtime.rig_file import load_rig
+from sim.forked_board import LibraryBoard
+from sim.plant import Plant, PlantConfig
+from sim.scenario import Scenario
+from sim.world import World
+from tests.realtime.conftest import RIG_FILE
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "subscriber.py"
+PATIENCE_S = 30.0
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
+    """Hash and number of the step edges of a move whose messages all go out by a real session, beside `kind`."""
+    rig, endpoint = load_rig(RIG_FILE), free_endpoint()
+    with Session(rig.name, [endpoint], []) as session, LibraryBoard() as board:
+        publishers = {name: session.publisher(name) for name, topic in TOPICS.items() if topic.kind != "query"}
+
+        def publish(topic: str, message: Message) -> None:
+            publishers[topic].put(message)
+
+        plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), 1)
+        run = Scenario(rig, World(rig, plant, board, 1), publish, pace=1.0)
+        server = session.serve_requests(run.loop.request)
+        with bad_subscriber(kind, rig.name, endpoint) as bad:
+            assert run.arm() and run.command("target", "position", target_m=(0.0, -0.0107, 0.021)).accepted
+            run.run(move_s, lambda: bad is not None and bad.tend() is None and False)
+            assert bad is None or kind != "leaving" or bad.lives > 1
+            assert kind != "flooding" or run.loop.gate.counts["malformed"] > 20
+        assert server is not None
+        return run.world.digest, int(run.world.edges.sum())
+
+
+@pytest.fixture(scope="module")
+def alone() -> tuple[str, int]:
+    digest, edges = digest_beside("nobody")
+    assert edges > 200
+    return digest, edges
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_step_edges_are_the_same_beside(kind: str, alone: tuple[str, int]) -> None:
+    assert digest_beside(kind) == alone
+
+
+def test_a_stop_gets_through_a_flood() -> None:
+    endpoint = free_endpoint()
+    done: list[str] = []
+
+    def obey(command: Command, now_ns: int) -> Reply:
+        done.append(command.action)
+        return Reply(stamp_ns=now_ns, id=command.id, result="accepted")
+
+    gate = CommandGate(time.monotonic_ns, obey)
+    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
+        server = rig.serve_requests(lambda name, payload: gate.answer(name, payload)[1])
+        with bad_subscriber("flooding", "simulated", endpoint):
+            deadline = time.monotonic() + PATIENCE_S
+            while gate.counts["flooded"] < 500 and time.monotonic() < deadline:
+                time.sleep(0.05)
+            flooded = gate.counts["flooded"]
+            assert flooded >= 500 and Commander(console, "console").stop().accepted and done == ["stop"]
+        assert server is not None
+
+
+def lines_of_the_example(arguments: list[str], session: Session, program: str) -> list[str]:
+    """The first two lines that the example prints while `session` publishes states."""
+    child = subprocess.Popen([sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True)
+    publisher, lines = session.publisher("state"), list[str]()
+    reader = threading.Thread(target=lambda: lines.extend(child.stdout.readline() for _ in range(2)))  # type: ignore[union-attr]
+    reader.start()
+    deadline = time.monotonic() + PATIENCE_S
+    while reader.is_alive() and time.monotonic() < deadline:
+        publisher.put(RigState(stamp_ns=2_500_000_000, mode="contact", safety_action="hold", cause="no fresh pose",
+                               force_N=0.1234))
+        time.sleep(0.01)
+    child.kill()
+    child.wait()
+    reader.join()
+    assert child.stdout is not None
+    child.stdout.close()
+    return lines
+
+
+SHOWN = ["2.500 s  contact  0.123 N  no fresh pose\n"] * 2
+
+
+def test_the_example_reads_on_this_machine() -> None:
+    program, endpoint = EXAMPLE.read_text(encoding="utf-8"), free_endpoint()
+    assert len(program.splitlines()) <= 15 and "import host" not in program and "protocol" not in program
+    assert "tcp/127.0.0.1:7451" in program and load_rig(RIG_FILE).zenoh.listen == ["tcp/127.0.0.1:7451"]
+    with Session("simulated", [endpoint], []) as session:
+        assert lines_of_the_example([], session, program.replace("tcp/127.0.0.1:7451", endpoint)) == SHOWN
+
+
+def test_the_example_reads_from_another_machine_with_its_certificate(tmp_path: Path) -> None:
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    keys.make_authority(tmp_path / "keys")
+    rig = keys.issue(tmp_path / "keys", "rig1", "rig", addresses=["127.0.0.1"])
+    reader = keys.issue(tmp_path / "keys", "analysis", "reader", connect=endpoint)
+    network = Network("simulated", (endpoint,), rig.folder, ("analysis",))
+    with Session("simulated", [], [], network) as session:
+        assert lines_of_the_example([str(reader.folder / keys.CLIENT_FILE)], session, EXAMPLE.read_text("utf-8")) == SHOWN
