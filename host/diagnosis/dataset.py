@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
@@ -62,13 +63,20 @@ def find_files(spec: NominalSpec, named: list[str], data_folder: str | None) -> 
 def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
     """Recordings of `files`; `needed` are the channels of the model, those in `optional` may be absent. Raises BadInput."""
     pieces: list[Recording] = []
-    for path in files:
-        columns = read_table(path)
-        whole = _one(spec, path.name, columns, needed, optional)
+    wholes = [_one(spec, path.name, read_table(path), needed, optional) for path in files]
+    shared = one_clock(wholes)
+    first = min(whole.time_s[0] for whole in wholes)
+    for path, whole in zip(files, wholes, strict=True):
+        whole = replace(whole, time_s=whole.time_s - first) if shared else replace(whole, time_s=whole.time_s - whole.time_s[0])
         cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
-        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows)
-                   for piece in cuts] or [whole]
+        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [whole]
     return _split(pieces, spec.data.heldout)
+
+
+def one_clock(recordings: list[Recording]) -> bool:
+    """Whether the recordings lie one after the other on one clock, so that phases and drifts run on through all."""
+    spans = sorted((r.time_s[0], r.time_s[-1]) for r in recordings)
+    return len(spans) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(spans))
 
 
 def _one(spec: NominalSpec, name: str, columns: dict[str, Array], needed: dict[str, ChannelSpec],
@@ -102,7 +110,7 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
         time_s = columns[spec.data.time]
         if not np.all(np.isfinite(time_s)) or np.any(np.diff(time_s) < 0) or time_s[-1] <= time_s[0]:
             raise BadInput("data.time", f"{spec.data.time} of {name} not increasing", "seconds that increase")
-        return time_s - time_s[0], True
+        return time_s, True
     if spec.data.rate_Hz is not None:
         return np.arange(n) / spec.data.rate_Hz, True
     return np.arange(n, dtype=np.float64), False
@@ -110,7 +118,7 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
 
 def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
     """Even grid; a grid point further than one and a half periods from any sample stays missing."""
-    grid = np.arange(0.0, time_s[-1] + 0.5 * dt_s, dt_s)
+    grid = np.arange(time_s[0], time_s[-1] + 0.5 * dt_s, dt_s)
     after = np.clip(np.searchsorted(time_s, grid), 1, time_s.size - 1)
     hole = (time_s[after] - time_s[after - 1]) > 3.0 * dt_s
     even = {}

@@ -98,6 +98,7 @@ class Effect:
 
     `port`: motion (a kinematic signal), turn (an angle), force (a force balance), timing, limit, drift and mix (a scalar reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
+    `source`: what it depends on besides: "load" (a force), "drag" (a force or bend that presses), "other" (another channel).
     `order`: place among the effects of one port, small first. `side`: motion ports only, before or after the nominal gain.
     `apply(signal, context, values, form)`: the changed signal. Force ports give `slots` for the force kernel instead.
     `contains`: ids of which this one is a generalization (nested pairs).
@@ -112,7 +113,7 @@ class Effect:
     apply: Apply | None = None
     slots: Callable[[Array, str], dict[str, float]] | None = None
     side: str = "input"
-    source: str = ""           # "", "load" or "other"
+    source: str = ""
     timed: bool = False
     forms: tuple[str, ...] = ("",)
     contains: tuple[str, ...] = ()
@@ -129,6 +130,7 @@ class Port:
     channels: tuple[str, ...]
     loads: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
+    drags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = 
         for effect in library():
             if effect.id in left_out or effect.port not in port.kind.split("+") or effect.id in left_out or (effect.timed and not timed):
                 continue
-            sources = {"": ("",), "load": port.loads, "other": port.others}[effect.source]
+            sources = {"": ("",), "load": port.loads, "drag": port.drags or port.loads, "other": port.others}[effect.source]
             forms = [form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out]
             found += [Candidate(effect, port, source, form) for source in sources for form in forms]
     return found

@@ -32,7 +32,7 @@ class Gain:
 
 
 def correlation_time(r: Array, longest: int | None = None) -> float:
-    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; by the initial positive sequence (Geyer 1992)."""
+    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay positive (Geyer 1992)."""
     good = np.isfinite(r)
     n = int(good.sum())
     if n < 20:
@@ -49,7 +49,7 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
     total = 1.0
     for k in range(1, limit, 2):
         pair = rho[k] + (rho[k + 1] if k + 1 < limit else 0.0)
-        if pair <= 0.0:
+        if pair <= 0.03:
             break
         total += 2.0 * pair
     return float(np.clip(total, 1.0, n / 4.0))
@@ -62,7 +62,7 @@ def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
     the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is gained.
     """
     independent, log_ratio, excess, excess_after = (np.zeros(floor.size) for _ in range(4))
-    blocks: list[float] = []
+    by_output: list[list[float]] = []
     for row in range(floor.size):
         b2, a2, n_eff, times = _pooled(pieces, which, before, after, row)
         if n_eff < 3.0:
@@ -71,11 +71,20 @@ def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
         excess[row] = max(0.0, 1.0 - floor[row] ** 2 / level_b)
         excess_after[row] = max(0.0, 1.0 - 1.5 * floor[row] ** 2 / level_a)
-        blocks += _blocks(pieces, which, before, after, row, times, level_a)
+        by_output.append(_blocks(pieces, which, before, after, row, times, level_a))
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
     share = float(1.0 - np.exp(-log_ratio[top]))
-    return Gain(gain, _sign_of_mean(np.array(blocks)), share, float(excess[top]), independent, log_ratio, excess_after)
+    return Gain(gain, _p_value(by_output), share, float(excess[top]), independent, log_ratio, excess_after)
+
+
+def _p_value(by_output: list[list[float]]) -> float:
+    """The smaller of: all outputs together, and the surest output times their number (Bonferroni)."""
+    if not by_output:
+        return 1.0
+    together = _sign_of_mean(np.concatenate([np.array(blocks) for blocks in by_output]))
+    alone = min(_sign_of_mean(np.array(blocks)) for blocks in by_output)
+    return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
 def _pooled(pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int) -> tuple[float, float, float, list[float]]:

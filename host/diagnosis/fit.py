@@ -49,6 +49,7 @@ class Problem:
     pieces: list[Piece]
     noise: list[Noise]
     scale: Array
+    columns: dict[str, str] = field(default_factory=dict)    # channel -> column, for equations
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""

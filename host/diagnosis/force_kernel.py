@@ -137,13 +137,13 @@ def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: fl
 
 @njit(cache=True)
 def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begin: Array, load: Array, control: Array, reference: Array,
-             start: float) -> Array:
+             start: float, begin_s: float) -> Array:
     """Motion of m a + c v + k x + (force terms) = u + offset from recorded or controlled input.
 
     Arguments:
         u: (n * 2 * substeps + 1,) input at half sub-steps. linear: m, c, k, offset. begin: x and v at the first sample.
         control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is
-            added to its force. start: friction held at first.
+            added to its force. start: friction held at first. begin_s: time of the first sample.
     Returns:
         (4, n): position, velocity, acceleration, input used.
     Runge-Kutta for the smooth forces; Coulomb friction as an impulse at the end of each sub-step, so that it can hold (Moreau 1988).
@@ -172,7 +172,7 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
             dry = p[COULOMB]
             if p[STRIBECK] > 0.0:
                 dry += p[EXCESS] * math.exp(-((v_old / p[STRIBECK]) ** 2))
-            x, v, x2, v2, a = _runge_kutta(s, push, i * dt_s + j * h, h, slow, linear, p)
+            x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
             if j == 0:
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
             if dry > 0.0:

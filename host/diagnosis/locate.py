@@ -38,17 +38,22 @@ def moving_rms(values: Array, dt_s: float) -> Array:
 
 def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
     """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed, short pieces dropped."""
-    rms = moving_rms(mismatch, dt_s)
+    rms = moving_rms(fill(mismatch), dt_s)
     high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], high.astype(np.int8), [0]))))
     spans = [[time_s[a], time_s[b - 1]] for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    joined: list[list[float]] = []
-    for span in spans:
-        if joined and span[0] - joined[-1][1] < JOIN_S:
-            joined[-1][1] = span[1]
+    return joined([(float(a), float(b)) for a, b in spans])
+
+
+def joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Windows in order, those nearer than half a second made one, those shorter than 0.3 s dropped."""
+    out: list[list[float]] = []
+    for a, b in sorted(spans):
+        if out and a - out[-1][1] < JOIN_S:
+            out[-1][1] = max(out[-1][1], b)
         else:
-            joined.append(list(span))
-    return [(float(a), float(b)) for a, b in joined if b - a >= SHORTEST_S]
+            out.append([a, b])
+    return [(a, b) for a, b in out if b - a >= SHORTEST_S]
 
 
 def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:

@@ -56,6 +56,7 @@ class Model(Protocol):
     fit_samples: int                   # and so many to fit; beyond, samples are averaged
     coarsest_s: float                  # period beyond which they must not be averaged
     travel: tuple[tuple[str, str, str], ...]   # signals a condition may speak of: words, key of Piece.inputs, unit
+    moves: dict[str, str]                      # channel of the motion at each port of `unlisted_at`
     unlisted_at: tuple[tuple[str, str], ...]   # ports of an equation found by search: whose motion it is made of, where it is added
     taken: frozenset[str]              # effects (id, or id:form) that the nominal model has already
 

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from host.diagnosis import noise as noise_module
 from host.diagnosis.chains import build, channels_of
-from host.diagnosis.dataset import Recording, load, thin
+from host.diagnosis.dataset import Recording, load, one_clock, thin
 from host.diagnosis.effect import candidates
 from host.diagnosis.equivalence import Standing, standings
 from host.diagnosis.evidence import whiteness
 from host.diagnosis.fit import Fit, Problem
-from host.diagnosis.locate import Condition, condition, inside, mismatch_of, windows
+from host.diagnosis.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.model import Model, Piece
 from host.diagnosis.noise import Noise
 from host.diagnosis.nominal import NominalSpec
@@ -75,8 +75,9 @@ def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Probl
     recordings = load(spec, files, *channels_of(spec))
     model = build(spec)
     factor = thinning(model, recordings)
-    full = _problem(model, recordings)
-    return model, (_problem(model, [thin(r, factor) for r in recordings]) if factor > 1 else full), full
+    columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
+    full = _problem(model, recordings, columns)
+    return model, (_problem(model, [thin(r, factor) for r in recordings], columns) if factor > 1 else full), full
 
 
 def thinning(model: Model, recordings: list[Recording]) -> int:
@@ -88,7 +89,7 @@ def thinning(model: Model, recordings: list[Recording]) -> int:
     return factor
 
 
-def _problem(model: Model, recordings: list[Recording]) -> Problem:
+def _problem(model: Model, recordings: list[Recording], columns: dict[str, str]) -> Problem:
     pieces = [model.prepare(r) for r in recordings]
     still = [noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed) for p in pieces]
     noises: list[Noise] = []
@@ -97,7 +98,7 @@ def _problem(model: Model, recordings: list[Recording]) -> Problem:
         noises.append(found)
         for piece in pieces:
             piece.y[row, noise_module.wild(piece.y[row], found.sigma)] = np.nan
-    return Problem(model, pieces, noises, np.ones(len(model.outputs)))
+    return Problem(model, pieces, noises, np.ones(len(model.outputs)), columns)
 
 
 def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozenset[str] = frozenset()) -> Diagnosis:
@@ -142,9 +143,9 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))
     spans = [windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma) for p, r in zip(full.pieces, residuals, strict=True)]
-    longest = max(range(len(spans)), key=lambda k: _energy(full.pieces[k], residuals[k][top]))
+    told = _told(full, spans, residuals, top)
     where = condition(full, residuals, top, max(1, sum(p.n for p in full.pieces) // 20000))
-    return Location(subsystem, [full.model.outputs[row].channel for row in rows], spans[longest], where, _share(full, found, spans, top))
+    return Location(subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top))
 
 
 def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
@@ -191,11 +192,11 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
         if not rows:
             continue
         top = max(rows, key=lambda row: _weight(full, alone, row))
-        spans = [_windows(piece, m[top]) for piece, m in zip(full.pieces, alone, strict=True)]
-        longest = max(range(len(spans)), key=lambda k: _energy(full.pieces[k], alone[k][top]))
+        strong = [row for row in rows if _weight(full, alone, row) >= 0.5 * _weight(full, alone, top)]
+        spans = [joined([span for row in strong for span in _windows(piece, m[row])]) for piece, m in zip(full.pieces, alone, strict=True)]
         share = _share(full, found, spans, top)
         where = condition(full, alone, top, max(1, sum(p.n for p in full.pieces) // 20000))
-        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], spans[longest], where, share))
+        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans, alone, top), where, share))
     return out
 
 
@@ -226,6 +227,13 @@ def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
 
 def _weight(full: Problem, change: list[Array], row: int) -> float:
     return _rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300) if any(np.isfinite(c[row]).any() for c in change) else 0.0
+
+
+def _told(full: Problem, spans: list[list[tuple[float, float]]], change: list[Array], row: int) -> list[tuple[float, float]]:
+    """Windows of all recordings where they share a clock, else those of the recording in which the mismatch is largest."""
+    if one_clock([piece.recording for piece in full.pieces]):
+        return sorted(span for each in spans for span in each)
+    return spans[max(range(len(spans)), key=lambda k: _energy(full.pieces[k], change[k][row]))]
 
 
 def _windows(piece: Piece, change: Array) -> list[tuple[float, float]]:

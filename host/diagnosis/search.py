@@ -59,6 +59,7 @@ class Trial:
     score: float
     starts: list[dict[str, float]] = field(default_factory=list)
     replaced: bool = False
+    period_s: float = 0.0
 
 
 @dataclass
@@ -184,6 +185,8 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
         terms, values, base, Q, rest = bases[drop]
         term = term_of(problem, candidate, fit)
         quick = slopes is not None and candidate.port.name in slopes[0]
+        if not term.parameters:
+            continue
         points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes, lines)
         if not points:
             continue
@@ -231,7 +234,7 @@ def _few(problem: Problem) -> Problem:
     count = max(1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used)))))
     chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
     pieces = [piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool)) for index, piece in enumerate(problem.pieces)]
-    return Problem(problem.model, pieces, problem.noise, problem.scale)
+    return replace(problem, pieces=pieces)
 
 
 def _smaller(problem: Problem) -> Problem:
@@ -239,7 +242,7 @@ def _smaller(problem: Problem) -> Problem:
     few = _few(problem)
     stride = max(1, int(sum(piece.fit.sum() for piece in few.pieces) * len(problem.noise) / SCREEN_ROWS))
     pieces = [replace(piece, fit=piece.fit & (np.arange(piece.n) % stride == 0)) for piece in few.pieces]
-    return Problem(problem.model, pieces, problem.noise, problem.scale)
+    return replace(problem, pieces=pieces)
 
 
 def _independent(problem: Problem, fit: Fit) -> float:
@@ -301,7 +304,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
     trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
     more = len(fit.values) - len(base.values)
-    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more, after, bool(item.drop))
+    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more, after, bool(item.drop), problem.pieces[0].recording.dt_s)
 
 
 def at_bound(fit: Fit) -> bool:
@@ -371,11 +374,24 @@ def rank(trials: list[Trial], base: Fit) -> None:
     top = trials[0]
     coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.heldout.excesses))))
     near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
-    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > near]
+    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)]
     if simpler:
         best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
         trials.remove(best)
         trials.insert(0, best)
+
+
+def of_sampling(trial: Trial) -> bool:
+    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples, not physics."""
+    if trial.candidate.effect.id not in ("latency", "rate_lag") or not trial.candidate.port.name.endswith("_drive"):
+        return False
+    return float(trial.fit.values[-1]) < 1.05 * trial.period_s
+
+
+def related(simple: Candidate, general: Candidate) -> bool:
+    """Whether `general` is a finer shape of `simple`, at the same place."""
+    a, b = simple.effect, general.effect
+    return simple.port.name == general.port.name and (a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family))
 
 
 def good_enough(trial: Trial, base: Fit) -> bool:
@@ -383,7 +399,7 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     more = max(len(trial.fit.values) - len(base.values), 0)
     gain = trial.heldout
     least = max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
-    return (not at_bound(trial.fit) and gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
+    return (not at_bound(trial.fit) and not of_sampling(trial) and gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
             and trial.trained.log_likelihood > ENOUGH + 2.0 * more)
 
 

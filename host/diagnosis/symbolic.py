@@ -13,7 +13,7 @@ from host.diagnosis.effect import Candidate, Context, Effect, Parameter, Port, S
 from host.diagnosis.evidence import correlation_time
 from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.model import Piece
-from host.diagnosis.operators import lag, play, since_reversal
+from host.diagnosis.operators import lag, play
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -31,31 +31,39 @@ class Equation:
     length: int
 
 
-def feature_names(problem: Problem, port: Port) -> list[str]:
-    """Names of the features at a port: the motion, its memory, its rate, and the other inputs."""
-    others = [name for name in (*port.loads, *port.others) if name in problem.pieces[0].inputs]
-    names = ["x", "play_small", "play_large", "since_reversal"]
-    if problem.pieces[0].recording.timed:
-        names += ["v", "lag_short", "lag_long"]
-    return [*names, *others]
-
-
 def features(problem: Problem, piece: Piece, port: Port) -> Array:
-    """Feature table (n, features) of one recording, each of unit size over all recordings."""
-    x = problem.model.motion(piece, port)
-    span = _span(problem, port)
-    u = (x - np.mean(x)) / span if port.kind.startswith("drift") else x / span
-    dt = piece.recording.dt_s
-    columns = [u, u - play(u, 0.05, 0.0), u - play(u, 0.2, 0.0), np.minimum(since_reversal(u, 0.01), 1.0)]
+    """Feature table (n, features) of one recording; the same scales in every recording."""
+    return np.array([values for values, _ in described(problem, piece, port)]).T
+
+
+def described(problem: Problem, piece: Piece, port: Port) -> list[tuple[Array, str]]:
+    """Features and their text in the names of columns: the motion, its memory, its rate, the other inputs and their rates."""
+    x, span, dt = problem.model.motion(piece, port), _span(problem, port), piece.recording.dt_s
+    name = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
+    out = [(x / span, f"({name} / {span:.6g})")]
+    for part in (0.1, 0.4):
+        out.append(((x - play(x, 0.5 * part * span, 0.0)) / span, f"(({name} - play({name}, {part * span:.6g})) / {span:.6g})"))
     if piece.recording.timed:
-        duration = max(float(p.recording.time_s[-1]) for p in problem.pieces)
-        rate = np.gradient(u, dt)
-        columns += [rate / (np.sqrt(np.mean(rate**2)) + 1e-12), u - lag(u, dt, max(5 * dt, 0.005 * duration)), u - lag(u, dt, 0.1 * duration)]
-    for name in (*port.loads, *port.others):
-        if name in piece.inputs:
-            size = np.sqrt(np.mean(np.concatenate([p.inputs[name] for p in problem.pieces]) ** 2)) + 1e-12
-            columns.append(piece.inputs[name] / size)
-    return np.array(columns).T
+        duration = max(float(p.recording.time_s[-1] - p.recording.time_s[0]) for p in problem.pieces)
+        out.append(_rated(problem, piece, name, lambda p: problem.model.motion(p, port)))
+        for time_constant in (max(5 * dt, 0.005 * duration), 0.1 * duration):
+            out.append(((x - lag(x, dt, time_constant)) / span, f"(({name} - lag({name}, {time_constant:.6g})) / {span:.6g})"))
+    for other in dict.fromkeys((*port.loads, *port.others)):
+        if other in piece.inputs:
+            size = float(np.sqrt(np.mean(np.concatenate([p.inputs[other] for p in problem.pieces]) ** 2))) or 1.0
+            text = problem.columns.get(other, other)
+            out.append((piece.inputs[other] / size, f"({text} / {size:.6g})"))
+            if piece.recording.timed and other in port.others:
+                out.append(_rated(problem, piece, text, lambda p, other=other: p.inputs[other]))  # type: ignore[misc]
+    return out
+
+
+def _rated(problem: Problem, piece: Piece, name: str, signal: Callable[[Piece], Array]) -> tuple[Array, str]:
+    """Rate of a signal over the RMS rate of all recordings, and its text."""
+    def rate(p: Piece) -> Array:
+        return np.gradient(signal(p), p.recording.dt_s)
+    size = float(np.sqrt(np.mean(np.concatenate([rate(p) for p in problem.pieces]) ** 2))) or 1.0
+    return rate(piece) / size, f"(rate({name}) / {size:.6g})"
 
 
 def _span(problem: Problem, port: Port) -> float:
@@ -127,7 +135,7 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Equation]:
     cut = len(X) // step * step
     X = X[:cut].reshape(-1, step, X.shape[1]).mean(axis=1)
     z = np.clip(z[:cut].reshape(-1, step).mean(axis=1) / size, -8.0, 8.0)
-    names, found = feature_names(problem, port), []
+    names, found = [text for _, text in described(problem, problem.pieces[0], port)], []
     for seed in SEEDS:
         regressor = SymbolicRegressor(
             allowed_symbols="add,sub,mul,div,sin,exp,abs,square,tanh,constant,variable", population_size=300, generations=60, max_length=LONGEST,
@@ -161,5 +169,5 @@ def as_candidate(port: Port, equation: Equation) -> Candidate:
         return np.asarray(signal + p[0] * equation.evaluate(c.extra["features"][port.name]))
 
     effect = Effect("unlisted", port.kind.split("+")[0], 76, parameters, "None of the known effects: the mismatch follows an equation found by search.",
-                    f"added = amplitude*({equation.text})", apply, side="input")
+                    equation.text, apply, side="input")
     return Candidate(effect, port, "", "search")

@@ -59,6 +59,7 @@ class Axis:
             self.taken |= {"softening:", "contact_nonlinear:"}
         self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
         self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None and self.free_run else ()
+        self.moves = {name: self.spec.output}
         self.quiet_inputs = (self.spec.input,)
 
     def prepare(self, recording: Recording) -> Piece:
@@ -139,7 +140,7 @@ class Axis:
         if not self.free_run:
             return self._follow(piece, linear, steps, p)
         run = run_axis(steps, extra["substeps"], piece.recording.dt_s, linear, p, extra["begin"], load, control, reference,
-                       piece.start.get(spec.subsystem, 0.0))
+                       piece.start.get(spec.subsystem, 0.0), float(piece.recording.time_s[0]))
         motion = run[("position", "velocity", "acceleration").index(spec.reads)]
         motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]

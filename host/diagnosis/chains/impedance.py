@@ -53,6 +53,7 @@ class Impedance:
             self.taken |= {"contact_nonlinear:", "softening:"}
         self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
         self.unlisted_at = ((name, f"{name}_reading"),)
+        self.moves = {name: self.spec.input}
         self.quiet_inputs = (self.spec.input, *loads)
 
     def prepare(self, recording: Recording) -> Piece:

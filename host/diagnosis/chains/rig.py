@@ -72,16 +72,17 @@ class Rig:
         self.outputs = tuple([Output(f"{part}_{axis}", unit, subsystem) for part, unit, subsystem in (
             ("tip", "m", "shape"), ("tip_turn", "rad", "shape"), ("shaft", "m", "shape"), ("shaft_turn", "rad", "shape"),
             ("force", "N", "contact")) for axis in "xyz"])
-        loads = {"insertion": ("axial_force", "curvature"), "roll": ("curvature", "handle_insertion"), "knob": ("axial_force", "handle_insertion")}
+        loads = {"insertion": ("axial_force",), "roll": (), "knob": ("axial_force",)}
         poses = tuple(o.channel for o in self.outputs)
         self.ports = tuple(
             [Port(axis, "motion+turn" if axis == "roll" else "motion", axis, poses, loads[axis],
-                  tuple(f"handle_{other}" for other in AXES if other != axis)) for axis in AXES]
+                  tuple(f"handle_{other}" for other in AXES if other != axis), ("axial_force", "curvature")) for axis in AXES]
             + [Port(name, kind, name, poses) for name, kind in (("shape", "shape"), ("contact", "contact"), ("pose_sensor", "pose"),
                                                                 ("force_sensor", "forces"), ("base", "base"))])
         units = {"insertion": "m", "roll": "rad", "knob": "rad"}
         self.travel = (*((axis, f"handle_{axis}", units[axis]) for axis in AXES), ("force", "axial_force", "N"))
         self.unlisted_at = tuple((axis, axis) for axis in AXES)
+        self.moves = {axis: f"handle_{axis}" for axis in AXES}
         self.quiet_inputs = tuple(HANDLES)
 
     def prepare(self, recording: Recording) -> Piece:
@@ -174,8 +175,9 @@ class Rig:
             for name in ("tip", "shaft"):
                 run[name] = np.einsum("abn,bn->an", state["turn"], run[name])
                 run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
+        placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
         law: dict[str, Any] = {
-            "gap": self.normal @ (free + state["shift"]) - theta[7], "stiffness": np.full(n, theta[8]), "exponent": 1.0, "reference": 1e-3,
+            "gap": self.normal @ placed - theta[7], "stiffness": np.full(n, theta[8]), "exponent": 1.0, "reference": 1e-3,
             "damping": 0.0, "crossley": 0.0, "relax": 0.0, "relax_time": 0.0, "friction": 0.0, "friction_distance": 1e-3,
         }
         law = _changed(law, acts, "contact", piece)

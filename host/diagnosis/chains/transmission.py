@@ -48,6 +48,7 @@ class Transmission:
         used = dict.fromkeys(name for link in self.links for name in (link.input, *link.load))
         self.travel = tuple((name.replace("_", " "), name, self.units[name]) for name in used)
         self.unlisted_at = tuple((name, name) for name in names)
+        self.moves = {name: link.input for name, link in zip(names, self.links, strict=True)}
         self.quiet_inputs = tuple(dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load]))
 
     def prepare(self, recording: Recording) -> Piece:

@@ -56,11 +56,18 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
     return {**state, "push": state["push"] + p[0] * slow}
 
 
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """The reading goes on changing after the force has."""
+    return np.asarray(signal + p[0] * np.vstack([lag(np.ascontiguousarray(row), c.dt_s, p[1]) - row for row in signal]))
+
+
 EFFECTS = (
+    Effect("creep_relaxation", "forces", 84, share, "The force sensor's reading creeps: a share {slow_share} arrives over {time_constant}.",
+           "y = x + slow_share*(lag(x, time_constant) - x)", apply_force, timed=True),
     Effect("creep_relaxation", "shape", 22, share, "Under force the shaft goes on giving way over {time_constant}.",
            "u = C (F + slow_share*lag(F, time_constant))", apply_shape, timed=True, forms=("force",)),
     Effect("creep_relaxation", "motion", 55, of_motion, "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
-           "y = x + slow_share*(lag(x, time_constant) - x)", apply_motion, timed=True),
+           "y = x + slow_share*(lag(x, time_constant) - x)", apply_motion, timed=True, contains=("rate_lag",)),
     Effect("creep_relaxation", "motion", 72, of_load, "Under {source} the output goes on giving way over {time_constant}.",
            "y = x + compliance*lag(load, time_constant)", apply_load, side="output", source="load", timed=True),
     Effect("creep_relaxation", "force", 21, force, "Part of the force, {stiffness}, relaxes over {time_constant}.",

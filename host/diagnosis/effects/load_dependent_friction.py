@@ -35,7 +35,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 EFFECTS = (
     Effect("load_dependent_friction", "motion", 47, lost, "Friction grows with {source}: the output stays behind by {coefficient} times its size.",
-           "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", apply, source="load"),
+           "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", apply, source="drag"),
     Effect("load_dependent_friction", "force", 12, force, "Friction grows with {source}: {coefficient} of its size, built up over {distance}.",
-           "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, source="load"),
+           "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, source="drag"),
 )

@@ -33,7 +33,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 EFFECTS = (
     Effect("resonance", "motion", 63, parameters, "The output rings at {frequency}, damping ratio {damping_ratio}.",
-           "y'' + 2 z w y' + w^2 y = w^2 x", apply, timed=True),
+           "y'' + 2 z w y' + w^2 y = w^2 x", apply, timed=True, contains=("rate_lag",)),
     Effect("resonance", "force", 40, force, "A part of the mass hangs on a spring and rings at {frequency}.",
            "m2 x2'' = k2 (x - x2) + c2 (x' - x2')", slots=slots, timed=True),
 )

@@ -9,7 +9,9 @@ from host.diagnosis.operators import whip
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Amplitude and phase."""
+    """Amplitude and phase; none where the axis does not turn by more than a radian."""
+    if s.span < 1.0:
+        return ()
     return (Parameter("amplitude", "rad", (0.1, 0.4, 0.9, 1.5), 1e-3, 6.0, log=True),
             Parameter("phase", "rad", tuple(np.arange(8) * np.pi / 4), -20.0, 20.0, step=0.3))
 

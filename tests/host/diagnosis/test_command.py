@@ -1,0 +1,74 @@
+"""The command as its user meets it: JSON by contract, a report that stands alone, bad input as one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from host.cli.contract_io import BadInput
+from host.cli.diagnose import diagnose
+from tests.host.diagnosis import planted
+
+KEYS = {"verdict", "located", "effects", "fit", "seconds"}
+FIT = {"heldout", "rmse_before", "rmse_after", "noise_floor", "unit", "per_channel", "whiteness_p_before", "whiteness_p_after"}
+EFFECT = {"id", "subsystem", "says", "equation", "parameters", "evidence", "indistinguishable_from", "experiment_to_tell_apart"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+    """JSON and report of a planted case."""
+    folder = tmp_path_factory.mktemp("case")
+    nominal, files = planted.transmission(folder, "backlash", 1)
+    diagnose([str(f) for f in files], str(nominal), str(folder / "o.json"), str(folder / "o.html"), None, None, True)
+    return json.loads((folder / "o.json").read_text()), (folder / "o.html").read_text()
+
+
+def test_json_is_what_the_contract_says(made: tuple[dict, str]) -> None:
+    verdict, _ = made
+    assert set(verdict) == KEYS and set(verdict["fit"]) == FIT and verdict["fit"]["heldout"] is True
+    (effect,) = verdict["effects"]
+    assert set(effect) == EFFECT and set(effect["evidence"]) == {"heldout_log_likelihood_gain", "p_value"}
+    (place,) = verdict["located"]
+    assert set(place) == {"subsystem", "channels", "windows_s", "condition", "residual_share"}
+    assert verdict["fit"]["rmse_after"] < verdict["fit"]["rmse_before"]
+    assert all(len(p["ci95"]) == 2 and p["ci95"][0] <= p["value"] <= p["ci95"][1] for p in effect["parameters"].values())
+
+
+def test_report_needs_nothing_from_outside(made: tuple[dict, str]) -> None:
+    _, page = made
+    assert page.count("data:image/svg+xml") >= 6 and "Missing: backlash (cable)" in page
+    assert 'src="http' not in page and "<script" not in page and "<link" not in page
+
+
+def test_misuse_is_bad_input(tmp_path: Path) -> None:
+    nominal, files = planted.transmission(tmp_path, "none", 0)
+    with pytest.raises(BadInput, match="--nominal"):
+        diagnose([str(files[0])])
+    with pytest.raises(BadInput, match="--without"):
+        diagnose([str(files[0])], str(nominal), without=["backlsh"])
+    with pytest.raises(BadInput, match="recording"):
+        diagnose([str(tmp_path / "none.csv")], str(nominal), quiet=True)
+
+
+def test_help_names_every_option() -> None:
+    import typer
+
+    app = typer.Typer()
+    app.command()(diagnose)
+    text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
+    for word in ("--nominal", "--json", "--report", "--data", "--without"):
+        assert word in text
+
+
+def test_progress_goes_to_standard_error(tmp_path: Path) -> None:
+    nominal, files = planted.transmission(tmp_path, "none", 0)
+    code = ("import sys; from host.cli.diagnose import diagnose; "
+            f"diagnose({[str(f) for f in files]!r}, {str(nominal)!r}, '-')")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["verdict"] == "nothing_missing"
+    assert "screening" in done.stderr

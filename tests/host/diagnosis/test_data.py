@@ -1,0 +1,116 @@
+"""Tables, channels, split and clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.cli.contract_io import BadInput
+from host.diagnosis.chains import channels_of
+from host.diagnosis.dataset import Recording, find_files, load, thin
+from host.diagnosis.nominal import NominalSpec, read_nominal
+from host.diagnosis.tables import read_table
+
+TOML = """
+name = "t"
+kind = "transmission"
+[data]
+time = "t"
+[channels.motor]
+column = "a"
+scale = 0.1
+unit = "rad"
+sign = -1
+[channels.jaw]
+column = "b"
+unit = "rad"
+[[link]]
+input = "motor"
+output = "jaw"
+"""
+
+
+def spec(folder: Path, text: str = TOML) -> NominalSpec:
+    path = folder / "n.toml"
+    path.write_text(text)
+    return read_nominal(path)
+
+
+def table(path: Path, start: float = 0.0, n: int = 100) -> Path:
+    t = start + np.arange(n) * 0.01
+    np.savetxt(path, np.column_stack((t, np.arange(n), np.arange(n) ** 2)), delimiter=",", header="t,a,b", comments="")
+    return path
+
+
+def read(folder: Path, files: list[Path], text: str = TOML) -> list[Recording]:
+    nominal = spec(folder, text)
+    return load(nominal, files, *channels_of(nominal))
+
+
+def test_every_kind_of_file_gives_the_same_columns(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+    import scipy.io
+
+    a = np.linspace(0, 1, 60)
+    np.savez(tmp_path / "x.npz", a=a)
+    scipy.io.savemat(tmp_path / "x.mat", {"a": a[:, None]})
+    pyarrow.parquet.write_table(pyarrow.table({"a": a}), tmp_path / "x.parquet")
+    np.savetxt(tmp_path / "x.csv", a, header="a", comments="")
+    for name in ("x.npz", "x.mat", "x.parquet", "x.csv"):
+        assert np.allclose(read_table(tmp_path / name)["a"], a)
+
+
+def test_empty_fields_are_missing(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n,3\nnan,4\n")
+    columns = read_table(tmp_path / "x.csv")
+    assert np.isnan(columns["a"][1:]).all() and columns["b"].tolist() == [2, 3, 4]
+
+
+def test_scale_and_sign_are_applied(tmp_path: Path) -> None:
+    (one,) = read(tmp_path, [table(tmp_path / "x.csv")])
+    assert one.channels["motor"][10] == pytest.approx(-1.0) and one.channels["jaw"][10] == pytest.approx(100.0)
+
+
+def test_a_lone_recording_is_split_into_blocks_and_three_by_recording(tmp_path: Path) -> None:
+    (one,) = read(tmp_path, [table(tmp_path / "x.csv")])
+    assert one.fit.any() and one.heldout.any() and not (one.fit & one.heldout).any()
+    three = read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "abc"])
+    assert [r.heldout.all() for r in three] == [False, True, False]
+
+
+def test_heldout_patterns_choose_recordings(tmp_path: Path) -> None:
+    text = TOML.replace('time = "t"', 'time = "t"\nheldout = ["c*"]')
+    assert [r.heldout.all() for r in read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "abc"], text)] == [False, False, True]
+    with pytest.raises(BadInput, match=r"data\.heldout"):
+        read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "ab"], text)
+
+
+def test_recordings_one_after_the_other_keep_their_clock(tmp_path: Path) -> None:
+    follow = read(tmp_path, [table(tmp_path / "a.csv", 5.0), table(tmp_path / "b.csv", 9.0)])
+    assert [r.time_s[0] for r in follow] == pytest.approx([0.0, 4.0])
+    apart = read(tmp_path, [table(tmp_path / "a.csv", 5.0), table(tmp_path / "b.csv", 5.0)])
+    assert [r.time_s[0] for r in apart] == [0.0, 0.0]
+
+
+def test_thinning_averages(tmp_path: Path) -> None:
+    (one,) = read(tmp_path, [table(tmp_path / "x.csv")])
+    assert thin(one, 4).channels["motor"][0] == pytest.approx(-0.15) and thin(one, 4).n == 25
+
+
+@pytest.mark.parametrize(("old", "new", "key"), [
+    ('column = "a"', 'column = "zz"', "channels.motor.column"), ("scale = 0.1", "skale = 0.1", "channels.motor.skale"),
+    ('kind = "transmission"', 'kind = "gearbox"', "kind"), ('input = "motor"', 'input = "motr"', "motr"), ('time = "t"', 'time = "tt"', "data.time"),
+])
+def test_bad_nominals_name_the_key(tmp_path: Path, old: str, new: str, key: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        read(tmp_path, [table(tmp_path / "x.csv")], TOML.replace(old, new))
+    assert caught.value.key == key
+
+
+def test_no_files_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SELDINGER_DATA", raising=False)
+    with pytest.raises(BadInput, match="recording"):
+        find_files(spec(tmp_path), [], None)

@@ -1,0 +1,88 @@
+"""The force kernel and the rig's shape against closed forms and coarse independent computations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from host.diagnosis.chains.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
+from host.diagnosis.force_kernel import along, run_axis, slot_array
+from tests.host.diagnosis import rig_cases
+
+
+def axis(u: np.ndarray, dt: float, linear: list[float], slots: dict[str, float], begin: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """Free run with linear interpolation of u."""
+    steps = np.append(np.interp(np.arange(u.size * 4) / 4, np.arange(u.size), u), u[-1])
+    return run_axis(steps, 2, dt, np.array(linear), slot_array([slots]), np.array(begin), np.zeros(u.size), np.zeros(0), np.zeros((1, u.size)), 0.0, 0.0)
+
+
+def test_cubic_oscillator_matches_an_adaptive_integrator() -> None:
+    dt, t = 0.005, np.arange(0, 4, 0.005)
+    u = np.sin(3 * t) + 0.4 * np.sin(7.3 * t)
+    def rhs(s: float, y: np.ndarray) -> list[float]:
+        return [y[1], np.interp(s, t, u) - 0.3 * y[1] - 20 * y[0] - 60 * y[0] ** 3]
+    wanted = solve_ivp(rhs, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
+    assert np.max(np.abs(axis(u, dt, [1.0, 0.3, 20.0, 0.0], {"cubic": 60.0})[0] - wanted)) < 1e-5
+
+
+def test_coulomb_friction_holds_without_creeping() -> None:
+    out = axis(np.full(2000, 0.9), 0.001, [1.0, 0.0, 0.0, 0.0], {"coulomb": 1.0})
+    assert np.max(np.abs(out[0])) == 0.0
+
+
+def test_coulomb_friction_slows_at_a_constant_rate() -> None:
+    out = axis(np.zeros(1000), 0.001, [2.0, 0.0, 0.0, 0.0], {"coulomb": 1.0}, (0.0, 0.3))
+    assert out[1][400] == pytest.approx(0.3 - 0.5 * 0.4, abs=2e-3)
+    assert out[1][-1] == 0.0 and out[0][-1] == pytest.approx(0.3**2 / (2 * 0.5), rel=0.01)
+
+
+def test_forces_along_a_motion_add_up() -> None:
+    t = np.arange(0, 2, 0.01)
+    x, v = np.sin(t), np.cos(t)
+    one = along(x, v, -x, np.ones(t.size), t, 0.01, 1e-3, 0.0, slot_array([{"viscous": 2.0}]))
+    two = along(x, v, -x, np.ones(t.size), t, 0.01, 1e-3, 0.0, slot_array([{"cubic": 3.0}]))
+    both = along(x, v, -x, np.ones(t.size), t, 0.01, 1e-3, 0.0, slot_array([{"viscous": 2.0}, {"cubic": 3.0}]))
+    assert np.allclose(one + two, both) and np.allclose(one, 2 * v)
+
+
+def shape(d: float, roll: float, kappa: float, force: np.ndarray) -> tuple[np.ndarray, ...]:
+    """One sample of the kernel."""
+    one = np.ones(1)
+    return shapes(d * one, roll * one, kappa * one, force[:, None], np.zeros((3, 1)), one / rig_cases.EI, rig_cases.EI / rig_cases.GJ,
+                  rig_cases.DISTAL, rig_cases.BEHIND, np.array([0.0, 0.0, 1.0]), NODES, WEIGHTS)
+
+
+def test_straight_shaft_bends_as_a_cantilever() -> None:
+    force, L = 0.02, 0.04
+    tip, tip_R, *_ = shape(-0.07, 0.0, 1e-9, np.array([0.0, -force, 0.0]))
+    assert tip[1, 0] == pytest.approx(-force * L**3 / (3 * rig_cases.EI), rel=1e-6)
+    assert rotation_logs(np.eye(3)[:, :, None], tip_R)[0, 0] == pytest.approx(force * L**2 / (2 * rig_cases.EI), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bent_and_rolled_shaft_matches_rigid_pieces(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    d, roll, kappa, force = rng.uniform(-0.075, -0.06), rng.uniform(-2, 2), rng.uniform(5, 25), rng.uniform(-0.15, 0.15, 3)
+    tip, tip_R, shaft, shaft_R, free, _ = shape(d, roll, kappa, force)
+    points, frames = rig_cases.shape(d, roll, kappa)
+    length = rig_cases.DISTAL + d
+    for position, R, upto in ((tip, tip_R, 1.0), (shaft, shaft_R, 1.0 - rig_cases.BEHIND / length)):
+        p, frame = rig_cases.bent(points, frames, force, upto)
+        assert np.allclose(position[:, 0], p, atol=1e-5)
+        assert np.max(np.abs(rotation_logs(R, frame[:, :, None]))) < 2e-3
+    assert np.allclose(free[:, 0], points[-1], atol=2e-6)
+
+
+def test_contact_is_the_equilibrium_of_two_springs() -> None:
+    gap = np.array([-1e-3, 0.0, 1e-3, 2e-3])
+    force = contact(gap, np.full(4, 0.01), np.full(4, 500.0), 1.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.01)
+    assert np.allclose(force, np.maximum(gap, 0) / (1 / 500 + 0.01))
+    bent = contact(gap, np.full(4, 0.01), np.full(4, 500.0), 1.5, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.01)
+    depth = gap - 0.01 * bent
+    assert np.allclose(bent[2:], 500 * 1e-3 * (depth[2:] / 1e-3) ** 1.5, atol=1e-6)
+
+
+def test_quaternions_become_rotations() -> None:
+    q = np.array([[np.cos(0.2)], [0.0], [0.0], [np.sin(0.2)]])
+    assert rotation_logs(np.eye(3)[:, :, None], matrices(q))[:, 0] == pytest.approx([0, 0, 0.4])

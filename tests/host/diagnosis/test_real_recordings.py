@@ -1,0 +1,53 @@
+"""Recordings that nobody here made: what is named, and how well held-out data are met. Skips where the data folder is absent."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.cli.diagnose import nominal_path
+from host.diagnosis.dataset import find_files
+from host.diagnosis.nominal import read_nominal
+from host.diagnosis.pipeline import Diagnosis, diagnose
+from host.diagnosis.verdict import as_json
+
+FOLDER = Path(os.environ.get("SELDINGER_DATA", Path(__file__).parents[3] / ".." / "shared" / "data"))
+pytestmark = [pytest.mark.data, pytest.mark.slow]
+
+
+def run(name: str) -> tuple[Diagnosis, dict]:
+    """Diagnosis with a nominal that ships."""
+    spec = read_nominal(nominal_path(name))
+    if not list(FOLDER.glob(spec.data.files[0])):
+        pytest.skip(f"{spec.data.files[0]} is not in {FOLDER}; set SELDINGER_DATA")
+    result = diagnose(spec, find_files(spec, [], str(FOLDER)), lambda what, part: None)
+    return result, as_json(result, 0.0)
+
+
+def test_cable_instrument_jaw_angle() -> None:
+    _, verdict = run("davinci_jaw")
+    assert {e["id"] for e in verdict["effects"]} >= {"compliance", "backlash"}
+    assert verdict["fit"]["rmse_after"] < 0.0084
+
+
+def test_cable_instrument_torque() -> None:
+    _, verdict = run("davinci_torque")
+    assert {e["id"] for e in verdict["effects"]} >= {"presliding_friction", "load_dependent_friction"}
+    assert verdict["fit"]["rmse_after"] < 0.010
+
+
+def test_positioning_system_friction() -> None:
+    result, verdict = run("emps")
+    assert verdict["effects"][0]["id"] == "coulomb_friction"
+    assert result.found.steps[0].key.startswith("coulomb_friction")
+
+
+def test_silverbox_spring() -> None:
+    result, verdict = run("silverbox")
+    assert verdict["effects"][0]["id"] == "nonlinear_stiffness"
+    left = {p.recording.name: float(np.sqrt(np.nanmean(r[0][p.heldout] ** 2)))
+            for p, r in zip(result.full.pieces, result.found.best_full.residuals, strict=True) if p.heldout.any()}
+    assert left["multisine_10"] < 0.363e-3 and left["arrow"] < 0.523e-3

@@ -1,0 +1,106 @@
+"""Noise, evidence and intervals on signals whose statistics are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from host.diagnosis import noise
+from host.diagnosis.dataset import Recording
+from host.diagnosis.evidence import compare, correlation_time, whiteness
+from host.diagnosis.locate import inside, joined, windows
+from host.diagnosis.model import Piece
+
+
+def ar1(rng: np.random.Generator, n: int, phi: float, sigma: float = 1.0) -> np.ndarray:
+    """First-order autoregression of standard deviation sigma."""
+    out = np.zeros(n)
+    for i in range(1, n):
+        out[i] = phi * out[i - 1] + np.sqrt(1 - phi**2) * rng.normal()
+    return sigma * out
+
+
+def piece(n: int) -> Piece:
+    """A recording that is all held out."""
+    every = np.ones(n, dtype=bool)
+    t = np.arange(n) * 0.01
+    return Piece(Recording("r", t, 0.01, True, {}, ~every, every), np.zeros((1, n)), ~every, every, {})
+
+
+def test_noise_comes_from_the_quiescent_parts() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(6000)
+    motion = np.where((t // 1000) % 2 == 0, 0.0, np.sin(t / 20.0)) + 0.0
+    y = motion + ar1(rng, t.size, 0.7, 0.02)
+    still = noise.quiescent([motion], 0.01, True)
+    found = noise.estimate([y], [still])
+    assert found.source == "quiescent parts" and found.sigma == pytest.approx(0.02, rel=0.15)
+    assert found.correlation_samples == pytest.approx((1 + 0.7) / (1 - 0.7), rel=0.35)
+
+
+def test_noise_without_rest_says_so() -> None:
+    y = np.sin(np.arange(4000) / 30.0) + 0.01 * np.random.default_rng(0).normal(size=4000)
+    found = noise.estimate([y], [np.zeros(4000, dtype=bool)])
+    assert "no quiescent part" in found.source and found.sigma == pytest.approx(0.01, rel=0.35)
+
+
+def test_whitened_noise_is_white() -> None:
+    rng = np.random.default_rng(2)
+    y = ar1(rng, 5000, 0.8, 0.5)
+    found = noise.estimate([y], [np.ones(5000, dtype=bool)])
+    w = found.whiten(ar1(rng, 5000, 0.8, 0.5))
+    assert np.nanstd(w) == pytest.approx(1.0, rel=0.06) and correlation_time(w) < 1.3
+
+
+def test_wild_samples_are_found_and_steps_are_not() -> None:
+    y = np.where(np.arange(300) > 150, 1.0, 0.0) + 0.001 * np.random.default_rng(0).normal(size=300)
+    y[40] = 9.0
+    assert np.flatnonzero(noise.wild(y, 0.001)).tolist() == [40]
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.sampled_from([0.0, 0.5, 0.9]), st.integers(0, 99))
+def test_correlation_time_of_an_autoregression(phi: float, seed: int) -> None:
+    r = ar1(np.random.default_rng(seed), 20000, phi)
+    assert correlation_time(r) == pytest.approx((1 + phi) / (1 - phi), rel=0.35)
+
+
+def test_nothing_gained_is_not_taken_for_something() -> None:
+    """Models that differ by what noise alone makes of a useless regressor: small p-values must be rare."""
+    small = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        r = ar1(rng, 3000, 0.9)
+        other = r - 0.03 * ar1(rng, 3000, 0.9)
+        small += compare([piece(3000)], "heldout", [r[None]], [other[None]], np.array([1.0])).p_value < 0.01
+    assert small <= 3
+
+
+def test_a_gain_is_counted_by_independent_samples() -> None:
+    rng = np.random.default_rng(0)
+    r = ar1(rng, 8000, 0.9)
+    s = np.sin(np.arange(8000) / 50.0)
+    gain = compare([piece(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]))
+    assert gain.p_value < 1e-6 and gain.share == pytest.approx(1 / 3, abs=0.05)
+    assert gain.log_likelihood == pytest.approx(0.5 * 8000 / 19 * np.log(1.5), rel=0.4)
+
+
+def test_whiteness_tells_noise_from_a_rest_that_is_none() -> None:
+    """The tester is tested: it must see a small slow rest, and a scale that is wrong."""
+    rng = np.random.default_rng(4)
+    every = np.ones(4000, dtype=bool)
+    white = rng.normal(size=4000)
+    assert whiteness([white], [every]) > 0.01
+    assert whiteness([white + 0.4 * np.sin(np.arange(4000) / 40.0)], [every]) < 1e-6
+    assert whiteness([1.2 * white], [every]) < 1e-6
+
+
+def test_windows_follow_their_definition() -> None:
+    t = np.arange(0, 20, 0.01)
+    m = np.where((t > 5) & (t < 8), 1.0, 0.0) + np.where((t > 8.3) & (t < 9), 1.0, 0.0)
+    ((a, b),) = windows(m, t, 0.01)
+    assert a == pytest.approx(5.0, abs=0.3) and b == pytest.approx(9.0, abs=0.3)
+    assert inside([(5.0, 9.0)], t).sum() == pytest.approx(400, abs=2)
+    assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)]) == [(1.0, 2.4), (3.0, 4.0)]
