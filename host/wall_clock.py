@@ -55,7 +55,9 @@ class Fleet:
         load_rig(self.rig_file)
         rig = str(self.rig_file)
         ports = json.loads(self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
-                                       "--seed", str(self._settings.seed)))
+                                       "--seed", str(self._settings.seed),
+                                       *(word for text in self._settings.effects for word in ("--effect", text))))
+        print(f"watch with: seldinger diagnose --live --rig {rig}", file=sys.stderr, flush=True)
         self._spawn("host", "host.estimator_process", rig, "--record", str(self._recording),
                     "--estimator", self._settings.estimator, "--seed", str(self._settings.seed))
         self._spawn("realtime", "realtime", "--rig", rig, "--board-port", ports["board"],
