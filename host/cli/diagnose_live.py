@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json as json_text
+import os
 import signal
 import sys
 import threading
@@ -25,6 +26,7 @@ def watch_rig(rig_file: str | None, json: str | None) -> None:
     """
     from host.diagnosis.live import warm_up, watch
 
+    os.nice(10)  # behind the rig's own processes
     rig = load_rig(Path(rig_file) if rig_file else SIMULATED_RIG)
     stopped = threading.Event()
 

@@ -25,6 +25,7 @@ POSE_ROWS = 12
 SMALLEST_SHARE = 0.1       # of the mismatch that a cause has to explain to be named
 AS_GOOD = 1.15             # error beside the best cause's with which another still counts
 IDLE_S = 0.02
+REST_S = 0.005
 SECOND_NS = 1_000_000_000
 
 
@@ -69,8 +70,9 @@ class Watch:
     All time is the rig's own (stamps of its poses), so that recorded messages and virtual time do as well as a live rig.
     """
 
-    def __init__(self, rig: Rig, settings: LiveSettings | None = None) -> None:
-        self.settings = settings or LiveSettings()
+    def __init__(self, rig: Rig, settings: LiveSettings | None = None, rest: Callable[[], None] = lambda: None) -> None:
+        """`rest` is called between the steps of long computations: a rig on the same machine must not be starved."""
+        self.settings, self._rest = settings or LiveSettings(), rest
         self.twin = Twin(rig)
         self.listener = Listener(rig, max(self.settings.learn_s, 30.0))
         self.pool = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
@@ -115,7 +117,7 @@ class Watch:
     def _learn(self) -> None:
         """Calibrates the twin on what was heard since arming, and notes how well it then agrees, second by second."""
         recording = self.listener.recording(-self._rows(self.settings.learn_s))
-        self.calibration = self.twin.calibrate(recording)
+        self.calibration = self.twin.calibrate(recording, self._rest)
         piece, residual = self._residual(-self._rows(self.settings.learn_s))
         residual = residual[:, piece.n // 4:]          # the approach is not what the rest will be like
         mean, rms = np.nanmean(residual, axis=1), np.sqrt(np.nanmean(residual**2, axis=1))
@@ -180,10 +182,11 @@ class Watch:
         piece.extra["weight"] = scale
         problem = Problem(self.twin, [piece], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
-        ranked = screen(problem, fit, self.pool, lambda what, part: None)[: self.settings.suspects]
+        ranked = screen(problem, fit, self.pool, lambda what, part: self._rest())[: self.settings.suspects]
         before = float(np.sum(problem.stacked((), calibration.theta) ** 2))
         found: dict[str, Suspect] = {}
         for item in ranked:
+            self._rest()
             tried = minimize(problem, (item.term,), np.concatenate((calibration.theta, item.begin[0])), rounds=6, tolerance=1e-3)
             left = float(np.sum(problem.stacked(tried.terms, tried.values) ** 2)) / max(before, 1e-12)
             suspect = Suspect(item.candidate.name, 1.0 - left, len(item.term.parameters))
@@ -224,7 +227,7 @@ class Bus(Protocol):
 
 def watch(rig: Rig, bus: Bus, publish: Callable[[Alarm], None], tell: Callable[[str], None], stop: Callable[[], bool]) -> int:
     """Watches until `stop`; publishes alarms, and tells what it does when that changes. How many alarms there were."""
-    watcher, said, count = Watch(rig), "", 0
+    watcher, said, count = Watch(rig, rest=lambda: time.sleep(REST_S)), "", 0
     while not stop():
         heard = bus.take()
         for topic, message, _ in heard:

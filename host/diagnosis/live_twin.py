@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -74,7 +75,7 @@ class Twin(RigChain):
         self.shaft_offset_m = rig.tracker.shaft_sensor_offset_m
         self.softness = 1.0
 
-    def calibrate(self, recording: Recording) -> Calibration:
+    def calibrate(self, recording: Recording, rest: Callable[[], None] = lambda: None) -> Calibration:
         """Offsets, softness and delay by Gauss-Newton on every EVERY-th frame of `recording` (its poses, free run)."""
         theta = np.array([p.grid[0] for p in self.parameters])
         scale = np.tile(np.repeat([3e-4, 4e-3], 3), 2)[:, None]
@@ -83,6 +84,7 @@ class Twin(RigChain):
             self.softness = float(np.exp(np.clip(z[3], -0.7, 0.7)))
             moved = theta.copy()
             moved[list(OFFSETS)] += z[:3]
+            rest()
             piece = self.prepare(thinned(delayed(recording, float(z[4])), EVERY))
             self.correct(piece, moved)
             r = (piece.y - self.simulate(piece, moved, []))[:12] / scale
