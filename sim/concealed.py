@@ -344,7 +344,8 @@ def make(plan: Plan, folder: Path) -> dict[str, Any]:
     rng = drawn.plan.stream(3)
     recorded = drawn.system.noisy(drawn.session, rng)
     start = drawn.system.case.nominal * (1.0 + 0.05 * rng.standard_normal(len(drawn.system.case.nominal)))
-    calibrated = drawn.system.calibrate(recorded, _TRAIN, start if drawn.plan.kind != "rig" else _near(drawn.system, rng), every=6)
+    start = _near(drawn.system, rng) if drawn.plan.kind == "rig" else start
+    calibrated = drawn.system.calibrate(recorded, _TRAIN, start, every=6)
     concealed_system.write(drawn.system, recorded, calibrated, folder, bool(rng.random() < 0.3))
     return label(drawn, recorded)
 
