@@ -16,6 +16,7 @@ from host.recording import RecordingWriter
 from protocol.topics import Message
 from realtime.rig_file import Rig, load_rig
 from sim.board import Board
+from sim.effects import parse
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Outcome, Scenario
 from sim.world import World
@@ -28,7 +29,10 @@ Progress = Callable[[str, float, float], None]
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """force_N wanted; hold_s after contact; pace: 1 is real time, 0 as fast as it goes; board: avr, native or auto."""
+    """force_N wanted; hold_s after contact; pace: 1 is real time, 0 as fast as it goes; board: avr, native or auto.
+
+    effects: planted in the simulated rig, as `sim.effects.parse` reads them.
+    """
 
     board: str = "auto"
     seed: int = 1
@@ -39,6 +43,7 @@ class DemoSettings:
     estimator: str = "host.estimation.planar:make_estimator"
     rig_file: Path = SIMULATED_RIG
     directory: Path = Path("runs")
+    effects: tuple[str, ...] = ()
 
 
 @dataclass
@@ -76,7 +81,7 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
     """
     rig = load_rig(settings.rig_file)
     service = EstimationService(load_estimator(settings.estimator, rig))
-    plant = simulated_plant(rig, settings.seed)
+    plant = simulated_plant(rig, settings.seed, effects=tuple(map(parse, settings.effects)))
     with Board(settings.board) as board:
         world = World(rig, plant, board, settings.seed)
         path = new_recording_path(settings.directory, "demo")

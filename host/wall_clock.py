@@ -57,9 +57,10 @@ class Fleet:
         self.rig_file.write_text(_with_endpoint(text, f"tcp/127.0.0.1:{_free_port()}"), encoding="utf-8")
         load_rig(self.rig_file)
         rig = str(self.rig_file)
-        self.ports = ports = json.loads(
-            self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
-                        "--seed", str(self._settings.seed)))
+        planted = [word for text in self._settings.effects for word in ("--effect", text)]
+        self.ports = ports = json.loads(self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
+                                                    "--seed", str(self._settings.seed), *planted))
+        print(f"watch with: seldinger diagnose --live --rig {rig}", file=sys.stderr, flush=True)
         self._spawn("host", "host.estimator_process", rig, "--record", str(self._recording),
                     "--estimator", self._settings.estimator, "--seed", str(self._settings.seed))
         if self._loop:

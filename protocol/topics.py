@@ -27,9 +27,10 @@ from protocol.messages import (
 )
 
 __all__ = [
-    "MAX_PAYLOAD_BYTES", "SCHEMA_VERSION", "TOPICS", "BoardCounters", "Command", "CommandCounts", "ForceEstimate",
-    "ForceSensor", "Log", "LoopTiming", "Message", "Pose", "Reply", "RigState", "SimulatedTruth", "Stage", "Topic",
-    "check_name", "columns", "decode", "encode", "histogram_bucket", "json_schema", "key", "request_key", "topic_of",
+    "MAX_PAYLOAD_BYTES", "SCHEMA_VERSION", "TOPICS", "Alarm", "BoardCounters", "Command", "CommandCounts",
+    "ForceEstimate", "ForceSensor", "Log", "LoopTiming", "Message", "Pose", "Reply", "RigState", "SimulatedTruth", "Stage",
+    "Topic", "check_name", "columns", "decode", "encode", "histogram_bucket", "json_schema", "key", "request_key",
+    "topic_of",
 ]
 
 MODES = ("disarmed", "hold", "position", "approach", "contact", "retract", "stopped")
@@ -271,6 +272,19 @@ class CommandCounts(Message):
 
 
 @message
+class Alarm(Message):
+    """Rig and twin have parted: where, and what is probably missing from the twin."""
+
+    subsystem: str = text("link of the chain, as in a diagnosis")
+    effect: str = text("probable cause: an id of the vocabulary, or unlisted")
+    channel: str = text("output that is furthest off")
+    score: float = number("", "how far it is beyond what is allowed; above 1 is an alarm", minimum=0)
+    explained: float = number("", "share of the mismatch that the cause explains", minimum=0, maximum=1)
+    since_ns: int = integer("ns", "when it was first seen, on the rig's clock")
+    words: str = text("the same in one sentence")
+
+
+@message
 class SimulatedTruth(Message):
     """What only a simulator can know. Drawn into reports; no controller, estimator or verdict reads it."""
 
@@ -307,6 +321,7 @@ _TABLE = (
     Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as they came, for the record"),
     Topic("reply", Reply, 0, "event", "realtime -> host, tools", "what became of them"),
     Topic("commander", CommandCounts, 1, "state", "realtime -> host, tools", "who holds the lease; counts of commands"),
+    Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin have parted: subsystem and probable cause"),
     Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
 )
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}

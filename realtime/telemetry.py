@@ -76,6 +76,7 @@ def state_message(inputs: np.record, outputs: np.record) -> RigState:
 
 def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
     """The message's histogram of tick times, from the loop's (n + 2,) one with bins of WORK_BIN_NS."""
+    work = work.copy()  # the loop's thread counts on meanwhile, which np.flatnonzero would not bear
     buckets = [0] * HISTOGRAM_BUCKETS
     for index in np.flatnonzero(work[:-2]):
         buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(work[index])

@@ -183,11 +183,20 @@ def _null(plan: Plan) -> Drawn | None:
     return Drawn(plan, system, (), session, rho, tuple(left), (NOTHING,)) if rho < 0.06 and np.max(size) < 0.13 else None
 
 
+def taught(system: System, left: Sequence[Array]) -> bool:
+    """Whether training recordings show the mismatch `left` too: at least half as strong as all do, where it is strongest."""
+    everywhere, training = (
+        np.sqrt(np.mean(np.vstack([left[i] for i in which]) ** 2, axis=0)) / system.sigma for which in (_ALL, _TRAIN)
+    )
+    top = int(np.argmax(everywhere))
+    return bool(training[top] >= 0.5 * everywhere[top])
+
+
 def _single(plan: Plan, menu: Sequence[Dish]) -> Drawn | None:
     system = _system(plan)
     dish, sign, start = _choose(plan, menu, plan.stream(2))
     found = scaled(system, dish, plan.rho, start, sign)
-    if found is None or not _fits(found[2], plan.rho):
+    if found is None or not _fits(found[2], plan.rho) or not taught(system, found[3]):
         return None
     return Drawn(plan, system, (found[0],), found[1], found[2], tuple(found[3]))
 
@@ -213,7 +222,7 @@ def _pair(plan: Plan) -> Drawn | None:
         session = system.run([one[0], other])
         tried.append((*measure(system, session), other, session))
     rho, left, other, session = min(tried, key=lambda t: t[0])
-    if rho < 0.2:
+    if rho < 0.2 or not (taught(system, one[3]) and taught(system, two[3])):
         return None
     return Drawn(plan, system, (one[0], other), session, rho, tuple(left))
 
@@ -335,7 +344,8 @@ def make(plan: Plan, folder: Path) -> dict[str, Any]:
     rng = drawn.plan.stream(3)
     recorded = drawn.system.noisy(drawn.session, rng)
     start = drawn.system.case.nominal * (1.0 + 0.05 * rng.standard_normal(len(drawn.system.case.nominal)))
-    calibrated = drawn.system.calibrate(recorded, _TRAIN, start if plan.kind != "rig" else _near(drawn.system, rng), every=6)
+    start = _near(drawn.system, rng) if drawn.plan.kind == "rig" else start
+    calibrated = drawn.system.calibrate(recorded, _TRAIN, start, every=6)
     concealed_system.write(drawn.system, recorded, calibrated, folder, bool(rng.random() < 0.3))
     return label(drawn, recorded)
 

@@ -142,21 +142,21 @@ def move(
     x = p[3] / p[2]
     last = 0.0
     for i in range(drive.size):
-        out[i] = x
         force = drive[i]
         if gains[0] > 0.0:
             error = drive[i] - (out[i - 2] + noise[i - 2] if i > 1 else x)
             total += error * dt_s
             force = p[2] * drive[i] + gains[0] * error + gains[1] * total
         used[i] = force
-        for k in range(INSIDE):
-            u = force if i == 0 or gains[0] > 0.0 else last + (force - last) * (k + 1.0) / INSIDE
+        for k in range(INSIDE if i > 0 else 0):
+            u = last if gains[0] > 0.0 else last + (force - last) * (k + 1.0) / INSIDE
             h = dt_s / INSIDE
             against = 0.0
             for j in range(codes.size):
-                against += extra(codes[j], q[j], state[j], x, v, times[i] + k * h, h, p[2])
+                against += extra(codes[j], q[j], state[j], x, v, times[i - 1] + k * h, h, p[2])
             v = (v + h / p[0] * (u + p[3] - p[2] * x - against)) / (1.0 + h * p[1] / p[0] + h * h * p[2] / p[0])
             x += h * v
+        out[i] = x
         last = force
 
 

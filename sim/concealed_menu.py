@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 Make = Callable[[float], dict[str, float]]
+FASTEST_MODE_HZ = 15.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,13 @@ class Dish:
 def _one(name: str, size: float, **fixed: float) -> Make:
     """A maker whose parameter `name` is proportional to the size."""
     return lambda s: {name: size * s, **fixed}
+
+
+def _mode(s: float) -> dict[str, float]:
+    """A mode of vibration, slower with its size. Raises ValueError for one that 40 Hz recordings cannot show."""
+    if 4.0 / s > FASTEST_MODE_HZ:
+        raise ValueError(f"frequency_Hz: found {4.0 / s:.3g}, wanted at most {FASTEST_MODE_HZ}")
+    return {"frequency_Hz": 4.0 / s, "damping_ratio": 0.12}
 
 
 def _axis(port: str, unit: str, load: str, stiffness: tuple[str, float], size: float, reach: float) -> list[Dish]:
@@ -70,7 +78,7 @@ def _axis(port: str, unit: str, load: str, stiffness: tuple[str, float], size: f
             _one(f"amplitude_{unit}", 0.3 * size, **{"frequency_Hz": 0.0, f"pitch_{unit}": 0.35 * reach}),
             (f"amplitude_{unit}",),
         ),
-        Dish("resonance", port, lambda s: {"frequency_Hz": min(4.0 / s, 60.0), "damping_ratio": 0.12}, ("frequency_Hz",)),
+        Dish("resonance", port, _mode, ("frequency_Hz",)),
     ]
 
 

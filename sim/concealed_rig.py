@@ -13,7 +13,7 @@ import numpy as np
 
 from sim import concealed_nominal as nominal
 from sim.catheter_chain import CatheterConfig
-from sim.concealed_signals import KINDS, presses, signal
+from sim.concealed_signals import KINDS, QUIET_S, presses, signal
 from sim.effects import Effect
 from sim.heart import HeartConfig
 from sim.knob import KnobConfig
@@ -173,7 +173,7 @@ def simulate(
     """Run the session. `distortion` stands between handle and rig; `replay` (n, 3) gives the handle instead of control."""
     reference, where = commands(case)
     rig = plant(case, effects)
-    loop = _Loop(case, reference) if case.closed_loop and replay is None else None
+    loop = _Loop(case, reference, where) if case.closed_loop and replay is None else None
     outputs, handles = np.empty((len(reference), 17)), np.empty_like(reference)
     last = reference[0].copy()
     for i in range(len(reference)):
@@ -197,9 +197,12 @@ def simulate(
 
 
 class _Loop:
-    """PI control of the tip's position on poses that are noisy and one frame late; hides part of what is planted."""
+    """PI control of the tip's position on poses that are noisy and one frame late; hides part of what is planted.
 
-    def __init__(self, case: RigCase, reference: Array) -> None:
+    Like a rig before it is armed, the handle holds still for the first moments of every recording.
+    """
+
+    def __init__(self, case: RigCase, reference: Array, where: list[slice]) -> None:
         self._rng = np.random.default_rng([case.seed, 7])
         self._noise = float(case.sigma[0])
         p, none = case.nominal, np.zeros((len(reference), 3))
@@ -214,6 +217,9 @@ class _Loop:
         )
         self._reference, self._sum, self._last = reference, np.zeros(3), reference[0].copy()
         self._seen = [self._target[0], self._target[0]]
+        self._held = np.zeros(len(reference), bool)
+        for part in where:
+            self._held[part.start : part.start + round(QUIET_S / FRAME_S)] = True
 
     def seen(self, position: Array) -> None:
         """The tracker's position of this frame, which control gets with the next one."""
@@ -221,6 +227,8 @@ class _Loop:
 
     def command(self, i: int) -> Array:
         """Handle position (3,) for frame i."""
+        if self._held[i]:
+            return self._last
         j, back = self._jacobian[i], max(0, i - 2)
         error = self._target[back] - self._seen[-2]
         step = np.linalg.solve(j.T @ j + (3e-4) ** 2 * np.eye(3), j.T @ error)

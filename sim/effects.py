@@ -189,6 +189,25 @@ def _values(effect: Effect) -> list[float]:
     return values
 
 
+def parse(text: str) -> Effect:
+    """The effect of a command line: ID@PORT, then maybe : and NAME=VALUE joined by commas; start_s is one of the names.
+
+    `backlash@insertion:width_m=0.002,start_s=25`. Raises ValueError for what is not in the catalogue.
+    """
+    name, _, given = text.partition(":")
+    effect_id, _, port = name.partition("@")
+    values = {}
+    for item in filter(None, given.split(",")):
+        key, _, value = item.partition("=")
+        try:
+            values[key.strip()] = float(value)
+        except ValueError:
+            raise ValueError(f"effect {name}: found {item!r}, wanted NAME=NUMBER") from None
+    effect = Effect(effect_id, port, {k: v for k, v in values.items() if k != "start_s"}, values.get("start_s", 0.0))
+    pack([effect])
+    return effect
+
+
 def pack(effects: Sequence[Effect]) -> np.ndarray:
     """Effects as the kernels' records, fresh states. Raises ValueError as `describe` and for parameters out of bounds."""
     records = np.zeros(len(effects), EFFECT).view(np.recarray)

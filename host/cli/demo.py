@@ -17,6 +17,7 @@ from host.recording import Recording
 from host.report import write_report
 from realtime.rig_file import RigFileError, load_rig
 from sim.board import KINDS, BoardUnavailable
+from sim.effects import parse
 
 _SHARES = {"approach": (0.0, 0.15), "hold": (0.15, 0.97), "retract": (0.97, 1.0)}
 
@@ -32,9 +33,12 @@ def demo(
     force_source: Annotated[str, typer.Option(help="What closes the force loop: sensor or estimate.")] = "sensor",
     rig: Annotated[Path, typer.Option(help="Rig file.")] = SIMULATED_RIG,
     directory: Annotated[Path, typer.Option("--dir", help="Where recording and report go.")] = Path("runs"),
+    effect: Annotated[
+        list[str] | None, typer.Option(help="Plant an effect: ID@PORT, or ID@PORT:NAME=VALUE,start_s=VALUE.")
+    ] = None,
 ) -> None:
     """Bring the tip from rest to a beating wall and hold a force on it."""
-    settings = _settings(board, seed, force, hold, fast, force_source, rig, directory)
+    settings = _settings(board, seed, force, hold, fast, force_source, rig, directory, tuple(effect or ()))
     try:
         run = _with_progress(settings, wall_clock)
     except BoardUnavailable as error:
@@ -60,18 +64,23 @@ def demo(
 
 
 def _settings(board: str, seed: int, force: float, hold: float, fast: bool, force_source: str, rig: Path,
-              directory: Path) -> DemoSettings:
+              directory: Path, effects: tuple[str, ...]) -> DemoSettings:
     if board not in KINDS:
         raise BadInput("--board", board, " or ".join(KINDS))
     if force_source not in ("sensor", "estimate"):
         raise BadInput("--force-source", force_source, "sensor or estimate")
+    for text in effects:
+        try:
+            parse(text)
+        except ValueError as error:
+            raise BadInput("--effect", text, str(error)) from None
     limit = load_rig(rig).safety.over_force_N
     if not 0.02 <= force < limit:
         raise BadInput("--force", force, f"at least 0.02 and below safety.over_force_N {limit} (N)")
     if not 1.0 <= hold <= 3600.0:
         raise BadInput("--hold", hold, "1 to 3600 (s)")
     return DemoSettings(board=board, seed=seed, force_N=force, hold_s=hold, pace=0.0 if fast else 1.0,
-                        force_source=force_source, rig_file=rig, directory=directory)
+                        force_source=force_source, rig_file=rig, directory=directory, effects=effects)
 
 
 def _with_progress(settings: DemoSettings, wall_clock: bool) -> DemoRun:

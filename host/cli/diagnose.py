@@ -45,8 +45,15 @@ def diagnose(
     data: Annotated[str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")] = None,
     without: Annotated[list[str] | None, typer.Option(help="effect id the finder is not to know")] = None,
     quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
+    live: Annotated[bool, typer.Option("--live", help="watch a running rig against its twin, and raise alarms")] = False,
+    rig: Annotated[str | None, typer.Option(help="with --live: the rig's file (default: the simulated rig)")] = None,
 ) -> None:
     """Where simulation and recording part, what physics was left out, its model, and the proof."""
+    if live:
+        from host.cli.diagnose_live import watch_rig
+
+        watch_rig(rig, json)
+        return
     from host.cli.contract_io import BadInput
     from host.diagnosis.dataset import find_files
     from host.diagnosis.effect import library

@@ -53,4 +53,4 @@ def view(
     with contextlib.ExitStack() as stack:
         loaded = load_rig(stack.enter_context(_simulated(rig, directory)) if simulated else rig)
         session = stack.enter_context(Session(loaded.name, [], loaded.zenoh.connect))
-        serve(LiveRig(loaded, session), port, f"rig {loaded.name}")
+        serve(stack.enter_context(contextlib.closing(LiveRig(loaded, session))), port, f"rig {loaded.name}")

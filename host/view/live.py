@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
-import uuid
-from collections.abc import Callable
 from typing import Any, Literal
 
 import msgpack
@@ -13,23 +12,17 @@ import zenoh
 from pydantic import Field, ValidationError
 
 from host.cli.contract_io import Request
+from host.commander import Acknowledgement, Commander
 from host.mechanics.catheter import load_catheter
 from host.view.picture import Picture
 from host.view.source import refusal
-from protocol.topics import TOPICS, Command, Reply, decode, key
+from protocol.topics import TOPICS, decode, key
 from protocol.zenoh_session import Session
 from realtime.rig_file import Rig
 
 # Messages kept between two frames: all of the traces' topics, the newest of the others.
 DEPTHS = {"stage": 1, "pose/tip": 1, "pose/shaft": 1, "force/sensor": 1, "board": 1, "loop": 1, "state": 64,
           "force/estimate": 64, "log": 32}
-COMMAND_LIFE_NS = 500_000_000
-ANSWER_S = 1.0
-# What a button means as a command: (action, target).
-BUTTONS: dict[str, tuple[str, str]] = {
-    "arm": ("arm", "none"), "hold": ("target", "hold"), "stop": ("stop", "none"), "disarm": ("disarm", "none"),
-    "clear": ("clear_fault", "none"),
-}
 
 
 class Press(Request):
@@ -39,19 +32,12 @@ class Press(Request):
     confirmed: bool = Field(default=False)
 
 
-def send(session: Session, button: str) -> Reply | None:
-    """The command of `button` on the operator's path; None where nobody answers within ANSWER_S."""
-    action, target = BUTTONS[button]
-    now_ns = time.monotonic_ns()
-    return session.ask(Command(stamp_ns=now_ns, id=uuid.uuid4().hex, expires_ns=now_ns + COMMAND_LIFE_NS,
-                               action=action, target=target), ANSWER_S)
-
-
 class LiveRig:
     """A `Source`. Never makes the rig wait: what is not taken in time is lost here."""
 
-    def __init__(self, rig: Rig, session: Session, send_button: Callable[[Session, str], Reply | None] = send) -> None:
-        self._rig, self._session, self._send = rig, session, send_button
+    def __init__(self, rig: Rig, session: Session) -> None:
+        self._rig, self._session = rig, session
+        self._commander = Commander(session, f"view-{os.getpid()}")
         self._picture = Picture(rig.effective(), dataclasses.asdict(load_catheter(rig.catheter.name)))
         self._subscribers = {
             topic: session.zenoh.declare_subscriber(key(rig.name, topic), zenoh.handlers.RingChannel(depth))
@@ -93,11 +79,25 @@ class LiveRig:
             return refusal(f"{where}: found {str(first['input'])[:60]!r}, wanted: {first['msg']}")
         if press.button != "stop" and not press.confirmed:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
-        reply = self._send(self._session, press.button)
-        if reply is None:
-            return {"action": press.button, "result": "unanswered",
-                    "text": f"no answer within {ANSWER_S:g} s: it may or may not have arrived"}
-        return {"action": press.button, "result": reply.result, "text": reply.text}
+        answer = self._command(press.button)
+        return {"action": press.button, "result": answer.result, "text": answer.reason.removeprefix(f"{answer.result}: ")}
+
+    def _command(self, button: str) -> Acknowledgement:
+        """Hold and stop need no lease. Arming takes and keeps it, until the rig is disarmed from here or the page ends."""
+        commander = self._commander
+        if button in ("hold", "stop"):
+            return commander.hold() if button == "hold" else commander.stop()
+        taken = commander.take()
+        if not taken.accepted:
+            return taken
+        answer = {"arm": commander.arm, "disarm": commander.disarm, "clear": commander.clear_fault}[button]()
+        if button != "arm" or not answer.accepted:
+            commander.release()
+        return answer
+
+    def close(self) -> None:
+        """Give the lease back."""
+        self._commander.close()
 
 
 def _radius_m(catheter: str) -> float:

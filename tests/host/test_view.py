@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from host.cli.contract_io import BadInput
+from host.commander import Acknowledgement, Commander
 from host.demo import SIMULATED_RIG
 from host.mechanics.catheter import load_catheter
 from host.recording import Recording
@@ -31,6 +33,7 @@ from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, t
 from host.view.shape import through, twin
 from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
 from protocol.zenoh_session import Session
+from realtime.command_gate import CommandGate
 from realtime.rig_file import Rig, load_rig
 from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
 
@@ -342,13 +345,14 @@ def live() -> Iterator[tuple[Session, LiveRig, list[Command]]]:
     there, here = loopback(rig)
     obeyed: list[Command] = []
 
-    def decide(command: Command) -> Reply:
+    def obey(command: Command, now_ns: int) -> Reply:
         obeyed.append(command)
-        return Reply(stamp_ns=time.monotonic_ns(), id=command.id, result="refused", text="no board")
+        return Reply(stamp_ns=now_ns, id=command.id, result="refused", text="no board")
 
-    with there, here:
-        server = there.serve_commands(time.monotonic_ns, decide)
-        yield there, LiveRig(rig, here), obeyed
+    gate = CommandGate(time.monotonic_ns, obey)
+    with there, here, closing(LiveRig(rig, here)) as view:
+        server = there.serve_requests(lambda name, payload: gate.answer(name, payload)[1])
+        yield there, view, obeyed
         del server
 
 
@@ -406,7 +410,7 @@ def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, Li
     there, view, obeyed = live
     publish_until_seen(there, view)
     for text, action, target in (('{"button": "arm", "confirmed": true}', "arm", "none"),
-                                 ('{"button": "hold", "confirmed": true}', "target", "hold"),
+                                 ('{"button": "hold", "confirmed": true}', "hold", "none"),
                                  ('{"button": "stop"}', "stop", "none")):
         answer = view.act(text)
         assert answer["result"] == "refused" and answer["text"] == "no board"
@@ -420,7 +424,7 @@ def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, Li
 def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
     sent: list[str] = []
     view = LiveRig.__new__(LiveRig)
-    view._session, view._send = None, lambda session, button: sent.append(button)  # type: ignore[assignment]
+    view._command = lambda button: sent.append(button) or Acknowledgement(True, "", "accepted")
     answer = view.act(text)
     try:
         press = Press.model_validate_json(text)
@@ -431,7 +435,14 @@ def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
     assert allowed or answer["result"] in ("malformed", "refused")
 
 
+class Unanswering:
+    """A rig that is not there."""
+
+    def ask(self, command: Command, timeout_s: float = 1.0) -> None:
+        """Nobody answers."""
+
+
 def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
     _, view, _ = live
-    view._send = lambda session, button: None
+    view._commander = Commander(Unanswering(), "view")
     assert view.act('{"button": "stop"}')["result"] == "unanswered"

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 from sim import concealed, concealed_generic, concealed_nominal, concealed_rig, concealed_system
 from sim.concealed import Plan
 from sim.concealed_menu import MENU, UNLISTED
-from sim.concealed_signals import KINDS, coloured, lost, presses, signal, windows
+from sim.concealed_signals import KINDS, QUIET_S, coloured, lost, presses, signal, windows
 from sim.concealed_system import Planted
 from sim.effects import Effect, pack
 
@@ -84,10 +85,43 @@ def test_feedback_hides_a_standing_effect() -> None:
     assert apart(True) < 0.5 * apart(False)
 
 
+def test_the_handle_holds_still_before_feedback_sets_in() -> None:
+    case = concealed_rig.draw(np.random.default_rng(4), True)
+    session = concealed_rig.simulate(case)
+    held = round(QUIET_S / concealed_rig.FRAME_S)
+    for handle in session.inputs:
+        assert not np.any(np.ptp(handle[:held], axis=0))
+        assert np.all(np.ptp(handle[held:], axis=0) > 0.0)
+
+
+def test_the_axis_is_recorded_when_it_moves_not_a_sample_later() -> None:
+    period, p = 0.01, np.array([0.5, 5.0, 100.0, 0.0])
+    time = np.arange(0.0, 4.0, period)
+    drive = np.sin(2.0 * np.pi * time) * np.minimum(time, 1.0)
+    exact = lsim(([1.0], p[:3]), drive, time)[1]
+    moved = concealed_generic.predict("axis", p, drive[:, None], period)[:, 0]
+    late = np.interp(time - period, time, exact)
+    assert np.sqrt(np.mean((moved - exact) ** 2)) < 0.2 * np.sqrt(np.mean((late - exact) ** 2))
+
+
+def test_a_mismatch_that_training_does_not_show_is_not_taught() -> None:
+    system = concealed_system.generic(concealed_generic.draw(np.random.default_rng(3), "axis", False))
+    hidden, shown = np.zeros((100, 1)), np.ones((100, 1))
+    assert concealed.taught(system, [shown, hidden, shown])
+    assert not concealed.taught(system, [0.1 * shown, hidden, shown])
+
+
+def test_a_mode_faster_than_the_recordings_is_refused() -> None:
+    mode = next(d for d in MENU["rig"] if (d.id, d.port) == ("resonance", "knob"))
+    assert mode.make(1.0)["frequency_Hz"] == 4.0
+    with pytest.raises(ValueError, match="frequency_Hz: found 40"):
+        mode.make(0.1)
+
+
 @pytest.mark.parametrize("kind", ["rig", "transmission"])
 def test_every_dish_is_in_the_catalogue_at_every_size(kind: str) -> None:
     for dish in MENU[kind]:
-        for size in (0.02, 1.0, 8.0):
+        for size in (0.3 if dish.id == "resonance" else 0.02, 1.0, 8.0):
             pack([Effect(dish.id, dish.port, dish.make(size))])
             assert set(dish.compared) <= set(dish.make(size))
 
@@ -100,7 +134,7 @@ def test_every_dish_shows_and_grows(kind: str) -> None:
     )
     system = concealed_system.generic(case)
     for dish in [*MENU[kind], *UNLISTED[kind]]:
-        small, large = (concealed.measure(system, system.run([Planted(dish, s)]))[0] for s in (0.2, 2.0))
+        small, large = (concealed.measure(system, system.run([Planted(dish, s)]))[0] for s in (0.3, 2.0))
         assert 0.0 < small < large, dish
 
 
@@ -143,6 +177,13 @@ def test_a_rig_case_from_seed_to_files(tmp_path: Path) -> None:
         "force_sensor",
         "base",
     )
+
+
+def test_a_slow_tone_leaves_delay_and_lag_open(tmp_path: Path) -> None:
+    turn = concealed.PUZZLES.index("one_slow_tone")
+    label = concealed.make(Plan(11, 4, "unidentifiable", "rig", False, 1.0, turn), tmp_path)
+    assert (label["puzzle"], label["kind"]) == ("one_slow_tone", "transmission")
+    assert {"latency", "rate_lag"} <= set(label["set"])
 
 
 def test_no_trace_of_the_truth_in_files_or_names(tmp_path: Path) -> None:

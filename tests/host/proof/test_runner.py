@@ -10,7 +10,7 @@ import pytest
 
 from host.cli.contract_io import BadInput
 from host.cli.prove import Bar, prove
-from host.proof import baselines, workers
+from host.proof import baselines, picture, workers
 from host.proof.runner import Settings, open_seal
 from host.proof.runner import prove as run
 from tests.host.proof import suite
@@ -249,3 +249,8 @@ def test_bar_draws_a_line_a_tenth_where_there_is_no_terminal(monkeypatch: pytest
     for done in range(101):
         bar("diagnose", done, 100)
     assert stream.getvalue().count("\n") == 11 and "100/100" in stream.getvalue()
+
+
+def test_a_case_as_a_picture(built: Built, tmp_path: Path) -> None:
+    picture.main(["--dir", str(built[0]), "--case", "case_0000", "--out", str(tmp_path / "case.png")])
+    assert (tmp_path / "case.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
