@@ -93,10 +93,13 @@ class LiveRig:
             return refusal(f"{where}: found {str(first['input'])[:60]!r}, wanted: {first['msg']}")
         if press.button != "stop" and not press.confirmed:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
+        asked_s = time.monotonic()
         reply = self._send(self._session, press.button)
         if reply is None:
-            return {"action": press.button, "result": "unanswered",
-                    "text": f"no answer within {ANSWER_S:g} s: it may or may not have arrived"}
+            at_once = time.monotonic() - asked_s < 0.5 * ANSWER_S
+            text = ("not sent: nothing there takes commands; is the control loop up?" if at_once
+                    else f"no answer within {ANSWER_S:g} s: it may or may not have arrived")
+            return {"action": press.button, "result": "unanswered", "text": text}
         return {"action": press.button, "result": reply.result, "text": reply.text}
 
 

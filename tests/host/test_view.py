@@ -24,7 +24,7 @@ from host.cli.contract_io import BadInput
 from host.demo import SIMULATED_RIG
 from host.mechanics.catheter import load_catheter
 from host.recording import Recording
-from host.view.live import LiveRig, Press
+from host.view.live import ANSWER_S, LiveRig, Press
 from host.view.picture import Picture, causes_of
 from host.view.replay import Replay, read_findings
 from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, three_js
@@ -442,4 +442,12 @@ def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
 def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
     _, view, _ = live
     view._send = lambda session, button: None
-    assert view.act('{"button": "stop"}')["result"] == "unanswered"
+    answer = view.act('{"button": "stop"}')
+    assert answer["result"] == "unanswered" and "not sent" in answer["text"]
+
+    def late(session: Session, button: str) -> Reply | None:
+        time.sleep(0.6 * ANSWER_S)
+        return None
+
+    view._send = late
+    assert "may or may not" in view.act('{"button": "stop"}')["text"]
