@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from realtime.safety import CAUSES
+
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
 LOG_LINES = 6
@@ -51,6 +53,8 @@ class Picture:
 
     def hear(self, topic: str, body: Body) -> None:
         """Take in one message as a dict; a missing key counts as nil. Topics of no concern cost nothing."""
+        if topic.startswith("pose/") and body.get("position_m") is None:
+            return    # not seen this time: the one before stands until it is old
         self._newest[topic] = body
         if topic == "state":
             self.now_ns = body["stamp_ns"]
@@ -114,7 +118,7 @@ class Picture:
         state = self._newest.get("state", {})
         frame = {
             "t": _seconds(self.now_ns), "mode": state.get("mode", ""), "action": state.get("safety_action", ""),
-            "cause": state.get("cause", ""), "force_N": _rounded(state.get("force_N"), 4),
+            "causes": causes_of(state.get("cause", "")), "force_N": _rounded(state.get("force_N"), 4),
             "target_force_N": state.get("target_force_N"), "pose_age_ms": _rounded(_ms(state.get("pose_age_ns")), 1),
             "rejected": [state.get("poses_rejected", 0), state.get("forces_rejected", 0)],
             "rows": list(self._force_rows), "estimates": list(self._estimate_rows),
@@ -154,6 +158,15 @@ class Picture:
         state = BOARD_STATES[code] if code < len(BOARD_STATES) else f"state {code}"
         age_ms = max(self.now_ns - board["stamp_ns"], 0) * 1e-6
         return {**{name: board.get(name) for name in names}, "state": state, "age_ms": _rounded(age_ms, 0)}
+
+
+def causes_of(text: str) -> list[str]:
+    """The sentences in a state's `cause`, one for each thing that is wrong: they are joined by what they also contain."""
+    known = [sentence for _, _, _, sentence in CAUSES if sentence in text]
+    rest = text
+    for sentence in known:
+        rest = rest.replace(sentence, "")
+    return sorted(known, key=text.index) if not rest.strip("; ") else [text]
 
 
 def _shape_of(parameters: Body) -> Callable[..., tuple[Any, float | None]] | None:

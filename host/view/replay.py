@@ -18,6 +18,8 @@ from host.view.source import refusal
 
 # Topics whose every message is shown, and those of which only the newest counts.
 EVERY, NEWEST = ("state", "force/estimate", "log"), ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "loop")
+# Of the others the last few: a tool that was not seen leaves the pose before it standing.
+LAST = 3
 # After a jump the traces are filled with so much of the past.
 HISTORY_S = 20.0
 MIN_SPEED, MAX_SPEED = 0.05, 50.0
@@ -123,7 +125,7 @@ class Replay:
             upto = int(np.searchsorted(self._times[topic], self._at_ns, side="right"))
             first = self._next[topic]
             if upto > first:
-                chosen = [upto - 1]
+                chosen = list(range(max(first, upto - LAST), upto))
                 if topic in EVERY:
                     chosen = sorted(set(np.linspace(first, upto - 1, min(upto - first, WAITING)).round().astype(int)))
                 for index in chosen:

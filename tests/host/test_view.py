@@ -27,12 +27,13 @@ from host.demo import SIMULATED_RIG
 from host.mechanics.catheter import load_catheter
 from host.recording import Recording
 from host.view.live import LiveRig, Press
-from host.view.picture import Picture
+from host.view.picture import Picture, causes_of
 from host.view.replay import Replay, read_findings
 from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, three_js
 from host.view.shape import through, twin
 from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
 from protocol.zenoh_session import Session
+from realtime import safety
 from realtime.command_gate import CommandGate
 from realtime.rig_file import Rig, load_rig
 from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
@@ -82,9 +83,16 @@ def test_a_picture_of_nothing_and_of_old_poses_shows_neither_tip_nor_force() -> 
     assert fresh["scene"]["tip"] == [0.0, 0.0, 0.02] and fresh["scene"]["force"] == [0.0, 0.0, 0.1]
     picture.hear("state", {**state, "stamp_ns": 900 * MS})
     old = picture.frame()
-    assert old["scene"]["tip"] == [] and old["scene"]["force"] == [] and old["cause"] == "no fresh pose"
+    assert old["scene"]["tip"] == [] and old["scene"]["force"] == [] and old["causes"] == ["no fresh pose"]
     assert len(old["rows"]) == 1, "each sample is handed out once"
     json.dumps(old, allow_nan=False)
+
+
+def test_several_causes_are_told_apart_though_their_sentences_hold_semicolons() -> None:
+    flags = safety.BOARD_SILENT | safety.OVER_FORCE | safety.POSE_STALE
+    assert causes_of("; ".join(safety.in_words(flags))) == safety.in_words(flags)
+    cut = "; ".join(safety.in_words(flags))[:-10]
+    assert causes_of(cut) == [cut] and causes_of("") == []
 
 
 # The player.
@@ -388,7 +396,7 @@ def test_what_the_rig_publishes_is_on_the_page(live: tuple[Session, LiveRig, lis
     before = view.frame()
     assert before["silent_s"] is None and before["mode"] == ""
     frame = publish_until_seen(there, view)
-    assert frame["mode"] == "contact" and frame["cause"] == "a pose was not used" and frame["silent_s"] < 1.0
+    assert frame["mode"] == "contact" and frame["causes"] == ["a pose was not used"] and frame["silent_s"] < 1.0
     np.testing.assert_allclose(frame["scene"]["shape"][-1], [0.0, -0.007, 0.028], atol=1e-5)
     assert frame["estimates"][-1][1:] == [0.14, 0.02] and frame["rows"][-1][1:3] == [0.15, 0.2]
 

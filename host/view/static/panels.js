@@ -35,7 +35,7 @@ export function showSafety(frame, live) {
   set("mode", silent ? "–" : MODES[frame.mode] || frame.mode || "–");
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;
   set("force", force);
-  const said = frame.cause ? frame.cause[0].toUpperCase() + frame.cause.slice(1) + "." : IDLE[frame.mode] || "Nothing is wrong.";
+  const said = frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "Nothing is wrong.";
   set("cause", !silent ? said : frame.silent_s === null ? "Nothing has been heard of the rig yet. Is it running, on this rig file’s endpoints?"
     : `Nothing heard of the rig for ${frame.silent_s.toFixed(0)} s. What is shown is old.`);
 }

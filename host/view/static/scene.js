@@ -2,7 +2,7 @@
 
 import {OrbitControls, THREE} from "/lib/three.js";
 
-const MM = 1000, MM_PER_N = 80, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [64, -34, 27], LOOK = [0, -4, 11];
+const MM = 1000, MM_PER_N = 80, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [74, -39, 36], LOOK = [0, -5, 15];
 
 const vector = m => new THREE.Vector3(m[0] * MM, m[1] * MM, m[2] * MM);
 
@@ -21,7 +21,7 @@ function label(text, color) {
   g.fillStyle = `#${color.getHexString()}`;
   g.fillText(text, 32, 32);
   const sprite = new THREE.Sprite(new THREE.SpriteMaterial({map: new THREE.CanvasTexture(canvas), depthWrite: false}));
-  sprite.scale.set(6, 6, 1);
+  sprite.scale.set(4.2, 4.2, 1);
   return sprite;
 }
 

@@ -168,7 +168,7 @@ export class Traces {
     g.fillStyle = a.color("muted");
     let at = 2;
     const write = text => { g.fillText(text, at, a.top - 7); at += g.measureText(text).width + 10; };
-    write(`${lane.label}  ${lane.unit}`);
+    write(`${lane.label} ${lane.unit}`.trim());
     for (const line of lane.lines) {
       const values = this.values[line.name], newest = values.length ? values[values.length - 1][0] : null;
       if (!line.label) continue;

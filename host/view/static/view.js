@@ -23,9 +23,9 @@ function link(text, state) {
 }
 
 const force = new Traces(element("force-card").querySelector("canvas"), [{
-  label: "force", unit: "N", scale: 1, digits: 3, least: 0.1, lines: [
-    {name: "estimate", label: "estimate ±2σ", color: "estimate", band: true},
-    {name: "wanted", label: "wanted", color: "target", dash: [5, 4]}, {name: "force", label: "steered by", color: "force"}]}]);
+  label: "", unit: "N", scale: 1, digits: 3, least: 0.1, lines: [
+    {name: "estimate", label: "estimate", color: "estimate", band: true},
+    {name: "wanted", label: "wanted", color: "target", dash: [5, 4]}, {name: "force", label: "in the loop", color: "force"}]}]);
 const pose = new Traces(element("pose-card").querySelector("canvas"), ["e1", "e2", "e3"].map((axis, index) => ({
   label: axis, unit: "mm", scale: 1000, digits: 2, least: 0.002, lines: [
     {name: `target${index}`, label: "target", color: "target", dash: [5, 4]}, {name: `tip${index}`, label: "tip", color: "catheter"}]})));
@@ -99,7 +99,7 @@ function draw() {
   if (page.scene && !page.scene.broken) {
     page.scene.show(frame.scene, frame.mode);
     const gap = frame.scene.gap_m;
-    element("scene-note").textContent = "Grid 10 mm, 8 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`);
+    element("scene-note").textContent = "Grid 10 mm; force arrow 8 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`);
   }
   link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "rig silent") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
 }

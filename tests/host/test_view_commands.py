@@ -1,0 +1,69 @@
+"""`seldinger view` and `seldinger play` as they are called: what they refuse, and that they serve."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from host.demo import SIMULATED_RIG
+from host.view.server import ADDRESS
+from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
+from tests.host.test_view import free_port
+
+ROOT = Path(__file__).parents[2]
+
+
+def seldinger(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "host.cli.main", *arguments], capture_output=True, text=True, cwd=ROOT,
+                          timeout=60, check=False)
+
+
+def serves(*arguments: str, port: int) -> tuple[int, str]:
+    """Exit status and standard error of a command that is served from until it is interrupted."""
+    child = subprocess.Popen([sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)],
+                             stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    for _ in range(600):
+        try:
+            assert httpx.get(f"http://{ADDRESS}:{port}/").status_code == 200
+            break
+        except httpx.TransportError:
+            assert child.poll() is None
+            time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    _, words = child.communicate(timeout=20)
+    return child.returncode, words
+
+
+def test_play_serves_a_recording_until_it_is_interrupted(recording: Path) -> None:  # noqa: F811
+    port = free_port()
+    status, words = serves("play", str(recording), port=port)
+    assert status in (0, 130) and f"http://{ADDRESS}:{port}/" in words and "Traceback" not in words
+
+
+def test_view_serves_before_the_rig_is_there() -> None:
+    status, words = serves("view", "--rig", str(SIMULATED_RIG), port=free_port())
+    assert status in (0, 130) and "rig simulated" in words and "Traceback" not in words
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    (("play", "nowhere.mcap"), "nowhere.mcap"), (("view", "--rig", "nowhere.toml"), "nowhere.toml"),
+])
+def test_what_is_not_there_is_named(arguments: tuple[str, ...], told: str) -> None:
+    done = seldinger(*arguments)
+    assert done.returncode == 2 and told in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_named(recording: Path) -> None:  # noqa: F811
+    with socket.socket() as taken:
+        taken.bind((ADDRESS, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = seldinger("play", str(recording), "--port", str(port))
+    assert done.returncode == 2 and f"--port: found {port}, wanted a port that is free" in done.stderr

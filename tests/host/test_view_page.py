@@ -1,0 +1,152 @@
+"""The page in a real browser, 1280 and 360 pixels wide: all drawn, nothing wider than the screen, buttons that ask."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from host.recording import Recording
+from host.view.replay import Findings, Replay, Window
+from host.view.server import ADDRESS, ViewServer
+from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
+from tests.host.test_view import free_port, running
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WIDTHS = [(1280, 800), (360, 740)]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no chromium: apt-get install chromium")
+    with playwright.sync_playwright() as p:
+        chromium = p.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        yield chromium
+        chromium.close()
+
+
+class OpenPage:
+    """A page of `port`, and what its console complained of."""
+
+    def __init__(self, browser: Any, port: int, size: tuple[int, int]) -> None:
+        self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        self.complaints: list[str] = []
+        self.page.on("console", lambda message: self._hear(message.type, message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.goto(f"http://{ADDRESS}:{port}/")
+        self.wait(lambda: self.page.evaluate("window.seldinger.frames > 10 && Boolean(window.seldinger.scene)"))
+
+    def _hear(self, kind: str, text: str) -> None:
+        # The software renderer complains of itself: reading pixels back is slow.
+        if kind in ("error", "warning") and "GPU stall" not in text:
+            self.complaints.append(text)
+
+    @staticmethod
+    def wait(until: Callable[[], bool], seconds: float = 20.0) -> None:
+        for _ in range(int(seconds * 20)):
+            if until():
+                return
+            time.sleep(0.05)
+        raise AssertionError("waited in vain")
+
+    def text(self, selector: str) -> str:
+        return str(self.page.inner_text(selector))
+
+    def picture_of(self, selector: str) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(self.page.locator(selector).screenshot())).convert("RGB")).astype(int)
+
+    def __enter__(self) -> OpenPage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.page.close()
+
+
+def near(picture: np.ndarray, color: str) -> int:
+    """How many pixels have about the hue of `color` (#rrggbb), whatever their brightness."""
+    wanted = np.array([int(color[i:i + 2], 16) for i in (1, 3, 5)], dtype=float)
+    size = np.linalg.norm(picture, axis=-1)
+    along = picture @ (wanted / np.linalg.norm(wanted)) / np.maximum(size, 1.0)
+    return int(((along > 0.99) & (size > 120)).sum())
+
+
+@pytest.mark.parametrize("size", WIDTHS, ids=lambda size: f"{size[0]}px")
+def test_a_recording_is_drawn_and_can_be_moved_about_in(browser: Any, size: tuple[int, int], recording: Path) -> None:  # noqa: F811
+    findings = Findings(verdict="missing_physics", says=["Play of 3.1 mm in insertion."],
+                        windows=[Window(subsystem="insertion", condition="after reversals", span_s=(0.2, 0.4))])
+    with (running(ViewServer(Replay(Recording(recording), findings=findings), port := free_port())),
+          OpenPage(browser, port, size) as open_page):
+        page = open_page.page
+        open_page.wait(lambda: open_page.text("#play") == "Again")
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert open_page.text("#mode") == "Contact" and open_page.text("#action") == "All well"
+        assert open_page.text("#force") == "0.200 N" and "Play of 3.1 mm" in page.text_content("#findings")
+        mark = page.evaluate("[...document.querySelectorAll('#windows i')].map(i => [i.style.left, i.style.width])")
+        assert [[round(float(part.rstrip("%"))) for part in one] for one in mark] == [[20, 20]]
+        page.evaluate("seek.value = 0.5; seek.dispatchEvent(new Event('input'))")
+        open_page.wait(lambda: open_page.text("#clock").startswith("0.5 of"))
+        scene = open_page.picture_of("#scene-card")
+        assert near(scene, "#2563c9") > 300, "the catheter"
+        page.evaluate("() => { seldinger.scene.wall.children[0].visible = false; seldinger.scene.render(); }")
+        open_page.wait(lambda: bool((abs(open_page.picture_of("#scene-card") - scene).max(axis=-1) > 20).sum() > 1000))
+        assert near(open_page.picture_of("#pose-card"), "#2563c9") > 30, "the trace of the tip"
+        assert page.locator("#controls").is_hidden() and open_page.complaints == []
+
+
+class Fake:
+    """A live rig that stands still and notes what it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+        self.silent_s: float | None = 0.01
+        self.causes = ["contact force above the limit: retracting"]
+
+    def hello(self) -> dict[str, Any]:
+        return {"kind": "live", "rig": "simulated", "catheter": "blazer_prime_xp", "over_force_N": 0.5, "radius_m": 0.0012,
+                "past": {"rows": [], "estimates": [], "log": []}}
+
+    def frame(self) -> dict[str, Any]:
+        now = time.monotonic()
+        return {"t": now, "mode": "retract", "action": "retract", "causes": self.causes, "force_N": 0.51,
+                "target_force_N": 0.2, "pose_age_ms": 20.0, "rejected": [0, 1],
+                "rows": [[now, 0.51, 0.2, 0.0, -0.007, 0.028, 0.0, -0.01, 0.025]],
+                "estimates": [[now, 0.5, 0.02]], "loop": None, "board": None, "silent_s": self.silent_s, "malformed": 0,
+                "scene": {"shape": [[0, 0, 0.002 * i] for i in range(15)], "gap_m": 0.001, "tip": [0, 0, 0.028],
+                          "force": [0, 0, 0.5], "estimate": [], "target": [0, -0.01, 0.025], "into": [0, 0, 1], "poses": {}}}
+
+    def act(self, text: str) -> dict[str, Any]:
+        self.asked.append(json.loads(text))
+        return {"action": self.asked[-1]["button"], "result": "refused", "text": "no board"}
+
+
+@pytest.mark.parametrize("size", WIDTHS, ids=lambda size: f"{size[0]}px")
+def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, size: tuple[int, int]) -> None:
+    fake = Fake()
+    with running(ViewServer(fake, port := free_port())), OpenPage(browser, port, size) as open_page:
+        page = open_page.page
+        open_page.wait(lambda: open_page.text("#action") == "Retracting")
+        assert open_page.text("#cause") == "Contact force above the limit: retracting."
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        box = page.locator('[data-button="stop"]').bounding_box()
+        assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], "Stop is on the screen without scrolling"
+        page.click('[data-button="arm"]')
+        assert fake.asked == [] and "press again" in open_page.text("#answer")
+        page.click('[data-button="arm"]')
+        open_page.wait(lambda: open_page.text("#answer") == "Arm: refused. no board")
+        page.click('[data-button="stop"]')
+        open_page.wait(lambda: len(fake.asked) == 2)
+        assert fake.asked == [{"button": "arm", "confirmed": True}, {"button": "stop", "confirmed": True}]
+        fake.silent_s = 3.0
+        open_page.wait(lambda: open_page.text("#action") == "Silent")
+        assert "old" in open_page.text("#cause") and open_page.complaints == []
