@@ -223,7 +223,7 @@ class LockstepLoop:
             self.publish("state", telemetry.state_message(u, y))
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self.publish("board", board_message(self.link, now_ns))
-        if number % self.rig.control.loop_hz == 0:
+        if number % telemetry.LOOP_EVERY == 0:
             self.publish("loop", telemetry.loop_message(
                 now_ns, self.rig.control.loop_hz, self.missed_ticks, self.work))
             self.publish("commander", self.gate.state())
