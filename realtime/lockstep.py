@@ -231,6 +231,9 @@ class LockstepLoop:
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")
         self.log(event.stamp_ns, level, event.device, event.text)
+        words = self.desk.back(event.device) if event.kind is DeviceEventKind.RECONNECTED else ""
+        if words:
+            self.log(event.stamp_ns, "warning", event.device, words)
 
     def log(self, now_ns: int, level: str, source: str, text: str) -> None:
         """A line for people, published as it is."""
