@@ -30,11 +30,13 @@ _STOP_TIMEOUT_S = 2.0
 class Fleet:
     """The three processes. Use as a context: leaving it stops everything in order, within two seconds.
 
-    loop: with the realtime process; without it whoever asks runs the loop, on `ports`.
+    loop: with the realtime process; without it whoever asks runs the loop, on `ports`. endpoint: where it is heard, one
+    of its own, so that fleets do not meet.
     """
 
     def __init__(self, settings: DemoSettings, recording: Path, loop: bool = True) -> None:
         self._settings, self._recording, self._loop = settings, recording, loop
+        self.endpoint = f"tcp/127.0.0.1:{_free_port()}"
         self.ports: dict[str, Any] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
         self.rig_file = Path(self._folder.name) / "rig.toml"
@@ -54,8 +56,9 @@ class Fleet:
 
     def _start(self) -> None:
         text = self._settings.rig_file.read_text(encoding="utf-8")
-        self.rig_file.write_text(_with_endpoint(text, f"tcp/127.0.0.1:{_free_port()}"), encoding="utf-8")
-        load_rig(self.rig_file)
+        self.rig_file.write_text(with_endpoint(text, self.endpoint), encoding="utf-8")
+        if load_rig(self.rig_file).zenoh.listen != [self.endpoint]:
+            raise OSError(f"{self._settings.rig_file}: found no section [zenoh] that could be given a port of its own")
         rig = str(self.rig_file)
         planted = [word for text in self._settings.effects for word in ("--effect", text)]
         self.ports = ports = json.loads(self._spawn("rig", "sim.rig_server", "--rig", rig, "--board", self._settings.board,
@@ -165,6 +168,7 @@ def run_wall_clock(settings: DemoSettings, progress: Progress) -> DemoRun:
     path = new_recording_path(settings.directory, "demo-wall-clock")
     run = DemoRun(path, Outcome(), settings.board)
     with Fleet(settings, path) as fleet:
+        print(f"topics at {fleet.endpoint}", file=sys.stderr)
         operator = Operator(fleet)
         try:
             _press(operator, run.outcome, ContactJob(TARGET_M, force_N=settings.force_N, hold_s=settings.hold_s), progress)
@@ -215,6 +219,9 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _with_endpoint(text: str, endpoint: str) -> str:
-    """The rig file's text with its zenoh endpoints replaced, so that two runs do not meet."""
-    return re.sub(r'^(listen|connect) = \[.*\]$', rf'\1 = ["{endpoint}"]', text, flags=re.M)
+def with_endpoint(text: str, endpoint: str) -> str:
+    """The rig file's text with the endpoints in its section [zenoh] replaced, so that two runs do not meet."""
+    before, zenoh, after = re.split(r"^(\[zenoh\])", text, maxsplit=1, flags=re.M)
+    own, other, rest = re.match(r"(.*?)(^\[|\Z)(.*)", after, flags=re.M | re.S).groups()  # type: ignore[union-attr]
+    own = re.sub(r"^(listen|connect)(\s*=\s*)\[[^\]]*\]", rf'\1\2["{endpoint}"]', own, flags=re.M)
+    return before + zenoh + own + other + rest

@@ -56,7 +56,10 @@ class Commander:
     def take(self) -> Acknowledgement:
         """Take the lease, or keep it for longer. Refused while another commander holds it."""
         with self._lock:
-            reply = self._ask("take")
+            try:
+                reply = self._ask("take")
+            except ValueError as error:
+                return Acknowledgement(False, str(error), "malformed")
             if reply is not None and reply.result == "accepted":
                 self._lease, self._lease_expires_ns = reply.lease, reply.lease_expires_ns
             return _said(reply)

@@ -308,10 +308,10 @@ class Topic(NamedTuple):
 
 
 _TABLE = (
-    Topic("stage", Stage, 1000, "state", "realtime -> host, tools", "handle: commands, encoders, catheter joints"),
+    Topic("stage", Stage, 250, "state", "realtime -> host, tools", "handle: commands, encoders, catheter joints"),
     Topic("pose/tip", Pose, 40, "state", "realtime -> host, tools", "tracker tool at the tip"),
     Topic("pose/shaft", Pose, 40, "state", "realtime -> host, tools", "tracker tool down the shaft"),
-    Topic("force/sensor", ForceSensor, 1000, "state", "realtime -> host, tools", "measured force"),
+    Topic("force/sensor", ForceSensor, 500, "state", "realtime -> host, tools", "measured force"),
     Topic("force/estimate", ForceEstimate, 40, "state", "host -> realtime, tools", "force estimated from poses"),
     Topic("state", RigState, 100, "state", "realtime -> host, tools", "mode, safety action and cause, target"),
     Topic("board", BoardCounters, 20, "state", "realtime -> host, tools", "counters of the stepper board"),
@@ -320,7 +320,7 @@ _TABLE = (
     Topic("request", Command, 0, "query", "commander -> realtime", "commands, on request/NAME; each is answered by a Reply"),
     Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as they came, for the record"),
     Topic("reply", Reply, 0, "event", "realtime -> host, tools", "what became of them"),
-    Topic("commander", CommandCounts, 1, "state", "realtime -> host, tools", "who holds the lease; counts of commands"),
+    Topic("commander", CommandCounts, 2, "state", "realtime -> host, tools", "who holds the lease; counts of commands"),
     Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin have parted: subsystem and probable cause"),
     Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import logging
 import re
 import threading
 import time
@@ -16,6 +17,7 @@ import zenoh
 from protocol.topics import MAX_PAYLOAD_BYTES, TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
 from protocol.zenoh_access import Network, check_network_endpoint, client_settings, network_settings
 
+logger = logging.getLogger("seldinger.requests")
 RECORDER_DEPTH = 4096
 _REQUESTS_WAITING, _REQUESTS_A_TURN, _TURN_S = 256, 32, 0.002
 _SETTINGS: dict[str, Any] = {
@@ -158,14 +160,15 @@ class RequestServer:
 
     def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
         self._prefix, self._give = f"{key(rig, 'request')}/", answer
+        self.failures = 0
         self._queryable = session.declare_queryable(request_key(rig, "*"), zenoh.handlers.RingChannel(_REQUESTS_WAITING),
                                                     complete=True)
         self._thread = threading.Thread(target=self._serve, name="requests", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
-        try:
-            while True:
+        while True:
+            try:
                 self._answer(self._queryable.recv())
                 for _ in range(_REQUESTS_A_TURN):
                     query = self._queryable.try_recv()
@@ -174,15 +177,19 @@ class RequestServer:
                     self._answer(query)
                 else:
                     time.sleep(_TURN_S)
-        except zenoh.ZError:
-            return
+            except zenoh.ZError:  # the session was closed
+                return
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             name = str(query.key_expr).removeprefix(self._prefix)
-            reply = self._give(name, b"" if query.payload is None else bytes(query.payload))
-            if reply is not None and "*" not in name:
-                query.reply(query.key_expr, encode(reply))
+            try:
+                reply = self._give(name, b"" if query.payload is None else bytes(query.payload))
+                if reply is not None and "*" not in name:
+                    query.reply(query.key_expr, encode(reply))
+            except Exception:  # one request must not end the answering of all others, a stop among them
+                self.failures += 1
+                logger.exception("request from %s failed", name[:40])
 
 
 def _open(config: zenoh.Config, listen: list[str]) -> zenoh.Session:

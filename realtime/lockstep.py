@@ -223,7 +223,7 @@ class LockstepLoop:
             self.publish("state", telemetry.state_message(u, y))
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self.publish("board", board_message(self.link, now_ns))
-        if number % self.rig.control.loop_hz == 0:
+        if number % telemetry.LOOP_EVERY == 0:
             self.publish("loop", telemetry.loop_message(
                 now_ns, self.rig.control.loop_hz, self.missed_ticks, self.work))
             self.publish("commander", self.gate.state())
@@ -231,6 +231,9 @@ class LockstepLoop:
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")
         self.log(event.stamp_ns, level, event.device, event.text)
+        words = self.desk.back(event.device) if event.kind is DeviceEventKind.RECONNECTED else ""
+        if words:
+            self.log(event.stamp_ns, "warning", event.device, words)
 
     def log(self, now_ns: int, level: str, source: str, text: str) -> None:
         """A line for people, published as it is."""

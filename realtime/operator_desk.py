@@ -72,10 +72,20 @@ class OperatorDesk:
         return ""
 
     def _disarm(self, command: Command) -> str:
+        self._rest()
+        return ""
+
+    def back(self, device: str) -> str:
+        """`device` was gone and is there again: what was armed is disarmed. Returns words for the log, empty for none."""
+        if not self._record.armed:
+            return ""
+        self._rest()
+        return f"{device} is back: disarmed, to be armed again"
+
+    def _rest(self) -> None:
         self._record.armed = 0
         self._set(COMMAND_HOLD)
         self._frames.append(self._link.disarm())
-        return ""
 
     def _stop(self, command: Command) -> str:
         self._set(COMMAND_STOP)

@@ -62,6 +62,7 @@ class RealtimeProcess:
         self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
         self._phase = PHASE_DISARMED
         self._params = tick_parameters(rig, force_source)
+        self._told_board_ns = 0
         self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
         os.set_blocking(self._port.fileno(), False)
         self._session = Session(rig.name, [], rig.zenoh.connect)
@@ -156,28 +157,67 @@ class RealtimeProcess:
     def _on_device(self, event: DeviceEvent) -> None:
         bad = event.kind in (DeviceEventKind.LOST, DeviceEventKind.WARNING, DeviceEventKind.ERROR)
         self._log("warning" if bad else "info", event.device, event.text)
+        if event.kind is DeviceEventKind.RECONNECTED:
+            with self._link_lock:
+                self._back(event.device)
+
+    def _back(self, device: str) -> None:
+        """A device is there again; the link's lock is held."""
+        words = self._desk.back(device)
+        if words:
+            self._mailboxes["command"].publish()
+            self._send(self._desk.take_frames())
+            self._log("warning", device, words)
 
     def _serve_board(self) -> None:
         """Read the board; keep the link's bring-up going; all that is sent goes through the loop's one writer."""
-        last_status_ns = 0
         while not self._stopping.is_set():
-            ready = select.select([self._port.fileno()], [], [], _POLL_S)[0]
-            now_ns = self.clock.now_ns()
-            with self._link_lock:
-                for event in self._link.feed(self._port.read(), now_ns) if ready else []:
-                    if event.kind is EventKind.STATUS:
-                        take_status(self._mailboxes["board"].record[0], self._link, now_ns)
-                        self._mailboxes["board"].publish()
-                        self._check_steps(now_ns)
-                    else:
-                        bad = event.kind in (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
-                        self._log("error" if bad else "info", "board", event.message)
-                self._send([self._link.advance(now_ns)])
-                if self._link.status is not None and now_ns - last_status_ns > 50_000_000:
-                    last_status_ns = now_ns
-                    self._publish("board", board_message(self._link, now_ns))
-            self._take_estimate(now_ns)
-            self._tell_host(self._supervision.host.silent(now_ns))
+            try:
+                self._board_turn()
+            except OSError as gone:
+                self._find_board_again(str(gone))
+
+    def _board_turn(self) -> None:
+        ready = select.select([self._port.fileno()], [], [], _POLL_S)[0]
+        data = self._port.read() if ready else b""
+        if ready and not data:
+            raise OSError("serial port hung up (unplugged?)")
+        now_ns = self.clock.now_ns()
+        with self._link_lock:
+            for event in self._link.feed(data, now_ns):
+                if event.kind is EventKind.STATUS:
+                    take_status(self._mailboxes["board"].record[0], self._link, now_ns)
+                    self._mailboxes["board"].publish()
+                    self._check_steps(now_ns)
+                else:
+                    bad = event.kind in (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
+                    self._log("error" if bad else "info", "board", event.message)
+            self._send([self._link.advance(now_ns)])
+            if self._link.status is not None and now_ns - self._told_board_ns > 50_000_000:
+                self._told_board_ns = now_ns
+                self._publish("board", board_message(self._link, now_ns))
+        self._take_estimate(now_ns)
+        self._tell_host(self._supervision.host.silent(now_ns))
+
+    def _find_board_again(self, why: str) -> None:
+        """Disarm, and wait for the port; the loop goes on at the same descriptor, which leads nowhere meanwhile."""
+        fd = self._port.fileno()
+        with open(os.devnull, "r+b", buffering=0) as nowhere:
+            os.dup2(nowhere.fileno(), fd)
+        with self._link_lock:
+            self._log("error", "board", why)
+            self._back("board")
+            self._link.unplugged()
+        while not self._stopping.wait(_OPEN_RETRY_S):
+            try:
+                found = open_serial(self._port.path, self.rig.board.baud)
+            except OSError:
+                continue
+            os.set_blocking(found.fileno(), False)
+            os.dup2(found.fileno(), fd)
+            found.close()
+            self._log("warning", "board", "its port is there again")
+            return
 
     def _check_steps(self, now_ns: int) -> None:
         board = self._mailboxes["board"].record[0]

@@ -24,7 +24,7 @@ from realtime.native_loop import WORK_BIN_NS
 from realtime.records import PHASE_CONTACT
 
 # Ticks (of 1 ms) between two messages of a topic.
-STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY = 4, 2, 10, 50
+STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY, LOOP_EVERY = 4, 2, 10, 50, 500
 
 
 def stage_message(params: np.record, inputs: np.record, outputs: np.record) -> Stage:

@@ -175,6 +175,16 @@ class StepperBoardLink:
         self._fault = Fault.NONE
         self.clock.restart()
 
+    def unplugged(self) -> None:
+        """The cable is out: the bring-up starts anew. The board and its starts are remembered, so that a reset is seen."""
+        if self.phase not in (LinkPhase.RESET, LinkPhase.MISMATCH):
+            self.phase = LinkPhase.HELLO
+        self.status = None
+        self._configured.clear()
+        self._pending.clear()
+        self._sent_ns = None
+        self.clock.restart()
+
     def hello(self) -> bytes:
         """HELLO, after a delimiter that ends whatever was on the line before."""
         return b"\0" + self._command("HELLO", protocol_hash=PROTOCOL_HASH)

@@ -6,6 +6,8 @@ import dataclasses
 import datetime
 import json
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,10 +19,12 @@ from cryptography import x509
 
 from host import keys
 from host.commander import Commander
+from host.wall_clock import with_endpoint
 from protocol.topics import Command, ForceSensor, Reply, encode, key, request_key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE, Network, client_settings
 from protocol.zenoh_session import Session
 from realtime.command_gate import CommandGate
+from tests.realtime.conftest import RIG_FILE
 
 PATIENCE_S = 30.0
 
@@ -156,6 +160,25 @@ def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory,
                                                         for message in messages}
         assert not any(everything.malformed for everything in inside)
         assert not hijacked and taken is not None
+
+
+def test_the_model_process_opens_the_way_in_that_the_rig_file_describes(laboratory: Laboratory, tmp_path: Path) -> None:
+    local, outside = (f"{kind}/127.0.0.1:{free_port()}" for kind in ("tcp", "tls"))
+    text = with_endpoint(RIG_FILE.read_text(encoding="utf-8"), local)
+    section = keys.network_lines(laboratory.folder, outside)
+    (tmp_path / "rig.toml").write_text(text[:text.index("[network]")] + section, encoding="utf-8")
+    child = subprocess.Popen([sys.executable, "-m", "host.estimator_process", str(tmp_path / "rig.toml"), "--estimator",
+                              "tests.host.no_estimator:make"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout is not None and "ready" in child.stdout.readline()
+        with Session("simulated", [], [local]) as realtime, \
+                Session.remote("simulated", outside, laboratory.folder / "analysis") as reader:
+            publisher, latest = realtime.publisher("force/sensor"), reader.latest("force/sensor")
+            assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
+    finally:
+        child.terminate()
+        child.wait()
+        child.stdout.close()  # type: ignore[union-attr]
 
 
 def refused(settings: dict[str, Any]) -> bool:

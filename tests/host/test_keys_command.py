@@ -12,6 +12,7 @@ import zenoh
 
 from host import keys
 from host.cli.main import main
+from host.services.units import UnitSettings, unit_texts
 from realtime.rig_file import load_rig, parse_rig, read_rig_data
 from tests.realtime.conftest import RIG_FILE
 
@@ -104,3 +105,13 @@ def test_a_bad_network_section_is_refused(changes: dict[str, list[str]]) -> None
     assert parse_rig(data | {"network": good}).access is not None
     with pytest.raises(ValueError, match="network"):
         parse_rig(data | {"network": good | changes})
+
+
+def test_the_installed_model_process_may_talk_to_the_peers_and_the_loop_may_not() -> None:
+    data = read_rig_data(RIG_FILE)
+    section = {"listen": ["tls/10.0.0.5:7448"], "keys": "/keys/rig1", "peers": ["10.0.0.7", "10.1.0.0/16"]}
+    texts = unit_texts(UnitSettings(Path("/etc/rig.toml"), 1), parse_rig(data | {"network": section}))
+    assert "IPAddressAllow=localhost 10.0.0.7 10.1.0.0/16\n" in texts["seldinger-host.service"]
+    assert "10.0.0.7" not in texts["seldinger-realtime.service"]
+    closed = unit_texts(UnitSettings(Path("/etc/rig.toml"), 1), parse_rig(data))
+    assert "IPAddressAllow=localhost \n" in closed["seldinger-host.service"]

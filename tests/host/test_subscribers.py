@@ -7,6 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from host import keys
 from host.bad_subscriber import KINDS, bad_subscriber
 from host.commander import Commander
+from host.wall_clock import with_endpoint
 from protocol.topics import TOPICS, Command, Message, Reply, RigState
 from protocol.zenoh_access import Network
 from protocol.zenoh_session import Session
@@ -35,6 +38,13 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def test_two_fleets_do_not_meet() -> None:
+    text = RIG_FILE.read_text(encoding="utf-8")
+    data, own = tomllib.loads(text), tomllib.loads(with_endpoint(text, "tcp/127.0.0.1:1234"))
+    assert own["zenoh"] == {"listen": ["tcp/127.0.0.1:1234"], "connect": ["tcp/127.0.0.1:1234"]}
+    assert own | {"zenoh": data["zenoh"]} == data
+
+
 def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
     """Hash and number of the step edges of a move whose messages all go out by a real session, beside `kind`."""
     rig, endpoint = load_rig(RIG_FILE), free_endpoint()
@@ -54,6 +64,19 @@ def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
             assert kind != "flooding" or run.loop.gate.counts["malformed"] > 20
         assert server is not None
         return run.world.digest, int(run.world.edges.sum())
+
+
+def test_the_rates_are_those_of_the_table() -> None:
+    rig, count = load_rig(RIG_FILE), Counter[str]()
+    with LibraryBoard() as board:
+        plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), 1)
+        run = Scenario(rig, World(rig, plant, board, 1), lambda topic, message: count.update([topic]))
+        assert run.arm()
+        count.clear()
+        run.run(2.0)
+    for name, topic in TOPICS.items():
+        if topic.rate_hz and topic.direction.startswith(("realtime", "sim")):
+            assert count[name] == pytest.approx(2 * topic.rate_hz, abs=1), name
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +138,7 @@ def test_the_example_reads_on_this_machine() -> None:
     assert len(program.splitlines()) <= 15 and "import host" not in program and "protocol" not in program
     assert "tcp/127.0.0.1:7451" in program and load_rig(RIG_FILE).zenoh.listen == ["tcp/127.0.0.1:7451"]
     with Session("simulated", [endpoint], []) as session:
-        assert lines_of_the_example([], session, program.replace("tcp/127.0.0.1:7451", endpoint)) == SHOWN
+        assert lines_of_the_example([endpoint], session, program) == SHOWN
 
 
 def test_the_example_reads_from_another_machine_with_its_certificate(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -246,6 +247,11 @@ def test_histogram_buckets_hold_what_their_edges_say(time_us: float) -> None:
     bucket = histogram_bucket(time_us)
     assert bucket == 0 or HISTOGRAM_EDGES_US[bucket] <= time_us * (1 + 1e-12)
     assert bucket == len(HISTOGRAM_EDGES_US) - 2 or time_us <= HISTOGRAM_EDGES_US[bucket + 1] * (1 + 1e-12)
+
+
+def test_the_page_has_the_table_as_it_is() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "topics.md").read_text(encoding="utf-8")
+    assert as_markdown() in page, "docs/topics.md: found another table, wanted that of `python -m protocol.topics`"
 
 
 def test_the_table_prints_every_topic_and_unit() -> None:

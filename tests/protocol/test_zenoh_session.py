@@ -165,6 +165,19 @@ def test_what_gets_no_reply_leaves_the_asker_without_one_at_once(endpoint: str) 
         assert until(lambda: console.ask(command(), timeout_s=60.0) is None and bool(heard)) and server is not None
 
 
+def test_a_failure_while_answering_leaves_the_others_answered(endpoint: str) -> None:
+    def answer(name: str, payload: bytes) -> Reply:
+        if name == "bad":
+            raise RuntimeError("broken")
+        return Reply(stamp_ns=5, id="c1", result="accepted")
+
+    with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
+        server = rig.serve_requests(answer)
+        assert until(lambda: console.ask(command()) is not None)
+        assert console.ask(command("bad", 2)) is None and server.failures == 1
+        assert console.ask(command("console", 3)) is not None
+
+
 def test_a_request_to_all_names_at_once_is_no_command(endpoint: str) -> None:
     heard: list[str] = []
 

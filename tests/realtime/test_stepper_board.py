@@ -211,3 +211,26 @@ def test_any_portions_and_any_noise_before(sizes: list[int], noise: bytes) -> No
         at, turn = at + size, turn + 1
     assert kinds(events) == [EventKind.IDENTIFIED, EventKind.STATUS]
     assert link.status is not None and link.status.last_setpoint == 9
+
+
+def test_a_board_unplugged_and_back_is_brought_up_again() -> None:
+    link, peer = ready()
+    link.feed(peer.status(state=State.RUNNING), 10 * MS)
+    link.unplugged()
+    assert link.phase is LinkPhase.HELLO and link.status is None and not link.armed
+    peer.heard.clear()
+    link.feed(peer.status(state=State.DISARMED), 900 * MS)
+    for ms in range(1000, 1005):
+        link.feed(peer.answer(link.advance(ms * MS)), ms * MS)
+    assert link.phase is LinkPhase.READY and peer.heard == ["HELLO", "CONFIGURE", "CONFIGURE", "CONFIGURE"]
+
+
+def test_a_board_that_lost_power_with_its_plug_is_not_believed() -> None:
+    link, peer = ready()
+    link.unplugged()
+    peer.identity["boot_count"] += 1
+    events = link.feed(peer.answer(link.advance(1000 * MS)), 1000 * MS)
+    assert kinds(events) == [EventKind.RESET] and "home the axes again" in events[0].message
+    assert link.phase is LinkPhase.RESET
+    link.unplugged()
+    assert link.phase is LinkPhase.RESET
