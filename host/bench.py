@@ -31,6 +31,7 @@ BENCHMARKS: dict[str, str] = {
     "estimate_case_5": "host.benchmarks.estimation:case_5",
     "estimate_case_6": "host.benchmarks.estimation:case_6",
     "estimate_batch": "host.benchmarks.estimation:batch",
+    "import_and_solve": "host.benchmarks.start_up:import_and_solve",
     "control_tick": "host.benchmarks.control:control_tick",
     "kalman_predict": "host.benchmarks.control:kalman_predict",
     "diagnose": "host.benchmarks.diagnosis:diagnose",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -88,8 +87,7 @@ class Peer:
         self.position: Array | None = None
 
     def __call__(self) -> object:
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a diverging peer overflows on its way
+        with np.errstate(all="ignore"):
             self.position = self._run()
         return self.position
 

@@ -44,4 +44,9 @@ def _accuracy(row: dict[str, Any]) -> str:
              if row.get(key) is not None and row.get("peer_" + key) is not None]
     if "right" in row:
         parts.append(f"right {row['right']} ({row['peer_right']}) of {row['cases']}")
+    if "noise_over_bound" in row:
+        parts.append(f"noise {row['noise_over_bound']:.3f} of the bound "
+                     f"({row['peer_noise_over_bound']:.3f}, {row['noise_peer']})")
+    if "poses_per_s" in row:
+        parts.append(f"{row['poses_per_s']:,.0f} poses/s on {row['workers']} cores")
     return ", ".join(parts) + ";"

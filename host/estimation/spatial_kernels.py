@@ -33,11 +33,11 @@ MOST_ITERATIONS = 40
 MOST_REFINEMENTS = 12
 CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last one of the coarse sweeps
 CLOSE_N = 2e-3
-GOAL_N, CAREFUL_GOAL_N = 2e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
+GOAL_N, CAREFUL_GOAL_N = 4e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
 LARGEST_DAMPING = 1e9
 LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
-NEGLIGIBLE = 1e-3  # weighted cost, far below noise, that explains the poses even where the force still creeps
+NEGLIGIBLE = 1e-5  # weighted cost, far below noise, that explains the poses even where the force still creeps
 SAME = 1e-2  # squared distance over its variance below which two forces are one
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -19,12 +20,20 @@ MARKER_NOISE_m = 1e-4
 _LOAD_STEPS = 12
 
 
+class FineShape(NamedTuple):
+    """A shape as it was recorded: arc lengths of the markers from the sheath's exit, their places, the tip's angle."""
+
+    stations_m: Array  # (n,)
+    markers_m: Array  # (n, 2)
+    tip_angle_rad: float
+
+
 def fine_shape(catheter: Catheter, insertion_m: float, curvature_per_m: float, force_N: Array,
-               random: np.random.Generator | None) -> tuple[Array, Array]:
-    """Stations (n,) m from the sheath's exit and marker positions (n, 2) m under a tip force (2,) N in the base frame.
+               random: np.random.Generator | None) -> FineShape:
+    """The shape under a tip force (2,) N in the base frame, the markers with noise where `random` is given.
 
     The bending moment obeys m' = Fx sin(theta) - Fy cos(theta), m(tip) = 0, theta' = kappa0 + m / EI, started at the
-    base and shot to the tip while the load grows. `fine_shape.last_angle_rad` is the tip's angle.
+    base and shot to the tip while the load grows.
     """
     pcar = catheter.pcar
     if pcar is None:
@@ -63,7 +72,6 @@ def fine_shape(catheter: Catheter, insertion_m: float, curvature_per_m: float, f
         found = root(lambda m, load=load: [shot(float(m[0]), load)[0][3]], [moment], tol=1e-11)
         moment = float(found.x[0])
     end, markers = shot(moment, np.asarray(force_N))
-    fine_shape.last_angle_rad = float(end[2])  # type: ignore[attr-defined]
     if random is not None:
         markers = markers + random.normal(0.0, MARKER_NOISE_m, markers.shape)
-    return stations, markers
+    return FineShape(stations, markers, float(end[2]))

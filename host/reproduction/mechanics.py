@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from host.reproduction import planar, spatial, spatial_force
+from host.reproduction import planar, spatial, spatial_experiments, spatial_force
 from host.reproduction.report import Section, write_reproduction
 
 PAGE = "reproduction-mechanics.html"
@@ -30,7 +30,7 @@ def sections_of(quick: bool) -> Iterator[tuple[str, Callable[[], Section]]]:
     for make in flat:
         if make not in second:
             yield make.__name__, make
-    for longer in spatial_force.SECTIONS:
+    for longer in (*spatial_force.SECTIONS, *spatial_experiments.SECTIONS):
         yield longer.__name__, partial(longer, quick)
 
 

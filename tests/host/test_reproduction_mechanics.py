@@ -8,7 +8,7 @@ import pytest
 from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.rod import rod_record
-from host.reproduction import fine_spatial, mechanics, planar, spatial, spatial_force
+from host.reproduction import fine_spatial, mechanics, planar, spatial, spatial_experiments, spatial_force
 from host.reproduction.report import as_json
 from host.reproduction.thesis_schemes import conventional, internal_loads, iterates
 
@@ -19,6 +19,7 @@ def test_run_writes_a_page_and_the_contract_keys(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(planar, "SECTIONS", (planar.figure_2_3,))
     monkeypatch.setattr(spatial, "SECTIONS", (spatial.figure_3_6, spatial.figure_3_7))
     monkeypatch.setattr(spatial_force, "SECTIONS", ())
+    monkeypatch.setattr(spatial_experiments, "SECTIONS", ())
     told: list[str] = []
     sections, page = mechanics.run(tmp_path, True, told.append)
     answer = as_json(sections, page)
@@ -31,7 +32,8 @@ def test_run_writes_a_page_and_the_contract_keys(tmp_path: Path, monkeypatch: py
 
 def test_every_section_comes_once_and_in_the_thesis_order() -> None:
     names = [name for name, _ in mechanics.sections_of(False)]
-    assert len(set(names)) == len(names) == len(planar.SECTIONS) + len(spatial.SECTIONS) + len(spatial_force.SECTIONS)
+    asked = [part.SECTIONS for part in (planar, spatial, spatial_force, spatial_experiments)]
+    assert len(set(names)) == len(names) == sum(map(len, asked))
     chapters = [int(name.split("_")[1]) for name in names]
     assert chapters == sorted(chapters) and set(chapters) == {2, 3, 4, 5}
 
