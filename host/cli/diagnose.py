@@ -45,12 +45,14 @@ def diagnose(
     data: Annotated[str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")] = None,
     without: Annotated[list[str] | None, typer.Option(help="effect id the finder is not to know")] = None,
     quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
+    effect: Annotated[list[str] | None, typer.Option(
+        help="effect that is known to be there: id@subsystem:key=value,... as the report gives it")] = None,
 ) -> None:
     """Where simulation and recording part, what physics was left out, its model, and the proof."""
     from host.cli.contract_io import BadInput
     from host.diagnosis.dataset import find_files
     from host.diagnosis.effect import library
-    from host.diagnosis.nominal import read_nominal
+    from host.diagnosis.nominal import effect_of, read_nominal
     from host.diagnosis.pipeline import diagnose as run
     from host.diagnosis.verdict import as_json
 
@@ -62,6 +64,7 @@ def diagnose(
     if not nominal:
         raise BadInput("--nominal", "nothing", "a TOML file")
     spec = read_nominal(nominal_path(nominal))
+    spec.effect += [effect_of(text) for text in effect or []]
     files = find_files(spec, recordings or [], data or os.environ.get("SELDINGER_DATA"))
     progress = Progress(quiet)
     result = run(spec, files, progress, frozenset(without or []))
