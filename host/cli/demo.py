@@ -73,7 +73,8 @@ def _settings(board: str, seed: int, force: float, hold: float, fast: bool, forc
         try:
             parse(text)
         except ValueError as error:
-            raise BadInput("--effect", text, str(error)) from None
+            found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
+            raise BadInput(f"--effect {text}", found, wanted) from None
     limit = load_rig(rig).safety.over_force_N
     if not 0.02 <= force < limit:
         raise BadInput("--force", force, f"at least 0.02 and below safety.over_force_N {limit} (N)")

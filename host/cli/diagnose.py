@@ -47,6 +47,8 @@ def diagnose(
     quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
     live: Annotated[bool, typer.Option("--live", help="watch a running rig against its twin, and raise alarms")] = False,
     rig: Annotated[str | None, typer.Option(help="with --live: the rig's file (default: the simulated rig)")] = None,
+    effect: Annotated[list[str] | None, typer.Option(
+        help="effect that is known to be there: id@subsystem:key=value,... as the report gives it")] = None,
 ) -> None:
     """Where simulation and recording part, what physics was left out, its model, and the proof."""
     if live:
@@ -57,7 +59,7 @@ def diagnose(
     from host.cli.contract_io import BadInput
     from host.diagnosis.dataset import find_files
     from host.diagnosis.effect import library
-    from host.diagnosis.nominal import read_nominal
+    from host.diagnosis.nominal import effect_of, read_nominal
     from host.diagnosis.pipeline import diagnose as run
     from host.diagnosis.verdict import as_json
 
@@ -69,6 +71,7 @@ def diagnose(
     if not nominal:
         raise BadInput("--nominal", "nothing", "a TOML file")
     spec = read_nominal(nominal_path(nominal))
+    spec.effect += [effect_of(text) for text in effect or []]
     files = find_files(spec, recordings or [], data or os.environ.get("SELDINGER_DATA"))
     progress = Progress(quiet)
     result = run(spec, files, progress, frozenset(without or []))

@@ -22,7 +22,10 @@ BLOCKS_OF_A_LONE_RECORDING = 10
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording. `channels` maps name to (n,) SI values; `fit` and `heldout` are masks (n,) over samples."""
+    """One recording. `channels` maps name to (n,) SI values; `fit` and `heldout` are masks (n,) over samples.
+
+    `time_s` counts from the first sample, or from the first recording where all share a clock; `begin_s` is where that is in the file.
+    """
 
     name: str
     time_s: Array
@@ -32,6 +35,7 @@ class Recording:
     fit: Mask
     heldout: Mask
     units: dict[str, str] = field(default_factory=dict)
+    begin_s: float = 0.0
 
     @property
     def n(self) -> int:
@@ -67,7 +71,8 @@ def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], o
     shared = one_clock(wholes)
     first = min(whole.time_s[0] for whole in wholes)
     for path, whole in zip(files, wholes, strict=True):
-        whole = replace(whole, time_s=whole.time_s - first) if shared else replace(whole, time_s=whole.time_s - whole.time_s[0])
+        begin = float(first if shared else whole.time_s[0])
+        whole = replace(whole, time_s=whole.time_s - begin, begin_s=begin)
         cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
         pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [whole]
     return _split(pieces, spec.data.heldout)
@@ -140,7 +145,8 @@ def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recor
     part = slice(start, last)
     use = np.arange(start, last) >= first
     channels = {key: values[part] for key, values in whole.channels.items()}
-    return replace(whole, name=name, time_s=whole.time_s[part] - whole.time_s[start], channels=channels, fit=use, heldout=use)
+    return replace(whole, name=name, time_s=whole.time_s[part] - whole.time_s[start], channels=channels, fit=use, heldout=use,
+                   begin_s=whole.begin_s + float(whole.time_s[start]))
 
 
 def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recording]:

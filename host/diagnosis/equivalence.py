@@ -10,7 +10,8 @@ import numpy.typing as npt
 from host.diagnosis.effect import Candidate
 from host.diagnosis.evidence import Gain, compare
 from host.diagnosis.fit import Fit, Problem, finish, minimize
-from host.diagnosis.search import Found, Trial, term_of, without
+from host.diagnosis.screening import term_of, without
+from host.diagnosis.search import Found, Trial
 
 Array = npt.NDArray[np.float64]
 MOST_RIVALS = 4

@@ -124,6 +124,33 @@ def _runge_kutta(s: tuple[float, float, float, float], u: tuple[float, float, fl
 
 
 @njit(cache=True)
+def polynomial(p: Array) -> bool:
+    """Whether position and speed alone, in powers, make the smooth force: then one short step serves."""
+    return p[MAXWELL_K] == 0.0 and p[SOFTENING] == 0.0 and p[GAP] == 0.0 and p[PITCH] <= 0.0 and p[FREQUENCY] <= 0.0 \
+        and p[CONTACT_N] <= 0.0 and p[MASS2] <= 0.0
+
+
+@njit(cache=True)
+def _pull(x: float, v: float, q: tuple[float, float, float, float, float, float]) -> float:
+    """Acceleration by spring and damper: q = (damping, drag, asymmetry, stiffness, quadratic, cubic), each per mass."""
+    return -(q[0] + q[1] * abs(v)) * v - q[2] * abs(v) - (q[3] + (q[4] + q[5] * x) * x) * x
+
+
+@njit(cache=True)
+def _short_step(x: float, v: float, u0: float, u1: float, u2: float, h: float,
+                q: tuple[float, float, float, float, float, float]) -> tuple[float, float, float]:
+    """One Runge-Kutta step of (x, v) for input accelerations at its start, middle and end; the last item is the acceleration at its start."""
+    a1 = u0 + _pull(x, v, q)
+    v2 = v + 0.5 * h * a1
+    a2 = u1 + _pull(x + 0.5 * h * v, v2, q)
+    v3 = v + 0.5 * h * a2
+    a3 = u1 + _pull(x + 0.5 * h * v2, v3, q)
+    v4 = v + h * a3
+    a4 = u2 + _pull(x + h * v3, v4, q)
+    return x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1
+
+
+@njit(cache=True)
 def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: float) -> tuple[float, bool]:
     """Speed after Coulomb friction `dry` has acted over a step, and whether the axis holds."""
     if v_old == 0.0 and abs(a_free) * m <= dry:
@@ -157,6 +184,9 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
     held, slow = hysteresis(z, 0.0, load[0], p), begin[0]
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
+    short = polynomial(p)
+    q = ((linear[1] + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, linear[2] / m, p[QUADRATIC] / m, p[CUBIC] / m)
+    remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0
     for i in range(n):
         if control.size:
             drive = control[2] * control[1] * (control[0] * (reference[0, i] - s[0]) - (s[0] - previous) / dt_s) + reference[1, i]
@@ -172,7 +202,11 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
             dry = p[COULOMB]
             if p[STRIBECK] > 0.0:
                 dry += p[EXCESS] * math.exp(-((v_old / p[STRIBECK]) ** 2))
-            x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
+            if short:
+                x, v, a = _short_step(x_old, v_old, push[0] / m, push[1] / m, push[2] / m, h, q)
+                x2, v2 = x, v
+            else:
+                x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
             if j == 0:
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
             if dry > 0.0:
@@ -181,7 +215,8 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
                 v = v_dry
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
-            held = hysteresis(z, x - x_old, load[i], p)
+            if remembers:
+                held = hysteresis(z, x - x_old, load[i], p)
             if not abs(x) < 1e12:
                 out[:, i:] = 1e12
                 return out

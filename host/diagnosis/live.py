@@ -16,7 +16,7 @@ from host.diagnosis.fit import Fit, Problem, finish, minimize
 from host.diagnosis.live_twin import Calibration, Listener, Twin
 from host.diagnosis.model import Piece
 from host.diagnosis.noise import Noise
-from host.diagnosis.search import screen
+from host.diagnosis.screening import screen
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 from realtime.rig_file import Rig
 

@@ -121,6 +121,23 @@ def _high_frequency(outputs: list[Array]) -> float:
     return float(np.median(spread)) if spread else 0.0
 
 
+def by_steps(x: Array, sigma: float, correlation: float, longest: int = 8) -> tuple[float, float]:
+    """Noise of `x` (n,) by its steps over 1 ... `longest` samples: standard deviation and correlation time (samples), no less than given.
+
+    Half the mean square of a step over k samples is sigma^2 (1 - rho_k); medians, so that the few large steps of a mismatch do not count.
+    """
+    good = x[np.isfinite(x)]
+    if good.size < 10 * longest:
+        return sigma, correlation
+    size = np.array([np.median(np.abs(good[k:] - good[:-k])) for k in range(1, longest + 1)]) * 1.4826 / np.sqrt(2.0)
+    level = float(np.max(size))
+    if level <= sigma:
+        return sigma, correlation
+    rho = 1.0 - (size / level) ** 2
+    first = int(np.argmax(rho < 0.05)) if np.any(rho < 0.05) else longest
+    return level, max(correlation, 1.0 + 2.0 * float(np.sum(rho[:first])))
+
+
 def wild(values: Array, sigma: float) -> Mask:
     """Samples that lie alone, far (12 sigma and 8 local spreads) from the median of their seven neighbours."""
     line = fill(values)

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from host.cli.contract_io import BadInput, Request, validate
 
@@ -114,6 +114,17 @@ class RigSpec(Request):
     wall_normal: list[float] = Field(default=[0.0, 0.0, 1.0], min_length=3, max_length=3)
 
 
+class EffectSpec(Request):
+    """An effect that is known to be there: id and port or subsystem, its parameters by their keys, refitted unless `free = false`."""
+
+    id: str
+    at: str
+    values: dict[str, float] = {}
+    source: str = ""
+    form: str = ""
+    free: bool = True
+
+
 class NominalSpec(Request):
     """A whole nominal TOML."""
 
@@ -127,6 +138,8 @@ class NominalSpec(Request):
     impedance: ImpedanceSpec | None = None
     callable: CallableSpec | None = None
     rig: RigSpec | None = None
+    effect: list[EffectSpec] = []
+    _folder: str = PrivateAttr(default=".")
 
     @model_validator(mode="after")
     def _section_present(self) -> NominalSpec:
@@ -135,10 +148,37 @@ class NominalSpec(Request):
             raise ValueError(f"kind {self.kind} wants a section [{section}]")
         return self
 
+    @property
+    def folder(self) -> str:
+        """Where the TOML lies: its function is looked for there."""
+        return self._folder
+
     def start(self, name: str, default: float) -> tuple[float, bool]:
         """Start value of nominal parameter `name`, and whether it may be refitted."""
         given = self.parameters.get(name, default)
         return (given.value, given.free) if isinstance(given, ParameterSpec) else (float(given), True)
+
+
+def effect_of(text: str) -> EffectSpec:
+    """An effect as written in one line, `backlash@cable:width_rad=0.02`; also `source=`, `form=` and `free=false`. Raises BadInput."""
+    head, _, tail = text.partition(":")
+    effect_id, _, at = head.partition("@")
+    content: dict[str, object] = {"id": effect_id, "at": at}
+    values: dict[str, float] = {}
+    for item in filter(None, tail.split(",")):
+        key, _, value = item.partition("=")
+        if key in ("source", "form"):
+            content[key] = value
+        elif key == "free":
+            content[key] = value != "false"
+        else:
+            try:
+                values[key] = float(value)
+            except ValueError:
+                raise BadInput("--effect", item, "key=number, for example backlash@cable:width_rad=0.02") from None
+    if not at:
+        raise BadInput("--effect", text, "id@subsystem:key=number,..., for example backlash@cable:width_rad=0.02")
+    return validate(EffectSpec, {**content, "values": values})
 
 
 def read_nominal(path: Path | str) -> NominalSpec:
@@ -150,4 +190,6 @@ def read_nominal(path: Path | str) -> NominalSpec:
         raise BadInput("nominal", f"{path}: {error}", "a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise BadInput("nominal", f"{path}: {error}", "valid TOML") from None
-    return validate(NominalSpec, content)
+    spec = validate(NominalSpec, content)
+    spec._folder = str(path.parent)
+    return spec

@@ -198,16 +198,16 @@ def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array
 
 
 @njit(cache=True)
-def calm(x: Array, sigma: float, correlation: float) -> Array:
+def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) -> Array:
     """`x` (n,) without noise `sigma` of that correlation time (samples): at every sample the longest mean about it that agrees
-    with all shorter ones (Lepski 1991)."""
+    with all shorter ones (Lepski 1991). `from_zero`: a mean within three of its standard errors counts as zero."""
     n = x.size
     total = np.zeros(n + 1)
     for i in range(n):
         total[i + 1] = total[i] + x[i]
     out = np.empty(n)
     for i in range(n):
-        low, high, best = -1e300, 1e300, x[i]
+        low, high, best, sure = -1e300, 1e300, x[i], 3.0 * sigma
         half = 2
         while half <= 2 * n:
             first, last = max(i - half, 0), min(i + half + 1, n)
@@ -216,10 +216,10 @@ def calm(x: Array, sigma: float, correlation: float) -> Array:
             spread = 3.0 * sigma * math.sqrt(correlation / count)
             if mean < low - spread or mean > high + spread:
                 break
-            best = mean
+            best, sure = mean, spread
             low, high = max(low, mean - spread), min(high, mean + spread)
             half = half + 1 if half < 4 else int(half * 1.3) + 1
-        out[i] = best
+        out[i] = 0.0 if from_zero and abs(best) < sure else best
     return out
 
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from host.diagnosis.effect import Port
+from host.diagnosis.locate import joined
 from host.diagnosis.model import Piece
 from host.diagnosis.pipeline import Diagnosis
 from host.report_style import ESTIMATED, FAINT, INK, MEASURED, MUTED, TRUTH, Picture, legend_above, picture, thinned
@@ -67,7 +68,8 @@ def over_time(result: Diagnosis) -> Picture:
     y = piece.y[row]
     nominal = y - result.found.nominal_full.residuals[index][row]
     best = y - result.found.best_full.residuals[index][row]
-    spans = [s for location in result.located for s in location.windows_s] if len(result.full.pieces) == 1 else _spans_here(result, index, row)
+    begin = piece.recording.begin_s
+    spans = joined([(a - begin, b - begin) for place in result.located for a, b in place.windows_s[piece.recording.name]])
     floor = result.figures.floor[row]
 
     def draw(figure: Figure, narrow: bool) -> None:
@@ -90,16 +92,6 @@ def over_time(result: Diagnosis) -> Picture:
 
     caption = f"Recording {piece.recording.name}{'' if piece.fit.any() else ', not used to fit'}. Below: recording minus model; the grey band is the noise."
     return picture(draw, 4.3, 4.6, "Recording and models over time", f"{output.channel} over time: recorded, nominal and extended model.", caption)
-
-
-def _spans_here(result: Diagnosis, index: int, row: int) -> list[tuple[float, float]]:
-    from host.diagnosis.locate import windows
-
-    piece = result.full.pieces[index]
-    change = result.found.nominal_full.residuals[index][row]
-    if result.found.best.terms:
-        change = change - result.found.best_full.residuals[index][row]
-    return windows(change, piece.recording.time_s, piece.recording.dt_s) if result.verdict != "nothing_missing" else []
 
 
 def loop(result: Diagnosis) -> Picture | None:

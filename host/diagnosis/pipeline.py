@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis import noise as noise_module
 from host.diagnosis.chains import build, channels_of
-from host.diagnosis.dataset import Recording, load, one_clock, thin
+from host.diagnosis.dataset import Recording, load, thin
 from host.diagnosis.effect import candidates
 from host.diagnosis.equivalence import Standing, standings
 from host.diagnosis.evidence import whiteness
 from host.diagnosis.fit import Fit, Problem
+from host.diagnosis.known import Known
 from host.diagnosis.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.model import Model, Piece
 from host.diagnosis.noise import Noise
@@ -35,7 +37,7 @@ class Location:
 
     subsystem: str
     channels: list[str]
-    windows_s: list[tuple[float, float]]
+    windows_s: dict[str, list[tuple[float, float]]]      # of every recording, in its file's own time
     condition: Condition | None
     residual_share: float
 
@@ -74,6 +76,8 @@ def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Probl
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
     recordings = load(spec, files, *channels_of(spec))
     model = build(spec)
+    if spec.effect:
+        model = cast(Model, Known(model, spec.effect, recordings))
     factor = thinning(model, recordings)
     columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
     full = _problem(model, recordings, columns)
@@ -143,7 +147,7 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))
     spans = [windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma) for p, r in zip(full.pieces, residuals, strict=True)]
-    told = _told(full, spans, residuals, top)
+    told = _told(full, spans)
     where = condition(full, residuals, top, max(1, sum(p.n for p in full.pieces) // 20000))
     return Location(subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top))
 
@@ -166,7 +170,7 @@ def _figures(full: Problem, found: Found) -> Figures:
     nominal, best = found.nominal_full, found.best_full
     for row in rows:
         for store, fit in ((before, nominal), (after, best)):
-            store[row] = _rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.pieces, strict=True)])
+            store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.pieces, strict=True)])
         for store, fit in ((white_b, nominal), (white_a, best)):
             masks = [p.heldout for p in full.pieces]
             store[row] = whiteness([full.noise[row].whiten(r[row]) for r in fit.residuals], masks)
@@ -176,7 +180,7 @@ def _figures(full: Problem, found: Found) -> Figures:
     return Figures(before, after, np.array([n.sigma for n in full.noise]), white_b, white_a, primary)
 
 
-def _rms(parts: list[Array]) -> float:
+def rms(parts: list[Array]) -> float:
     together = np.concatenate(parts)
     together = together[np.isfinite(together)]
     return float(np.sqrt(np.mean(together**2))) if together.size else float("nan")
@@ -196,7 +200,7 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
         spans = [joined([span for row in strong for span in _windows(piece, m[row])]) for piece, m in zip(full.pieces, alone, strict=True)]
         share = _share(full, found, spans, top)
         where = condition(full, alone, top, max(1, sum(p.n for p in full.pieces) // 20000))
-        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans, alone, top), where, share))
+        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans), where, share))
     return out
 
 
@@ -226,22 +230,17 @@ def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
 
 
 def _weight(full: Problem, change: list[Array], row: int) -> float:
-    return _rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300) if any(np.isfinite(c[row]).any() for c in change) else 0.0
+    return rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300) if any(np.isfinite(c[row]).any() for c in change) else 0.0
 
 
-def _told(full: Problem, spans: list[list[tuple[float, float]]], change: list[Array], row: int) -> list[tuple[float, float]]:
-    """Windows of all recordings where they share a clock, else those of the recording in which the mismatch is largest."""
-    if one_clock([piece.recording for piece in full.pieces]):
-        return sorted(span for each in spans for span in each)
-    return spans[max(range(len(spans)), key=lambda k: _energy(full.pieces[k], change[k][row]))]
+def _told(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
+    """Windows of every recording by its name, in the time of its file."""
+    begins = [piece.recording.begin_s for piece in full.pieces]
+    return {piece.recording.name: [(a + begin, b + begin) for a, b in each] for piece, each, begin in zip(full.pieces, spans, begins, strict=True)}
 
 
 def _windows(piece: Piece, change: Array) -> list[tuple[float, float]]:
     return windows(change, piece.recording.time_s, piece.recording.dt_s)
-
-
-def _energy(piece: Piece, change: Array) -> float:
-    return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
 
 
 def _share(full: Problem, found: Found, spans: list[list[tuple[float, float]]], row: int) -> float:

@@ -43,7 +43,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         footer=f"{len(result.full.pieces)} recordings, {sum(p.n for p in result.full.pieces)} samples, {verdict['seconds']:.0f} s.",
         lines=lines(result, verdict), pictures=pictures(result), effects=[shown_effect(e) for e in verdict["effects"]],
         nominal=_nominal(result), candidates=candidates(result), located=verdict["located"], partly=result.rest.left, noises=_noises(result),
-        output=result.model.outputs[row].channel.replace("_", " "), recording=piece.recording.name, switches=[switch(e) for e in verdict["effects"]],
+        output=result.model.outputs[row].channel.replace("_", " "), recording=piece.recording.name, switches=switches(result),
         heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
         verdict=verdict["verdict"])
     target.write_text(text, encoding="utf-8")
@@ -104,10 +104,24 @@ def shown_effect(effect: dict[str, Any]) -> dict[str, Any]:
             "p": short(effect["evidence"]["p_value"])}
 
 
-def switch(effect: dict[str, Any]) -> str:
-    """The option that switches the effect on in the twin."""
-    values = ",".join(f"{key}={p['value']:.6g}" for key, p in effect["parameters"].items())
-    return f"--effect {effect['id']}@{effect['subsystem']}:{values}"
+def switches(result: Diagnosis) -> tuple[str, str]:
+    """What switches the effects on in the nominal model: options of the command line, and lines for its TOML file."""
+    options, tables = [], []
+    at = len(result.model.parameters)
+    for term in result.found.best.terms:
+        values = result.found.best.values[at: at + len(term.parameters)]
+        at += len(term.parameters)
+        c = term.candidate
+        if c.effect.id == "unlisted":
+            continue
+        texts = {key: text for key, text in (("source", c.source), ("form", c.form)) if text}
+        numbers = {p.key: f"{float(v):.6g}" for p, v in zip(term.parameters, values, strict=True) if p.high > p.low}
+        told = [f"{key}={value}" for key, value in (texts | numbers).items()]
+        options.append(f"--effect '{c.effect.id}@{c.port.name}:{','.join(told)}'")
+        lines_ = [f'id = "{c.effect.id}"', f'at = "{c.port.name}"', *(f'{key} = "{value}"' for key, value in texts.items()),
+                  "values = { " + ", ".join(f"{key} = {value}" for key, value in numbers.items()) + " }"]
+        tables.append("\n".join(["[[effect]]", *lines_]))
+    return " ".join(options), "\n\n".join(tables)
 
 
 def candidates(result: Diagnosis) -> list[Row]:

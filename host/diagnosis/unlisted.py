@@ -12,7 +12,8 @@ import numpy.typing as npt
 from host.diagnosis.effect import Port
 from host.diagnosis.evidence import compare
 from host.diagnosis.fit import Problem, finish, minimize, reweigh
-from host.diagnosis.search import Found, Screened, Step, good_enough, rank, term_of, try_fit, without
+from host.diagnosis.screening import Screened, term_of, without
+from host.diagnosis.search import Found, Step, good_enough, rank, try_fit
 from host.diagnosis.symbolic import Predictable, as_candidate, features, predictable, search_equation
 
 Array = npt.NDArray[np.float64]

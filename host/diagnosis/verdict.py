@@ -10,7 +10,8 @@ import numpy as np
 from host.diagnosis.effect import Candidate, Parameter
 from host.diagnosis.equivalence import Standing
 from host.diagnosis.experiment import experiment
-from host.diagnosis.pipeline import Diagnosis, Location
+from host.diagnosis.locate import joined
+from host.diagnosis.pipeline import Diagnosis, Location, rms
 
 PARTLY = 0.05          # share of the mismatch left, from which on a verdict says so
 
@@ -29,14 +30,32 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         "effects": effects(result),
         "fit": {"heldout": True, "rmse_before": figures.before[primary], "rmse_after": figures.after[primary],
                 "noise_floor": figures.floor[primary], "unit": result.model.outputs[primary].unit, "per_channel": per_channel,
+                "per_recording": per_recording(result),
                 "whiteness_p_before": figures.white_before[primary], "whiteness_p_after": figures.white_after[primary]},
         "seconds": seconds,
     }
 
 
 def _located(location: Location) -> dict[str, Any]:
-    return {"subsystem": location.subsystem, "channels": location.channels, "windows_s": [list(span) for span in location.windows_s],
+    return {"subsystem": location.subsystem, "channels": location.channels, "windows_s": every_window(location),
+            "windows_by_recording": {name: [list(span) for span in spans] for name, spans in location.windows_s.items()},
             "condition": location.condition.says if location.condition else "all along", "residual_share": location.residual_share}
+
+
+def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
+    """RMS error before and after of every channel in every recording that was held out, by their names."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for piece, before, after in zip(result.full.pieces, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True):
+        if piece.heldout.any():
+            found[piece.recording.name] = {
+                output.channel: {"rmse_before": rms([b[piece.heldout]]), "rmse_after": rms([a[piece.heldout]])}
+                for output, b, a in zip(result.model.outputs, before, after, strict=True) if np.isfinite(b[piece.heldout]).any()}
+    return found
+
+
+def every_window(location: Location) -> list[list[float]]:
+    """Windows of all recordings in order, those that overlap made one: recordings may lie on one clock, or each start at zero."""
+    return [list(span) for span in joined([span for spans in location.windows_s.values() for span in spans])]
 
 
 def effects(result: Diagnosis) -> list[dict[str, Any]]:

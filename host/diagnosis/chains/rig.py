@@ -12,7 +12,7 @@ from host.diagnosis.chains.rig_kernel import NODES, WEIGHTS, contact, drag_along
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Candidate, Context, Parameter, Port
 from host.diagnosis.model import Act, Output, Piece, apply_acts, tolerance_of
-from host.diagnosis.noise import estimate, quiescent
+from host.diagnosis.noise import by_steps, estimate, quiescent
 from host.diagnosis.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.operators import calm, fill
 
@@ -126,7 +126,7 @@ class Rig:
         return [(noise.sigma, noise.correlation_samples) for noise in found]
 
     def settle(self, piece: Piece, theta: Array) -> None:
-        """Recorded force as the shape's input: simulated contact force plus what of the difference is not noise.
+        """Recorded force as the shape's input: simulated contact force plus what of the difference is surely not noise.
 
         Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant of contact.
         """
@@ -135,8 +135,8 @@ class Rig:
             piece.extra["force"] = self._run(piece, theta, [])["force"]
             return
         simulated = self.simulate(piece, theta, [])[12:15]
-        sigmas = self._force_noise(piece.recording, piece.inputs, recorded)
-        piece.extra["force"] = simulated + np.vstack([calm(fill(row), *s) for row, s in zip(recorded - simulated, sigmas, strict=True)])
+        sigmas = [by_steps(row, *s) for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)]
+        piece.extra["force"] = simulated + np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
         piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
 
     def guess(self, pieces: list[Piece]) -> Array:

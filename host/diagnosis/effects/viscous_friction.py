@@ -17,7 +17,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     power = 2 if form == "quadratic" else 1
     unit = f"{s.unit} s{power if power > 1 else ''}/{s.motion_unit}{power if power > 1 else ''}"
     size = s.need / max(s.speed, 1e-300) ** power
-    return (Parameter("coefficient", unit, (size,), -np.inf if power > 1 else 0.0, np.inf, linear=True),)
+    return (Parameter("coefficient", unit, (size,), 0.0, np.inf, linear=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

@@ -104,3 +104,13 @@ def test_windows_follow_their_definition() -> None:
     assert a == pytest.approx(5.0, abs=0.3) and b == pytest.approx(9.0, abs=0.3)
     assert inside([(5.0, 9.0)], t).sum() == pytest.approx(400, abs=2)
     assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)]) == [(1.0, 2.4), (3.0, 4.0)]
+
+
+def test_noise_by_steps_is_not_misled_by_a_slow_signal_or_by_jumps() -> None:
+    rng = np.random.default_rng(3)
+    t = np.arange(3000) / 40.0
+    e = rng.normal(size=t.size + 1)
+    rough = 0.05 * (e[1:] + 0.5 * e[:-1]) / np.sqrt(1.25)
+    sigma, correlation = noise.by_steps(rough + 0.2 * np.sin(0.3 * t) + 0.5 * (t > 30.0), 1e-4, 1.0)
+    assert sigma == pytest.approx(0.05, rel=0.1) and 1.3 < correlation < 2.6
+    assert noise.by_steps(rough, 0.3, 4.0) == (0.3, 4.0)
