@@ -18,12 +18,6 @@ _FORCE_INTEGRAL_LIMIT_N_s = 0.5
 
 
 @njit(cache=True)
-def normal_force(force_N, normal) -> float:  # type: ignore[no-untyped-def]
-    """Compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
-    return -(force_N[0] * normal[0] + force_N[1] * normal[1] + force_N[2] * normal[2])
-
-
-@njit(cache=True)
 def move_goal(goal_m, target_m, step_m: float) -> None:  # type: ignore[no-untyped-def]
     """Bring `goal_m` (3,) up to `step_m` nearer to `target_m` (3,), in place."""
     distance = 0.0
