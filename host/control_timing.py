@@ -63,5 +63,7 @@ def tick_us(rig: Rig, seed: int = 1) -> dict[str, float]:
         times_us = np.zeros(TICKS)
         _timed(*records, noise_N, period_ns, times_us)
         rounds.append(np.percentile(times_us, (50, 99, 99.9)))
+    if bench.outputs[0].phase != PHASE_CONTACT:
+        raise ValueError("control study: found the contact lost, wanted it for as long as the tick is timed")
     p50, p99, p999 = np.min(rounds, axis=0)
     return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "ticks": float(TICKS)}

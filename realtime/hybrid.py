@@ -55,14 +55,14 @@ def tip_error(config, state, contact: bool, tip_m, target_m, normal, wanted_N: f
 def apply(config, kinematics, state, tip_m, error_m, period_s: float, work) -> None:  # type: ignore[no-untyped-def]
     """Advance the joint command (body insertion m, roll rad, knob rad) of `state` by one tick.
 
-    The inverse kinematics is called twice (Fig. 6.12): for the predicted tip and for the wanted one; their
-    difference is the joint error of the PI controller. `work` (3, 3) is scratch space.
+    The inverse kinematics is called twice (Fig. 6.12), on the branch nearest to the last command: for the predicted tip
+    and for the wanted one; their difference is the joint error of the PI controller. `work` (3, 3) is scratch space.
     """
     measured, wanted, goal_m = work[0], work[1], work[2]
     for i in range(3):
         goal_m[i] = tip_m[i] + error_m[i]
-    inverse_kinematics.apply(kinematics, tip_m, state.joint[1], measured)
-    inverse_kinematics.apply(kinematics, goal_m, state.joint[1], wanted)
+    inverse_kinematics.apply_nearest(kinematics, tip_m, state.joint, measured)
+    inverse_kinematics.apply_nearest(kinematics, goal_m, state.joint, wanted)
     for axis in range(N_AXES):
         limit = _ERROR_LIMIT[axis]
         error = min(max(wanted[axis] - measured[axis], -limit), limit)

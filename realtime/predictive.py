@@ -198,7 +198,7 @@ def _joints_ahead(params, state, target_m, ahead_s: float, out) -> None:  # type
     share = min(own.goal_speed * ahead_s / max(distance, 1e-9), 1.0)
     for i in range(3):
         own.point_m[i] = goal_m[i] + share * (target_m[i] - goal_m[i]) - own.offset_m[i]
-    inverse_kinematics.apply(params.kinematics, own.point_m, state.hybrid.joint[1], out)
+    inverse_kinematics.apply_nearest(params.kinematics, own.point_m, state.hybrid.joint, out)
 
 
 @njit(cache=True)
@@ -248,7 +248,7 @@ def _contact_joints(params, state, along_m: float, out) -> None:  # type: ignore
         short_m += own.point_m[i] * own.normal[i]
     for i in range(3):
         own.point_m[i] -= short_m * own.normal[i]
-    inverse_kinematics.apply(params.kinematics, own.point_m, state.hybrid.joint[1], out)
+    inverse_kinematics.apply_nearest(params.kinematics, own.point_m, state.hybrid.joint, out)
 
 
 @njit(cache=True)

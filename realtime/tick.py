@@ -129,7 +129,8 @@ def _locate(params, state, inputs, tip_m) -> None:  # type: ignore[no-untyped-de
     backlash.start(config, state.backlash, forward_m)
     joint[1] = backlash.distal_roll(config, state.stage.position[1])
     joint[2] = state.stage.position[2]
-    inverse_kinematics.apply(params.kinematics, tip_m, joint[1], state.work[0])
+    joint[0] = forward_m + params.kinematics.insertion_at_home_m
+    inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint, state.work[0])
     joint[0] = state.work[0, 0]
     state.home_m = joint[0] - forward_m
     _believe(params, state)
