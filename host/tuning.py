@@ -1,4 +1,4 @@
-"""Gains of the hybrid controller by minimizing (7.4) on the simulated rig, and the stability margin of what comes out.
+"""Gains of the thesis' controller by minimizing (7.4) on the simulated rig, and the stability margin of what comes out.
 
 The rig is `sim.ideal_rig` (the tick on the plant, obedient stages): the board's firmware adds nothing to the loop but its
 lead time, which is kept. An iteration of (7.4) is taken as 50 ms, its 40 iterations as 2 s from first contact on.
@@ -74,9 +74,9 @@ def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
 
 
 def with_gains(rig: Rig, gains: dict[str, float]) -> Rig:
-    """`rig` with [control] gains replaced. Raises RigFileError for a gain out of its bounds or not known."""
+    """`rig` under the thesis' law with these gains. Raises RigFileError for a gain out of its bounds or not known."""
     data = rig.effective()
-    data["control"] = {**data["control"], **gains}
+    data["control"] = {**data["control"], "law": "thesis", **gains}
     return parse_rig(data, "gains")
 
 
@@ -163,8 +163,8 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
 
 
 def _unchecked(rig: Rig, gains: dict[str, float]) -> Rig:
-    """`rig` with gains that may be out of bounds: only for the simulated search of a margin."""
-    return rig.model_copy(update={"control": rig.control.model_copy(update=gains)})
+    """As `with_gains` with gains that may be out of bounds: only for the simulated search of a margin."""
+    return rig.model_copy(update={"control": rig.control.model_copy(update={"law": "thesis", **gains})})
 
 
 class _Cost:

@@ -18,12 +18,6 @@ _FORCE_INTEGRAL_LIMIT_N_s = 0.5
 
 
 @njit(cache=True)
-def normal_force(force_N, normal) -> float:  # type: ignore[no-untyped-def]
-    """Compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
-    return -(force_N[0] * normal[0] + force_N[1] * normal[1] + force_N[2] * normal[2])
-
-
-@njit(cache=True)
 def move_goal(goal_m, target_m, step_m: float) -> None:  # type: ignore[no-untyped-def]
     """Bring `goal_m` (3,) up to `step_m` nearer to `target_m` (3,), in place."""
     distance = 0.0
@@ -61,14 +55,14 @@ def tip_error(config, state, contact: bool, tip_m, target_m, normal, wanted_N: f
 def apply(config, kinematics, state, tip_m, error_m, period_s: float, work) -> None:  # type: ignore[no-untyped-def]
     """Advance the joint command (body insertion m, roll rad, knob rad) of `state` by one tick.
 
-    The inverse kinematics is called twice (Fig. 6.12): for the predicted tip and for the wanted one; their
-    difference is the joint error of the PI controller. `work` (3, 3) is scratch space.
+    The inverse kinematics is called twice (Fig. 6.12), on the branch nearest to the last command: for the predicted tip
+    and for the wanted one; their difference is the joint error of the PI controller. `work` (3, 3) is scratch space.
     """
     measured, wanted, goal_m = work[0], work[1], work[2]
     for i in range(3):
         goal_m[i] = tip_m[i] + error_m[i]
-    inverse_kinematics.apply(kinematics, tip_m, state.joint[1], measured)
-    inverse_kinematics.apply(kinematics, goal_m, state.joint[1], wanted)
+    inverse_kinematics.apply_nearest(kinematics, tip_m, state.joint, measured)
+    inverse_kinematics.apply_nearest(kinematics, goal_m, state.joint, wanted)
     for axis in range(N_AXES):
         limit = _ERROR_LIMIT[axis]
         error = min(max(wanted[axis] - measured[axis], -limit), limit)

@@ -7,7 +7,7 @@ import ipaddress
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -147,6 +147,23 @@ class Control(_Section):
     contact_force_N: Annotated[float, Field(gt=0.005, le=0.1)]
     reversal_threshold_m: Annotated[float, Field(ge=0, le=0.002)]
     acceleration_noise_m_per_s2: Positive
+    law: Literal["thesis", "predictive"] = "predictive"
+    force_frame: Literal["base", "tip"] = "base"
+    move_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)] = 0.03
+    move_accel_m_per_s2: Annotated[float, Field(gt=0, le=2)] = 0.2
+    slide_speed_m_per_s: Annotated[float, Field(gt=0, le=0.02)] = 0.005
+    offset_memory_s: Annotated[float, Field(ge=0.05, le=10)] = 0.4
+    contact_memory_s: Annotated[float, Field(ge=0.05, le=30)] = 1.0
+    force_slew_N_per_s: Annotated[float, Field(gt=0, le=2)] = 0.3
+    force_margin_N: Annotated[float, Field(ge=0, le=0.1)] = 0.04
+    tip_compliance_m_per_N: Annotated[float, Field(gt=1e-4, le=0.1)] = 0.01
+    stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    reversal_share: Annotated[float, Field(ge=0, le=2)] = 0.75
+    reversal_depth_m: Annotated[float, Field(ge=0, le=0.002)] = 0.0001
+    play_noise_m: Positive = 0.00003
+    blind_approach_share: Annotated[float, Field(gt=0, le=1)] = 0.5
+    play_caution_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
+    play_sd_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
 
     @model_validator(mode="after")
     def _stable(self) -> Control:

@@ -24,10 +24,12 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
     ("steps_lost", STOP, True, "encoder and commanded steps have parted: stopped; look for a jam or a loose encoder plug, "
      "clear, and home the axes"),
     ("force_disagrees", RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
+    ("force_handover", WARN, False, "the force sensor is silent, frozen or off: the model's estimate closes the loop"),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 POSE_REJECTED, FORCE_REJECTED, POSE_STALE, POSES_WILD, FORCE_STALE, OVER_FORCE, POSE_LOST, FORCE_LOST, \
-    BOARD_SILENT, BOARD_FAULT, OPERATOR_STOP, STEPS_LOST, FORCE_DISAGREES = (1 << index for index in range(len(CAUSES)))
+    BOARD_SILENT, BOARD_FAULT, OPERATOR_STOP, STEPS_LOST, FORCE_DISAGREES, \
+    FORCE_HANDOVER = (1 << index for index in range(len(CAUSES)))
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 
 _HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE

@@ -22,6 +22,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "reproduce": ("host.cli.reproduce", "reproduce", "The thesis' figures again: mechanics or control."),
     "characterize": ("host.cli.characterize", "characterize", "Backlash, slopes and dead zones of a rig, by sweeps."),
     "tune": ("host.cli.tune", "tune", "Gains of the force controller on the simulated rig."),
+    "control-study": ("host.cli.control_study", "control_study", "The controller's figures, each beside its reference."),
     "plan": ("host.cli.plan", "plan", "A path of the tip past obstacles, from a JSON request."),
     "faults": ("host.cli.faults", "faults", "Faults in every phase on the simulated rig: what is detected, and when."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),

@@ -1,4 +1,4 @@
-"""`seldinger tune`: gains of the hybrid controller by (7.4), simplex beside a global search, with their stability margin."""
+"""`seldinger tune`: gains of the thesis' controller by (7.4), simplex beside a global search, with their margin."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tune(
     seed: Annotated[int, typer.Option(help="Of the global search.")] = 1,
     check: Annotated[bool, typer.Option("--check", help="Only the margin of the rig's present gains.")] = False,
 ) -> None:
-    """Tune the controller's gains on the simulated rig, over desired forces of 0.1, 0.2 and 0.3 N."""
+    """Tune the gains of the thesis' law on the simulated rig, over desired forces of 0.1, 0.2 and 0.3 N."""
     if not 8 <= evaluations <= 5000:
         raise BadInput("--evaluations", evaluations, "8 to 5000")
     if not 1 <= processes <= 64:

@@ -23,7 +23,7 @@ def play(inputs: np.ndarray, width: float) -> np.ndarray:
 
 def test_backlash_inverse_undoes_a_play(rig: Rig) -> None:
     config, state = tick_parameters(rig)[0].backlash, new(BACKLASH_STATE)[0]
-    config.threshold_m = 0.0
+    config.threshold_m = config.caution_m = 0.0
     wanted = 0.008 * np.sin(np.linspace(0, 12, 3000))
     backlash.start(config, state, wanted[0])
     handle = np.array([backlash.apply(config, state, w) for w in wanted])

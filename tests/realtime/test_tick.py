@@ -20,6 +20,7 @@ from realtime.records import (
     STATE,
     new,
 )
+from realtime.rig_file import Rig, parse_rig
 from realtime.tick import tick
 from tests.realtime.conftest import Bench
 
@@ -32,12 +33,17 @@ def armed(bench: Bench) -> Bench:
     return bench
 
 
-def in_contact(bench: Bench) -> Bench:
+def with_law(rig: Rig, law: str) -> Rig:
+    data = rig.effective()
+    return parse_rig({**data, "control": {**data["control"], "law": law}})
+
+
+def in_contact(bench: Bench, force_N: float = 0.1) -> Bench:
     armed(bench)
     bench.command(COMMAND_CONTACT, target_m=(0.0, -0.006, 0.040), force_N=0.2)
     bench.run(0.2)
     assert bench.outputs[0].phase == PHASE_APPROACH
-    bench.force[:] = (0.0, 0.0, 0.1)
+    bench.force[:] = (0.0, 0.0, force_N)
     bench.run(0.1)
     assert bench.outputs[0].phase == PHASE_CONTACT
     return bench
@@ -68,13 +74,21 @@ def test_position_command_moves_towards_the_goal_within_stage_limits(bench: Benc
     assert last[0] > 0.001
 
 
-def test_force_below_wanted_pushes_on_and_above_pulls_back(bench: Bench) -> None:
-    in_contact(bench)
+@pytest.mark.parametrize("law", ["thesis", "predictive"])
+def test_force_below_wanted_pushes_on_and_above_pulls_back(rig: Rig, law: str) -> None:
+    bench = in_contact(Bench(with_law(rig, law)))
     before = bench.outputs[0].joint[0]
     assert bench.run(0.3).joint[0] > before
-    bench.force[:] = (0.0, 0.0, 0.3)
+    bench = in_contact(Bench(with_law(rig, law)), 0.3)
     before = bench.outputs[0].joint[0]
     assert bench.run(0.3).joint[0] < before
+
+
+def test_a_force_that_answers_no_motion_is_not_run_after_without_bound(bench: Bench) -> None:
+    """A sensor that shows the same whatever is done: the law stays within a hand's breadth of where it touched."""
+    in_contact(bench)
+    before = bench.outputs[0].joint[0]
+    assert abs(bench.run(5.0).joint[0] - before) < 0.015
 
 
 def test_no_fresh_pose_holds_then_stops(bench: Bench) -> None:
@@ -82,9 +96,9 @@ def test_no_fresh_pose_holds_then_stops(bench: Bench) -> None:
     bench.with_pose = False
     bench.run(0.080)
     assert bench.outputs[0].action == safety.HOLD
-    joint = bench.outputs[0].joint[0]
+    joint = bench.run(0.030).joint[0]
     assert bench.run(0.020).joint[0] == joint
-    bench.run(0.080)
+    bench.run(0.050)
     assert bench.outputs[0].action == safety.STOP and bench.outputs[0].phase == PHASE_STOPPED
     bench.with_pose = True
     bench.run(0.5)

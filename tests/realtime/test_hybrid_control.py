@@ -1,0 +1,228 @@
+"""Position and force control closed over the simulated plant: hold, touch, reversals, frames, any loop rate."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from realtime import backlash, constraint_frame, free_tip, hybrid, inverse_kinematics
+from realtime.configure import tick_parameters
+from realtime.intake import rotation
+from realtime.records import (
+    BACKLASH_STATE,
+    COMMAND_HOLD,
+    HISTORY,
+    HYBRID_STATE,
+    PHASE_CONTACT,
+    new,
+)
+from realtime.rig_file import Rig, parse_rig
+from sim.heart import HeartConfig
+from sim.ideal_rig import IdealRig, Trace
+from sim.plant import PlantConfig
+from sim.tissue import TissueConfig
+from sim.vessel import VesselConfig
+
+WALL_m = np.array((0.0, -0.0107, 0.025))
+WANTED_N = 0.2
+STILL = HeartConfig(beat_m=0.0, respiration_m=0.0)
+
+
+def changed(rig: Rig, section: str = "control", **values: object) -> Rig:
+    data = rig.effective()
+    data[section] = {**data[section], **values}
+    return parse_rig(data)
+
+
+def bench(rig: Rig, heart: HeartConfig, seed: int = 0, normal: tuple = (0.0, 0.0, -1.0)) -> IdealRig:
+    """The tip 3 mm before the wall, the play taken up forward."""
+    out, transmission = np.zeros(3), rig.transmission
+    inverse_kinematics.apply(tick_parameters(rig)[0].kinematics, WALL_m - (0.0, 0.0, 0.003), 0.0, out)
+    handle = (out[0] - transmission.insertion_at_home_m) / transmission.insertion_slope + 0.5 * 0.0031
+    return IdealRig(rig, PlantConfig(
+        start_stage=(float(handle), 0.0, float(out[2])), vessel=VesselConfig(start_in_play=1.0), heart=heart,
+        tissue=TissueConfig(point_m=tuple(WALL_m), normal=normal)), seed)  # type: ignore[arg-type]
+
+
+def pressed(rig: Rig, heart: HeartConfig, seconds: float = 10.0, seed: int = 0) -> Trace:
+    return bench(rig, heart, seed).press(WANTED_N, WALL_m, seconds).since_contact()
+
+
+def rms_N(trace: Trace, after_s: float = 4.0) -> float:
+    kept = trace.force_N[trace.time_s > after_s]
+    assert kept.size > 1000
+    return float(np.sqrt(np.mean((kept - WANTED_N) ** 2)))
+
+
+def still_catheter_N(rig: Rig) -> float:
+    """RMS force about its mean with the stages held still in contact."""
+    run = bench(rig, HeartConfig())
+    run.press(WANTED_N, WALL_m, 3.0)
+    run._command(COMMAND_HOLD)
+    return float(np.std(run.run(6.0).force_N))
+
+
+def test_force_on_a_beating_wall_against_thesis_and_still_catheter(rig: Rig) -> None:
+    ours = pressed(rig, HeartConfig())
+    assert np.all(ours.phase == PHASE_CONTACT) and np.min(ours.force_N) > 0.0
+    assert rms_N(ours) < 0.25 * still_catheter_N(rig)
+    assert rms_N(ours) < 0.5 * rms_N(pressed(changed(rig, law="thesis"), HeartConfig()))
+    assert np.mean(ours.force_N[ours.time_s > 4.0]) == pytest.approx(WANTED_N, abs=0.005)
+
+
+def test_an_irregular_beat_never_breaks_the_touch(rig: Rig) -> None:
+    trace = pressed(rig, HeartConfig(irregularity=0.1, premature_share=0.05), 12.0)
+    assert np.min(trace.force_N) > 0.0 and rms_N(trace) < 0.02
+
+
+@pytest.mark.parametrize("heart", [STILL, HeartConfig()], ids=["still", "beating"])
+def test_touching_is_gentle(rig: Rig, heart: HeartConfig) -> None:
+    trace = pressed(rig, heart, 4.0)
+    assert np.max(trace.force_N) < WANTED_N + 0.05
+
+
+@pytest.mark.parametrize("play_m", [0.0025, 0.0037])
+def test_a_play_known_to_06_mm_is_enough(rig: Rig, play_m: float) -> None:
+    trace = pressed(changed(rig, "transmission", insertion_backlash_m=play_m), HeartConfig(), 12.0)
+    assert np.min(trace.force_N) > 0.0 and rms_N(trace, 6.0) < 0.25 * 0.078
+
+
+@pytest.mark.parametrize("loop_hz", [500, 2000])
+def test_gains_hold_at_any_loop_rate(rig: Rig, loop_hz: int) -> None:
+    trace = pressed(changed(rig, loop_hz=loop_hz), HeartConfig(), 8.0)
+    assert np.min(trace.force_N) > 0.0 and rms_N(trace) < 0.01
+
+
+def test_changes_of_phase_have_no_bump(rig: Rig) -> None:
+    """Through approach, touch, hold and release the stages stay within their limits, and the force does not kick."""
+    run = bench(rig, HeartConfig())
+    stages = [run.press(WANTED_N, WALL_m, 5.0).stage]
+    run._command(COMMAND_HOLD)
+    stages.append(run.run(0.5).stage)
+    after = run.press(WANTED_N, WALL_m, 1.0)
+    speed = np.diff(np.concatenate([*stages, after.stage]), axis=0) * 1000
+    limit = run.params[0].stage
+    assert np.all(np.abs(speed) <= limit.max_speed * (1 + 1e-3) + 1e3 / limit.steps_per_unit)
+    assert np.all(np.abs(np.diff(speed, axis=0)) * 1000 <= limit.max_accel + 4e6 / limit.steps_per_unit)
+    assert np.max(after.force_N) < WANTED_N + 0.15 and after.phase[-1] == PHASE_CONTACT
+
+
+def test_the_wall_s_normal_is_learned_from_the_force(rig: Rig) -> None:
+    tilt = np.radians(10.0)
+    run = bench(rig, STILL, normal=(0.0, float(np.sin(tilt)), float(-np.cos(tilt))))
+    run.inputs[0].command.normal[:] = (0.0, 0.0, -1.0)
+    run.press(0.15, WALL_m, 8.0)
+    learned = run.state[0].predictive.normal
+    assert run.outputs[0].phase == PHASE_CONTACT
+    assert np.degrees(np.arccos(learned @ (0.0, np.sin(tilt), -np.cos(tilt)))) < 2.0
+
+
+def test_positions_are_reached_without_overshoot(rig: Rig) -> None:
+    run = bench(rig, STILL)
+    start = WALL_m - (0.0, 0.0, 0.003)
+    for goal in (start + (0.004, 0.002, -0.001), start + (-0.005, -0.001, 0.0015)):
+        trace = run.go(goal, 2.0)
+        way = goal - trace.tip_m[0]
+        assert np.max((trace.tip_m - goal) @ way) / np.linalg.norm(way) < 1e-3
+        assert np.linalg.norm(trace.tip_m[-1] - goal) < 0.5e-3
+
+
+def test_the_handle_starts_across_before_the_body_has_to_turn(rig: Rig) -> None:
+    config, state = tick_parameters(changed(rig, play_caution_m=0.0))[0].backlash, new(BACKLASH_STATE)[0]
+    backlash.start(config, state, 0.0)
+    turned_s = None
+    for k in range(500):
+        t = 1e-3 * k
+        wanted, soon, later = (0.001 * np.sin(4 * np.pi * (t + ahead)) for ahead in (0.0, 0.065, 0.125))
+        state.body_m = max(state.body_m, wanted)
+        handle = backlash.apply_ahead(config, state, wanted, soon, later, 0.0001)
+        if turned_s is None and state.direction < 0:
+            turned_s = t
+            assert handle - wanted == pytest.approx(-config.width_m / 2)
+    assert turned_s == pytest.approx(0.125 - 0.0325, abs=0.003)
+
+
+def test_small_ripple_is_not_worth_a_crossing(rig: Rig) -> None:
+    config, state = tick_parameters(changed(rig, play_caution_m=0.0))[0].backlash, new(BACKLASH_STATE)[0]
+    backlash.start(config, state, 0.0)
+    for k in range(2000):
+        wanted, soon, later = (0.00004 * np.sin(4 * np.pi * (1e-3 * k + ahead)) for ahead in (0.0, 0.065, 0.125))
+        state.body_m = max(state.body_m, wanted)
+        backlash.apply_ahead(config, state, wanted, soon, later, 0.0001)
+    assert state.direction == 1.0
+
+
+def test_believed_body_is_the_play_operator_and_a_narrower_play_is_bounded(rig: Rig) -> None:
+    config, state = tick_parameters(changed(rig, play_caution_m=0.0))[0].backlash, new(BACKLASH_STATE)[0]
+    backlash.start(config, state, 0.0)
+    body = [backlash.follow(config, state, h) for h in (0.00155, 0.00355, 0.00155, -0.00155, -0.00255)]
+    assert body == pytest.approx([0.0, 0.002, 0.002, 0.0, -0.001])
+    assert state.flank == -1.0
+    assert backlash.narrow(config, state, 0.0004) == pytest.approx(0.0004)
+    assert backlash.narrow(config, state, 1.0) == pytest.approx(0.0006)
+
+
+@given(insertion=st.floats(-0.09, 0.05), bend=st.floats(-2.1, 2.1), roll=st.floats(-3, 3))
+def test_the_free_tip_undoes_the_inverse_kinematics(rig: Rig, insertion: float, bend: float, roll: float) -> None:
+    config, tip, back = tick_parameters(rig)[0].kinematics, np.zeros(3), np.zeros(3)
+    curvature = bend / min(config.distal_length_m, config.distal_length_m + insertion)
+    assume(abs(curvature) < 44 and abs(bend) > 0.05)
+    joint = np.array([insertion, roll, inverse_kinematics.knob_of_curvature(config, curvature)])
+    free_tip.apply(config, joint, tip)
+    inverse_kinematics.apply(config, tip, roll, back)
+    assert back == pytest.approx(joint, abs=1e-6)
+
+
+def test_past_joints_are_interpolated_and_run_out() -> None:
+    ring, out = new(HISTORY)[0], np.zeros(3)
+    assert free_tip.joint_at(ring, 5, out) == 0.0
+    for k in range(1, 400):
+        free_tip.remember(ring, 1_000_000 * k, np.array([1.0, 2.0, 3.0]) * k, 1.0 if k < 300 else -1.0)
+    assert free_tip.joint_at(ring, 350_250_000, out) == -1.0 and out == pytest.approx(np.array([1.0, 2.0, 3.0]) * 350.25)
+    assert free_tip.joint_at(ring, 290_000_000, out) == 1.0
+    assert free_tip.joint_at(ring, 100_000_000, out) == 0.0
+
+
+vector = st.tuples(*[st.floats(-5, 5)] * 3).map(np.array)
+unit = st.tuples(*[st.floats(-1, 1)] * 4).map(np.array).filter(lambda q: np.linalg.norm(q) > 0.1).map(
+    lambda q: q / np.linalg.norm(q))
+
+
+@given(quaternion=unit, value=vector)
+def test_forces_turn_with_the_measured_pose(quaternion: np.ndarray, value: np.ndarray) -> None:
+    out = np.zeros(3)
+    constraint_frame.to_base(quaternion, value, out)
+    assert out == pytest.approx(rotation(quaternion) @ value, abs=1e-9)
+    assert np.linalg.norm(out) == pytest.approx(np.linalg.norm(value), abs=1e-9)
+
+
+@given(force=vector, share=st.floats(0, 1))
+def test_a_learned_normal_is_unit_and_near_the_commanded_one(force: np.ndarray, share: float) -> None:
+    commanded = np.array([0.0, 0.0, -1.0])
+    normal = commanded.copy()
+    for _ in range(20):
+        constraint_frame.follow_force(normal, commanded, force, share)
+    assert np.linalg.norm(normal) == pytest.approx(1.0) and normal @ commanded > 0.93
+
+
+@given(tip=vector, target=vector, force=st.floats(-1, 1))
+def test_the_selection_matrix_keeps_force_and_position_apart(rig: Rig, tip: np.ndarray, target: np.ndarray,
+                                                             force: float) -> None:
+    """The thesis' law: across the normal only the position error, along it only the force error."""
+    config, normal, out = tick_parameters(rig)[0].hybrid, np.array([0.0, 0.6, -0.8]), np.zeros(3)
+    across = np.eye(3) - np.outer(normal, normal)
+    hybrid.tip_error(config, new(HYBRID_STATE)[0], True, tip, target, normal, WANTED_N, force, 1e-3, out)
+    assert across @ out == pytest.approx(across @ (target - tip), abs=1e-9)
+    error = WANTED_N - force
+    assert -out @ normal == pytest.approx(
+        config.force_gain_m_per_N * error + config.force_integral_m_per_N_s * 1e-3 * error, abs=1e-9)
+
+
+def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
+    """Nothing of the simulator's stiffness is built in: a wall of 300 N/m instead of 1000."""
+    run = bench(rig, HeartConfig())
+    softer = replace(run.plant.config, tissue=replace(run.plant.config.tissue, stiffness_N_per_m=300.0))
+    trace = IdealRig(rig, softer).press(WANTED_N, WALL_m, 10.0).since_contact()
+    assert np.min(trace.force_N) > 0.0 and rms_N(trace) < 0.01
