@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from realtime.safety import CAUSES
-
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
 LOG_LINES = 6
@@ -162,6 +160,8 @@ class Picture:
 
 def causes_of(text: str) -> list[str]:
     """The sentences in a state's `cause`, one for each thing that is wrong: they are joined by what they also contain."""
+    from realtime.safety import CAUSES  # with a compiler behind it, that who only reads recordings need not wait for
+
     known = [sentence for _, _, _, sentence in CAUSES if sentence in text]
     rest = text
     for sentence in known:
@@ -180,7 +180,11 @@ def _shape_of(parameters: Body) -> Callable[..., tuple[Any, float | None]] | Non
         points = twin(catheter, joints[0], joints[1], joints[2], force_N) if catheter else None
         return (None, None) if points is None else through(points, tip_m)
 
-    return shape if catheter is not None else None
+    if catheter is None:
+        return None
+    # Once now: the kernels are loaded before anything waits for a frame or a recording.
+    shape((-0.5 * catheter.distal_length_m, 0.0, 0.0), None, None)
+    return shape
 
 
 def _seconds(stamp_ns: int) -> float:
