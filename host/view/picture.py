@@ -56,7 +56,9 @@ class Picture:
         self._newest[topic] = body
         if topic == "state":
             self.now_ns = body["stamp_ns"]
-            tip, target = body.get("tip_m") or (None,) * 3, body.get("target_m") or (None,) * 3
+            # Before the first pose the loop's prediction is where it was switched on: nothing that is known.
+            tip = (body.get("tip_m") if "pose/tip" in self._newest else None) or (None,) * 3
+            target = body.get("target_m") or (None,) * 3
             self._force_rows.append([
                 _seconds(body["stamp_ns"]), _rounded(body.get("force_N"), 5), _rounded(body.get("target_force_N"), 5),
                 *(_rounded(value, 6) for value in (*tip, *target))])
