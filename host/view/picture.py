@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from realtime.safety import CAUSES
-
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
 LOG_LINES = 6
@@ -58,7 +56,9 @@ class Picture:
         self._newest[topic] = body
         if topic == "state":
             self.now_ns = body["stamp_ns"]
-            tip, target = body.get("tip_m") or (None,) * 3, body.get("target_m") or (None,) * 3
+            # Before the first pose the loop's prediction is where it was switched on: nothing that is known.
+            tip = (body.get("tip_m") if "pose/tip" in self._newest else None) or (None,) * 3
+            target = body.get("target_m") or (None,) * 3
             self._force_rows.append([
                 _seconds(body["stamp_ns"]), _rounded(body.get("force_N"), 5), _rounded(body.get("target_force_N"), 5),
                 *(_rounded(value, 6) for value in (*tip, *target))])
@@ -162,6 +162,8 @@ class Picture:
 
 def causes_of(text: str) -> list[str]:
     """The sentences in a state's `cause`, one for each thing that is wrong: they are joined by what they also contain."""
+    from realtime.safety import CAUSES  # with a compiler behind it, that who only reads recordings need not wait for
+
     known = [sentence for _, _, _, sentence in CAUSES if sentence in text]
     rest = text
     for sentence in known:
@@ -180,7 +182,11 @@ def _shape_of(parameters: Body) -> Callable[..., tuple[Any, float | None]] | Non
         points = twin(catheter, joints[0], joints[1], joints[2], force_N) if catheter else None
         return (None, None) if points is None else through(points, tip_m)
 
-    return shape if catheter is not None else None
+    if catheter is None:
+        return None
+    # Once now: the kernels are loaded before anything waits for a frame or a recording.
+    shape((-0.5 * catheter.distal_length_m, 0.0, 0.0), None, None)
+    return shape
 
 
 def _seconds(stamp_ns: int) -> float:

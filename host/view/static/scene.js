@@ -2,7 +2,7 @@
 
 import {OrbitControls, THREE} from "/lib/three.js";
 
-const MM = 1000, MM_PER_N = 80, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [74, -39, 36], LOOK = [0, -5, 15];
+const MM = 1000, MM_PER_N = 50, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [74, -39, 36], LOOK = [0, -5, 15];
 
 const vector = m => new THREE.Vector3(m[0] * MM, m[1] * MM, m[2] * MM);
 

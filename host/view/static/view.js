@@ -99,7 +99,7 @@ function draw() {
   if (page.scene && !page.scene.broken) {
     page.scene.show(frame.scene, frame.mode);
     const gap = frame.scene.gap_m;
-    element("scene-note").textContent = "Grid 10 mm; force arrow 8 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`);
+    element("scene-note").textContent = "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`);
   }
   link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "rig silent") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
 }

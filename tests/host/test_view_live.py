@@ -1,0 +1,138 @@
+"""The view of the running rig: what it publishes is on the page, what a page may send reaches it, nothing else does."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.commander import Acknowledgement, Commander
+from host.demo import SIMULATED_RIG
+from host.view.live import LiveRig, Press
+from host.view.server import ADDRESS
+from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
+from protocol.zenoh_session import Session
+from realtime.command_gate import CommandGate
+from realtime.rig_file import Rig, load_rig
+from tests.host.test_view import MS, free_port
+
+
+def loopback(rig: Rig) -> tuple[Session, Session]:
+    endpoint = f"tcp/{ADDRESS}:{free_port()}"
+    return Session(rig.name, [endpoint], []), Session(rig.name, [], [endpoint])
+
+
+@pytest.fixture
+def live() -> Iterator[tuple[Session, LiveRig, list[Command]]]:
+    rig = load_rig(SIMULATED_RIG)
+    there, here = loopback(rig)
+    obeyed: list[Command] = []
+
+    def obey(command: Command, now_ns: int) -> Reply:
+        obeyed.append(command)
+        return Reply(stamp_ns=now_ns, id=command.id, result="refused", text="no board")
+
+    gate = CommandGate(time.monotonic_ns, obey)
+    with there, here, closing(LiveRig(rig, here)) as view:
+        server = there.serve_requests(lambda name, payload: gate.answer(name, payload)[1])
+        yield there, view, obeyed
+        del server
+
+
+def publish_until_seen(there: Session, view: LiveRig) -> dict[str, Any]:
+    rig_time = [1_000_000_000]
+    messages = {"stage": Stage, "pose/tip": Pose, "force/sensor": ForceSensor, "force/estimate": ForceEstimate,
+                "state": RigState}
+    publishers = {topic: there.publisher(topic) for topic in messages}
+    contents: dict[str, dict[str, Any]] = {
+        "stage": {"command_insertion_m": 0.0, "command_roll_rad": 0.0, "command_knob_rad": 0.0, "joint_insertion_m": -0.08,
+                  "joint_roll_rad": 0.0, "joint_curvature_per_m": 18.0},
+        "pose/tip": {"arrival_ns": 0, "frame": 1, "missing": False, "position_m": (0.0, -0.007, 0.028),
+                     "quaternion_wxyz": (1.0, 0.0, 0.0, 0.0)},
+        "force/sensor": {"arrival_ns": 0, "force_N": (0.0, 0.0, 0.15)},
+        "force/estimate": {"frame": "base", "converged": True, "force_N": (0.0, 0.0, 0.14), "published_ns": 0,
+                           "compute_us": 1.0, "covariance_N2": (4e-4, 0, 0, 0, 4e-4, 0, 0, 0, 4e-4)},
+        "state": {"mode": "contact", "safety_action": "warn", "cause": "a pose was not used", "tip_m": (0.0, -0.007, 0.028),
+                  "force_direction": (0.0, 0.0, 1.0), "target_m": (0.0, -0.01, 0.025), "target_force_N": 0.2,
+                  "force_N": 0.15}}
+    for _ in range(500):
+        rig_time[0] += 10 * MS
+        for topic, message in messages.items():
+            publishers[topic].put(message(stamp_ns=rig_time[0], **contents[topic]))
+        time.sleep(0.01)
+        frame = view.frame()
+        if frame["scene"]["shape"] and frame["estimates"] and frame["scene"]["force"]:
+            return frame
+    raise AssertionError("the view heard nothing")
+
+
+def test_what_the_rig_publishes_is_on_the_page(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, _ = live
+    before = view.frame()
+    assert before["silent_s"] is None and before["mode"] == ""
+    frame = publish_until_seen(there, view)
+    assert frame["mode"] == "contact" and frame["causes"] == ["a pose was not used"] and frame["silent_s"] < 1.0
+    np.testing.assert_allclose(frame["scene"]["shape"][-1], [0.0, -0.007, 0.028], atol=1e-5)
+    assert frame["estimates"][-1][1:] == [0.14, 0.02] and frame["rows"][-1][1:3] == [0.15, 0.2]
+
+
+def test_garbage_on_the_topics_is_counted_and_not_shown(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, _ = live
+    publish_until_seen(there, view)
+    for payload in (b"", b"\xff" * 20, encode(RigState(stamp_ns=1, mode="hold", safety_action="none"))[:-3]):
+        there.zenoh.put(key(there.rig, "state"), payload)
+    for _ in range(300):
+        frame = view.frame()
+        if frame["malformed"] == 3:
+            break
+        time.sleep(0.01)
+    assert frame["malformed"] == 3 and frame["mode"] == "contact"
+
+
+def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    there, view, obeyed = live
+    publish_until_seen(there, view)
+    for text, action, target in (('{"button": "arm", "confirmed": true}', "arm", "none"),
+                                 ('{"button": "hold", "confirmed": true}', "hold", "none"),
+                                 ('{"button": "stop"}', "stop", "none")):
+        answer = view.act(text)
+        assert answer["result"] == "refused" and answer["text"] == "no board"
+        assert (obeyed[-1].action, obeyed[-1].target) == (action, target)
+    assert len(obeyed) == 3
+
+
+@given(text=st.one_of(st.text(max_size=80), st.builds(json.dumps, st.dictionaries(
+    st.sampled_from(["button", "confirmed", "action", "target"]),
+    st.sampled_from(["arm", "stop ", "hold", "ARM", "true"]) | st.booleans() | st.none() | st.integers()))))
+def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
+    sent: list[str] = []
+    view = LiveRig.__new__(LiveRig)
+    view._command = lambda button: sent.append(button) or Acknowledgement(True, "", "accepted")
+    answer = view.act(text)
+    try:
+        press = Press.model_validate_json(text)
+        allowed = press.confirmed or press.button == "stop"
+    except ValueError:
+        allowed = False
+    assert bool(sent) == allowed
+    assert allowed or answer["result"] in ("malformed", "refused")
+
+
+class Unanswering:
+    """A rig that is not there."""
+
+    def ask(self, command: Command, timeout_s: float = 1.0) -> None:
+        """Nobody answers."""
+
+
+def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
+    _, view, _ = live
+    view._commander = Commander(Unanswering(), "view")
+    assert view.act('{"button": "stop"}')["result"] == "unanswered"
