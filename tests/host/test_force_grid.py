@@ -10,7 +10,7 @@ import pytest
 
 from host.benchmarks import force_grid
 from host.estimation.spatial import estimate_cosserat
-from tests.host.test_spatial_estimation import INSERTION_m, LIVEWIRE, STEEROCATH, posed, sensors_of
+from tests.host.test_spatial_estimation import LIVEWIRE, STEEROCATH, INSERTION_m, posed, sensors_of
 
 
 def test_a_search_that_ends_beyond_the_largest_force_is_not_a_perfect_fit() -> None:
