@@ -34,7 +34,6 @@ MOST_REFINEMENTS = 12
 CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last one of the coarse sweeps
 CLOSE_N = 2e-3
 GOAL_N, CAREFUL_GOAL_N = 2e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
-FIRST_SHRINK = 0.05
 LARGEST_DAMPING = 1e9
 LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
@@ -238,8 +237,6 @@ def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
         shrink = size / max(before, 1e-300)
         if shrink > 0.9 and size > 10.0 * goal and sweeps > 1:
             break
-        if sweeps == 1:  # the ratio to a coarse step says too little of how the fine ones will shrink
-            shrink = max(4.0 * shrink, FIRST_SHRINK)
         shrink = min(shrink, 0.9)
         settled = size * shrink / (1.0 - shrink) < goal
         before = size
