@@ -23,7 +23,7 @@ from host.mechanics.cosserat_kernels import (
     sweep,
 )
 from host.mechanics.small_matrices import apply3, inverse3
-from host.mechanics.tip_shooting import NO_STATIONS, length3, load_number, newton_matrix, scale_to
+from host.mechanics.tip_shooting import NO_STATIONS, broyden, length3, load_number, newton_matrix, scale_to
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ MOST_ITERATIONS = 40
 MOST_REFINEMENTS = 12
 CLOSE = 0.04  # a step below this share of the force, or CLOSE_N, is the last one of the coarse sweeps
 CLOSE_N = 2e-3
-GOAL_N, CAREFUL_GOAL_N = 4e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
+GOAL_N, CAREFUL_GOAL_N = 2e-7, 1e-9  # expected error of the force at which the fine sweeps stop, QUICK and CAREFUL
 LARGEST_DAMPING = 1e9
 LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
@@ -209,22 +209,25 @@ def goal_of(p: Problem) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
-    """Fine phase: chord steps of x (3,), in place, with the kept sensitivities. Returns (settled, cost, sweeps).
+    """Fine phase: Broyden steps of x (3,), in place, from the kept sensitivities. Returns (settled, cost, sweeps).
 
     Stops where the error left, guessed from how fast the steps shrink, is below `goal_of`; the residuals s.raw and s.z
     are carried over the last step by their sensitivities.
     """
     m = ROWS_OF_CASE[p.case] + p.prior.shape[0]
-    slope, step = s.vectors[1], s.vectors[2]
+    change, slope, step = s.vectors[0], s.vectors[1], s.vectors[2]
     before, settled, cost, sweeps = damped_step(0.0, s), False, 0.0, 0
     goal = goal_of(p)
     while sweeps < MOST_REFINEMENTS and not settled:
         cost = cost_at(p, x, p.bend, False, s)
         sweeps += 1
         for i in range(3):
-            slope[i] = 0.0
+            change[i], slope[i] = slope[i], 0.0
             for k in range(m):
                 slope[i] += s.kept_A[k, i] * s.z[k]
+            change[i] -= slope[i]
+        if sweeps > 1:
+            broyden(s.inverse, step, change, s.vectors[3])
         apply3(s.inverse, slope, step)
         size = length3(step)
         if not size < LARGEST_REFINEMENT_N:

@@ -10,6 +10,7 @@ import pytest
 
 from host import bench
 from host.bench import Timed, alternate, find, row_of, run
+from host.benchmarks import control
 from host.cli.contract_io import BadInput
 
 CONTRACT_NAMES = ["pcar_direct", "pcar_inverse", "cosserat_tip", "cosserat_global",
@@ -76,3 +77,15 @@ def test_a_real_benchmark_holds_its_accuracy(name: str, monkeypatch: pytest.Monk
     (row,), missing = run([name], 1, quiet)
     assert not missing and all(key in row for key in CONTRACT_KEYS)
     assert row["name"] == name and row["right"] == row["cases"] == 4 and row["tip_error_m"] < 1e-6
+
+
+def test_the_predictor_is_the_textbooks_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "READINGS", 1)
+    row = control.kalman_predict(3, lambda line: None)[0]
+    assert row["position_difference_m"] < 1e-12
+
+
+def test_the_tick_as_plain_python_is_the_compiled_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "READINGS", 1)
+    row = control.control_tick(3, lambda line: None)[0]
+    assert row["joint_difference"] == 0.0
