@@ -153,9 +153,11 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
         commander.take()
         if not commander.arm().accepted:
             commander.clear_fault()
-            time.sleep(0.3)
+            time.sleep(0.5)
             return False
-        time.sleep(0.3)
+        deadline = time.monotonic() + 5.0
+        while process._phase != PHASE_HOLD and time.monotonic() < deadline:
+            time.sleep(0.02)
         return process._phase == PHASE_HOLD
 
     until(armed_and_holding, "the rig to be armed")
