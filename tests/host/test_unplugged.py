@@ -167,6 +167,7 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
     assert process.alive and not commander.arm().accepted
     cable.plug()
     until(lambda: process._link.status is not None, "the board to be found again")
+    until(lambda: process._phase == PHASE_DISARMED, "the loop to say that it is disarmed")
     for _ in range(20):
         time.sleep(0.02)
         assert process._phase == PHASE_DISARMED
