@@ -70,7 +70,7 @@ class CommandGate:
         self._lease = Lease()
         self._seen: dict[str, int] = {}
         self._buckets: dict[str, _Bucket] = {}
-        self._told_ns, self._untold = 0, 0
+        self._told_ns, self._untold = -_TOLD_EVERY_NS, 0
         self.counts = {"accepted": 0, "refused": 0, "expired": 0, "replayed": 0, "malformed": 0, "flooded": 0}
 
     def state(self) -> CommandCounts:

@@ -153,9 +153,11 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
         commander.take()
         if not commander.arm().accepted:
             commander.clear_fault()
-            time.sleep(0.3)
+            time.sleep(0.5)
             return False
-        time.sleep(0.3)
+        deadline = time.monotonic() + 5.0
+        while process._phase != PHASE_HOLD and time.monotonic() < deadline:
+            time.sleep(0.02)
         return process._phase == PHASE_HOLD
 
     until(armed_and_holding, "the rig to be armed")
@@ -165,6 +167,7 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
     assert process.alive and not commander.arm().accepted
     cable.plug()
     until(lambda: process._link.status is not None, "the board to be found again")
+    until(lambda: process._phase == PHASE_DISARMED, "the loop to say that it is disarmed")
     for _ in range(20):
         time.sleep(0.02)
         assert process._phase == PHASE_DISARMED

@@ -238,3 +238,17 @@ def test_the_record_shows_no_secret_and_no_renewal() -> None:
     assert for_the_record(*again) is None
     assert for_the_record(*rig.gate.answer("console", encode(rig.command(action="clock")))) is None
     assert for_the_record(*rig.gate.answer("console", b"")) is None
+
+
+def test_refusals_are_told_at_once_and_then_counted_for_half_a_second() -> None:
+    rig = Rig(now_ns=0)
+
+    def told() -> str:
+        return rig.gate.in_words("console", *rig.gate.answer("console", b"junk"))
+
+    assert told().startswith("console: request: malformed: payload") and [told() for _ in range(7)] == [""] * 7
+    rig.now_ns += S
+    assert told().endswith("(and 7 more not told)")
+    assert rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="take")))) == \
+        "console: take: accepted"
+    assert rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="clock")))) == ""

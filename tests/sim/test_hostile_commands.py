@@ -153,7 +153,7 @@ def test_what_is_malformed_is_counted_and_logged(board: LibraryBoard) -> None:
     run = Tapped(board)
     run.loop.request("intruder", b"junk")
     assert run.loop.gate.counts["malformed"] == 1 and run.loop.gate.state().malformed == 1
-    assert any("intruder: malformed" in log.text for log in run.logs)  # type: ignore[attr-defined]
+    assert any("intruder: request: malformed" in log.text for log in run.logs)  # type: ignore[attr-defined]
 
 
 def test_the_attack_would_have_moved_it_with_the_lease(undisturbed: Moved) -> None:
