@@ -15,8 +15,10 @@ Array = npt.NDArray[np.float64]
 def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[float, float]]:
     """Interval of every parameter (nominal, then effects) of `fit`; those held have none (value twice).
 
-    Linearized at the fit, in each parameter's own scale (logarithm for positive ones). Scores are summed over blocks of at least four
-    correlation times and taken as independent (Liang and Zeger 1986); quantiles of Student's t with as many degrees of freedom as blocks
+    Linearized at the fit, in each parameter's own scale (logarithm for positive ones). Scores are summed over blocks of
+    at least four
+    correlation times and taken as independent (Liang and Zeger 1986); quantiles of Student's t with as many degrees of
+    freedom as blocks
     beyond parameters.
     """
     parameters = problem.parameters(fit.terms)
@@ -45,7 +47,9 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
 
 
 def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
-    """Rate of the weighted simulation by the state from which each recording runs freely, where a model has one: it is estimated too."""
+    """Rate of the weighted simulation by the state from which each recording runs freely, where a model has one: it
+    is estimated too.
+    """
     columns = []
     for piece in problem.pieces:
         if piece.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in piece.extra:
@@ -66,8 +70,8 @@ def _block_scores(problem: Problem, fit: Fit, J: Array, base: Array) -> Array:
         if n == 0:
             continue
         rows = len(problem.model.outputs)
-        r = base[at: at + rows * n].reshape(rows, n)
-        product = (J[at: at + rows * n] * base[at: at + rows * n, None]).reshape(rows, n, -1).sum(axis=0)
+        r = base[at : at + rows * n].reshape(rows, n)
+        product = (J[at : at + rows * n] * base[at : at + rows * n, None]).reshape(rows, n, -1).sum(axis=0)
         at += rows * n
         tau = max(correlation_time(row) for row in r)
         parts = int(np.clip(n / max(4.0 * tau, 10.0), 1, 60))

@@ -58,7 +58,10 @@ def main() -> None:
     arguments = parser.parse_args()
     for case in arguments.cases:
         share, error = coverage(case, arguments.fits)
-        print(f"{case:12} {100 * share:5.1f} % of {arguments.fits} intervals hold the truth; median error {100 * error:.2f} %", flush=True)
+        print(
+            f"{case:12} {100 * share:5.1f} % of {arguments.fits} intervals hold the truth; median error {100 * error:.2f} %",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -102,6 +102,7 @@ def test_rig_backlash_is_found_in_its_place(tmp_path: Path) -> None:
             gap = q[i] - y[i - 1]
             y[i] = y[i - 1] + (gap - 8e-4 * np.sign(gap) if abs(gap) > 8e-4 else 0.0)
         return y
+
     result = run(rig_cases.write(tmp_path, rig_cases.Truth(insertion=play), 1, duration_s=15.0))
     effect = as_json(result, 0.0)["effects"][0]
     assert (effect["id"], effect["subsystem"]) == ("backlash", "insertion")
