@@ -14,7 +14,9 @@ from host.cli.contract_io import write_json
 
 
 class Progress:
-    """One line on standard error that says what is being done; drawn over itself on a terminal, one line a task elsewhere."""
+    """One line on standard error that says what is being done; drawn over itself on a terminal, one line a task
+    elsewhere.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self.quiet, self.last, self.drawn, self.began = quiet, "", 0.0, time.monotonic()
@@ -38,17 +40,23 @@ class Progress:
 
 
 def diagnose(
-    recordings: Annotated[list[str] | None, typer.Argument(help="tables or folders; without any, those the nominal TOML names")] = None,
+    recordings: Annotated[
+        list[str] | None, typer.Argument(help="tables or folders; without any, those the nominal TOML names")
+    ] = None,
     nominal: Annotated[str, typer.Option(help="nominal model, a TOML file or the name of one that ships")] = "",
     json: Annotated[str | None, typer.Option(help="where the verdict goes; - for standard output")] = None,
     report: Annotated[str | None, typer.Option(help="where the report page goes (one HTML file)")] = None,
-    data: Annotated[str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")] = None,
+    data: Annotated[
+        str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")
+    ] = None,
     without: Annotated[list[str] | None, typer.Option(help="effect id the finder is not to know")] = None,
     quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
     live: Annotated[bool, typer.Option("--live", help="watch a running rig against its twin, and raise alarms")] = False,
     rig: Annotated[str | None, typer.Option(help="with --live: the rig's file (default: the simulated rig)")] = None,
-    effect: Annotated[list[str] | None, typer.Option(
-        help="effect that is known to be there: id@subsystem:key=value,... as the report gives it")] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(help="effect that is known to be there: id@subsystem:key=value,... as the report gives it"),
+    ] = None,
 ) -> None:
     """Where simulation and recording part, what physics was left out, its model, and the proof."""
     if live:

@@ -24,7 +24,8 @@ BLOCKS_OF_A_LONE_RECORDING = 10
 class Recording:
     """One recording. `channels` maps name to (n,) SI values; `fit` and `heldout` are masks (n,) over samples.
 
-    `time_s` counts from the first sample, or from the first recording where all share a clock; `begin_s` is where that is in the file.
+    `time_s` counts from the first sample, or from the first recording where all share a clock; `begin_s` is where that
+    is in the file.
     """
 
     name: str
@@ -74,7 +75,9 @@ def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], o
         begin = float(first if shared else whole.time_s[0])
         whole = replace(whole, time_s=whole.time_s - begin, begin_s=begin)
         cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
-        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [whole]
+        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [
+            whole
+        ]
     return _split(pieces, spec.data.heldout)
 
 
@@ -84,8 +87,9 @@ def one_clock(recordings: list[Recording]) -> bool:
     return len(spans) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(spans))
 
 
-def _one(spec: NominalSpec, name: str, columns: dict[str, Array], needed: dict[str, ChannelSpec],
-         optional: set[str]) -> Recording:
+def _one(
+    spec: NominalSpec, name: str, columns: dict[str, Array], needed: dict[str, ChannelSpec], optional: set[str]
+) -> Recording:
     channels = {}
     for key, channel in needed.items():
         if channel.column in columns:
@@ -145,8 +149,15 @@ def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recor
     part = slice(start, last)
     use = np.arange(start, last) >= first
     channels = {key: values[part] for key, values in whole.channels.items()}
-    return replace(whole, name=name, time_s=whole.time_s[part] - whole.time_s[start], channels=channels, fit=use, heldout=use,
-                   begin_s=whole.begin_s + float(whole.time_s[start]))
+    return replace(
+        whole,
+        name=name,
+        time_s=whole.time_s[part] - whole.time_s[start],
+        channels=channels,
+        fit=use,
+        heldout=use,
+        begin_s=whole.begin_s + float(whole.time_s[start]),
+    )
 
 
 def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recording]:
@@ -154,7 +165,11 @@ def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recordin
     if patterns is not None:
         out = [any(fnmatch(p.name, pattern) for pattern in patterns) for p in pieces]
         if len(pieces) > 1 and (all(out) or not any(out)):
-            raise BadInput("data.heldout", patterns, "patterns that match some recordings, not all: " + ", ".join(p.name for p in pieces))
+            raise BadInput(
+                "data.heldout",
+                patterns,
+                "patterns that match some recordings, not all: " + ", ".join(p.name for p in pieces),
+            )
         if len(pieces) == 1:
             patterns = None
     if patterns is None and len(pieces) >= 3:
@@ -162,7 +177,9 @@ def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recordin
     elif patterns is None:
         return [replace(p, fit=u & ~b, heldout=u & b) for p, u in zip(pieces, used, strict=True) for b in [_blocks(p.n)]]
     nothing = [np.zeros(p.n, dtype=bool) for p in pieces]
-    return [replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(pieces, used, nothing, out, strict=True)]
+    return [
+        replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(pieces, used, nothing, out, strict=True)
+    ]
 
 
 def _blocks(n: int) -> Mask:
@@ -175,14 +192,22 @@ def thin(recording: Recording, factor: int) -> Recording:
     if factor <= 1:
         return recording
     n = recording.n // factor
+
     def average(values: Array) -> Array:
         blocks = values[: n * factor].reshape(n, factor)
         good = np.isfinite(blocks)
         count = good.sum(axis=1)
         total = np.where(good, blocks, 0.0).sum(axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
     def every(mask: Mask) -> Mask:
         return np.asarray(mask[: n * factor].reshape(n, factor).all(axis=1))
-    return replace(recording, time_s=average(recording.time_s), dt_s=recording.dt_s * factor,
-                   channels={key: average(values) for key, values in recording.channels.items()},
-                   fit=every(recording.fit), heldout=every(recording.heldout))
+
+    return replace(
+        recording,
+        time_s=average(recording.time_s),
+        dt_s=recording.dt_s * factor,
+        channels={key: average(values) for key, values in recording.channels.items()},
+        fit=every(recording.fit),
+        heldout=every(recording.heldout),
+    )

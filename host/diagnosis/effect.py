@@ -1,4 +1,4 @@
-"""What an effect module is: an id, the ports it may act at, its parameters with bounds, and how it changes the signal there."""
+"""What an effect module is: an id, the ports it may act at, its parameters with bounds, and what it does to a signal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter. `grid`: values tried first; `log`: fitted as its logarithm (positive); `linear`: the change is proportional to it."""
+    """One parameter. `grid`: values tried first; `log`: fitted as its logarithm (positive); `linear`: the change is
+    proportional to it.
+    """
 
     name: str
     unit: str
@@ -28,7 +30,7 @@ class Parameter:
     high: float = np.inf
     log: bool = False
     linear: bool = False
-    step: float = 0.0          # natural size of a signed parameter; 0: the largest of the grid
+    step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
 
     @property
     def key(self) -> str:
@@ -42,20 +44,20 @@ class Parameter:
 class Scale:
     """Sizes at a port, from the recordings to fit: what start values and bounds are made of."""
 
-    unit: str                  # of the signal the effect changes
-    span: float                # peak to peak of that signal
+    unit: str  # of the signal the effect changes
+    span: float  # peak to peak of that signal
     low: float
     high: float
-    speed: float               # RMS rate, per second
-    tolerance: float           # movements below this are not movements
-    need: float                # RMS of the mismatch as seen at this port
+    speed: float  # RMS rate, per second
+    tolerance: float  # movements below this are not movements
+    need: float  # RMS of the mismatch as seen at this port
     dt_s: float
     duration_s: float
     timed: bool
     source_unit: str = ""
     source_span: float = 1.0
     source_rms: float = 1.0
-    motion_unit: str = ""      # force ports: unit of the motion
+    motion_unit: str = ""  # force ports: unit of the motion
     motion_span: float = 1.0
 
 
@@ -65,9 +67,9 @@ class Context:
 
     time_s: Array
     dt_s: float
-    motion: Array              # nominal input of the port
+    motion: Array  # nominal input of the port
     tolerance: float
-    start: float = 0.0         # displacement needed at the first sample: start of memory
+    start: float = 0.0  # displacement needed at the first sample: start of memory
     source: Array | None = None
     extra: dict[str, Any] = field(default_factory=dict)
     _cache: dict[str, Array] = field(default_factory=dict)
@@ -96,7 +98,8 @@ Parameters = Callable[[Scale, str], tuple[Parameter, ...]]
 class Effect:
     """One effect at one kind of port.
 
-    `port`: motion (a kinematic signal), turn (an angle), force (a force balance), timing, limit, drift and mix (a scalar reading),
+    `port`: motion (a kinematic signal), turn (an angle), force (a force balance), timing, limit, drift and mix (a scalar
+    reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
     `source`: what it depends on besides: "load" (a force), "drag" (a force or bend that presses), "other" (another channel).
     `order`: place among the effects of one port, small first. `side`: motion ports only, before or after the nominal gain.
@@ -117,7 +120,7 @@ class Effect:
     timed: bool = False
     forms: tuple[str, ...] = ("",)
     contains: tuple[str, ...] = ()
-    family: str = ""           # of one family only one acts at a port: the second takes the place of the first
+    family: str = ""  # of one family only one acts at a port: the second takes the place of the first
 
 
 @dataclass(frozen=True)
@@ -169,15 +172,23 @@ def library() -> tuple[Effect, ...]:
 def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = frozenset()) -> list[Candidate]:
     """All candidates at `ports`; rate effects only with a time line.
 
-    `left_out`: ids, id:form, or id:form@port, not to use: what the nominal model has already, and those of a leave-one-out proof.
+    `left_out`: ids, id:form, or id:form@port, not to use: what the nominal model has already, and those of a
+    leave-one-out proof.
     """
     found = []
     for port in ports:
         for effect in library():
-            if effect.id in left_out or effect.port not in port.kind.split("+") or effect.id in left_out or (effect.timed and not timed):
+            if (
+                effect.id in left_out
+                or effect.port not in port.kind.split("+")
+                or effect.id in left_out
+                or (effect.timed and not timed)
+            ):
                 continue
             sources = {"": ("",), "load": port.loads, "drag": port.drags or port.loads, "other": port.others}[effect.source]
-            forms = [form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out]
+            forms = [
+                form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out
+            ]
             found += [Candidate(effect, port, source, form) for source in sources for form in forms]
     return found
 

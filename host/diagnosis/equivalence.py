@@ -1,4 +1,4 @@
-"""Models that the data cannot tell from the best: rivals put in each effect's place, refitted, and compared on held-out blocks."""
+"""Models that the data cannot tell from the best: rivals in each effect's place, refitted, compared on held-out blocks."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from host.diagnosis.search import Found, Trial
 
 Array = npt.NDArray[np.float64]
 MOST_RIVALS = 4
-NEAR = 0.6           # a rival must have earned this part of the winner's likelihood
-CANNOT_TELL = 4.0    # log-likelihood below which two models are not told apart
+NEAR = 0.6  # a rival must have earned this part of the winner's likelihood
+CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,9 @@ def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
     return out
 
 
-def _equals(problem: Problem, best: Fit, candidate: Candidate, rivals: list[Trial], less: Fit, gain: Gain, floor: Array) -> tuple[Candidate, ...]:
+def _equals(
+    problem: Problem, best: Fit, candidate: Candidate, rivals: list[Trial], less: Fit, gain: Gain, floor: Array
+) -> tuple[Candidate, ...]:
     found: list[Candidate] = []
     reach = max((trial.heldout.log_likelihood for trial in rivals), default=0.0)
     for trial in rivals[: MOST_RIVALS + 2]:
@@ -53,8 +55,10 @@ def _equals(problem: Problem, best: Fit, candidate: Candidate, rivals: list[Tria
         if any(trial.candidate.key == term.candidate.key for term in best.terms):
             continue
         term = term_of(problem, trial.candidate, less)
-        start = trial.fit.values[-len(term.parameters):]
-        other = finish(problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4))
+        start = trial.fit.values[-len(term.parameters) :]
+        other = finish(
+            problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
+        )
         ahead = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
         if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > 0.05 and ahead.share < 0.1):
             found.append(trial.candidate)

@@ -1,4 +1,4 @@
-"""How much a model gains on held-out samples when residuals are coloured: effective sample size, log-likelihood, paired blocks."""
+"""What a model gains on held-out samples when residuals are coloured: sample size, log-likelihood, paired blocks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ FEWEST_BLOCKS = 6
 
 @dataclass(frozen=True)
 class Gain:
-    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output that gained most.
+    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output
+    that gained most.
 
-    `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards. `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
+    `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards.
+    `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
     """
 
     log_likelihood: float
@@ -32,7 +34,9 @@ class Gain:
 
 
 def correlation_time(r: Array, longest: int | None = None) -> float:
-    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay positive (Geyer 1992)."""
+    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay
+    positive (Geyer 1992).
+    """
     good = np.isfinite(r)
     n = int(good.sum())
     if n < 20:
@@ -58,8 +62,10 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
 def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array) -> Gain:
     """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit` or `heldout`).
 
-    Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it is divided by
-    the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is gained.
+    Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
+    is divided by
+    the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is
+    gained.
     """
     independent, log_ratio, excess, excess_after = (np.zeros(floor.size) for _ in range(4))
     by_output: list[list[float]] = []
@@ -87,7 +93,9 @@ def _p_value(by_output: list[list[float]]) -> float:
     return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
-def _pooled(pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int) -> tuple[float, float, float, list[float]]:
+def _pooled(
+    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int
+) -> tuple[float, float, float, list[float]]:
     sum_b = sum_a = count = n_eff = 0.0
     times = []
     for piece, b, a in zip(pieces, before, after, strict=True):
@@ -105,8 +113,9 @@ def _pooled(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
     return sum_b / max(count, 1.0), sum_a / max(count, 1.0), n_eff, times
 
 
-def _blocks(pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int, times: list[float],
-            level: float) -> list[float]:
+def _blocks(
+    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int, times: list[float], level: float
+) -> list[float]:
     found = []
     for piece, b, a, tau in zip(pieces, before, after, times, strict=True):
         mask = getattr(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
@@ -119,7 +128,9 @@ def _blocks(pieces: list[Piece], which: str, before: list[Array], after: list[Ar
 
 
 def _sign_of_mean(blocks: Array) -> float:
-    """One-sided p-value that independent blocks do not gain: the smaller of t test and signed ranks (blocks of unlike size), doubled."""
+    """One-sided p-value that independent blocks do not gain: the smaller of t test and signed ranks (blocks of unlike
+    size), doubled.
+    """
     if blocks.size < FEWEST_BLOCKS:
         return 0.5 if blocks.size == 0 or np.mean(blocks) <= 0 else 0.04
     spread = np.std(blocks) + 1e-300
@@ -130,9 +141,11 @@ def _sign_of_mean(blocks: Array) -> float:
 
 
 def whiteness(residuals: list[Array], masks: list[Mask], lags: int = 25) -> float:
-    """p-value that whitened residuals (each (n,), unit variance if the model is right) are white with no more than noise power.
+    """p-value that whitened residuals (each (n,), unit variance if the model is right) are white with no more than noise
+    power.
 
-    Ljung-Box over `lags`, pooled over recordings, together with a chi-square test of the level; the smaller p-value, doubled.
+    Ljung-Box over `lags`, pooled over recordings, together with a chi-square test of the level; the smaller p-value,
+    doubled.
     """
     q = dof = power = count = 0.0
     for r, mask in zip(residuals, masks, strict=True):

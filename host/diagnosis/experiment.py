@@ -10,17 +10,38 @@ from host.diagnosis.effect import Candidate
 
 # What an effect's mark depends on; two effects are told apart by varying what only one of them depends on.
 DEPENDS: dict[str, frozenset[str]] = {
-    "backlash": frozenset({"reversal"}), "dead_zone": frozenset({"place"}), "coulomb_friction": frozenset({"reversal"}),
-    "presliding_friction": frozenset({"reversal", "amplitude"}), "load_dependent_friction": frozenset({"reversal", "load"}),
-    "stribeck_friction": frozenset({"reversal", "speed"}), "viscous_friction": frozenset({"speed"}), "rate_lag": frozenset({"speed", "frequency"}),
-    "latency": frozenset({"speed"}), "clock_drift": frozenset({"speed", "time"}), "compliance": frozenset({"load"}),
-    "nonlinear_stiffness": frozenset({"load", "amplitude"}), "creep_relaxation": frozenset({"hold"}), "plastic_set": frozenset({"overload"}),
-    "softening": frozenset({"time", "amplitude"}), "sensor_drift": frozenset({"time"}), "asymmetry": frozenset({"place"}),
-    "static_nonlinearity": frozenset({"place", "amplitude"}), "saturation": frozenset({"place"}), "coupling": frozenset({"other"}),
-    "whip": frozenset({"turns"}), "periodic_disturbance": frozenset({"hold"}), "resonance": frozenset({"frequency"}),
-    "gravity_load": frozenset({"turns"}), "flow_drag": frozenset({"hold"}), "second_contact": frozenset({"place"}),
-    "contact_nonlinear": frozenset({"load", "amplitude"}), "contact_viscous": frozenset({"load", "speed"}), "contact_friction": frozenset({"load", "reversal"}),
-    "base_motion": frozenset({"time", "hold"}), "field_distortion": frozenset({"place"}), "missed_steps": frozenset({"time"}),
+    "backlash": frozenset({"reversal"}),
+    "dead_zone": frozenset({"place"}),
+    "coulomb_friction": frozenset({"reversal"}),
+    "presliding_friction": frozenset({"reversal", "amplitude"}),
+    "load_dependent_friction": frozenset({"reversal", "load"}),
+    "stribeck_friction": frozenset({"reversal", "speed"}),
+    "viscous_friction": frozenset({"speed"}),
+    "rate_lag": frozenset({"speed", "frequency"}),
+    "latency": frozenset({"speed"}),
+    "clock_drift": frozenset({"speed", "time"}),
+    "compliance": frozenset({"load"}),
+    "nonlinear_stiffness": frozenset({"load", "amplitude"}),
+    "creep_relaxation": frozenset({"hold"}),
+    "plastic_set": frozenset({"overload"}),
+    "softening": frozenset({"time", "amplitude"}),
+    "sensor_drift": frozenset({"time"}),
+    "asymmetry": frozenset({"place"}),
+    "static_nonlinearity": frozenset({"place", "amplitude"}),
+    "saturation": frozenset({"place"}),
+    "coupling": frozenset({"other"}),
+    "whip": frozenset({"turns"}),
+    "periodic_disturbance": frozenset({"hold"}),
+    "resonance": frozenset({"frequency"}),
+    "gravity_load": frozenset({"turns"}),
+    "flow_drag": frozenset({"hold"}),
+    "second_contact": frozenset({"place"}),
+    "contact_nonlinear": frozenset({"load", "amplitude"}),
+    "contact_viscous": frozenset({"load", "speed"}),
+    "contact_friction": frozenset({"load", "reversal"}),
+    "base_motion": frozenset({"time", "hold"}),
+    "field_distortion": frozenset({"place"}),
+    "missed_steps": frozenset({"time"}),
 }
 SEGMENTS: dict[str, str] = {
     "reversal": "triangle, amplitudes 0.2, 0.5 and 1.0 of the range, 0.1 Hz, 3 periods each",
@@ -47,7 +68,9 @@ def experiment(model: Any, candidate: Candidate, alike: tuple[Candidate, ...], p
         theirs = DEPENDS.get(other.effect.id, frozenset({"amplitude"}))
         for kind in sorted(own ^ theirs) or ["amplitude", "speed"]:
             axis = candidate.port.name if candidate.port.kind.startswith("motion") else model.quiet_inputs[0]
-            lines.append(f"{axis}: {SEGMENTS.get(kind, SEGMENTS['amplitude'])}  # {candidate.effect.id} against {other.effect.id}")
+            lines.append(
+                f"{axis}: {SEGMENTS.get(kind, SEGMENTS['amplitude'])}  # {candidate.effect.id} against {other.effect.id}"
+            )
     return "\n".join(dict.fromkeys(lines))
 
 

@@ -13,7 +13,7 @@ from host.diagnosis.model import Act, Model, Piece
 from host.diagnosis.noise import Noise
 
 Array = npt.NDArray[np.float64]
-HUBER = 4.0          # residuals beyond this many scales pull with constant force
+HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
 
 
@@ -31,7 +31,7 @@ class Fit:
 
     terms: tuple[Term, ...]
     values: Array
-    residuals: list[Array] = field(default_factory=list)      # per piece (outputs, n): measured - simulated
+    residuals: list[Array] = field(default_factory=list)  # per piece (outputs, n): measured - simulated
     jacobian: Array | None = None
     cost: float = np.inf
 
@@ -49,7 +49,7 @@ class Problem:
     pieces: list[Piece]
     noise: list[Noise]
     scale: Array
-    columns: dict[str, str] = field(default_factory=dict)    # channel -> column, for equations
+    columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""
@@ -57,14 +57,17 @@ class Problem:
 
     def simulate(self, piece: Piece, terms: tuple[Term, ...], values: Array) -> Array:
         """Outputs (outputs, n) of one recording."""
-        n = len(self.model.parameters)
-        acts: list[Act] = []
-        at = n
-        for term in terms:
-            acts.append((term.candidate, values[at: at + len(term.parameters)]))
-            at += len(term.parameters)
-        out = self.model.simulate(piece, values[:n], acts)
+        out = self.model.simulate(piece, *self.parted(terms, values))
         return np.where(np.abs(out) < 1e150, out, 1e150)
+
+    def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[Act]]:
+        """Nominal parameters, and every effect with its own."""
+        at = len(self.model.parameters)
+        nominal, acts = values[:at], []
+        for term in terms:
+            acts.append((term.candidate, values[at : at + len(term.parameters)]))
+            at += len(term.parameters)
+        return nominal, acts
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
         """Measured minus simulated, NaN outside the part asked for (`fit`, `heldout` or `all`)."""
@@ -106,7 +109,9 @@ def _moved(p: Parameter, value: float, by: float) -> float:
 
 
 def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, sizes: list[float]) -> Array:
-    """Rate of the weighted simulation by each free parameter in its own scale, by one-sided differences that stay in bounds."""
+    """Rate of the weighted simulation by each free parameter in its own scale, by one-sided differences that stay in
+    bounds.
+    """
     parameters = problem.parameters(terms)
     columns = []
     for index in free(parameters):
@@ -149,7 +154,11 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
             trial = values.copy()
             for place, index in enumerate(moving):
                 p = parameters[index]
-                trial[index] = _moved(p, values[index], by[place]) if p.log else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
+                trial[index] = (
+                    _moved(p, values[index], by[place])
+                    if p.log
+                    else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
+                )
             r_new = problem.stacked(terms, trial)
             cost_new, w_new = _robust(r_new)
             if cost_new < cost:
@@ -200,7 +209,9 @@ def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
     out = []
     for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
         first = slice(0, max(5, round(0.3 / piece.recording.dt_s)) if piece.recording.timed else 5)
-        needs = {port.name: problem.model.needs(piece, port, fit.values[:n], residual)[first] for port in problem.model.ports}
+        needs = {
+            port.name: problem.model.needs(piece, port, fit.values[:n], residual)[first] for port in problem.model.ports
+        }
         out.append({name: float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0 for name, need in needs.items()})
     return out
 
@@ -224,8 +235,12 @@ def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, floa
 
 def tuned(term: Term, lines: Array) -> tuple[Parameter, ...]:
     """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual."""
-    return tuple(replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3]) if p.name == "frequency" and p.unit == "Hz"
-                 and any(q.linear for q in term.parameters) else p for p in term.parameters)
+    return tuple(
+        replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3])
+        if p.name == "frequency" and p.unit == "Hz" and any(q.linear for q in term.parameters)
+        else p
+        for p in term.parameters
+    )
 
 
 def lines_of(residuals: list[Array], dt_s: float, count: int = 5) -> Array:

@@ -10,21 +10,78 @@ from numba import njit
 
 Array = npt.NDArray[np.float64]
 SLOTS = (
-    "coulomb", "static_excess", "stribeck_speed", "presliding", "presliding_distance", "presliding_maxwell", "load_friction",
-    "load_friction_distance", "viscous", "drag", "viscous_asymmetry", "quadratic", "cubic", "maxwell_stiffness", "maxwell_time",
-    "softening", "sine", "cosine", "pitch", "frequency", "second_mass", "second_omega", "second_damping",
-    "contact_stiffness", "contact_place", "contact_exponent", "contact_damping", "stiffness", "gap", "backward_ratio",
+    "coulomb",
+    "static_excess",
+    "stribeck_speed",
+    "presliding",
+    "presliding_distance",
+    "presliding_maxwell",
+    "load_friction",
+    "load_friction_distance",
+    "viscous",
+    "drag",
+    "viscous_asymmetry",
+    "quadratic",
+    "cubic",
+    "maxwell_stiffness",
+    "maxwell_time",
+    "softening",
+    "sine",
+    "cosine",
+    "pitch",
+    "frequency",
+    "second_mass",
+    "second_omega",
+    "second_damping",
+    "contact_stiffness",
+    "contact_place",
+    "contact_exponent",
+    "contact_damping",
+    "stiffness",
+    "gap",
+    "backward_ratio",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
-(COULOMB, EXCESS, STRIBECK, PRESLIDING, PRE_DISTANCE, PRE_MAXWELL, LOAD, LOAD_DISTANCE, VISCOUS, DRAG, ASYMMETRY, QUADRATIC, CUBIC,
- MAXWELL_K, MAXWELL_T, SOFTENING, SINE, COSINE, PITCH, FREQUENCY, MASS2, OMEGA2, DAMPING2, CONTACT_K, CONTACT_X, CONTACT_N, CONTACT_C,
- STIFFNESS, GAP, BACKWARD) = range(len(SLOTS))
+(
+    COULOMB,
+    EXCESS,
+    STRIBECK,
+    PRESLIDING,
+    PRE_DISTANCE,
+    PRE_MAXWELL,
+    LOAD,
+    LOAD_DISTANCE,
+    VISCOUS,
+    DRAG,
+    ASYMMETRY,
+    QUADRATIC,
+    CUBIC,
+    MAXWELL_K,
+    MAXWELL_T,
+    SOFTENING,
+    SINE,
+    COSINE,
+    PITCH,
+    FREQUENCY,
+    MASS2,
+    OMEGA2,
+    DAMPING2,
+    CONTACT_K,
+    CONTACT_X,
+    CONTACT_N,
+    CONTACT_C,
+    STIFFNESS,
+    GAP,
+    BACKWARD,
+) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 
 
 @njit(cache=True)
 def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
-    """Force without dry friction: against the motion, to be overcome by the input. `slow`: x after the lag of the Maxwell branch."""
+    """Force without dry friction: against the motion, to be overcome by the input. `slow`: x after the lag of the
+    Maxwell branch.
+    """
     force = p[VISCOUS] * v + p[DRAG] * v * abs(v) + p[ASYMMETRY] * abs(v) + p[QUADRATIC] * x * x + p[CUBIC] * x * x * x
     force += p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x
     force -= p[STIFFNESS] * min(max(x, -p[GAP]), p[GAP])
@@ -40,7 +97,9 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
 
 @njit(cache=True)
 def hysteresis(z: Array, dx: float, load: float, p: Array) -> float:
-    """Presliding and load-dependent friction after a step dx; `z` (5,) is moved on: four Maxwell elements (or one of Dahl), and the load's."""
+    """Presliding and load-dependent friction after a step dx; `z` (5,) is moved on: four Maxwell elements (or one of
+    Dahl), and the load's.
+    """
     force = 0.0
     side = 1.0 if dx > 0.0 else -1.0
     if p[PRESLIDING] != 0.0:
@@ -61,7 +120,9 @@ def hysteresis(z: Array, dx: float, load: float, p: Array) -> float:
 
 @njit(cache=True)
 def start_state(z: Array, start: float, load: float, p: Array) -> float:
-    """Friction states such that together they hold `start` at the first sample, as far as they can; returns Coulomb's share."""
+    """Friction states such that together they hold `start` at the first sample, as far as they can; returns Coulomb's
+    share.
+    """
     level = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD] * abs(load)
     share = min(max(start / level, -1.0), 1.0) if level != 0.0 else 0.0
     z[:] = share
@@ -69,7 +130,9 @@ def start_state(z: Array, start: float, load: float, p: Array) -> float:
 
 
 @njit(cache=True)
-def along(x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tolerance: float, start: float, p: Array) -> Array:
+def along(
+    x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tolerance: float, start: float, p: Array
+) -> Array:
     """Force of all terms along a measured motion x, v, a (n,)."""
     out = np.empty(x.size)
     z = np.zeros(5)
@@ -97,7 +160,9 @@ def along(x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tole
 
 
 @njit(cache=True)
-def _accelerations(x: float, v: float, x2: float, v2: float, u: float, t: float, slow: float, linear: Array, p: Array) -> tuple[float, float]:
+def _accelerations(
+    x: float, v: float, x2: float, v2: float, u: float, t: float, slow: float, linear: Array, p: Array
+) -> tuple[float, float]:
     """Accelerations of the axis and of the second mass; `u` with offset and held friction."""
     force = u - linear[1] * v - linear[2] * x - smooth_force(x, v, t, slow, p)
     pull = 0.0
@@ -108,8 +173,15 @@ def _accelerations(x: float, v: float, x2: float, v2: float, u: float, t: float,
 
 
 @njit(cache=True)
-def _runge_kutta(s: tuple[float, float, float, float], u: tuple[float, float, float], t: float, h: float, slow: float, linear: Array,
-                 p: Array) -> tuple[float, float, float, float, float]:
+def _runge_kutta(
+    s: tuple[float, float, float, float],
+    u: tuple[float, float, float],
+    t: float,
+    h: float,
+    slow: float,
+    linear: Array,
+    p: Array,
+) -> tuple[float, float, float, float, float]:
     """One step of (x, v, x2, v2); the last item is the acceleration at its start."""
     x, v, y, w = s
     a1, b1 = _accelerations(x, v, y, w, u[0], t, slow, linear, p)
@@ -119,15 +191,27 @@ def _runge_kutta(s: tuple[float, float, float, float], u: tuple[float, float, fl
     a3, b3 = _accelerations(x + 0.5 * h * v2, v3, y + 0.5 * h * w2, w3, u[1], t + 0.5 * h, slow, linear, p)
     v4, w4 = v + h * a3, w + h * b3
     a4, b4 = _accelerations(x + h * v3, v4, y + h * w3, w4, u[2], t + h, slow, linear, p)
-    return (x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4),
-            y + h / 6.0 * (w + 2.0 * w2 + 2.0 * w3 + w4), w + h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4), a1)
+    return (
+        x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4),
+        v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4),
+        y + h / 6.0 * (w + 2.0 * w2 + 2.0 * w3 + w4),
+        w + h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4),
+        a1,
+    )
 
 
 @njit(cache=True)
 def polynomial(p: Array) -> bool:
     """Whether position and speed alone, in powers, make the smooth force: then one short step serves."""
-    return p[MAXWELL_K] == 0.0 and p[SOFTENING] == 0.0 and p[GAP] == 0.0 and p[PITCH] <= 0.0 and p[FREQUENCY] <= 0.0 \
-        and p[CONTACT_N] <= 0.0 and p[MASS2] <= 0.0
+    return (
+        p[MAXWELL_K] == 0.0
+        and p[SOFTENING] == 0.0
+        and p[GAP] == 0.0
+        and p[PITCH] <= 0.0
+        and p[FREQUENCY] <= 0.0
+        and p[CONTACT_N] <= 0.0
+        and p[MASS2] <= 0.0
+    )
 
 
 @njit(cache=True)
@@ -137,9 +221,12 @@ def _pull(x: float, v: float, q: tuple[float, float, float, float, float, float]
 
 
 @njit(cache=True)
-def _short_step(x: float, v: float, u0: float, u1: float, u2: float, h: float,
-                q: tuple[float, float, float, float, float, float]) -> tuple[float, float, float]:
-    """One Runge-Kutta step of (x, v) for input accelerations at its start, middle and end; the last item is the acceleration at its start."""
+def _short_step(
+    x: float, v: float, u0: float, u1: float, u2: float, h: float, q: tuple[float, float, float, float, float, float]
+) -> tuple[float, float, float]:
+    """One Runge-Kutta step of (x, v) for input accelerations at its start, middle and end; the last item is the
+    acceleration at its start.
+    """
     a1 = u0 + _pull(x, v, q)
     v2 = v + 0.5 * h * a1
     a2 = u1 + _pull(x + 0.5 * h * v, v2, q)
@@ -163,8 +250,19 @@ def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: fl
 
 
 @njit(cache=True)
-def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begin: Array, load: Array, control: Array, reference: Array,
-             start: float, begin_s: float) -> Array:
+def run_axis(
+    u: Array,
+    substeps: int,
+    dt_s: float,
+    linear: Array,
+    p: Array,
+    begin: Array,
+    load: Array,
+    control: Array,
+    reference: Array,
+    start: float,
+    begin_s: float,
+) -> Array:
     """Motion of m a + c v + k x + (force terms) = u + offset from recorded or controlled input.
 
     Arguments:
@@ -173,7 +271,8 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
             added to its force. start: friction held at first. begin_s: time of the first sample.
     Returns:
         (4, n): position, velocity, acceleration, input used.
-    Runge-Kutta for the smooth forces; Coulomb friction as an impulse at the end of each sub-step, so that it can hold (Moreau 1988).
+    Runge-Kutta for the smooth forces; Coulomb friction as an impulse at the end of each sub-step, so that it can hold
+    (Moreau 1988).
     """
     n = load.size
     out = np.empty((4, n))
@@ -189,7 +288,10 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
     remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0
     for i in range(n):
         if control.size:
-            drive = control[2] * control[1] * (control[0] * (reference[0, i] - s[0]) - (s[0] - previous) / dt_s) + reference[1, i]
+            drive = (
+                control[2] * control[1] * (control[0] * (reference[0, i] - s[0]) - (s[0] - previous) / dt_s)
+                + reference[1, i]
+            )
             drive = min(max(drive, -control[3]), control[3])
             previous = s[0]
         out[0, i], out[1, i] = s[0], s[1]
@@ -197,7 +299,11 @@ def run_axis(u: Array, substeps: int, dt_s: float, linear: Array, p: Array, begi
         for j in range(substeps):
             place = (i * substeps + j) * 2
             more = offset - held
-            push = (drive + more, drive + more, drive + more) if control.size else (u[place] + more, u[place + 1] + more, u[place + 2] + more)
+            push = (
+                (drive + more, drive + more, drive + more)
+                if control.size
+                else (u[place] + more, u[place + 1] + more, u[place + 2] + more)
+            )
             x_old, v_old = s[0], s[1]
             dry = p[COULOMB]
             if p[STRIBECK] > 0.0:

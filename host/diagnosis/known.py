@@ -1,4 +1,4 @@
-"""Effects that are known and switched on: a nominal model with them in it, so that only what is still missing is looked for."""
+"""Effects that are known and switched on in the nominal model, so that only what is still missing is looked for."""
 
 from __future__ import annotations
 
@@ -17,12 +17,25 @@ Array = npt.NDArray[np.float64]
 
 
 class Known:
-    """`inner` with effects of the vocabulary switched on; their parameters join the nominal ones and are refitted with them."""
+    """`inner` with effects of the vocabulary switched on; their parameters join the nominal ones and are refitted
+    with them.
+    """
 
     def __init__(self, inner: Model, effects: list[EffectSpec], recordings: list[Recording]) -> None:
         self.inner = inner
-        for name in ("kind", "outputs", "ports", "quiet_inputs", "screen_samples", "fit_samples", "coarsest_s", "travel", "moves",
-                     "unlisted_at", "taken"):
+        for name in (
+            "kind",
+            "outputs",
+            "ports",
+            "quiet_inputs",
+            "screen_samples",
+            "fit_samples",
+            "coarsest_s",
+            "travel",
+            "moves",
+            "unlisted_at",
+            "taken",
+        ):
             setattr(self, name, getattr(inner, name))
         pieces = [inner.prepare(recording) for recording in recordings]
         self.acts: list[tuple[Candidate, tuple[Parameter, ...]]] = []
@@ -35,6 +48,10 @@ class Known:
         self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.acts}
         if hasattr(inner, "settle"):
             self.settle = lambda piece, theta: inner.settle(piece, theta[: self.own])
+        if hasattr(inner, "begin_anew"):
+            self.begin_anew = lambda piece, theta, acts: inner.begin_anew(
+                piece, theta[: self.own], self.with_known(theta, acts)
+            )
         if hasattr(inner, "sensitivity"):
             self.sensitivity = self._sensitivity
             self.change = lambda piece, theta, *rest: inner.change(piece, theta[: self.own], *rest)  # type: ignore[attr-defined]
@@ -51,7 +68,7 @@ class Known:
         """`acts` and the known ones, with their share of `theta`."""
         known, at = [], self.own
         for candidate, parameters in self.acts:
-            known.append((candidate, theta[at: at + len(parameters)]))
+            known.append((candidate, theta[at : at + len(parameters)]))
             at += len(parameters)
         return [*known, *acts]
 
@@ -77,11 +94,18 @@ def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
     pool = candidates(model.ports, timed)
     at = [c for c in pool if c.effect.id == spec.id and spec.at in (c.port.name, c.port.subsystem)]
     if not at:
-        raise BadInput("effect", f"{spec.id}@{spec.at}", "one of " + ", ".join(dict.fromkeys(f"{c.effect.id}@{c.port.name}" for c in pool)))
+        raise BadInput(
+            "effect",
+            f"{spec.id}@{spec.at}",
+            "one of " + ", ".join(dict.fromkeys(f"{c.effect.id}@{c.port.name}" for c in pool)),
+        )
     exact = [c for c in at if c.form == spec.form and c.source == (spec.source or c.source) and fits(c, spec)]
     if not exact:
-        raise BadInput(f"effect {spec.id}@{spec.at}", f"source {spec.source!r}, form {spec.form!r}, {', '.join(spec.values)}",
-                       "a source and form of " + ", ".join(f"({c.source!r}, {c.form!r})" for c in at))
+        raise BadInput(
+            f"effect {spec.id}@{spec.at}",
+            f"source {spec.source!r}, form {spec.form!r}, {', '.join(spec.values)}",
+            "a source and form of " + ", ".join(f"({c.source!r}, {c.form!r})" for c in at),
+        )
     return exact[0]
 
 
@@ -95,7 +119,9 @@ def fits(candidate: Candidate, spec: EffectSpec) -> bool:
 
 
 def placed(candidate: Candidate, parameters: tuple[Parameter, ...], spec: EffectSpec) -> tuple[Parameter, ...]:
-    """`parameters` that start at the values given, renamed so that they tell effect and place. Raises BadInput for a key unknown."""
+    """`parameters` that start at the values given, renamed so that they tell effect and place. Raises BadInput for a
+    key unknown.
+    """
     from dataclasses import replace
 
     keys = {p.key: p for p in parameters}
@@ -106,6 +132,14 @@ def placed(candidate: Candidate, parameters: tuple[Parameter, ...], spec: Effect
     for key, p in keys.items():
         value = spec.values.get(key, p.grid[0])
         bounds = (min(p.low, value), max(p.high, value)) if spec.free else (value, value)
-        out.append(replace(p, name=f"{candidate.effect.id}_{candidate.port.name}_{p.name}", grid=(value,), low=bounds[0], high=bounds[1],
-                           step=p.step or abs(value) or 1.0))
+        out.append(
+            replace(
+                p,
+                name=f"{candidate.effect.id}_{candidate.port.name}_{p.name}",
+                grid=(value,),
+                low=bounds[0],
+                high=bounds[1],
+                step=p.step or abs(value) or 1.0,
+            )
+        )
     return tuple(out)

@@ -22,8 +22,8 @@ from realtime.rig_file import Rig
 
 Array = npt.NDArray[np.float64]
 POSE_ROWS = 12
-SMALLEST_SHARE = 0.1       # of the mismatch that a cause has to explain to be named
-AS_GOOD = 1.15             # error beside the best cause's with which another still counts
+SMALLEST_SHARE = 0.1  # of the mismatch that a cause has to explain to be named
+AS_GOOD = 1.15  # error beside the best cause's with which another still counts
 IDLE_S = 0.02
 REST_S = 0.005
 SECOND_NS = 1_000_000_000
@@ -34,7 +34,8 @@ class LiveSettings:
     """learn_s of motion calibrate the twin; then every every_s the last window_s are looked at.
 
     level, shift: how far RMS (as a factor) and mean (in spreads of a mean over a window) may go before an alarm;
-    settle_s: so long it has to last; a cause is then sought in all that was heard since. suspects: candidates fitted before one is named.
+    settle_s: so long it has to last; a cause is then sought in all that was heard since.
+    suspects: candidates fitted before one is named.
     """
 
     learn_s: float = 10.0
@@ -119,7 +120,7 @@ class Watch:
         recording = self.listener.recording(-self._rows(self.settings.learn_s))
         self.calibration = self.twin.calibrate(recording, self._rest)
         piece, residual = self._residual(-self._rows(self.settings.learn_s))
-        residual = residual[:, piece.n // 4:]          # the approach is not what the rest will be like
+        residual = residual[:, piece.n // 4 :]  # the approach is not what the rest will be like
         mean, rms = np.nanmean(residual, axis=1), np.sqrt(np.nanmean(residual**2, axis=1))
         blocks = np.array_split(residual, max(3, round(0.75 * self.settings.learn_s)), axis=1)
         spread = np.std([np.nanmean(block, axis=1) for block in blocks], axis=0) / np.sqrt(self.settings.window_s)
@@ -165,13 +166,26 @@ class Watch:
         now_ns, row = self.listener.stamps_ns[-1], int(np.argmax(score))
         suspects = self._suspects(self._residual(-self._rows(since_s))[0])
         channel = self.twin.outputs[row].channel
-        first, explained = (suspects[0].name, suspects[0].explained) if suspects else (f"unlisted@{self.twin.outputs[row].subsystem}", 0.0)
+        first, explained = (
+            (suspects[0].name, suspects[0].explained) if suspects else (f"unlisted@{self.twin.outputs[row].subsystem}", 0.0)
+        )
         effect, _, subsystem = first.partition("@")
         others = ", ".join(s.name for s in suspects[1:])
-        words = (f"{subsystem}: probably {effect}, which explains {explained:.0%}" + (f" (as well may be {others})" if others else "")
-                 + f"; {channel} has left the twin for {since_s:.1f} s")
-        return Alarm(stamp_ns=now_ns, subsystem=subsystem, effect=effect, channel=channel, score=float(score[row]),
-                     explained=float(np.clip(explained, 0.0, 1.0)), since_ns=now_ns - round(since_s * SECOND_NS), words=words)
+        words = (
+            f"{subsystem}: probably {effect}, which explains {explained:.0%}"
+            + (f" (as well may be {others})" if others else "")
+            + f"; {channel} has left the twin for {since_s:.1f} s"
+        )
+        return Alarm(
+            stamp_ns=now_ns,
+            subsystem=subsystem,
+            effect=effect,
+            channel=channel,
+            score=float(score[row]),
+            explained=float(np.clip(explained, 0.0, 1.0)),
+            since_ns=now_ns - round(since_s * SECOND_NS),
+            words=words,
+        )
 
     def _suspects(self, piece: Piece) -> list[Suspect]:
         """Causes that explain the window about as well as any does, the one with the fewest parameters first."""
@@ -187,7 +201,9 @@ class Watch:
         found: dict[str, Suspect] = {}
         for item in ranked:
             self._rest()
-            tried = minimize(problem, (item.term,), np.concatenate((calibration.theta, item.begin[0])), rounds=6, tolerance=1e-3)
+            tried = minimize(
+                problem, (item.term,), np.concatenate((calibration.theta, item.begin[0])), rounds=6, tolerance=1e-3
+            )
             left = float(np.sum(problem.stacked(tried.terms, tried.values) ** 2)) / max(before, 1e-12)
             suspect = Suspect(item.candidate.name, 1.0 - left, len(item.term.parameters))
             if suspect.name not in found or found[suspect.name].parameters > suspect.parameters:
@@ -203,17 +219,38 @@ def warm_up(rig: Rig) -> None:
     """Runs everything once on made-up rows, so that kernels are compiled before the rig is listened to."""
     watcher = Watch(rig, LiveSettings(learn_s=4.0, window_s=2.0, settle_s=0.5))
     period_ns = watcher.listener.period_ns
-    watcher.hear("state", RigState(stamp_ns=0, mode="hold", safety_action="none", cause="", poses_rejected=0, forces_rejected=0))
+    watcher.hear(
+        "state", RigState(stamp_ns=0, mode="hold", safety_action="none", cause="", poses_rejected=0, forces_rejected=0)
+    )
     for frame in range(round(7.0 * SECOND_NS / period_ns)):
         now = frame * period_ns
         shift = 0.002 * math.sin(2e-9 * now)
         where = (0.0, -0.004 - (0.01 if now > 5 * SECOND_NS else 0.0), 0.02 + shift)
-        watcher.hear("stage", Stage(stamp_ns=now, command_insertion_m=shift, command_roll_rad=0.0, command_knob_rad=0.6,
-                                    encoder_insertion_m=shift, encoder_roll_rad=shift, encoder_knob_rad=0.6 + shift))
+        watcher.hear(
+            "stage",
+            Stage(
+                stamp_ns=now,
+                command_insertion_m=shift,
+                command_roll_rad=0.0,
+                command_knob_rad=0.6,
+                encoder_insertion_m=shift,
+                encoder_roll_rad=shift,
+                encoder_knob_rad=0.6 + shift,
+            ),
+        )
         watcher.hear("force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=(0.0, 0.0, 0.05)))
         for topic in ("pose/tip", "pose/shaft"):
-            watcher.hear(topic, Pose(stamp_ns=now, arrival_ns=now, frame=frame, missing=False, position_m=where,
-                                     quaternion_wxyz=(1.0, 0.0, 0.0, 0.0)))
+            watcher.hear(
+                topic,
+                Pose(
+                    stamp_ns=now,
+                    arrival_ns=now,
+                    frame=frame,
+                    missing=False,
+                    position_m=where,
+                    quaternion_wxyz=(1.0, 0.0, 0.0, 0.0),
+                ),
+            )
         watcher.look()
 
 
@@ -225,7 +262,9 @@ class Bus(Protocol):
         ...
 
 
-def watch(rig: Rig, bus: Bus, publish: Callable[[Alarm], None], tell: Callable[[str], None], stop: Callable[[], bool]) -> int:
+def watch(
+    rig: Rig, bus: Bus, publish: Callable[[Alarm], None], tell: Callable[[str], None], stop: Callable[[], bool]
+) -> int:
     """Watches until `stop`; publishes alarms, and tells what it does when that changes. How many alarms there were."""
     watcher, said, count = Watch(rig, rest=lambda: time.sleep(REST_S)), "", 0
     while not stop():

@@ -1,4 +1,4 @@
-"""The twin of a running rig: messages become rows, one a tracker frame; the chain of kind rig, made exact by the rod model."""
+"""The twin of a running rig: a row a tracker frame out of its messages; the chain of kind rig, made exact by the rod model."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Array = npt.NDArray[np.float64]
 HANDLES = ("handle_insertion", "handle_roll", "handle_knob")
 COLUMNS = (*HANDLES, *TIP, *SHAFT, *FORCE)
 KEPT_STAGES, KEPT_FORCES = 4000, 4000
-FORCE_HALF_NS = 5_000_000          # forces this near a frame are averaged into its row
+FORCE_HALF_NS = 5_000_000  # forces this near a frame are averaged into its row
 EVERY, ROUNDS = 4, 3
-OFFSETS = (1, 3, 5)                # places of insertion, roll and knob offset among the chain's parameters
+OFFSETS = (1, 3, 5)  # places of insertion, roll and knob offset among the chain's parameters
 LONGEST_DELAY_S = 0.025
-LATEST_NS = 60_000_000             # a frame waits so long for the stage's and the second tool's message
+LATEST_NS = 60_000_000  # a frame waits so long for the stage's and the second tool's message
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Calibration:
 
     theta: Array
     delay_s: float
-    error: float               # RMS left, in units of 0.3 mm and 4 mrad
+    error: float  # RMS left, in units of 0.3 mm and 4 mrad
 
     def applied(self, recording: Recording) -> Recording:
         """`recording` with its inputs as late as the poses are."""
@@ -55,8 +55,14 @@ def delayed(recording: Recording, delay_s: float) -> Recording:
 
 def thinned(recording: Recording, every: int) -> Recording:
     """Every so-manieth row."""
-    return replace(recording, time_s=recording.time_s[::every], dt_s=recording.dt_s * every, fit=recording.fit[::every],
-                   heldout=recording.heldout[::every], channels={k: v[::every] for k, v in recording.channels.items()})
+    return replace(
+        recording,
+        time_s=recording.time_s[::every],
+        dt_s=recording.dt_s * every,
+        fit=recording.fit[::every],
+        heldout=recording.heldout[::every],
+        channels={k: v[::every] for k, v in recording.channels.items()},
+    )
 
 
 class Twin(RigChain):
@@ -70,7 +76,9 @@ class Twin(RigChain):
         self.catheter: Catheter = load_catheter(rig.catheter.name)
         mechanics = self.catheter.cosserat
         if mechanics is None:
-            raise ValueError(f"catheter.name: found {rig.catheter.name!r} without spatial mechanics, wanted one that has them")
+            raise ValueError(
+                f"catheter.name: found {rig.catheter.name!r} without spatial mechanics, wanted one that has them"
+            )
         super().__init__(_spec(rig, mechanics.EI1, mechanics.GJ / mechanics.EI1))
         self.shaft_offset_m = rig.tracker.shaft_sensor_offset_m
         self.softness = 1.0
@@ -135,23 +143,47 @@ class Twin(RigChain):
             rows += [pose[:3], np.where(good, turn, np.nan)]
         return np.vstack([*rows, piece.extra["force"]])
 
-    def _solve(self, insertion: float, roll: float, kappa: float, force: Array, start: CosseratSolution | None) -> CosseratSolution:
-        return solve_cosserat(self.catheter, float(insertion), float(kappa), force, stations_m=(self.shaft_offset_m,),
-                              roll_rad=float(roll), start=start)
+    def _solve(
+        self, insertion: float, roll: float, kappa: float, force: Array, start: CosseratSolution | None
+    ) -> CosseratSolution:
+        return solve_cosserat(
+            self.catheter,
+            float(insertion),
+            float(kappa),
+            force,
+            stations_m=(self.shaft_offset_m,),
+            roll_rad=float(roll),
+            start=start,
+        )
 
 
 def _spec(rig: Rig, rigidity: float, torsion_to_bending: float) -> NominalSpec:
     """The nominal file of the twin: everything held."""
     known = rig.transmission
-    values = {"insertion_gain": known.insertion_slope, "insertion_offset_m": known.insertion_at_home_m, "roll_slope": known.roll_slope,
-              "roll_offset_rad": 0.0, "knob_gain_per_m_rad": 1.0, "knob_offset_per_m": 0.0, "bending_stiffness_N_m2": rigidity,
-              "wall_distance_m": 1.0, "wall_stiffness_N_per_m": 1000.0}
-    return NominalSpec.model_validate({
-        "name": f"twin of {rig.name}", "kind": "rig", "data": {"time": "time_s"},
-        "rig": {"distal_length_m": rig.catheter.distal_length_m, "shaft_sensor_offset_m": rig.tracker.shaft_sensor_offset_m,
-                "torsion_to_bending": torsion_to_bending},
-        "parameters": {key: {"value": float(value), "free": False} for key, value in values.items()},
-    })
+    values = {
+        "insertion_gain": known.insertion_slope,
+        "insertion_offset_m": known.insertion_at_home_m,
+        "roll_slope": known.roll_slope,
+        "roll_offset_rad": 0.0,
+        "knob_gain_per_m_rad": 1.0,
+        "knob_offset_per_m": 0.0,
+        "bending_stiffness_N_m2": rigidity,
+        "wall_distance_m": 1.0,
+        "wall_stiffness_N_per_m": 1000.0,
+    }
+    return NominalSpec.model_validate(
+        {
+            "name": f"twin of {rig.name}",
+            "kind": "rig",
+            "data": {"time": "time_s"},
+            "rig": {
+                "distal_length_m": rig.catheter.distal_length_m,
+                "shaft_sensor_offset_m": rig.tracker.shaft_sensor_offset_m,
+                "torsion_to_bending": torsion_to_bending,
+            },
+            "parameters": {key: {"value": float(value), "free": False} for key, value in values.items()},
+        }
+    )
 
 
 class Listener:
@@ -208,7 +240,9 @@ class Listener:
             self.stamps_ns.append(self.stamps_ns[-1] + self.period_ns)
             self.rows.append(np.full(len(COLUMNS), np.nan))
         self.stamps_ns.append(tip.stamp_ns)
-        self.rows.append(np.array([*self._handle(tip.stamp_ns), *_numbers(tip), *_numbers(shaft), *self._force(tip.stamp_ns)]))
+        self.rows.append(
+            np.array([*self._handle(tip.stamp_ns), *_numbers(tip), *_numbers(shaft), *self._force(tip.stamp_ns)])
+        )
         return lost + 1
 
     def _handle(self, stamp_ns: int) -> list[float]:
@@ -217,7 +251,11 @@ class Listener:
         for before in reversed(self._stages):
             if before[0] <= stamp_ns:
                 share = (stamp_ns - before[0]) / max(after[0] - before[0], 1)
-                return [a + share * (b - a) for a, b in zip(before[1:], after[1:], strict=True)] if after[0] > before[0] else list(before[1:])
+                return (
+                    [a + share * (b - a) for a, b in zip(before[1:], after[1:], strict=True)]
+                    if after[0] > before[0]
+                    else list(before[1:])
+                )
             after = before
         return list(after[1:])
 

@@ -1,4 +1,4 @@
-"""Where and when: windows of the mismatch, and the operating condition that gathers most of it, under false-discovery control."""
+"""Where and when: windows of the mismatch, and the condition that gathers most of it, under false-discovery control."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def moving_rms(values: Array, dt_s: float) -> Array:
 
 
 def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
-    """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed, short pieces dropped."""
+    """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed,
+    short pieces dropped.
+    """
     rms = moving_rms(fill(mismatch), dt_s)
     high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], high.astype(np.int8), [0]))))
@@ -90,7 +92,8 @@ def features(problem: Problem, piece: Piece) -> dict[str, Array]:
 
 
 def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1) -> Condition | None:
-    """The condition under which the mismatch of output `row` gathers most, beyond its share of samples; None if none is sure.
+    """The condition under which the mismatch of output `row` gathers most, beyond its share of samples; None if none is
+    sure.
 
     `stride`: every so many samples are looked at.
     """

@@ -52,13 +52,15 @@ class Model(Protocol):
     ports: tuple[Port, ...]
     parameters: tuple[Parameter, ...]
     quiet_inputs: tuple[str, ...]
-    screen_samples: int                # about so many samples are enough to screen by
-    fit_samples: int                   # and so many to fit; beyond, samples are averaged
-    coarsest_s: float                  # period beyond which they must not be averaged
-    travel: tuple[tuple[str, str, str], ...]   # signals a condition may speak of: words, key of Piece.inputs, unit
-    moves: dict[str, str]                      # channel of the motion at each port of `unlisted_at`
-    unlisted_at: tuple[tuple[str, str], ...]   # ports of an equation found by search: whose motion it is made of, where it is added
-    taken: frozenset[str]              # effects (id, or id:form) that the nominal model has already
+    screen_samples: int  # about so many samples are enough to screen by
+    fit_samples: int  # and so many to fit; beyond, samples are averaged
+    coarsest_s: float  # period beyond which they must not be averaged
+    travel: tuple[tuple[str, str, str], ...]  # signals a condition may speak of: words, key of Piece.inputs, unit
+    moves: dict[str, str]  # channel of the motion at each port of `unlisted_at`
+    unlisted_at: tuple[
+        tuple[str, str], ...
+    ]  # ports of an equation found by search: whose motion it is made of, where it is added
+    taken: frozenset[str]  # effects (id, or id:form) that the nominal model has already
 
     def prepare(self, recording: Recording) -> Piece:
         """Inputs filled and derived, outputs stacked."""
@@ -103,7 +105,9 @@ def apply_acts(signal: Array, acts: list[Act], port: str, piece: Piece, side: st
             continue
         source = piece.inputs[candidate.source] if candidate.source else None
         base = piece.inputs.get(f"motion:{port}", motion) if candidate.effect.side == "output" else signal
-        context = Context(piece.recording.time_s, piece.recording.dt_s, base, tolerance, piece.start.get(port, 0.0), source, piece.extra)
+        context = Context(
+            piece.recording.time_s, piece.recording.dt_s, base, tolerance, piece.start.get(port, 0.0), source, piece.extra
+        )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal
 
@@ -124,11 +128,23 @@ def scale_of(model: Model, pieces: list[Piece], port: Port, candidate: Candidate
     if candidate.effect.side == "output":
         unit = used[0].extra["units"].get(f"output:{port.name}", unit)
     span = max(high - low, 1e-12)
-    return Scale(unit=unit, span=span, low=low, high=high, speed=speed, tolerance=tolerance_of(together, span),
-                 need=max(need_rms, 1e-12), dt_s=dt, duration_s=duration, timed=used[0].recording.timed,
-                 source_unit=units.get(candidate.source, used[0].extra["units"].get(candidate.source, "")) or "1",
-                 source_span=float(np.ptp(source)) or 1.0, source_rms=float(np.sqrt(np.mean(source**2))) or 1.0,
-                 motion_unit=used[0].extra["units"].get(f"motion:{port.name}", unit), motion_span=span)
+    return Scale(
+        unit=unit,
+        span=span,
+        low=low,
+        high=high,
+        speed=speed,
+        tolerance=tolerance_of(together, span),
+        need=max(need_rms, 1e-12),
+        dt_s=dt,
+        duration_s=duration,
+        timed=used[0].recording.timed,
+        source_unit=units.get(candidate.source, used[0].extra["units"].get(candidate.source, "")) or "1",
+        source_span=float(np.ptp(source)) or 1.0,
+        source_rms=float(np.sqrt(np.mean(source**2))) or 1.0,
+        motion_unit=used[0].extra["units"].get(f"motion:{port.name}", unit),
+        motion_span=span,
+    )
 
 
 def stack(recording: Recording, names: list[str]) -> Array:

@@ -1,4 +1,4 @@
-"""Sensor noise from the quiescent parts of a recording: level, colour, wild samples. Never from the residual to be explained."""
+"""Sensor noise from the quiescent parts of a recording: level, colour, wild samples. Never from the residual to explain."""
 
 from __future__ import annotations
 
@@ -30,10 +30,12 @@ class Noise:
         return float(np.clip(1.0 / (gain * gain * flat), 1.0, 1e4)) if gain > 0 and flat > 0 else 1.0
 
     def whiten(self, residual: Array) -> Array:
-        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN beside missing samples."""
+        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN beside
+        missing samples.
+        """
         out = residual.copy()
         for k, a in enumerate(self.ar):
-            out[k + 1:] -= a * residual[: -k - 1]
+            out[k + 1 :] -= a * residual[: -k - 1]
         out[: self.ar.size] = np.nan
         return out / (self.sigma / np.sqrt(autocovariance_of(self.ar)[0]))
 
@@ -78,7 +80,9 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     step = max((quantum(values) for values in outputs), default=0.0)
     floor = step / np.sqrt(12.0)
     if sum(piece.size for piece in pieces) < 100:
-        return Noise(max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)")
+        return Noise(
+            max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
+        )
     table = []
     for piece in pieces:
         spread = 1.4826 * np.median(np.abs(piece - np.median(piece))) + 1e-300
@@ -92,7 +96,9 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
 
 
 def _typical(table: Array, sizes: Array) -> Array:
-    """Mean of the autocovariances (pieces, lags), by size, over the pieces of middling level: one that holds a jump does not count."""
+    """Mean of the autocovariances (pieces, lags), by size, over the pieces of middling level: one that holds a jump
+    does not count.
+    """
     order = np.argsort(table[:, 0])
     place = (np.cumsum(sizes[order]) - 0.5 * sizes[order]) / sizes.sum()
     middle = order[(place > 0.15) & (place < 0.85)] if order.size > 3 else order[: max(1, order.size - 1)]
@@ -122,9 +128,11 @@ def _high_frequency(outputs: list[Array]) -> float:
 
 
 def by_steps(x: Array, sigma: float, correlation: float, longest: int = 8) -> tuple[float, float]:
-    """Noise of `x` (n,) by its steps over 1 ... `longest` samples: standard deviation and correlation time (samples), no less than given.
+    """Noise of `x` (n,) by its steps over 1 ... `longest` samples: standard deviation and correlation time (samples), no
+    less than given.
 
-    Half the mean square of a step over k samples is sigma^2 (1 - rho_k); medians, so that the few large steps of a mismatch do not count.
+    Half the mean square of a step over k samples is sigma^2 (1 - rho_k); medians, so that the few large steps of a
+    mismatch do not count.
     """
     good = x[np.isfinite(x)]
     if good.size < 10 * longest:

@@ -115,7 +115,9 @@ class RigSpec(Request):
 
 
 class EffectSpec(Request):
-    """An effect that is known to be there: id and port or subsystem, its parameters by their keys, refitted unless `free = false`."""
+    """An effect that is known to be there: id and port or subsystem, its parameters by their keys, refitted unless
+    `free = false`.
+    """
 
     id: str
     at: str
@@ -160,7 +162,9 @@ class NominalSpec(Request):
 
 
 def effect_of(text: str) -> EffectSpec:
-    """An effect as written in one line, `backlash@cable:width_rad=0.02`; also `source=`, `form=` and `free=false`. Raises BadInput."""
+    """An effect as written in one line, `backlash@cable:width_rad=0.02`; also `source=`, `form=` and `free=false`.
+    Raises BadInput.
+    """
     head, _, tail = text.partition(":")
     effect_id, _, at = head.partition("@")
     content: dict[str, object] = {"id": effect_id, "at": at}

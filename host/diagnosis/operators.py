@@ -13,7 +13,9 @@ Array = npt.NDArray[np.float64]
 
 @njit(cache=True)
 def play(x: Array, radius: float, start: float) -> Array:
-    """Backlash operator of half-width `radius`: the output rests until the input pushes it. `start`: first output minus input."""
+    """Backlash operator of half-width `radius`: the output rests until the input pushes it. `start`: first output
+    minus input.
+    """
     out = np.empty(x.size)
     z = x[0] + min(max(start, -radius), radius)
     for i in range(x.size):
@@ -124,7 +126,9 @@ def overload(x: Array, level: float) -> Array:
 
 @njit(cache=True)
 def whip(theta: Array, amplitude_rad: float, phase_rad: float) -> Array:
-    """Tip roll of a pre-curved shaft in a curved vessel: out + A sin(out + phase) = in, on the branch that is followed; jumps if A > 1."""
+    """Tip roll of a pre-curved shaft in a curved vessel: out + A sin(out + phase) = in, on the branch that is
+    followed; jumps if A > 1.
+    """
     out = np.empty(theta.size)
     y = theta[0]
     for i in range(theta.size):
@@ -199,7 +203,8 @@ def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array
 
 @njit(cache=True)
 def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) -> Array:
-    """`x` (n,) without noise `sigma` of that correlation time (samples): at every sample the longest mean about it that agrees
+    """`x` (n,) without noise `sigma` of that correlation time (samples): at every sample the longest mean about it that
+    agrees
     with all shorter ones (Lepski 1991). `from_zero`: a mean within three of its standard errors counts as zero."""
     n = x.size
     total = np.zeros(n + 1)

@@ -1,4 +1,4 @@
-"""Pictures of a diagnosis: the chain with the faulty link, recording against both models, the loop, the fit before and after."""
+"""Pictures of a diagnosis: the chain with its faulty link, recording against both models, the loop, the fit."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ FAULT, SHADE = "#b03a32", "#f6e3da"
 def shown(result: Diagnosis) -> tuple[Piece, int, int]:
     """The held-out recording (piece, its index) and output that show the mismatch best."""
     row = result.figures.primary
+
     def gain(index: int) -> float:
         piece = result.full.pieces[index]
         mask = piece.heldout
@@ -30,6 +31,7 @@ def shown(result: Diagnosis) -> tuple[Piece, int, int]:
             return -1.0
         change = result.found.nominal_full.residuals[index][row][mask] - result.found.best_full.residuals[index][row][mask]
         return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
+
     index = max(range(len(result.full.pieces)), key=gain)
     return result.full.pieces[index], index, row
 
@@ -50,8 +52,21 @@ def chain(result: Diagnosis) -> Picture:
         for k, name in enumerate(names):
             x, y = k % per_row, -(k // per_row)
             colour = FAULT if name in bad else INK
-            axes.text(x, y, name.replace("_", " "), ha="center", va="center", color=colour, fontsize=9.5, fontweight="bold" if name in bad else "normal",
-                      bbox={"boxstyle": "round,pad=0.45", "fc": SHADE if name in bad else "#ffffff", "ec": colour if name in bad else FAINT})
+            axes.text(
+                x,
+                y,
+                name.replace("_", " "),
+                ha="center",
+                va="center",
+                color=colour,
+                fontsize=9.5,
+                fontweight="bold" if name in bad else "normal",
+                bbox={
+                    "boxstyle": "round,pad=0.45",
+                    "fc": SHADE if name in bad else "#ffffff",
+                    "ec": colour if name in bad else FAINT,
+                },
+            )
             if k + 1 < len(names) and x < per_row - 1:
                 axes.annotate("", (x + 0.62, y), (x + 0.40, y), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 0.9})
 
@@ -78,7 +93,11 @@ def over_time(result: Diagnosis) -> Picture:
             for a, b in spans:
                 axes.axvspan(a, b, color=SHADE, lw=0)
         bins = 300 if narrow else 700
-        for values, colour, label, width in ((y, MEASURED, "recorded", 1.6), (nominal, FAULT, "nominal, refitted", 1.0), (best, INK, "extended", 1.0)):
+        for values, colour, label, width in (
+            (y, MEASURED, "recorded", 1.6),
+            (nominal, FAULT, "nominal, refitted", 1.0),
+            (best, INK, "extended", 1.0),
+        ):
             if label != "extended" or result.found.best.terms:
                 top.plot(*thinned(t, values, bins), color=colour, lw=width, label=label)
         bottom.axhspan(-floor, floor, color="#e6edf3", lw=0)
@@ -90,14 +109,29 @@ def over_time(result: Diagnosis) -> Picture:
         bottom.set_xlabel("time (s)" if piece.recording.timed else "sample")
         legend_above(top, 2 if narrow else 3)
 
-    caption = f"Recording {piece.recording.name}{'' if piece.fit.any() else ', not used to fit'}. Below: recording minus model; the grey band is the noise."
-    return picture(draw, 4.3, 4.6, "Recording and models over time", f"{output.channel} over time: recorded, nominal and extended model.", caption)
+    unused = "" if piece.fit.any() else ", not used to fit"
+    caption = f"Recording {piece.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
+    return picture(
+        draw,
+        4.3,
+        4.6,
+        "Recording and models over time",
+        f"{output.channel} over time: recorded, nominal and extended model.",
+        caption,
+    )
 
 
 def loop(result: Diagnosis) -> Picture | None:
     """Input against what the nominal model leaves: memory shows as a loop."""
     ports = {port.name: port for port in result.model.ports}
-    name = next((term.candidate.port.name for term in result.found.best.terms if term.candidate.port.kind.split("+")[0] in ("motion", "force")), None)
+    name = next(
+        (
+            term.candidate.port.name
+            for term in result.found.best.terms
+            if term.candidate.port.kind.split("+")[0] in ("motion", "force")
+        ),
+        None,
+    )
     if name is None:
         return None
     port: Port = ports[name]
@@ -105,7 +139,9 @@ def loop(result: Diagnosis) -> Picture | None:
     x = result.model.motion(piece, port)
     left = result.found.nominal_full.residuals[index][row]
     extra = left - result.found.best_full.residuals[index][row]
-    travel = next((f"{words} ({unit})" for words, key, unit in result.model.travel if key.endswith(name)), result.model.travel[0][0])
+    travel = next(
+        (f"{words} ({unit})" for words, key, unit in result.model.travel if key.endswith(name)), result.model.travel[0][0]
+    )
     if port.kind.startswith("motion") and name not in ("insertion", "roll", "knob"):
         travel = f"{result.model.travel[0][0]} ({result.model.travel[0][2]})"
     unit = result.model.outputs[row].unit
@@ -118,8 +154,14 @@ def loop(result: Diagnosis) -> Picture | None:
         axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
         legend_above(axes, 1 if narrow else 2)
 
-    return picture(draw, 3.3, 3.0, "Loop", "Input against what the nominal model leaves, and what the effects add.",
-                   "A loop means memory or rate; a single curve means neither.")
+    return picture(
+        draw,
+        3.3,
+        3.0,
+        "Loop",
+        "Input against what the nominal model leaves, and what the effects add.",
+        "A loop means memory or rate; a single curve means neither.",
+    )
 
 
 def before_after(result: Diagnosis) -> Picture:
@@ -140,7 +182,10 @@ def before_after(result: Diagnosis) -> Picture:
         axes.set_yticks(place, names)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set(xlabel="RMS error on held-out samples, in units of the noise (dotted: the noise itself)", ylim=(-0.6, len(rows) - 0.4))
+        axes.set(
+            xlabel="RMS error on held-out samples, in units of the noise (dotted: the noise itself)",
+            ylim=(-0.6, len(rows) - 0.4),
+        )
         if narrow:
             axes.set_xlabel("held-out error / noise")
         axes.margins(x=0.08)

@@ -1,4 +1,4 @@
-"""One diagnosis from files to findings: load, noise, search, equals, intervals, location, and figures on untouched samples."""
+"""One diagnosis from files to findings: load, noise, search, equals, intervals, location, figures on untouched samples."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Location:
 
     subsystem: str
     channels: list[str]
-    windows_s: dict[str, list[tuple[float, float]]]      # of every recording, in its file's own time
+    windows_s: dict[str, list[tuple[float, float]]]  # of every recording, in its file's own time
     condition: Condition | None
     residual_share: float
 
@@ -68,7 +68,7 @@ class Diagnosis:
     located: list[Location]
     figures: Figures
     verdict: str = "nothing_missing"
-    rest: Rest = Rest(None, 0.0)
+    rest: Rest = field(default_factory=lambda: Rest(None, 0.0))
     notes: list[str] = field(default_factory=list)
 
 
@@ -95,7 +95,10 @@ def thinning(model: Model, recordings: list[Recording]) -> int:
 
 def _problem(model: Model, recordings: list[Recording], columns: dict[str, str]) -> Problem:
     pieces = [model.prepare(r) for r in recordings]
-    still = [noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed) for p in pieces]
+    still = [
+        noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed)
+        for p in pieces
+    ]
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
         found = noise_module.estimate([p.y[row] for p in pieces], still)
@@ -124,7 +127,9 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
     named = bool(found.best.terms) and not rest.doubtful
-    result.verdict = "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
+    result.verdict = (
+        "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
+    )
     if not located and rest.sure and rest.predictable is not None:
         result.located = [_unexplained(full, found, rest.predictable.port.subsystem)]
     return result
@@ -146,10 +151,15 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     residuals = found.nominal_full.residuals
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))
-    spans = [windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma) for p, r in zip(full.pieces, residuals, strict=True)]
+    spans = [
+        windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma)
+        for p, r in zip(full.pieces, residuals, strict=True)
+    ]
     told = _told(full, spans)
     where = condition(full, residuals, top, max(1, sum(p.n for p in full.pieces) // 20000))
-    return Location(subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top))
+    return Location(
+        subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top)
+    )
 
 
 def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
@@ -159,6 +169,8 @@ def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
         settle = getattr(full.model, "settle", None)
         if settle is not None and not fit.terms:
             settle(piece, fit.values)
+        if "begin" in coarse.extra:
+            piece.extra["begin"] = coarse.extra["begin"]
     again = replace(fit)
     again.residuals = [piece.y - full.simulate(piece, fit.terms, fit.values) for piece in full.pieces]
     return again
@@ -197,7 +209,10 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
             continue
         top = max(rows, key=lambda row: _weight(full, alone, row))
         strong = [row for row in rows if _weight(full, alone, row) >= 0.5 * _weight(full, alone, top)]
-        spans = [joined([span for row in strong for span in _windows(piece, m[row])]) for piece, m in zip(full.pieces, alone, strict=True)]
+        spans = [
+            joined([span for row in strong for span in _windows(piece, m[row])])
+            for piece, m in zip(full.pieces, alone, strict=True)
+        ]
         share = _share(full, found, spans, top)
         where = condition(full, alone, top, max(1, sum(p.n for p in full.pieces) // 20000))
         out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans), where, share))
@@ -205,13 +220,15 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
 
 
 def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
-    """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted for neither."""
+    """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted
+    for neither.
+    """
     if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
         return mismatch_of(full, found.nominal_full, found.best_full)
     n = len(full.model.parameters)
     terms, values, at = [], list(found.best.values[:n]), n
     for term in found.best.terms:
-        part = found.best.values[at: at + len(term.parameters)]
+        part = found.best.values[at : at + len(term.parameters)]
         at += len(term.parameters)
         if term.candidate.port.subsystem != subsystem:
             terms.append(term)
@@ -230,13 +247,20 @@ def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
 
 
 def _weight(full: Problem, change: list[Array], row: int) -> float:
-    return rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300) if any(np.isfinite(c[row]).any() for c in change) else 0.0
+    return (
+        rms([c[row] for c in change]) / max(full.noise[row].sigma, 1e-300)
+        if any(np.isfinite(c[row]).any() for c in change)
+        else 0.0
+    )
 
 
 def _told(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
     """Windows of every recording by its name, in the time of its file."""
     begins = [piece.recording.begin_s for piece in full.pieces]
-    return {piece.recording.name: [(a + begin, b + begin) for a, b in each] for piece, each, begin in zip(full.pieces, spans, begins, strict=True)}
+    return {
+        piece.recording.name: [(a + begin, b + begin) for a, b in each]
+        for piece, each, begin in zip(full.pieces, spans, begins, strict=True)
+    }
 
 
 def _windows(piece: Piece, change: Array) -> list[tuple[float, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from textwrap import wrap
 from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -36,16 +37,30 @@ class Row(NamedTuple):
 
 def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
     """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
-    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     piece, _, row = shown(result)
+    samples = sum(p.n for p in result.full.pieces)
     text = environment.get_template("diagnosis.html.j2").render(
-        title=headline(result, verdict), eyebrow=f"Diagnosis of {result.spec.name}", lead=lead(result, verdict),
-        footer=f"{len(result.full.pieces)} recordings, {sum(p.n for p in result.full.pieces)} samples, {verdict['seconds']:.0f} s.",
-        lines=lines(result, verdict), pictures=pictures(result), effects=[shown_effect(e) for e in verdict["effects"]],
-        nominal=_nominal(result), candidates=candidates(result), located=verdict["located"], partly=result.rest.left, noises=_noises(result),
-        output=result.model.outputs[row].channel.replace("_", " "), recording=piece.recording.name, switches=switches(result),
+        title=headline(result, verdict),
+        eyebrow=f"Diagnosis of {result.spec.name}",
+        lead=lead(result, verdict),
+        footer=f"{len(result.full.pieces)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
+        lines=lines(result, verdict),
+        pictures=pictures(result),
+        effects=[shown_effect(e) for e in verdict["effects"]],
+        nominal=_nominal(result),
+        candidates=candidates(result),
+        located=verdict["located"],
+        partly=result.rest.left,
+        noises=_noises(result),
+        output=result.model.outputs[row].channel.replace("_", " "),
+        recording=piece.recording.name,
+        switches=switches(result),
         heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
-        verdict=verdict["verdict"])
+        verdict=verdict["verdict"],
+    )
     target.write_text(text, encoding="utf-8")
     return target
 
@@ -71,9 +86,15 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
     unit = fit["unit"]
     if verdict["verdict"] == "nothing_missing":
         return "No effect of the vocabulary improves the fit of recordings that were not used to fit."
-    said = f"With it the error on recordings that were not used to fit falls from {short(fit['rmse_before'])} to {short(fit['rmse_after'])} {unit}."
+    it = "it" if len(verdict["effects"]) == 1 else "them"
+    said = f"With {it} the error on recordings that were not used to fit falls from {short(fit['rmse_before'])} "
+    said += f"to {short(fit['rmse_after'])} {unit}."
     if verdict["verdict"] == "mismatch_not_identified":
-        return "What was tried stands below; its parts are probably stand-ins for something else." if verdict["effects"] else "Windows and conditions stand below."
+        return (
+            "What was tried stands below; its parts are probably stand-ins for something else."
+            if verdict["effects"]
+            else "Windows and conditions stand below."
+        )
     return said
 
 
@@ -86,8 +107,10 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     """Key figures."""
     fit = verdict["fit"]
     unit = f"{NBSP}{fit['unit']}"
-    found = [Line("held-out error, nominal", short(fit["rmse_before"]) + unit, "refitted"),
-             Line("held-out error, extended", short(fit["rmse_after"]) + unit, f"noise {short(fit['noise_floor'])}{unit}")]
+    found = [
+        Line("held-out error, nominal", short(fit["rmse_before"]) + unit, "refitted"),
+        Line("held-out error, extended", short(fit["rmse_after"]) + unit, f"noise {short(fit['noise_floor'])}{unit}"),
+    ]
     if verdict["located"]:
         found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
     if result.found.best.terms:
@@ -97,11 +120,24 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
 
 def shown_effect(effect: dict[str, Any]) -> dict[str, Any]:
     """An effect with its numbers as text."""
-    rows = [(words(key), short(p["value"]), f"{short(p['ci95'][0])} … {short(p['ci95'][1])}") for key, p in effect["parameters"].items()]
-    return {**effect, "name": words(effect["id"]), "where": words(effect["subsystem"]), "rows": rows,
-            "alike": [words(name.replace("@", " at ")) for name in effect["indistinguishable_from"]],
-            "script": effect["experiment_to_tell_apart"].splitlines(), "gain": short(effect["evidence"]["heldout_log_likelihood_gain"]),
-            "p": short(effect["evidence"]["p_value"])}
+    rows = [
+        (words(key), short(p["value"]), f"{short(p['ci95'][0])} … {short(p['ci95'][1])}")
+        for key, p in effect["parameters"].items()
+    ]
+    return {
+        **effect,
+        "name": words(effect["id"]),
+        "where": words(effect["subsystem"]),
+        "rows": rows,
+        "alike": [words(name.replace("@", " at ")) for name in effect["indistinguishable_from"]],
+        "script": [
+            line
+            for text in effect["experiment_to_tell_apart"].splitlines()
+            for line in wrap(text, 88, subsequent_indent="    ")
+        ],
+        "gain": short(effect["evidence"]["heldout_log_likelihood_gain"]),
+        "p": short(effect["evidence"]["p_value"]),
+    }
 
 
 def switches(result: Diagnosis) -> tuple[str, str]:
@@ -109,7 +145,7 @@ def switches(result: Diagnosis) -> tuple[str, str]:
     options, tables = [], []
     at = len(result.model.parameters)
     for term in result.found.best.terms:
-        values = result.found.best.values[at: at + len(term.parameters)]
+        values = result.found.best.values[at : at + len(term.parameters)]
         at += len(term.parameters)
         c = term.candidate
         if c.effect.id == "unlisted":
@@ -118,10 +154,14 @@ def switches(result: Diagnosis) -> tuple[str, str]:
         numbers = {p.key: f"{float(v):.6g}" for p, v in zip(term.parameters, values, strict=True) if p.high > p.low}
         told = [f"{key}={value}" for key, value in (texts | numbers).items()]
         options.append(f"--effect '{c.effect.id}@{c.port.name}:{','.join(told)}'")
-        lines_ = [f'id = "{c.effect.id}"', f'at = "{c.port.name}"', *(f'{key} = "{value}"' for key, value in texts.items()),
-                  "values = { " + ", ".join(f"{key} = {value}" for key, value in numbers.items()) + " }"]
+        lines_ = [
+            f'id = "{c.effect.id}"',
+            f'at = "{c.port.name}"',
+            *(f'{key} = "{value}"' for key, value in texts.items()),
+            "values = { " + ", ".join(f"{key} = {value}" for key, value in numbers.items()) + " }",
+        ]
         tables.append("\n".join(["[[effect]]", *lines_]))
-    return " ".join(options), "\n\n".join(tables)
+    return "\n".join(options), "\n\n".join(tables)
 
 
 def candidates(result: Diagnosis) -> list[Row]:
@@ -129,19 +169,40 @@ def candidates(result: Diagnosis) -> list[Row]:
     rows = []
     for count, step in enumerate(result.found.steps, start=1):
         if step.move == "backward":
-            rows.append(Row(str(count), f"{words(step.key)} dropped again", short(step.gain.log_likelihood), short(step.gain.p_value), "", False))
+            rows.append(
+                Row(
+                    str(count),
+                    f"{words(step.key)} dropped again",
+                    short(step.gain.log_likelihood),
+                    short(step.gain.p_value),
+                    "",
+                    False,
+                )
+            )
         for trial in step.trials[:6]:
-            rows.append(Row(str(count), words(trial.candidate.key.replace("@", " at ")), short(trial.heldout.log_likelihood), short(trial.heldout.p_value),
-                            f"{100 * trial.heldout.share:.1f} %", trial.candidate.key == step.key))
+            rows.append(
+                Row(
+                    str(count),
+                    words(trial.candidate.key.replace("@", " at ").replace("(", " (")),
+                    short(trial.heldout.log_likelihood),
+                    short(trial.heldout.p_value),
+                    f"{100 * trial.heldout.share:.1f} %",
+                    trial.candidate.key == step.key,
+                )
+            )
     return rows
 
 
 def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
     spans = result.intervals
-    return [(words(p.name), f"{short(float(v))} {p.unit}".strip(), f"{short(a)} … {short(b)}" if p.high > p.low else "held")
-            for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)]
+    return [
+        (words(p.name), f"{short(float(v))} {p.unit}".strip(), f"{short(a)} … {short(b)}" if p.high > p.low else "held")
+        for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)
+    ]
 
 
 def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
-    return [(words(o.channel), f"{short(n.sigma)} {o.unit}", f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
-            for o, n in zip(result.model.outputs, result.full.noise, strict=True)]
+    return [
+        (words(o.channel), f"{short(n.sigma)} {o.unit}", f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+        for o, n in zip(result.model.outputs, result.full.noise, strict=True)
+    ]

@@ -17,17 +17,20 @@ from host.diagnosis.model import scale_of
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-SCREEN_ROWS = 24000        # residuals to screen by, about
-AT_REST = frozenset({"periodic_disturbance", "sensor_drift"})   # seen without any motion of their port
-GRID = 160                 # grid points of one candidate at most
-SCAN_SECONDS = 0.4         # time to screen one candidate, about
+SCREEN_ROWS = 24000  # residuals to screen by, about
+AT_REST = frozenset({"periodic_disturbance", "sensor_drift"})  # seen without any motion of their port
+GRID = 160  # grid points of one candidate at most
+SCAN_SECONDS = 0.4  # time to screen one candidate, about
 
 
 def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
     """`candidate` with bounds and start values for these recordings."""
     n = len(problem.model.parameters)
-    needs = [problem.model.needs(piece, candidate.port, fit.values[:n], residual)[piece.fit]
-             for piece, residual in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()]
+    needs = [
+        problem.model.needs(piece, candidate.port, fit.values[:n], residual)[piece.fit]
+        for piece, residual in zip(problem.pieces, fit.residuals, strict=True)
+        if piece.fit.any()
+    ]
     together = np.concatenate(needs)
     rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
     scale = scale_of(problem.model, problem.pieces, candidate.port, candidate, rms)
@@ -42,7 +45,7 @@ def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Te
     n = len(problem.model.parameters)
     terms, values, at = [], list(fit.values[:n]), n
     for term in fit.terms:
-        part = fit.values[at: at + len(term.parameters)]
+        part = fit.values[at : at + len(term.parameters)]
         at += len(term.parameters)
         if term.candidate.key not in drop:
             terms.append(term)
@@ -62,7 +65,9 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
                 return None
             if other.effect.id not in ("creep_relaxation", "periodic_disturbance"):
                 drop.append(other.key)
-        elif other.effect.id in candidate.effect.contains or (candidate.effect.family and candidate.effect.family == other.effect.family):
+        elif other.effect.id in candidate.effect.contains or (
+            candidate.effect.family and candidate.effect.family == other.effect.family
+        ):
             drop.append(other.key)
         elif candidate.effect.id in other.effect.contains:
             return None
@@ -81,14 +86,18 @@ class Screened:
 
 
 def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
-    """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid search)."""
+    """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
+    search).
+    """
     problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
     found = []
     bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
     n_eff = _independent(problem, fit)
     slopes = _slopes(problem, fit)
-    used = [np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()]
+    used = [
+        np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
+    ]
     lines = lines_of(used, problem.pieces[0].recording.dt_s)
     resting = _resting(problem)
     began = perf_counter()
@@ -145,11 +154,15 @@ def _slopes(problem: Problem, fit: Fit) -> Slopes | None:
     n = len(problem.model.parameters)
     acts, at = [], n
     for term in fit.terms:
-        acts.append((term.candidate, fit.values[at: at + len(term.parameters)]))
+        acts.append((term.candidate, fit.values[at : at + len(term.parameters)]))
         at += len(term.parameters)
     axes = [port.name for port in problem.model.ports if port.kind.startswith("motion")]
-    return [{axis: sensitivity(piece, fit.values[:n], axis, acts) for axis in axes} if piece.fit.any() else {axis: piece.y for axis in axes}
-            for piece in problem.pieces]
+    return [
+        {axis: sensitivity(piece, fit.values[:n], axis, acts) for axis in axes}
+        if piece.fit.any()
+        else {axis: piece.y for axis in axes}
+        for piece in problem.pieces
+    ]
 
 
 def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slopes) -> Array:
@@ -159,7 +172,7 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
     rows = []
     for piece, S in zip(problem.pieces, slopes, strict=True):
         if piece.fit.any():
-            change = problem.model.change(piece, trial[:n], S, term.candidate, trial[-len(term.parameters):])  # type: ignore[attr-defined]
+            change = problem.model.change(piece, trial[:n], S, term.candidate, trial[-len(term.parameters) :])  # type: ignore[attr-defined]
             rows.append(np.where(np.isfinite(piece.y), change, 0.0)[:, piece.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
 
@@ -167,9 +180,14 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
 def enough(problem: Problem) -> Problem:
     """The problem with enough recordings to fit, spread over all; the rest neither fitted nor simulated."""
     used = [index for index, piece in enumerate(problem.pieces) if piece.fit.any()]
-    count = max(1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used)))))
+    count = max(
+        1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used))))
+    )
     chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
-    pieces = [piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool)) for index, piece in enumerate(problem.pieces)]
+    pieces = [
+        piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool))
+        for index, piece in enumerate(problem.pieces)
+    ]
     return replace(problem, pieces=pieces)
 
 
@@ -191,8 +209,18 @@ def _independent(problem: Problem, fit: Fit) -> float:
     return total
 
 
-def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array,
-          rest: Array, most: int, slopes: Slopes | None, lines: Array) -> list[tuple[float, Array]]:
+def _scan(
+    problem: Problem,
+    terms: tuple[Term, ...],
+    values: Array,
+    term: Term,
+    base: Array,
+    Q: Array,
+    rest: Array,
+    most: int,
+    slopes: Slopes | None,
+    lines: Array,
+) -> list[tuple[float, Array]]:
     """(energy taken, start values of the term) at each grid point; `rest` is orthogonal to the columns of `Q`."""
     points = []
     linear = [p for p in term.parameters if p.linear]
@@ -205,7 +233,9 @@ def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, 
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
             fast = slopes is not None and term.candidate.port.name in slopes[0]
-            columns.append(_fast(problem, terms, trial, slopes) if fast and slopes is not None else base - problem.stacked(terms, trial))
+            columns.append(
+                _fast(problem, terms, trial, slopes) if fast and slopes is not None else base - problem.stacked(terms, trial)
+            )
         D = np.array(columns)
         B = D @ Q
         G, g = D @ D.T - B @ B.T, D @ rest
@@ -214,7 +244,9 @@ def _scan(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, 
             continue
         a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
         if linear:
-            a = np.array([min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)])
+            a = np.array(
+                [min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)]
+            )
         elif not 0.2 < a[0] < 5.0:
             continue
         taken = float(2.0 * a @ g - a @ G @ a)

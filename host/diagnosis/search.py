@@ -1,4 +1,4 @@
-"""Which effects are missing: screening by projection, joint refits, forward, upgrade, swap and backward moves on held-out evidence."""
+"""Which effects are missing: joint refits; forward, upgrade, swap and backward moves on held-out evidence."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from host.diagnosis.screening import Screened, enough, screen, without
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-FULL_FITS = 8              # candidates refitted in full at each step
-FIRST_ROUNDS, MORE_ROUNDS = 5, 9   # of a fit: from each start, and from the best of these on
+FULL_FITS = 8  # candidates refitted in full at each step
+FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
 MOST_EFFECTS = 5
-ENOUGH = 6.0               # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
-SURE = 1e-2                # p-value a new effect has to reach on held-out blocks
-SMALLEST_SHARE = 0.015     # of the held-out error of some output it has to take away,
-SMALLEST_EXCESS = 0.10     # and this much of what is above noise
-COARSE = 0.15              # far above noise, a finer shape has to take this share of the error to be told from a simpler one
-INEXACT = 0.02             # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
+ENOUGH = 6.0  # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
+SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
+SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
+SMALLEST_EXCESS = 0.10  # and this much of what is above noise
+COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
+INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
 NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
 REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 
@@ -79,12 +79,29 @@ def settle(problem: Problem, values: Array) -> None:
     own = getattr(problem.model, "settle", None)
     for piece in problem.pieces if own is not None else ():
         own(piece, values)  # type: ignore[misc]
+    begin_anew(problem, Fit((), values))
+
+
+def begin_anew(problem: Problem, fit: Fit) -> None:
+    """Lets a model that runs freely from a measured state find that state anew."""
+    own = getattr(problem.model, "begin_anew", None)
+    for piece in problem.pieces if own is not None else ():
+        own(piece, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
+
+
+def refined(problem: Problem, fit: Fit) -> Fit:
+    """`fit` brought to its end on all samples, together with the states that recordings begin from."""
+    for _ in range(2 if hasattr(problem.model, "begin_anew") else 1):
+        begin_anew(problem, fit)
+        fit = minimize(problem, fit.terms, fit.values)
+    return finish(problem, fit)
 
 
 def fit_nominal(problem: Problem) -> Fit:
     """Nominal parameters refitted on all samples to fit; sets the weights of outputs and the start of memories.
 
-    A model that takes a measured output as an input too (`settle`) has it freed of noise before each fit, with what it simulates itself:
+    A model that takes a measured output as an input too (`settle`) has it freed of noise before each fit, with what it
+    simulates itself:
     errors in a variable that the fit takes for exact would bend its parameters.
     """
     fit = Fit((), problem.model.guess(problem.pieces))
@@ -104,7 +121,10 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     terms, values = without(base, problem, item.drop)
     few = enough(problem)
     begins = item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]
-    fits = [minimize(few, (*terms, item.term), np.concatenate((values, begin)), rounds=FIRST_ROUNDS, tolerance=1e-4) for begin in begins]
+    fits = [
+        minimize(few, (*terms, item.term), np.concatenate((values, begin)), rounds=FIRST_ROUNDS, tolerance=1e-4)
+        for begin in begins
+    ]
     fit = min(fits, key=lambda f: f.cost)
     fit = minimize(few, fit.terms, fit.values, rounds=MORE_ROUNDS, tolerance=1e-4)
     if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
@@ -117,16 +137,33 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
     trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
     more = len(fit.values) - len(base.values)
-    return Trial(item.candidate, fit, heldout, trained, heldout.log_likelihood - more, after, bool(item.drop), problem.pieces[0].recording.dt_s)
+    return Trial(
+        item.candidate,
+        fit,
+        heldout,
+        trained,
+        heldout.log_likelihood - more,
+        after,
+        bool(item.drop),
+        problem.pieces[0].recording.dt_s,
+    )
 
 
 def at_bound(fit: Fit) -> bool:
     """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
     term = fit.terms[-1]
-    values = fit.values[-len(term.parameters):]
-    return any(p.high > p.low and ((np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
-                                   or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high)))
-               for p, value in zip(term.parameters, values, strict=True)) and term.candidate.effect.id not in NATURAL_BOUNDS
+    values = fit.values[-len(term.parameters) :]
+    return (
+        any(
+            p.high > p.low
+            and (
+                (np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
+                or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high))
+            )
+            for p, value in zip(term.parameters, values, strict=True)
+        )
+        and term.candidate.effect.id not in NATURAL_BOUNDS
+    )
 
 
 def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
@@ -152,16 +189,23 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
 
 def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
     n = len(problem.model.parameters)
-    needs = [problem.model.needs(piece, candidate.port, fit.values[:n], r) for piece, r in zip(problem.pieces, fit.residuals, strict=True)]
+    needs = [
+        problem.model.needs(piece, candidate.port, fit.values[:n], r)
+        for piece, r in zip(problem.pieces, fit.residuals, strict=True)
+    ]
     return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
 
 
 def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: float) -> None:
-    """Start of memory at `port` that leaves the least error in `piece`: a scan over [-reach, reach], then its best cell halved."""
+    """Start of memory at `port` that leaves the least error in `piece`: a scan over [-reach, reach], then its best
+    cell halved.
+    """
+
     def error(start: float) -> float:
         piece.start[port] = start
         r = (piece.y - problem.simulate(piece, fit.terms, fit.values)) / problem.scale[:, None]
         return float(np.nansum(np.minimum(r * r, 16.0)))
+
     old = piece.start.get(port, 0.0)
     tried = {float(s): error(float(s)) for s in (*np.linspace(-reach, reach, 9), old)}
     step = 0.125 * reach
@@ -175,7 +219,9 @@ def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: floa
 
 
 def rank(trials: list[Trial], base: Fit) -> None:
-    """Sorts trials by held-out likelihood, with one effective sample size for all, that of the trial with the least error."""
+    """Sorts trials by held-out likelihood, with one effective sample size for all, that of the trial with the least
+    error.
+    """
     if not trials:
         return
     most = np.max([trial.heldout.independent for trial in trials], axis=0)
@@ -187,7 +233,11 @@ def rank(trials: list[Trial], base: Fit) -> None:
     top = trials[0]
     coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.heldout.excesses))))
     near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
-    simpler = [t for t in trials if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)]
+    simpler = [
+        t
+        for t in trials
+        if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)
+    ]
     if simpler:
         best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
         trials.remove(best)
@@ -195,7 +245,9 @@ def rank(trials: list[Trial], base: Fit) -> None:
 
 
 def of_sampling(trial: Trial) -> bool:
-    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples, not physics."""
+    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples,
+    not physics.
+    """
     if trial.candidate.effect.id not in ("latency", "rate_lag") or not trial.candidate.port.name.endswith("_drive"):
         return False
     return float(trial.fit.values[-1]) < 1.05 * trial.period_s
@@ -204,7 +256,9 @@ def of_sampling(trial: Trial) -> bool:
 def related(simple: Candidate, general: Candidate) -> bool:
     """Whether `general` is a finer shape of `simple`, at the same place."""
     a, b = simple.effect, general.effect
-    return simple.port.name == general.port.name and (a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family))
+    return simple.port.name == general.port.name and (
+        a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family)
+    )
 
 
 def good_enough(trial: Trial, base: Fit) -> bool:
@@ -212,8 +266,14 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     more = max(len(trial.fit.values) - len(base.values), 0)
     gain = trial.heldout
     least = max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
-    return (not at_bound(trial.fit) and not of_sampling(trial) and gain.log_likelihood > ENOUGH + more and gain.p_value < SURE and gain.share > least
-            and trial.trained.log_likelihood > ENOUGH + 2.0 * more)
+    return (
+        not at_bound(trial.fit)
+        and not of_sampling(trial)
+        and gain.log_likelihood > ENOUGH + more
+        and gain.p_value < SURE
+        and gain.share > least
+        and trial.trained.log_likelihood > ENOUGH + 2.0 * more
+    )
 
 
 def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
@@ -239,7 +299,7 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         rivals[winner.candidate.key] = [trial for trial in trials if trial is not winner]
         set_starts(problem, winner.starts)
-        best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
+        best = refined(problem, winner.fit)
         reweigh(problem, best)
         best = _prune(problem, best, floor, steps)
     return Found(nominal, best, steps, rivals)

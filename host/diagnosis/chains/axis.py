@@ -1,4 +1,4 @@
-"""Force in, motion out: m a + c v + k x = force + offset, simulated freely, from recorded force or under the recorded controller."""
+"""Force in, motion out: m a + c v + k x = force + offset, simulated freely, from recorded force or under a controller."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Parameter, Port
+from host.diagnosis.evidence import correlation_time
 from host.diagnosis.force_kernel import run_axis, slot_array
 from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
 from host.diagnosis.nominal import NominalSpec
@@ -22,8 +23,10 @@ FOLLOWER_RAD_S = 20.0
 class Axis:
     """Nominal model of kind `axis`.
 
-    With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and without a spring, the
-    axis would run away from any recording: then it is held to the recorded motion by a soft follower, and the force the follower needs
+    With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
+    without a spring, the
+    axis would run away from any recording: then it is held to the recorded motion by a soft follower, and the force the
+    follower needs
     (zero if nothing is missing) is compared instead.
     """
 
@@ -43,10 +46,17 @@ class Axis:
         if self.spec.controller is not None or not self.free_run:
             outputs.append(Output(self.spec.input, force, name))
         self.outputs = tuple(outputs)
-        self.ports = (Port(name, "force", name, tuple(o.channel for o in outputs)), Port(f"{name}_drive", "timing+limit", name, (self.spec.output,)),
-                      Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)))
-        defaults = {"mass": (1.0, f"{force} s2/{motion}"), "damping": (1.0, f"{force} s/{motion}"), "stiffness": (1.0, f"{force}/{motion}"),
-                    "offset": (0.0, force)}
+        self.ports = (
+            Port(name, "force", name, tuple(o.channel for o in outputs)),
+            Port(f"{name}_drive", "timing+limit", name, (self.spec.output,)),
+            Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
+        )
+        defaults = {
+            "mass": (1.0, f"{force} s2/{motion}"),
+            "damping": (1.0, f"{force} s/{motion}"),
+            "stiffness": (1.0, f"{force}/{motion}"),
+            "offset": (0.0, force),
+        }
         parameters = []
         for term in self.spec.terms:
             value, free = spec.start(term, defaults[term][0])
@@ -74,12 +84,28 @@ class Axis:
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
         x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
         name = spec.subsystem
-        reads = {"position": (x, v), "velocity": (np.cumsum(x) * recording.dt_s, x), "acceleration": (np.zeros_like(x), np.zeros_like(x))}
+        reads = {
+            "position": (x, v),
+            "velocity": (np.cumsum(x) * recording.dt_s, x),
+            "acceleration": (np.zeros_like(x), np.zeros_like(x)),
+        }
         piece.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
-        piece.extra.update(begin=np.array(begin), x=x, v=v, substeps=self._substeps(piece), tolerance=tolerance_of(motion, float(np.ptp(motion))))
-        piece.extra["units"] = {**self.units, name: self.units[spec.input], f"motion:{name}": self.units[spec.output],
-                                f"{name}_drive": self.units[spec.input], f"{name}_reading": self.units[spec.output]}
+        piece.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
+        piece.extra.update(
+            begin=np.array(begin),
+            x=x,
+            v=v,
+            substeps=self._substeps(piece),
+            tolerance=tolerance_of(motion, float(np.ptp(motion))),
+        )
+        piece.extra["units"] = {
+            **self.units,
+            name: self.units[spec.input],
+            f"motion:{name}": self.units[spec.output],
+            f"{name}_drive": self.units[spec.input],
+            f"{name}_reading": self.units[spec.output],
+        }
         piece.extra["steps"] = upsample(piece.inputs[spec.input], 2 * piece.extra["substeps"], spec.hold)
         if not self.free_run:
             piece.y = np.zeros_like(y)
@@ -108,8 +134,10 @@ class Axis:
         size = np.linalg.norm(A, axis=0) + 1e-300
         A, b = np.concatenate((A.real, A.imag)), np.concatenate((b.real, b.imag))
         found = np.linalg.lstsq(A / size, b, rcond=1e-12)[0] / size
-        pick = [value if term in self.given or not np.isfinite(f) or (p.log and f <= 0) else f
-                for term, value, f, p in zip(self.spec.terms, given, found, self.parameters, strict=True)]
+        pick = [
+            value if term in self.given or not np.isfinite(f) or (p.log and f <= 0) else f
+            for term, value, f, p in zip(self.spec.terms, given, found, self.parameters, strict=True)
+        ]
         return np.array(pick)
 
     def _substeps(self, piece: Piece) -> int:
@@ -128,7 +156,11 @@ class Axis:
         if drive:
             changed = apply_acts(piece.inputs[spec.input], drive, f"{spec.subsystem}_drive", piece, None)
             steps = upsample(changed, 2 * extra["substeps"], spec.hold)
-        slots = [candidate.effect.slots(values, candidate.form) for candidate, values in acts if candidate.effect.slots is not None]
+        slots = [
+            candidate.effect.slots(values, candidate.form)
+            for candidate, values in acts
+            if candidate.effect.slots is not None
+        ]
         p = slot_array([*slots, {"stiffness": float(linear[2])}])
         load = np.zeros(piece.n)
         if spec.controller is not None:
@@ -139,14 +171,48 @@ class Axis:
             control, reference = np.zeros(0), load[None, :]
         if not self.free_run:
             return self._follow(piece, linear, steps, p)
-        run = run_axis(steps, extra["substeps"], piece.recording.dt_s, linear, p, extra["begin"], load, control, reference,
-                       piece.start.get(spec.subsystem, 0.0), float(piece.recording.time_s[0]))
+        run = run_axis(
+            steps,
+            extra["substeps"],
+            piece.recording.dt_s,
+            linear,
+            p,
+            extra["begin"],
+            load,
+            control,
+            reference,
+            piece.start.get(spec.subsystem, 0.0),
+            float(piece.recording.time_s[0]),
+        )
         motion = run[("position", "velocity", "acceleration").index(spec.reads)]
         motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
 
+    def begin_anew(self, piece: Piece, theta: Array, acts: list[Act]) -> None:
+        """Position and speed at the first sample, as measured there and as the free run wants them, each by its own
+        variance.
+
+        Only a motion read as position is begun so: its first speed is a derivative of noise, and its error rings on.
+        """
+        if not self.free_run or self.spec.controller is not None or self.spec.reads != "position":
+            return
+        begin, spread, _ = piece.extra["measured"]
+        piece.extra["begin"] = begin
+        r = piece.y[0] - self.simulate(piece, theta, acts)[0]
+        columns = []
+        for k in range(2):
+            piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+            columns.append((piece.y[0] - self.simulate(piece, theta, acts)[0] - r) * -1.0)
+        used = np.isfinite(r)
+        A, b = np.array(columns).T[used], r[used]
+        sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
+        by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
+        piece.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
+
     def _follow(self, piece: Piece, linear: Array, steps: Array, p: Array) -> Array:
-        """Force error along the measured motion: recorded input against what the equation of motion needs, both smoothed alike."""
+        """Force error along the measured motion: recorded input against what the equation of motion needs, both
+        smoothed alike.
+        """
         from host.diagnosis.force_kernel import along
 
         extra, dt = piece.extra, piece.recording.dt_s
@@ -154,7 +220,17 @@ class Axis:
         x, v = extra["x"], extra["v"]
         a = np.gradient(v, dt)
         need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
-        need = need + along(x, v, a, np.zeros(piece.n), piece.recording.time_s, dt, extra["tolerance"], piece.start.get(self.spec.subsystem, 0.0), p)
+        need = need + along(
+            x,
+            v,
+            a,
+            np.zeros(piece.n),
+            piece.recording.time_s,
+            dt,
+            extra["tolerance"],
+            piece.start.get(self.spec.subsystem, 0.0),
+            p,
+        )
         force = smooth_derivatives(steps[:: 2 * extra["substeps"]][: piece.n], dt, window)[0]
         return np.asarray(need - force)[None, :]
 
@@ -165,7 +241,9 @@ class Axis:
         return piece.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else piece.extra["x"]
 
     def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
-        """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of size)."""
+        """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of
+        size).
+        """
         if len(self.outputs) == 2 or not self.free_run:
             return np.asarray(residual[-1])
         if port.name.endswith("_reading"):
@@ -174,8 +252,21 @@ class Axis:
         return np.asarray(residual[0] * size)
 
 
+def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> tuple[Array, float]:
+    """Standard deviations (2,) of position and speed at the first sample, read off a cubic over `window` samples; and
+    the noise.
+    """
+    first = slice(0, min(motion.size, 20 * window))
+    noise = float(np.std((motion - smooth)[first])) * float(np.sqrt(window / max(window - 4.0, 1.0)))
+    t = np.arange(window) * dt_s
+    covariance = np.linalg.inv(np.vander(t / t[-1], 4, increasing=True).T @ np.vander(t / t[-1], 4, increasing=True))
+    return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300), noise
+
+
 def upsample(u: Array, factor: int, hold: str) -> Array:
-    """Input at `factor` points per sample, (n * factor + 1,). zero: held; linear; band_limited: sinc (whole record, by Fourier)."""
+    """Input at `factor` points per sample, (n * factor + 1,). zero: held; linear; band_limited: sinc (whole record,
+    by Fourier).
+    """
     n = u.size
     if hold == "zero":
         return np.append(np.repeat(u, factor), u[-1])
@@ -184,8 +275,8 @@ def upsample(u: Array, factor: int, hold: str) -> Array:
     from scipy.signal import resample
 
     pad = min(n - 1, 400)
-    mirrored = np.concatenate((u[pad:0:-1], u, u[-2: -pad - 2: -1]))
+    mirrored = np.concatenate((u[pad:0:-1], u, u[-2 : -pad - 2 : -1]))
     size = 2 ** math.ceil(math.log2(mirrored.size))
     mirrored = np.pad(mirrored, (0, size - mirrored.size), mode="linear_ramp", end_values=mirrored[0])
     fine = resample(mirrored, size * factor)
-    return np.asarray(fine[pad * factor: (pad + n) * factor + 1])
+    return np.asarray(fine[pad * factor : (pad + n) * factor + 1])

@@ -1,4 +1,4 @@
-"""A Python function as nominal model: `name(inputs, parameters, time_s)` gives the outputs; effects act on what goes in and comes out."""
+"""A Python function as nominal model; effects act on what goes into it and on what comes out."""
 
 from __future__ import annotations
 
@@ -38,11 +38,25 @@ class External:
         inputs, outputs, name = self.spec.inputs, self.spec.outputs, self.spec.subsystem
         self.outputs = tuple([Output(output, self.units[output], name) for output in outputs])
         loads = tuple(self.spec.load)
-        self.ports: tuple[Port, ...] = tuple([
-            Port(channel, "motion+turn" if self.units[channel] == "rad" else "motion", name, tuple(outputs), loads,
-                 tuple(other for other in inputs if other != channel)) for channel in inputs])
-        self.ports += tuple([Port(f"{channel}_reading", "drift+timing+limit+mix", name, (channel,), loads, tuple(inputs))
-                             for channel in outputs])
+        self.ports: tuple[Port, ...] = tuple(
+            [
+                Port(
+                    channel,
+                    "motion+turn" if self.units[channel] == "rad" else "motion",
+                    name,
+                    tuple(outputs),
+                    loads,
+                    tuple(other for other in inputs if other != channel),
+                )
+                for channel in inputs
+            ]
+        )
+        self.ports += tuple(
+            [
+                Port(f"{channel}_reading", "drift+timing+limit+mix", name, (channel,), loads, tuple(inputs))
+                for channel in outputs
+            ]
+        )
         parameters = []
         for key in spec.parameters:
             value, free = spec.start(key, 0.0)
@@ -57,8 +71,13 @@ class External:
     def prepare(self, recording: Recording) -> Piece:
         """Inputs bridged, outputs stacked."""
         spec = self.spec
-        piece = Piece(recording, stack(recording, spec.outputs), recording.fit, recording.heldout,
-                      filled(recording, list(self.quiet_inputs)))
+        piece = Piece(
+            recording,
+            stack(recording, spec.outputs),
+            recording.fit,
+            recording.heldout,
+            filled(recording, list(self.quiet_inputs)),
+        )
         units = dict(self.units)
         for channel in spec.inputs:
             values = piece.inputs[channel]
@@ -80,8 +99,11 @@ class External:
         for name in self.spec.outputs:
             row = np.asarray(found[name] if isinstance(found, dict) and name in found else np.nan, dtype=np.float64)
             if row.shape != (piece.n,):
-                raise BadInput("callable.function", f"{self.spec.function} gave {name} of shape {row.shape}",
-                               f"a dictionary with {name} of shape ({piece.n},)")
+                raise BadInput(
+                    "callable.function",
+                    f"{self.spec.function} gave {name} of shape {row.shape}",
+                    f"a dictionary with {name} of shape ({piece.n},)",
+                )
             rows.append(apply_acts(row, acts, f"{name}_reading", piece, None))
         return np.vstack(rows)
 
@@ -93,16 +115,27 @@ class External:
         return np.where(np.isfinite(row), row, np.nanmedian(row))
 
     def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
-        """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their noise."""
+        """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their
+        noise.
+        """
         if port.name not in piece.inputs:
             return np.asarray(residual[self.spec.outputs.index(port.channels[0])])
         step = 1e-4 * (float(np.ptp(piece.inputs[port.name])) or 1.0)
-        moved = Piece(piece.recording, piece.y, piece.fit, piece.heldout,
-                      {**piece.inputs, port.name: piece.inputs[port.name] + step}, piece.start, piece.extra)
+        moved = Piece(
+            piece.recording,
+            piece.y,
+            piece.fit,
+            piece.heldout,
+            {**piece.inputs, port.name: piece.inputs[port.name] + step},
+            piece.start,
+            piece.extra,
+        )
         slope = (self.simulate(moved, theta, []) - self.simulate(piece, theta, [])) / step
         weight = np.asarray(piece.extra.get("weight", np.ones(len(self.outputs))))[:, None]
         s = np.where(np.isfinite(residual), slope, 0.0) / weight
-        return np.asarray(np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300))
+        return np.asarray(
+            np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)
+        )
 
 
 def function_of(text: str, folder: str) -> Function:

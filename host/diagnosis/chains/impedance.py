@@ -9,11 +9,13 @@ from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Parameter, Port
 from host.diagnosis.force_kernel import along, slot_array
 from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.noise import estimate, quiescent
 from host.diagnosis.nominal import NominalSpec
 from host.diagnosis.operators import smooth_derivatives
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
+CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
 
 class Impedance:
@@ -32,9 +34,16 @@ class Impedance:
         force, motion, name = self.units[self.spec.output], self.units[self.spec.input], self.spec.subsystem
         self.outputs = (Output(self.spec.output, force, name),)
         loads, others = tuple(self.spec.load), tuple(self.spec.others)
-        self.ports = (Port(name, "force", name, (self.spec.output,), loads, others),
-                      Port(f"{name}_reading", "drift+timing+limit+mix", name, (self.spec.output,), (), others))
-        unit = {"mass": f"{force} s2/{motion}", "damping": f"{force} s/{motion}", "stiffness": f"{force}/{motion}", "offset": force}
+        self.ports = (
+            Port(name, "force", name, (self.spec.output,), loads, others),
+            Port(f"{name}_reading", "drift+timing+limit+mix", name, (self.spec.output,), (), others),
+        )
+        unit = {
+            "mass": f"{force} s2/{motion}",
+            "damping": f"{force} s/{motion}",
+            "stiffness": f"{force}/{motion}",
+            "offset": force,
+        }
         self.terms: list[tuple[str, str]] = []
         parameters = []
         for term in self.spec.terms:
@@ -58,13 +67,20 @@ class Impedance:
 
     def prepare(self, recording: Recording) -> Piece:
         """Motion smoothed to velocity and acceleration without phase."""
-        piece = Piece(recording, stack(recording, [self.spec.output]), recording.fit, recording.heldout,
-                      filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]))
+        piece = Piece(
+            recording,
+            stack(recording, [self.spec.output]),
+            recording.fit,
+            recording.heldout,
+            filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]),
+        )
         motion = piece.inputs[self.spec.input]
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1) if recording.timed else 7
         x, v, a = smooth_derivatives(motion, recording.dt_s, window)
         piece.inputs[f"motion:{self.spec.subsystem}"] = motion
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
+        if estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma < CLEAN * tolerance:
+            x = motion  # smoothing would round its reversals, and friction with them
         piece.extra.update(v=v, a=a, x=x, tolerance=tolerance)
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
         piece.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
@@ -85,12 +101,24 @@ class Impedance:
             stiffness = value if term == "stiffness" else stiffness
         here = [(candidate, values) for candidate, values in acts if candidate.effect.slots is not None]
         for source in dict.fromkeys(candidate.source for candidate, _ in here):
-            filled_slots = [candidate.effect.slots(values, candidate.form) for candidate, values in here
-                            if candidate.source == source and candidate.effect.slots is not None]
+            filled_slots = [
+                candidate.effect.slots(values, candidate.form)
+                for candidate, values in here
+                if candidate.source == source and candidate.effect.slots is not None
+            ]
             load = piece.inputs[source] if source else np.zeros(piece.n)
             p = slot_array([*filled_slots, {"stiffness": float(stiffness)}])
-            force = force + along(extra["x"], extra["v"], extra["a"], load, piece.recording.time_s, piece.recording.dt_s,
-                                  extra["tolerance"], piece.start.get(self.spec.subsystem, 0.0), p)
+            force = force + along(
+                extra["x"],
+                extra["v"],
+                extra["a"],
+                load,
+                piece.recording.time_s,
+                piece.recording.dt_s,
+                extra["tolerance"],
+                piece.start.get(self.spec.subsystem, 0.0),
+                p,
+            )
         return np.asarray(apply_acts(force, acts, f"{self.spec.subsystem}_reading", piece, None))[None, :]
 
     def motion(self, piece: Piece, port: Port) -> Array:

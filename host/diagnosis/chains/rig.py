@@ -1,4 +1,4 @@
-"""The catheter rig's twin: handle -> insertion, roll, curvature -> shape -> contact -> sensors, with a port at every link."""
+"""The catheter rig's twin: handle -> insertion, roll, curvature -> shape -> contact -> sensors, a port at every link."""
 
 from __future__ import annotations
 
@@ -17,16 +17,34 @@ from host.diagnosis.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.operators import calm, fill
 
 Array = npt.NDArray[np.float64]
-HANDLES = {"handle_insertion": ("handle_insertion_m", "m"), "handle_roll": ("handle_roll_rad", "rad"), "handle_knob": ("handle_knob_rad", "rad")}
+HANDLES = {
+    "handle_insertion": ("handle_insertion_m", "m"),
+    "handle_roll": ("handle_roll_rad", "rad"),
+    "handle_knob": ("handle_knob_rad", "rad"),
+}
 TIP = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
 SHAFT = tuple(name.replace("tip", "shaft") for name in TIP)
 FORCE = ("force_x_N", "force_y_N", "force_z_N")
-PARAMETERS = (("insertion_gain", "", 1.0), ("insertion_offset", "m", 0.0), ("roll_slope", "", 1.0), ("roll_offset", "rad", 0.0),
-              ("knob_gain", "1/(m rad)", 30.0), ("knob_offset", "1/m", 0.0), ("bending_stiffness", "N m2", 3e-4), ("wall_distance", "m", 0.04),
-              ("wall_stiffness", "N/m", 1000.0))
-KEYS = {"insertion_offset": "insertion_offset_m", "roll_offset": "roll_offset_rad", "knob_gain": "knob_gain_per_m_rad",
-        "knob_offset": "knob_offset_per_m", "bending_stiffness": "bending_stiffness_N_m2", "wall_distance": "wall_distance_m",
-        "wall_stiffness": "wall_stiffness_N_per_m"}
+PARAMETERS = (
+    ("insertion_gain", "", 1.0),
+    ("insertion_offset", "m", 0.0),
+    ("roll_slope", "", 1.0),
+    ("roll_offset", "rad", 0.0),
+    ("knob_gain", "1/(m rad)", 30.0),
+    ("knob_offset", "1/m", 0.0),
+    ("bending_stiffness", "N m2", 3e-4),
+    ("wall_distance", "m", 0.04),
+    ("wall_stiffness", "N/m", 1000.0),
+)
+KEYS = {
+    "insertion_offset": "insertion_offset_m",
+    "roll_offset": "roll_offset_rad",
+    "knob_gain": "knob_gain_per_m_rad",
+    "knob_offset": "knob_offset_per_m",
+    "bending_stiffness": "bending_stiffness_N_m2",
+    "wall_distance": "wall_distance_m",
+    "wall_stiffness": "wall_stiffness_N_per_m",
+}
 AXES = ("insertion", "roll", "knob")
 
 
@@ -69,16 +87,45 @@ class Rig:
             low, high = (value, value) if not free else (0.02 * value, 50.0 * value) if positive else (-np.inf, np.inf)
             parameters.append(Parameter(name, unit, (value,), low, high, log=positive and free, step=abs(value) or 1.0))
         self.parameters = tuple(parameters)
-        self.outputs = tuple([Output(f"{part}_{axis}", unit, subsystem) for part, unit, subsystem in (
-            ("tip", "m", "shape"), ("tip_turn", "rad", "shape"), ("shaft", "m", "shape"), ("shaft_turn", "rad", "shape"),
-            ("force", "N", "contact")) for axis in "xyz"])
+        self.outputs = tuple(
+            [
+                Output(f"{part}_{axis}", unit, subsystem)
+                for part, unit, subsystem in (
+                    ("tip", "m", "shape"),
+                    ("tip_turn", "rad", "shape"),
+                    ("shaft", "m", "shape"),
+                    ("shaft_turn", "rad", "shape"),
+                    ("force", "N", "contact"),
+                )
+                for axis in "xyz"
+            ]
+        )
         loads = {"insertion": ("axial_force",), "roll": (), "knob": ("axial_force",)}
         poses = tuple(o.channel for o in self.outputs)
         self.ports = tuple(
-            [Port(axis, "motion+turn" if axis == "roll" else "motion", axis, poses, loads[axis],
-                  tuple(f"handle_{other}" for other in AXES if other != axis), ("axial_force", "curvature")) for axis in AXES]
-            + [Port(name, kind, name, poses) for name, kind in (("shape", "shape"), ("contact", "contact"), ("pose_sensor", "pose"),
-                                                                ("force_sensor", "forces"), ("base", "base"))])
+            [
+                Port(
+                    axis,
+                    "motion+turn" if axis == "roll" else "motion",
+                    axis,
+                    poses,
+                    loads[axis],
+                    tuple(f"handle_{other}" for other in AXES if other != axis),
+                    ("axial_force", "curvature"),
+                )
+                for axis in AXES
+            ]
+            + [
+                Port(name, kind, name, poses)
+                for name, kind in (
+                    ("shape", "shape"),
+                    ("contact", "contact"),
+                    ("pose_sensor", "pose"),
+                    ("force_sensor", "forces"),
+                    ("base", "base"),
+                )
+            ]
+        )
         units = {"insertion": "m", "roll": "rad", "knob": "rad"}
         self.travel = (*((axis, f"handle_{axis}", units[axis]) for axis in AXES), ("force", "axial_force", "N"))
         self.unlisted_at = tuple((axis, axis) for axis in AXES)
@@ -95,18 +142,39 @@ class Rig:
             inputs[f"motion:{axis}"] = inputs[f"handle_{axis}"]
         force = np.vstack([channels.get(name, missing) for name in FORCE])
         poses = [np.vstack([channels.get(name, missing) for name in names]) for names in (TIP, SHAFT)]
-        extra: dict[str, Any] = {"force": np.vstack([calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)])}
+        extra: dict[str, Any] = {
+            "force": np.vstack(
+                [calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)]
+            )
+        }
         for axis in AXES:
             motion = inputs[f"handle_{axis}"]
             extra[f"tolerance:{axis}"] = tolerance_of(motion, float(np.ptp(motion)))
-        units = {"insertion": "m", "output:insertion": "m", "roll": "rad", "output:roll": "rad", "knob": "rad", "output:knob": "1/m",
-                 "shape": "1/m", "contact": "N", "pose_sensor": "m", "force_sensor": "N", "base": "m", "axial_force": "N", "curvature": "1/m",
-                 "handle_insertion": "m", "handle_roll": "rad", "handle_knob": "rad"}
+        units = {
+            "insertion": "m",
+            "output:insertion": "m",
+            "roll": "rad",
+            "output:roll": "rad",
+            "knob": "rad",
+            "output:knob": "1/m",
+            "shape": "1/m",
+            "contact": "N",
+            "pose_sensor": "m",
+            "force_sensor": "N",
+            "base": "m",
+            "axial_force": "N",
+            "curvature": "1/m",
+            "handle_insertion": "m",
+            "handle_roll": "rad",
+            "handle_knob": "rad",
+        }
         extra["units"] = units
         inputs["axial_force"] = self.normal @ extra["force"]
         theta = np.array([p.grid[0] for p in self.parameters])
         inputs["curvature"] = theta[4] * inputs["handle_knob"] + theta[5]
-        piece = Piece(recording, np.full((len(self.outputs), n), np.nan), recording.fit, recording.heldout, inputs, extra=extra)
+        piece = Piece(
+            recording, np.full((len(self.outputs), n), np.nan), recording.fit, recording.heldout, inputs, extra=extra
+        )
         given, extra["force"] = extra["force"], np.zeros((3, n))
         run = self._run(piece, theta, [])
         extra["force"] = given
@@ -128,15 +196,21 @@ class Rig:
     def settle(self, piece: Piece, theta: Array) -> None:
         """Recorded force as the shape's input: simulated contact force plus what of the difference is surely not noise.
 
-        Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant of contact.
+        Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant
+        of contact.
         """
         recorded = piece.y[12:15]
         if not np.isfinite(recorded).any():
             piece.extra["force"] = self._run(piece, theta, [])["force"]
             return
         simulated = self.simulate(piece, theta, [])[12:15]
-        sigmas = [by_steps(row, *s) for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)]
-        piece.extra["force"] = simulated + np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
+        sigmas = [
+            by_steps(row, *s)
+            for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)
+        ]
+        piece.extra["force"] = simulated + np.vstack(
+            [calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)]
+        )
         piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
 
     def guess(self, pieces: list[Piece]) -> Array:
@@ -147,8 +221,15 @@ class Rig:
         """Outputs (15, n), free run from the handle and the recorded force."""
         run = self._run(piece, theta, acts)
         reference = piece.extra["reference"]
-        return np.vstack([run["tip"], rotation_logs(reference[0], run["tip_R"]), run["shaft"], rotation_logs(reference[1], run["shaft_R"]),
-                          run["force"]])
+        return np.vstack(
+            [
+                run["tip"],
+                rotation_logs(reference[0], run["tip_R"]),
+                run["shaft"],
+                rotation_logs(reference[1], run["shaft_R"]),
+                run["force"],
+            ]
+        )
 
     def links(self, piece: Piece, theta: Array, acts: list[Act]) -> tuple[Array, Array, Array]:
         """Insertion, roll and curvature (n,) behind the three axes."""
@@ -163,26 +244,56 @@ class Rig:
         insertion, roll, kappa = self.links(piece, theta, acts)
         n = piece.n
         state: dict[str, Any] = {
-            "insertion": insertion, "roll": roll, "kappa": kappa, "flex": np.full(n, 1.0 / theta[6]), "extra": np.zeros((3, n)),
-            "push": piece.extra["force"], "shift": np.zeros((3, n)), "normal": self.normal, "distal": self.spec.distal_length_m,
+            "insertion": insertion,
+            "roll": roll,
+            "kappa": kappa,
+            "flex": np.full(n, 1.0 / theta[6]),
+            "extra": np.zeros((3, n)),
+            "push": piece.extra["force"],
+            "shift": np.zeros((3, n)),
+            "normal": self.normal,
+            "distal": self.spec.distal_length_m,
         }
         state["push"] = 2.0 * state["push"] - _vector(state["push"], acts, "force_sensor", piece)
         state = _changed(state, acts, "shape", piece)
         state = _changed(state, acts, "base", piece)
         tip, tip_R, shaft, shaft_R, free, soft = self._shapes(piece, state)
-        run: dict[str, Any] = {"tip": tip + state["shift"], "tip_R": tip_R, "shaft": shaft + state["shift"], "shaft_R": shaft_R}
+        run: dict[str, Any] = {
+            "tip": tip + state["shift"],
+            "tip_R": tip_R,
+            "shaft": shaft + state["shift"],
+            "shaft_R": shaft_R,
+        }
         if "turn" in state:
             for name in ("tip", "shaft"):
                 run[name] = np.einsum("abn,bn->an", state["turn"], run[name])
                 run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
         placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
         law: dict[str, Any] = {
-            "gap": self.normal @ placed - theta[7], "stiffness": np.full(n, theta[8]), "exponent": 1.0, "reference": 1e-3,
-            "damping": 0.0, "crossley": 0.0, "relax": 0.0, "relax_time": 0.0, "friction": 0.0, "friction_distance": 1e-3,
+            "gap": self.normal @ placed - theta[7],
+            "stiffness": np.full(n, theta[8]),
+            "exponent": 1.0,
+            "reference": 1e-3,
+            "damping": 0.0,
+            "crossley": 0.0,
+            "relax": 0.0,
+            "relax_time": 0.0,
+            "friction": 0.0,
+            "friction_distance": 1e-3,
         }
         law = _changed(law, acts, "contact", piece)
-        normal_force = contact(law["gap"], self.normal @ soft, law["stiffness"], law["exponent"], law["reference"], law["damping"],
-                               law["crossley"], law["relax"], law["relax_time"], piece.recording.dt_s)
+        normal_force = contact(
+            law["gap"],
+            self.normal @ soft,
+            law["stiffness"],
+            law["exponent"],
+            law["reference"],
+            law["damping"],
+            law["crossley"],
+            law["relax"],
+            law["relax_time"],
+            piece.recording.dt_s,
+        )
         force = self.normal[:, None] * normal_force
         if law["friction"]:
             along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
@@ -192,14 +303,28 @@ class Rig:
 
     def _shapes(self, piece: Piece, state: dict[str, Any]) -> tuple[Array, ...]:
         """Kernel call; the last two results are kept, since contact and sensors change without the shape."""
-        key = tuple(hash(np.ascontiguousarray(state[name]).tobytes()) for name in ("insertion", "roll", "kappa", "push", "extra", "flex"))
+        key = tuple(
+            hash(np.ascontiguousarray(state[name]).tobytes())
+            for name in ("insertion", "roll", "kappa", "push", "extra", "flex")
+        )
         kept: dict[Any, tuple[Array, ...]] = piece.extra.setdefault("kept", {})
         if key not in kept:
             while len(kept) > 1:
                 kept.pop(next(iter(kept)))
             kept[key] = shapes(
-                state["insertion"], state["roll"], state["kappa"], -state["push"], state["extra"], state["flex"],
-                1.0 / self.spec.torsion_to_bending, self.spec.distal_length_m, self.spec.shaft_sensor_offset_m, self.normal, NODES, WEIGHTS)
+                state["insertion"],
+                state["roll"],
+                state["kappa"],
+                -state["push"],
+                state["extra"],
+                state["flex"],
+                1.0 / self.spec.torsion_to_bending,
+                self.spec.distal_length_m,
+                self.spec.shaft_sensor_offset_m,
+                self.normal,
+                NODES,
+                WEIGHTS,
+            )
         return kept[key]
 
     def change(self, piece: Piece, theta: Array, S: dict[str, Array], candidate: Candidate, values: Array) -> Array:
@@ -222,7 +347,9 @@ class Rig:
         return piece.inputs["curvature"] if port.name == "shape" else np.nan_to_num(piece.y[0]) - np.nan_to_num(piece.y[2])
 
     def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
-        """What the port would have to add: least squares over the pose rows by the port's sensitivity; residual itself at the sensors."""
+        """What the port would have to add: least squares over the pose rows by the port's sensitivity; residual
+        itself at the sensors.
+        """
         if port.name in AXES:
             S = self.sensitivity(piece, theta, port.name)
             weight = piece.extra.get("weight", np.ones(len(self.outputs)))[:12, None]
@@ -265,5 +392,12 @@ def _vector(force: Array, acts: list[Act], port: str, piece: Piece) -> Array:
 
 
 def _context(piece: Piece, source: str) -> Context:
-    return Context(piece.recording.time_s, piece.recording.dt_s, piece.inputs["motion:insertion"], 0.0, 0.0,
-                   piece.inputs[source] if source else None, piece.extra)
+    return Context(
+        piece.recording.time_s,
+        piece.recording.dt_s,
+        piece.inputs["motion:insertion"],
+        0.0,
+        0.0,
+        piece.inputs[source] if source else None,
+        piece.extra,
+    )

@@ -1,4 +1,4 @@
-"""Shape of the rig's catheter: constant-curvature arc plus linear elastic deflection by the tip force, and the contact force it meets."""
+"""Shape of the rig's catheter, an arc plus linear elastic deflection by the tip force, and the contact force it meets."""
 
 from __future__ import annotations
 
@@ -26,9 +26,23 @@ def _free_point(s: float, straight: float, kappa: float) -> tuple[float, float, 
 
 
 @njit(cache=True)
-def _deflection(s1: float, length: float, straight: float, kappa: float, fx: float, fy: float, fz: float, flex: float, twist: float,
-                nodes: Array, weights: Array, out: Array) -> None:
-    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force, roll 0: integrals of curvature change over [0, s1]."""
+def _deflection(
+    s1: float,
+    length: float,
+    straight: float,
+    kappa: float,
+    fx: float,
+    fy: float,
+    fz: float,
+    flex: float,
+    twist: float,
+    nodes: Array,
+    weights: Array,
+    out: Array,
+) -> None:
+    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force, roll 0: integrals of curvature change over
+    [0, s1].
+    """
     out[:] = 0.0
     yt, zt, _ = _free_point(length, straight, kappa)
     y1, z1, _ = _free_point(s1, straight, kappa)
@@ -85,16 +99,31 @@ def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p:
 
 
 @njit(cache=True)
-def shapes(insertion: Array, roll: Array, kappa: Array, force: Array, extra: Array, flex: Array, twist_ratio: float, distal: float,
-           offset: float, normal: Array, nodes: Array, weights: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+def shapes(
+    insertion: Array,
+    roll: Array,
+    kappa: Array,
+    force: Array,
+    extra: Array,
+    flex: Array,
+    twist_ratio: float,
+    distal: float,
+    offset: float,
+    normal: Array,
+    nodes: Array,
+    weights: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Poses under tip force, and the free tip with its compliance.
 
     Arguments:
-        insertion, roll, kappa: (n,). force: (3, n) on the tip, base frame; extra: (3, n) further tip force that is there without contact.
-        flex: (n,) 1/EI. twist_ratio: EI/GJ. distal: length of the arc fully out. offset: of the second sensor behind the tip.
+        insertion, roll, kappa: (n,). force: (3, n) on the tip, base frame; extra: (3, n) further tip force that is there
+        without contact.
+        flex: (n,) 1/EI. twist_ratio: EI/GJ. distal: length of the arc fully out. offset: of the second sensor behind the
+        tip.
         normal: (3,) of the wall.
     Returns:
-        tip position (3, n), tip rotation (3, 3, n), shaft position, shaft rotation, free tip (3, n), compliance by a unit normal force (3, n).
+        tip position (3, n), tip rotation (3, 3, n), shaft position, shaft rotation, free tip (3, n), compliance by a
+        unit normal force (3, n).
     """
     n = insertion.size
     tip, shaft, free, soft = np.empty((3, n)), np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
@@ -125,22 +154,48 @@ def shapes(insertion: Array, roll: Array, kappa: Array, force: Array, extra: Arr
         ex, ey, ez = extra[0, i], extra[1, i], extra[2, i]
         bend[:] = 0.0
         if ex != 0.0 or ey != 0.0 or ez != 0.0:
-            _deflection(length, length, straight, kappa[i], c * ex + s * ey, -s * ex + c * ey, ez, flex[i], twist, nodes, weights, bend)
+            _deflection(
+                length,
+                length,
+                straight,
+                kappa[i],
+                c * ex + s * ey,
+                -s * ex + c * ey,
+                ez,
+                flex[i],
+                twist,
+                nodes,
+                weights,
+                bend,
+            )
         x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
         free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z0
         nx, ny, nz = normal[0], normal[1], normal[2]
-        _deflection(length, length, straight, kappa[i], c * nx + s * ny, -s * nx + c * ny, nz, flex[i], twist, nodes, weights, unit)
+        _deflection(
+            length, length, straight, kappa[i], c * nx + s * ny, -s * nx + c * ny, nz, flex[i], twist, nodes, weights, unit
+        )
         soft[0, i], soft[1, i], soft[2, i] = c * unit[0] - s * unit[1], s * unit[0] + c * unit[1], unit[2]
     return tip, tip_R, shaft, shaft_R, free, soft
 
 
 @njit(cache=True)
-def contact(gap: Array, soft: Array, stiffness: Array, exponent: float, reference: float, damping: float, crossley: float, relax: float,
-            relax_time: float, dt_s: float) -> Array:
+def contact(
+    gap: Array,
+    soft: Array,
+    stiffness: Array,
+    exponent: float,
+    reference: float,
+    damping: float,
+    crossley: float,
+    relax: float,
+    relax_time: float,
+    dt_s: float,
+) -> Array:
     """Normal force (n,) on the wall in equilibrium with the shaft.
 
     gap: (n,) how far the free tip would be inside; soft: (n,) normal compliance of the shaft; depth = gap - soft * force.
-    Law: k r (depth/r)^exponent + damping depth' + crossley k depth depth' + a Maxwell branch (relax k, relax_time). exponent 1: linear.
+    Law: k r (depth/r)^exponent + damping depth' + crossley k depth depth' + a Maxwell branch (relax k, relax_time).
+    exponent 1: linear.
     """
     out = np.zeros(gap.size)
     depth_old, slow = 0.0, 0.0
@@ -158,7 +213,11 @@ def contact(gap: Array, soft: Array, stiffness: Array, exponent: float, referenc
             depth = gap[i] - c * f
             rate = (depth - depth_old) / dt_s
             branch = depth + (slow - depth) * decay
-            law = k * reference * (max(depth, 0.0) / reference) ** exponent + damping * rate + crossley * k * max(depth, 0.0) * rate
+            law = (
+                k * reference * (max(depth, 0.0) / reference) ** exponent
+                + damping * rate
+                + crossley * k * max(depth, 0.0) * rate
+            )
             law += relax * k * (depth - branch)
             if law > f:
                 low = f
@@ -175,7 +234,9 @@ def contact(gap: Array, soft: Array, stiffness: Array, exponent: float, referenc
 
 @njit(cache=True)
 def drag_along(tangent: Array, distance: float) -> Array:
-    """Vector friction state (3, n), length at most one, dragged along by the tip's tangential path (3, n) over `distance`."""
+    """Vector friction state (3, n), length at most one, dragged along by the tip's tangential path (3, n) over
+    `distance`.
+    """
     out = np.zeros(tangent.shape)
     z = np.zeros(3)
     for i in range(1, tangent.shape[1]):
@@ -211,6 +272,10 @@ def rotation_logs(reference: Array, R: Array) -> Array:
 def matrices(quaternion: Array) -> Array:
     """Rotation matrices (3, 3, n) of quaternions (4, n), scalar first; NaN stays NaN."""
     w, x, y, z = quaternion / np.sqrt(np.sum(quaternion**2, axis=0))
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                     [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

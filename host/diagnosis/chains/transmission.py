@@ -26,17 +26,26 @@ class Transmission:
     def __init__(self, spec: NominalSpec) -> None:
         self.links: list[LinkSpec] = spec.link
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
-        names = [link.subsystem if len(spec.link) == 1 or _alone(link, spec) else f"{link.subsystem}_{link.output}" for link in spec.link]
+        names = [
+            link.subsystem if len(spec.link) == 1 or _alone(link, spec) else f"{link.subsystem}_{link.output}"
+            for link in spec.link
+        ]
         self.names = names
         self.outputs = tuple(Output(link.output, self.units[link.output], link.subsystem) for link in self.links)
         ports: list[Port] = []
         parameters: list[Parameter] = []
         for name, link in zip(names, self.links, strict=True):
             turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
-            ports += [Port(name, turn, link.subsystem, (link.output,), tuple(link.load), tuple(link.others)),
-                      Port(f"{name}_reading", "drift", link.subsystem, (link.output,))]
+            ports += [
+                Port(name, turn, link.subsystem, (link.output,), tuple(link.load), tuple(link.others)),
+                Port(f"{name}_reading", "drift", link.subsystem, (link.output,)),
+            ]
             prefix = "" if len(self.links) == 1 else f"{name}_"
-            ratio = "" if self.units[link.input] == self.units[link.output] else f"{self.units[link.output]}/{self.units[link.input]}"
+            ratio = (
+                ""
+                if self.units[link.input] == self.units[link.output]
+                else f"{self.units[link.output]}/{self.units[link.input]}"
+            )
             for key, unit, default in (("gain", ratio, 1.0), ("offset", self.units[link.output], 0.0)):
                 value, free = spec.start(prefix + key, default)
                 bound = np.inf if free else value
@@ -49,13 +58,20 @@ class Transmission:
         self.travel = tuple((name.replace("_", " "), name, self.units[name]) for name in used)
         self.unlisted_at = tuple((name, name) for name in names)
         self.moves = {name: link.input for name, link in zip(names, self.links, strict=True)}
-        self.quiet_inputs = tuple(dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load]))
+        self.quiet_inputs = tuple(
+            dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load])
+        )
 
     def prepare(self, recording: Recording) -> Piece:
         """Inputs bridged, outputs stacked."""
         names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *link.others)))
-        piece = Piece(recording, stack(recording, [link.output for link in self.links]), recording.fit, recording.heldout,
-                      filled(recording, names))
+        piece = Piece(
+            recording,
+            stack(recording, [link.output for link in self.links]),
+            recording.fit,
+            recording.heldout,
+            filled(recording, names),
+        )
         units: dict[str, str] = dict(self.units)
         for name, link in zip(self.names, self.links, strict=True):
             motion = piece.inputs[link.input]
@@ -76,7 +92,7 @@ class Transmission:
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
             signal = apply_acts(piece.inputs[link.input], acts, name, piece, "input")
             signal = theta[at] * signal + theta[at + 1]
-            for constant in theta[at + 2: at + 2 + link.lag_order]:
+            for constant in theta[at + 2 : at + 2 + link.lag_order]:
                 signal = lag(signal, piece.recording.dt_s, float(constant))
             at += 2 + link.lag_order
             signal = apply_acts(signal, acts, name, piece, "output")

@@ -10,8 +10,10 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Relative difference of gain on the two sides of a centre."""
     centre = 0.0 if s.low < 0.0 < s.high else 0.5 * (s.low + s.high)
-    return (Parameter("ratio", "", (s.need / s.span,), -2.0, 2.0, linear=True),
-            Parameter("centre", s.unit, (centre,), s.low, s.high, step=0.1 * s.span))
+    return (
+        Parameter("ratio", "", (s.need / s.span,), -2.0, 2.0, linear=True),
+        Parameter("centre", s.unit, (centre,), s.low, s.high, step=0.1 * s.span),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -30,7 +32,23 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("asymmetry", "motion", 32, parameters, "The gain differs by {ratio} on the two sides of {centre}.", "y = x + ratio*|x - centre|", apply),
-    Effect("asymmetry", "force", 15, force, "Friction differs between the two directions: {viscous_difference}.",
-           "F = viscous_difference*|v|", slots=slots, timed=True),
+    Effect(
+        "asymmetry",
+        "motion",
+        32,
+        parameters,
+        "The gain differs by {ratio} on the two sides of {centre}.",
+        "y = x + ratio*|x - centre|",
+        apply,
+    ),
+    Effect(
+        "asymmetry",
+        "force",
+        15,
+        force,
+        "Friction differs between the two directions: {viscous_difference}.",
+        "F = viscous_difference*|v|",
+        slots=slots,
+        timed=True,
+    ),
 )

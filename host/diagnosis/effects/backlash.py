@@ -18,6 +18,14 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("backlash", "motion", 40, parameters, "After every reversal the output rests until a gap of {width} is taken up.",
-           "y = play(x, width/2)", apply, family="dry"),
+    Effect(
+        "backlash",
+        "motion",
+        40,
+        parameters,
+        "After every reversal the output rests until a gap of {width} is taken up.",
+        "y = play(x, width/2)",
+        apply,
+        family="dry",
+    ),
 )

@@ -23,15 +23,19 @@ def beat(s: Scale, form: str) -> tuple[Parameter, ...]:
 def jump(s: Scale, form: str) -> tuple[Parameter, ...]:
     """A displacement and a turn at one instant."""
     instants = tuple(np.linspace(0.04, 0.96, 24) * s.duration_s)
-    return (*(Parameter(f"displacement_{a}", "m", (1e-3,), linear=True) for a in "xyz"),
-            *(Parameter(f"turn_{a}", "rad", (0.02,), -1.0, 1.0, step=0.02, linear=True) for a in "xyz"),
-            Parameter("instant", "s", instants, 0.0, s.duration_s, step=0.005 * s.duration_s))
+    return (
+        *(Parameter(f"displacement_{a}", "m", (1e-3,), linear=True) for a in "xyz"),
+        *(Parameter(f"turn_{a}", "rad", (0.02,), -1.0, 1.0, step=0.02, linear=True) for a in "xyz"),
+        Parameter("instant", "s", instants, 0.0, s.duration_s, step=0.005 * s.duration_s),
+    )
 
 
 def tilt(s: Scale, form: str) -> tuple[Parameter, ...]:
     """A constant displacement and turn against the calibrated place."""
-    return (*(Parameter(f"displacement_{a}", "m", (1e-3,), linear=True) for a in "xy"),
-            *(Parameter(f"turn_{a}", "rad", (0.02,), -1.0, 1.0, step=0.02, linear=True) for a in "xy"))
+    return (
+        *(Parameter(f"displacement_{a}", "m", (1e-3,), linear=True) for a in "xy"),
+        *(Parameter(f"turn_{a}", "rad", (0.02,), -1.0, 1.0, step=0.02, linear=True) for a in "xy"),
+    )
 
 
 def _turned(turn: Array, when: Array) -> Array:
@@ -56,8 +60,28 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 SAYS = "The sheath's exit moves: all poses move with it."
 EFFECTS = (
-    Effect("base_motion", "base", 50, beat, SAYS, "x = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, timed=True, forms=("beat",)),
+    Effect(
+        "base_motion",
+        "base",
+        50,
+        beat,
+        SAYS,
+        "x = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply,
+        timed=True,
+        forms=("beat",),
+    ),
     Effect("base_motion", "base", 51, drift, SAYS, "x = x + rate*t", apply, timed=True, forms=("drift",)),
-    Effect("base_motion", "base", 52, jump, SAYS, "x = R (x + displacement) after the instant", apply, timed=True, forms=("jump",)),
+    Effect(
+        "base_motion",
+        "base",
+        52,
+        jump,
+        SAYS,
+        "x = R (x + displacement) after the instant",
+        apply,
+        timed=True,
+        forms=("jump",),
+    ),
     Effect("base_motion", "base", 53, tilt, SAYS, "x = R (x + displacement)", apply, forms=("constant",)),
 )

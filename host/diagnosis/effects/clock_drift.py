@@ -30,9 +30,27 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 SAYS = "One clock runs faster: the delay grows by {rate}."
 EFFECTS = tuple(
-    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True) for port in ("motion", "timing")
+    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True)
+    for port in ("motion", "timing")
 ) + (
-    Effect("clock_drift", "pose", 83, parameters, "The tracker's clock runs off: its delay grows by {rate}.", "y(t) = x(t - rate*t)", apply_pose, timed=True),
-    Effect("clock_drift", "forces", 83, parameters, "The force sensor's clock runs off: its delay grows by {rate}.", "y(t) = x(t - rate*t)", apply_force,
-           timed=True),
+    Effect(
+        "clock_drift",
+        "pose",
+        83,
+        parameters,
+        "The tracker's clock runs off: its delay grows by {rate}.",
+        "y(t) = x(t - rate*t)",
+        apply_pose,
+        timed=True,
+    ),
+    Effect(
+        "clock_drift",
+        "forces",
+        83,
+        parameters,
+        "The force sensor's clock runs off: its delay grows by {rate}.",
+        "y(t) = x(t - rate*t)",
+        apply_force,
+        timed=True,
+    ),
 )

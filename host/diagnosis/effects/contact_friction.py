@@ -7,8 +7,10 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Coefficient of friction, and the distance of its build-up."""
-    return (Parameter("coefficient", "", (0.1,), 0.0, 3.0, linear=True),
-            Parameter("distance", "m", (2e-4, 1e-3, 4e-3), 1e-5, 0.05, log=True))
+    return (
+        Parameter("coefficient", "", (0.1,), 0.0, 3.0, linear=True),
+        Parameter("distance", "m", (2e-4, 1e-3, 4e-3), 1e-5, 0.05, log=True),
+    )
 
 
 def apply(law: dict, c: Context, p: Array, form: str) -> dict:
@@ -17,6 +19,13 @@ def apply(law: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("contact_friction", "contact", 23, parameters, "The tip drags on the tissue: tangential force up to {coefficient} of the normal force.",
-           "|F_t| <= coefficient*F_n", apply),
+    Effect(
+        "contact_friction",
+        "contact",
+        23,
+        parameters,
+        "The tip drags on the tissue: tangential force up to {coefficient} of the normal force.",
+        "|F_t| <= coefficient*F_n",
+        apply,
+    ),
 )

@@ -17,9 +17,18 @@ def apply(law: dict, c: Context, p: Array, form: str) -> dict:
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """One-sided spring: place, stiffness and exponent."""
-    return (Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, float("inf"), linear=True),
-            Parameter("place", s.motion_unit, tuple(s.low + f * s.motion_span for f in (0.2, 0.4, 0.6, 0.8)), s.low, s.high, step=0.1 * s.motion_span),
-            Parameter("exponent", "", (1.0, 1.5, 2.2), 0.5, 5.0, log=True))
+    return (
+        Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, float("inf"), linear=True),
+        Parameter(
+            "place",
+            s.motion_unit,
+            tuple(s.low + f * s.motion_span for f in (0.2, 0.4, 0.6, 0.8)),
+            s.low,
+            s.high,
+            step=0.1 * s.motion_span,
+        ),
+        Parameter("exponent", "", (1.0, 1.5, 2.2), 0.5, 5.0, log=True),
+    )
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -28,8 +37,22 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("contact_nonlinear", "contact", 20, parameters, "The tissue's force goes with depth to the power {exponent}.",
-           "F = k*r*(depth/r)^exponent, r = 1 mm", apply),
-    Effect("contact_nonlinear", "force", 24, force, "Beyond {place} a one-sided spring comes in, to the power {exponent}.",
-           "F = stiffness*max(0, x - place)^exponent", slots=slots),
+    Effect(
+        "contact_nonlinear",
+        "contact",
+        20,
+        parameters,
+        "The tissue's force goes with depth to the power {exponent}.",
+        "F = k*r*(depth/r)^exponent, r = 1 mm",
+        apply,
+    ),
+    Effect(
+        "contact_nonlinear",
+        "force",
+        24,
+        force,
+        "Beyond {place} a one-sided spring comes in, to the power {exponent}.",
+        "F = stiffness*max(0, x - place)^exponent",
+        slots=slots,
+    ),
 )

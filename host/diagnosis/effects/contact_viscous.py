@@ -13,8 +13,10 @@ def damping(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def relaxation(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Share that relaxes, and time constant."""
-    return (Parameter("relaxing_share", "", (0.2, 0.6), 1e-3, 20.0, log=True),
-            Parameter("time_constant", "s", spread(0.1, 0.2 * s.duration_s, 4), 0.02, s.duration_s, log=True))
+    return (
+        Parameter("relaxing_share", "", (0.2, 0.6), 1e-3, 20.0, log=True),
+        Parameter("time_constant", "s", spread(0.1, 0.2 * s.duration_s, 4), 0.02, s.duration_s, log=True),
+    )
 
 
 def apply(law: dict, c: Context, p: Array, form: str) -> dict:
@@ -25,8 +27,26 @@ def apply(law: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("contact_viscous", "contact", 21, damping, "The tissue resists speed: {damping}.", "F = k*depth + damping*rate", apply, timed=True,
-           forms=("", "crossley")),
-    Effect("contact_viscous", "contact", 22, relaxation, "The tissue's force relaxes over {time_constant}.", "F = k*depth + branch that relaxes",
-           apply, timed=True, forms=("relaxation",)),
+    Effect(
+        "contact_viscous",
+        "contact",
+        21,
+        damping,
+        "The tissue resists speed: {damping}.",
+        "F = k*depth + damping*rate",
+        apply,
+        timed=True,
+        forms=("", "crossley"),
+    ),
+    Effect(
+        "contact_viscous",
+        "contact",
+        22,
+        relaxation,
+        "The tissue's force relaxes over {time_constant}.",
+        "F = k*depth + branch that relaxes",
+        apply,
+        timed=True,
+        forms=("relaxation",),
+    ),
 )

@@ -28,7 +28,24 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("coulomb_friction", "motion", 45, lost, "The output stays behind by {lost_motion}, against the motion, from the first step after a reversal.",
-           "y = x - lost_motion*sign(v)", apply, family="dry"),
-    Effect("coulomb_friction", "force", 10, force, "A constant force of {force} acts against the motion.", "F = force*sign(v)", slots=slots, family="dry"),
+    Effect(
+        "coulomb_friction",
+        "motion",
+        45,
+        lost,
+        "The output stays behind by {lost_motion}, against the motion, from the first step after a reversal.",
+        "y = x - lost_motion*sign(v)",
+        apply,
+        family="dry",
+    ),
+    Effect(
+        "coulomb_friction",
+        "force",
+        10,
+        force,
+        "A constant force of {force} acts against the motion.",
+        "F = force*sign(v)",
+        slots=slots,
+        family="dry",
+    ),
 )

@@ -9,7 +9,11 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Gain from the other channel."""
-    return (Parameter("gain", f"{s.unit}/{s.source_unit}" if s.unit != s.source_unit else "", (s.need / s.source_rms,), linear=True),)
+    return (
+        Parameter(
+            "gain", f"{s.unit}/{s.source_unit}" if s.unit != s.source_unit else "", (s.need / s.source_rms,), linear=True
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -18,7 +22,25 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("coupling", "motion", 73, parameters, "{source} moves this channel too, gain {gain}.", "y = x + gain*other", apply,
-           side="output", source="other"),
-    Effect("coupling", "mix", 21, parameters, "{source} moves this reading too, gain {gain}.", "y = x + gain*other", apply, source="other"),
+    Effect(
+        "coupling",
+        "motion",
+        73,
+        parameters,
+        "{source} moves this channel too, gain {gain}.",
+        "y = x + gain*other",
+        apply,
+        side="output",
+        source="other",
+    ),
+    Effect(
+        "coupling",
+        "mix",
+        21,
+        parameters,
+        "{source} moves this reading too, gain {gain}.",
+        "y = x + gain*other",
+        apply,
+        source="other",
+    ),
 )

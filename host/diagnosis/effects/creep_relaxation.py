@@ -10,7 +10,14 @@ from host.diagnosis.operators import lag
 
 def taus(s: Scale) -> Parameter:
     """Time constant between a few samples and the whole recording."""
-    return Parameter("time_constant", "s", spread(max(10 * s.dt_s, 0.01 * s.duration_s), 0.3 * s.duration_s, 4), 3 * s.dt_s, 3 * s.duration_s, log=True)
+    return Parameter(
+        "time_constant",
+        "s",
+        spread(max(10 * s.dt_s, 0.01 * s.duration_s), 0.3 * s.duration_s, 4),
+        3 * s.dt_s,
+        3 * s.duration_s,
+        log=True,
+    )
 
 
 def of_motion(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -25,7 +32,10 @@ def of_load(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Stiffness of the branch that relaxes, and its time constant."""
-    return (Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, np.inf, linear=True), taus(s))
+    return (
+        Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, np.inf, linear=True),
+        taus(s),
+    )
 
 
 def apply_motion(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -62,14 +72,58 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("creep_relaxation", "forces", 84, share, "The force sensor's reading creeps: a share {slow_share} arrives over {time_constant}.",
-           "y = x + slow_share*(lag(x, time_constant) - x)", apply_force, timed=True),
-    Effect("creep_relaxation", "shape", 22, share, "Under force the shaft goes on giving way over {time_constant}.",
-           "u = C (F + slow_share*lag(F, time_constant))", apply_shape, timed=True, forms=("force",)),
-    Effect("creep_relaxation", "motion", 55, of_motion, "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
-           "y = x + slow_share*(lag(x, time_constant) - x)", apply_motion, timed=True, contains=("rate_lag",)),
-    Effect("creep_relaxation", "motion", 72, of_load, "Under {source} the output goes on giving way over {time_constant}.",
-           "y = x + compliance*lag(load, time_constant)", apply_load, side="output", source="load", timed=True),
-    Effect("creep_relaxation", "force", 21, force, "Part of the force, {stiffness}, relaxes over {time_constant}.",
-           "F = stiffness*(x - lag(x, time_constant))", slots=slots, timed=True),
+    Effect(
+        "creep_relaxation",
+        "forces",
+        84,
+        share,
+        "The force sensor's reading creeps: a share {slow_share} arrives over {time_constant}.",
+        "y = x + slow_share*(lag(x, time_constant) - x)",
+        apply_force,
+        timed=True,
+    ),
+    Effect(
+        "creep_relaxation",
+        "shape",
+        22,
+        share,
+        "Under force the shaft goes on giving way over {time_constant}.",
+        "u = C (F + slow_share*lag(F, time_constant))",
+        apply_shape,
+        timed=True,
+        forms=("force",),
+    ),
+    Effect(
+        "creep_relaxation",
+        "motion",
+        55,
+        of_motion,
+        "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
+        "y = x + slow_share*(lag(x, time_constant) - x)",
+        apply_motion,
+        timed=True,
+        contains=("rate_lag",),
+    ),
+    Effect(
+        "creep_relaxation",
+        "motion",
+        72,
+        of_load,
+        "Under {source} the output goes on giving way over {time_constant}.",
+        "y = x + compliance*lag(load, time_constant)",
+        apply_load,
+        side="output",
+        source="load",
+        timed=True,
+    ),
+    Effect(
+        "creep_relaxation",
+        "force",
+        21,
+        force,
+        "Part of the force, {stiffness}, relaxes over {time_constant}.",
+        "F = stiffness*(x - lag(x, time_constant))",
+        slots=slots,
+        timed=True,
+    ),
 )

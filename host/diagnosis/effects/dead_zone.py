@@ -11,8 +11,10 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Centre and half-width of the band."""
     inside = tuple(s.low + f * s.span for f in (0.15, 0.3, 0.5, 0.7, 0.85))
     centre = inside + ((0.0,) if s.low < 0.0 < s.high else ())
-    return (Parameter("centre", s.unit, centre, s.low, s.high, step=0.1 * s.span),
-            Parameter("half_width", s.unit, spread(0.01 * s.span, 0.25 * s.span, 5), 1e-3 * s.span, 0.5 * s.span, log=True))
+    return (
+        Parameter("centre", s.unit, centre, s.low, s.high, step=0.1 * s.span),
+        Parameter("half_width", s.unit, spread(0.01 * s.span, 0.25 * s.span, 5), 1e-3 * s.span, 0.5 * s.span, log=True),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -21,6 +23,13 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("dead_zone", "motion", 30, parameters, "Nothing happens within {half_width} of {centre}, whichever way it is entered.",
-           "y = x - clip(x - centre, -half_width, half_width)", apply),
+    Effect(
+        "dead_zone",
+        "motion",
+        30,
+        parameters,
+        "Nothing happens within {half_width} of {centre}, whichever way it is entered.",
+        "y = x - clip(x - centre, -half_width, half_width)",
+        apply,
+    ),
 )

@@ -9,7 +9,9 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Drag per exposed length, steady and pulsatile, across the axis; frequency of the beat."""
-    parts = tuple(Parameter(f"{part}_{a}", "N/m", (0.05,), linear=True) for a in "xy" for part in ("steady", "sine", "cosine"))
+    parts = tuple(
+        Parameter(f"{part}_{a}", "N/m", (0.05,), linear=True) for a in "xy" for part in ("steady", "sine", "cosine")
+    )
     lines = tuple(np.arange(0.3, min(3.0, 0.4 / s.dt_s), 0.5 / s.duration_s))
     return (*parts, Parameter("frequency", "Hz", lines, 0.1, 0.45 / s.dt_s, step=0.1 / s.duration_s))
 
@@ -24,6 +26,14 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("flow_drag", "shape", 31, parameters, "Flow drags on the exposed shaft and pulses at {frequency}.",
-           "F_tip = 3/8 (steady + pulse)*exposed length", apply, timed=True),
+    Effect(
+        "flow_drag",
+        "shape",
+        31,
+        parameters,
+        "Flow drags on the exposed shaft and pulses at {frequency}.",
+        "F_tip = 3/8 (steady + pulse)*exposed length",
+        apply,
+        timed=True,
+    ),
 )

@@ -19,5 +19,13 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("gravity_load", "shape", 30, parameters, "The shaft sags under its weight.", "F_tip = 3/8 weight*exposed length", apply),
+    Effect(
+        "gravity_load",
+        "shape",
+        30,
+        parameters,
+        "The shaft sags under its weight.",
+        "F_tip = 3/8 weight*exposed length",
+        apply,
+    ),
 )

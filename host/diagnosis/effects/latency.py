@@ -11,7 +11,9 @@ from host.diagnosis.operators import shift
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Delay."""
     size = max(2.0 * s.dt_s, 1e-3 * s.duration_s)
-    return (Parameter("delay", "s", (0.5 * s.dt_s, 2.0 * s.dt_s, 6.0 * s.dt_s, size), 0.0, 0.05 * s.duration_s, step=s.dt_s),)
+    return (
+        Parameter("delay", "s", (0.5 * s.dt_s, 2.0 * s.dt_s, 6.0 * s.dt_s, size), 0.0, 0.05 * s.duration_s, step=s.dt_s),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -40,6 +42,24 @@ SAYS = "The channel is {delay} late, at every frequency alike."
 EFFECTS = tuple(
     Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True) for port in ("motion", "timing")
 ) + (
-    Effect("latency", "pose", 82, parameters, "The tracker's poses are {delay} late.", "y(t) = x(t - delay)", apply_pose, timed=True),
-    Effect("latency", "forces", 82, parameters, "The force readings are {delay} late.", "y(t) = x(t - delay)", apply_force, timed=True),
+    Effect(
+        "latency",
+        "pose",
+        82,
+        parameters,
+        "The tracker's poses are {delay} late.",
+        "y(t) = x(t - delay)",
+        apply_pose,
+        timed=True,
+    ),
+    Effect(
+        "latency",
+        "forces",
+        82,
+        parameters,
+        "The force readings are {delay} late.",
+        "y(t) = x(t - delay)",
+        apply_force,
+        timed=True,
+    ),
 )

@@ -10,16 +10,26 @@ from host.diagnosis.operators import dahl
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
-    return (Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-            Parameter("distance", s.unit, spread(0.01 * s.span, 0.3 * s.span, 4), 1e-3 * s.span, 3.0 * s.span, log=True))
+    return (
+        Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
+        Parameter("distance", s.unit, spread(0.01 * s.span, 0.3 * s.span, 4), 1e-3 * s.span, 3.0 * s.span, log=True),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction per load, and the distance of its build-up."""
     unit = "" if s.unit == s.source_unit else f"{s.unit}/{s.source_unit}"
-    return (Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-            Parameter("distance", s.motion_unit, spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 5), 3e-4 * s.motion_span,
-                      3.0 * s.motion_span, log=True))
+    return (
+        Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
+        Parameter(
+            "distance",
+            s.motion_unit,
+            spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 5),
+            3e-4 * s.motion_span,
+            3.0 * s.motion_span,
+            log=True,
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -34,8 +44,24 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("load_dependent_friction", "motion", 47, lost, "Friction grows with {source}: the output stays behind by {coefficient} times its size.",
-           "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", apply, source="drag"),
-    Effect("load_dependent_friction", "force", 12, force, "Friction grows with {source}: {coefficient} of its size, built up over {distance}.",
-           "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, source="drag"),
+    Effect(
+        "load_dependent_friction",
+        "motion",
+        47,
+        lost,
+        "Friction grows with {source}: the output stays behind by {coefficient} times its size.",
+        "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
+        apply,
+        source="drag",
+    ),
+    Effect(
+        "load_dependent_friction",
+        "force",
+        12,
+        force,
+        "Friction grows with {source}: {coefficient} of its size, built up over {distance}.",
+        "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
+        slots=slots,
+        source="drag",
+    ),
 )

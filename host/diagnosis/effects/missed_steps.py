@@ -9,8 +9,12 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Size of the jump and its instant."""
-    return (Parameter("jump", s.unit, (s.need,), linear=True),
-            Parameter("instant", "s", tuple(np.linspace(0.02, 0.98, 49) * s.duration_s), 0.0, s.duration_s, step=0.005 * s.duration_s))
+    return (
+        Parameter("jump", s.unit, (s.need,), linear=True),
+        Parameter(
+            "instant", "s", tuple(np.linspace(0.02, 0.98, 49) * s.duration_s), 0.0, s.duration_s, step=0.005 * s.duration_s
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -19,5 +23,14 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("missed_steps", "motion", 10, parameters, "At {instant} the axis lost {jump} and never got it back.", "y = x + jump*(t > instant)", apply, timed=True),
+    Effect(
+        "missed_steps",
+        "motion",
+        10,
+        parameters,
+        "At {instant} the axis lost {jump} and never got it back.",
+        "y = x + jump*(t > instant)",
+        apply,
+        timed=True,
+    ),
 )

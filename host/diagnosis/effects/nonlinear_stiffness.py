@@ -10,8 +10,10 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Compliance and its cubic part."""
     unit = f"{s.unit}/{s.source_unit}"
-    return (Parameter("compliance", unit, (s.need / s.source_rms,), linear=True),
-            Parameter("cubic", f"{unit}3", (s.need / s.source_rms**3,), linear=True))
+    return (
+        Parameter("compliance", unit, (s.need / s.source_rms,), linear=True),
+        Parameter("cubic", f"{unit}3", (s.need / s.source_rms**3,), linear=True),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -44,9 +46,35 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("nonlinear_stiffness", "shape", 20, bend, "The shaft's deflection is not linear in the force.", "u = C F (1 + a F^2)", apply_shape),
-    Effect("nonlinear_stiffness", "motion", 71, per_load, "The spring between input and output is not linear in {source}.",
-           "y = x + compliance*load + cubic*load^3", apply, side="output", source="load", contains=("compliance",)),
-    Effect("nonlinear_stiffness", "force", 20, force, "The spring hardens or softens with deflection: cubic coefficient {cubic}.",
-           "F = cubic*x^3", slots=slots, forms=("", "quadratic")),
+    Effect(
+        "nonlinear_stiffness",
+        "shape",
+        20,
+        bend,
+        "The shaft's deflection is not linear in the force.",
+        "u = C F (1 + a F^2)",
+        apply_shape,
+    ),
+    Effect(
+        "nonlinear_stiffness",
+        "motion",
+        71,
+        per_load,
+        "The spring between input and output is not linear in {source}.",
+        "y = x + compliance*load + cubic*load^3",
+        apply,
+        side="output",
+        source="load",
+        contains=("compliance",),
+    ),
+    Effect(
+        "nonlinear_stiffness",
+        "force",
+        20,
+        force,
+        "The spring hardens or softens with deflection: cubic coefficient {cubic}.",
+        "F = cubic*x^3",
+        slots=slots,
+        forms=("", "quadratic"),
+    ),
 )

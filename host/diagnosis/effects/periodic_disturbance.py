@@ -11,8 +11,18 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine, and frequency or pitch."""
     pair = (Parameter("sine", s.unit, (s.need,), linear=True), Parameter("cosine", s.unit, (s.need,), linear=True))
     if form == "place":
-        return (*pair, Parameter("pitch", s.motion_unit or s.unit, spread(s.motion_span / 40.0, s.motion_span, 60), s.motion_span / 200.0,
-                                 2.0 * s.motion_span, log=True, step=3e-3))
+        return (
+            *pair,
+            Parameter(
+                "pitch",
+                s.motion_unit or s.unit,
+                spread(s.motion_span / 40.0, s.motion_span, 60),
+                s.motion_span / 200.0,
+                2.0 * s.motion_span,
+                log=True,
+                step=3e-3,
+            ),
+        )
     top = min(0.2 / s.dt_s, 8.0)
     lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
     return (*pair, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
@@ -30,12 +40,17 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 SAYS = "A periodic disturbance rides on the signal."
+
+
 def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Motion of the wall along its normal."""
     top = min(0.2 / s.dt_s, 5.0)
     lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
-    return (Parameter("sine", "m", (3e-4,), linear=True), Parameter("cosine", "m", (3e-4,), linear=True),
-            Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    return (
+        Parameter("sine", "m", (3e-4,), linear=True),
+        Parameter("cosine", "m", (3e-4,), linear=True),
+        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s),
+    )
 
 
 def apply_wall(law: dict, c: Context, p: Array, form: str) -> dict:
@@ -45,11 +60,65 @@ def apply_wall(law: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("periodic_disturbance", "contact", 10, wall, "The wall moves to and fro at {frequency}.", "depth = depth + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
-           apply_wall, timed=True),
-    Effect("periodic_disturbance", "motion", 75, parameters, SAYS, "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, side="output", timed=True),
-    Effect("periodic_disturbance", "motion", 25, parameters, SAYS, "y = x + sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)", apply, forms=("place",)),
-    Effect("periodic_disturbance", "force", 30, parameters, SAYS, "F = sine*sin(2 pi f t) + cosine*cos(2 pi f t)", slots=slots, timed=True),
-    Effect("periodic_disturbance", "force", 31, parameters, SAYS, "F = sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)", slots=slots, forms=("place",)),
-    Effect("periodic_disturbance", "mix", 81, parameters, SAYS, "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)", apply, timed=True),
+    Effect(
+        "periodic_disturbance",
+        "contact",
+        10,
+        wall,
+        "The wall moves to and fro at {frequency}.",
+        "depth = depth + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply_wall,
+        timed=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "motion",
+        75,
+        parameters,
+        SAYS,
+        "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply,
+        side="output",
+        timed=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "motion",
+        25,
+        parameters,
+        SAYS,
+        "y = x + sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)",
+        apply,
+        forms=("place",),
+    ),
+    Effect(
+        "periodic_disturbance",
+        "force",
+        30,
+        parameters,
+        SAYS,
+        "F = sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        slots=slots,
+        timed=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "force",
+        31,
+        parameters,
+        SAYS,
+        "F = sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)",
+        slots=slots,
+        forms=("place",),
+    ),
+    Effect(
+        "periodic_disturbance",
+        "mix",
+        81,
+        parameters,
+        SAYS,
+        "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply,
+        timed=True,
+    ),
 )

@@ -11,8 +11,10 @@ from host.diagnosis.operators import overload
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Yield level, and set per excess."""
     size = max(abs(s.low), abs(s.high))
-    return (Parameter("set_per_excess", "", (s.need / size,), -1.0, 1.0, linear=True),
-            Parameter("yield", s.unit, tuple(f * size for f in (0.5, 0.7, 0.85, 0.95)), 0.2 * size, size, step=0.1 * size))
+    return (
+        Parameter("set_per_excess", "", (s.need / size,), -1.0, 1.0, linear=True),
+        Parameter("yield", s.unit, tuple(f * size for f in (0.5, 0.7, 0.85, 0.95)), 0.2 * size, size, step=0.1 * size),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -23,8 +25,12 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 def bend(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Yield curvature, and set per excess."""
     size = max(abs(s.low), abs(s.high))
-    return (Parameter("set_per_excess", "", (0.1,), -1.0, 1.0, linear=True),
-            Parameter("yield_curvature", "1/m", tuple(f * size for f in (0.4, 0.6, 0.75, 0.9)), 0.1 * size, size, step=0.1 * size))
+    return (
+        Parameter("set_per_excess", "", (0.1,), -1.0, 1.0, linear=True),
+        Parameter(
+            "yield_curvature", "1/m", tuple(f * size for f in (0.4, 0.6, 0.75, 0.9)), 0.1 * size, size, step=0.1 * size
+        ),
+    )
 
 
 def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
@@ -33,8 +39,22 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("plastic_set", "shape", 23, bend, "Bent beyond {yield_curvature}, the shaft keeps {set_per_excess} of the excess.",
-           "kappa = kappa + set*max excess so far", apply_shape),
-    Effect("plastic_set", "motion", 57, parameters, "Beyond {yield} the rest position shifts, and stays shifted, by {set_per_excess} of the excess.",
-           "y = x + set_per_excess*max excess of |x| over yield so far", apply),
+    Effect(
+        "plastic_set",
+        "shape",
+        23,
+        bend,
+        "Bent beyond {yield_curvature}, the shaft keeps {set_per_excess} of the excess.",
+        "kappa = kappa + set*max excess so far",
+        apply_shape,
+    ),
+    Effect(
+        "plastic_set",
+        "motion",
+        57,
+        parameters,
+        "Beyond {yield} the rest position shifts, and stays shifted, by {set_per_excess} of the excess.",
+        "y = x + set_per_excess*max excess of |x| over yield so far",
+        apply,
+    ),
 )

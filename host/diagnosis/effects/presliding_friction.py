@@ -10,15 +10,25 @@ from host.diagnosis.operators import dahl, maxwell_slip
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion when fully built up, and the distance over which that happens."""
-    return (Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
-            Parameter("distance", s.unit, spread(0.01 * s.span, 0.6 * s.span, 5), 1e-3 * s.span, 3.0 * s.span, log=True))
+    return (
+        Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
+        Parameter("distance", s.unit, spread(0.01 * s.span, 0.6 * s.span, 5), 1e-3 * s.span, 3.0 * s.span, log=True),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction force when fully built up, and the distance over which that happens."""
-    return (Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
-            Parameter("distance", s.motion_unit, spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 6), 3e-4 * s.motion_span,
-                      3.0 * s.motion_span, log=True))
+    return (
+        Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
+        Parameter(
+            "distance",
+            s.motion_unit,
+            spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 6),
+            3e-4 * s.motion_span,
+            3.0 * s.motion_span,
+            log=True,
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -34,8 +44,28 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("presliding_friction", "motion", 46, lost, "The output stays behind by up to {lost_motion}, built up over {distance} after each reversal.",
-           "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance", apply, forms=("dahl", "maxwell"), contains=("backlash", "coulomb_friction"), family="dry"),
-    Effect("presliding_friction", "force", 11, force, "Friction of {force} builds up over {distance} after each reversal.",
-           "F = force*z,  dz = (1 - z*sign(dx))*dx/distance", slots=slots, forms=("dahl", "maxwell"), contains=("coulomb_friction",), family="dry"),
+    Effect(
+        "presliding_friction",
+        "motion",
+        46,
+        lost,
+        "The output stays behind by up to {lost_motion}, built up over {distance} after each reversal.",
+        "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance",
+        apply,
+        forms=("dahl", "maxwell"),
+        contains=("backlash", "coulomb_friction"),
+        family="dry",
+    ),
+    Effect(
+        "presliding_friction",
+        "force",
+        11,
+        force,
+        "Friction of {force} builds up over {distance} after each reversal.",
+        "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
+        slots=slots,
+        forms=("dahl", "maxwell"),
+        contains=("coulomb_friction",),
+        family="dry",
+    ),
 )

@@ -10,7 +10,11 @@ from host.diagnosis.operators import lag
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Time constant."""
-    return (Parameter("time_constant", "s", spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6), 0.02 * s.dt_s, 0.3 * s.duration_s, log=True),)
+    return (
+        Parameter(
+            "time_constant", "s", spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6), 0.02 * s.dt_s, 0.3 * s.duration_s, log=True
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -36,9 +40,27 @@ def rows(values: Array, c: Context, time_constant_s: float) -> Array:
 
 SAYS = "The output follows with a first-order lag of {time_constant}."
 EFFECTS = tuple(
-    Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True) for port in ("motion", "timing")
+    Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True)
+    for port in ("motion", "timing")
 ) + (
-    Effect("rate_lag", "pose", 81, parameters, "The tracker follows with a lag of {time_constant}.", "time_constant*dy/dt + y = x", apply_pose, timed=True),
-    Effect("rate_lag", "forces", 81, parameters, "The force sensor follows with a lag of {time_constant}.", "time_constant*dy/dt + y = x", apply_force,
-           timed=True),
+    Effect(
+        "rate_lag",
+        "pose",
+        81,
+        parameters,
+        "The tracker follows with a lag of {time_constant}.",
+        "time_constant*dy/dt + y = x",
+        apply_pose,
+        timed=True,
+    ),
+    Effect(
+        "rate_lag",
+        "forces",
+        81,
+        parameters,
+        "The force sensor follows with a lag of {time_constant}.",
+        "time_constant*dy/dt + y = x",
+        apply_force,
+        timed=True,
+    ),
 )

@@ -24,5 +24,13 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 EFFECTS = (
     Effect("rectified_sensor", "forces", 90, parameters, "The force sensor gives magnitudes only.", "y = |x|", apply_force),
-    Effect("rectified_sensor", "drift", 90, parameters, "The sensor gives the magnitude only: its reading folds at zero.", "y = |x|", apply),
+    Effect(
+        "rectified_sensor",
+        "drift",
+        90,
+        parameters,
+        "The sensor gives the magnitude only: its reading folds at zero.",
+        "y = |x|",
+        apply,
+    ),
 )

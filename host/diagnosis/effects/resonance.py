@@ -10,15 +10,23 @@ from host.diagnosis.operators import second_order
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Frequency and damping ratio."""
-    return (Parameter("frequency", "Hz", spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True),
-            Parameter("damping_ratio", "", (0.03, 0.2), 1e-3, 2.0, log=True))
+    return (
+        Parameter(
+            "frequency", "Hz", spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True
+        ),
+        Parameter("damping_ratio", "", (0.03, 0.2), 1e-3, 2.0, log=True),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Share of a mass behind a spring, its frequency and damping ratio."""
-    return (Parameter("mass_share", "", (0.1,), 1e-3, 5.0, log=True),
-            Parameter("frequency", "Hz", spread(5.0 / s.duration_s, 0.25 / s.dt_s, 6), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True),
-            Parameter("damping_ratio", "", (0.05,), 1e-3, 2.0, log=True))
+    return (
+        Parameter("mass_share", "", (0.1,), 1e-3, 5.0, log=True),
+        Parameter(
+            "frequency", "Hz", spread(5.0 / s.duration_s, 0.25 / s.dt_s, 6), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True
+        ),
+        Parameter("damping_ratio", "", (0.05,), 1e-3, 2.0, log=True),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -32,8 +40,25 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("resonance", "motion", 63, parameters, "The output rings at {frequency}, damping ratio {damping_ratio}.",
-           "y'' + 2 z w y' + w^2 y = w^2 x", apply, timed=True, contains=("rate_lag",)),
-    Effect("resonance", "force", 40, force, "A part of the mass hangs on a spring and rings at {frequency}.",
-           "m2 x2'' = k2 (x - x2) + c2 (x' - x2')", slots=slots, timed=True),
+    Effect(
+        "resonance",
+        "motion",
+        63,
+        parameters,
+        "The output rings at {frequency}, damping ratio {damping_ratio}.",
+        "y'' + 2 z w y' + w^2 y = w^2 x",
+        apply,
+        timed=True,
+        contains=("rate_lag",),
+    ),
+    Effect(
+        "resonance",
+        "force",
+        40,
+        force,
+        "A part of the mass hangs on a spring and rings at {frequency}.",
+        "m2 x2'' = k2 (x - x2) + c2 (x' - x2')",
+        slots=slots,
+        timed=True,
+    ),
 )

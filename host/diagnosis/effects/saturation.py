@@ -31,7 +31,16 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 SAYS = "Beyond {limit} nothing follows."
 EFFECTS = tuple(
-    Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower")) for port in ("motion", "limit")
+    Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower"))
+    for port in ("motion", "limit")
 ) + (
-    Effect("saturation", "forces", 89, largest, "The force sensor does not read beyond {limit}.", "y = clip(x, -limit, limit)", apply_force),
+    Effect(
+        "saturation",
+        "forces",
+        89,
+        largest,
+        "The force sensor does not read beyond {limit}.",
+        "y = clip(x, -limit, limit)",
+        apply_force,
+    ),
 )

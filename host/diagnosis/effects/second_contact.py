@@ -9,9 +9,11 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Stiffness of the obstacle as felt at the tip, its clearance and direction across the axis."""
-    return (Parameter("stiffness", "N/m", (20.0,), 0.0, 1e5, linear=True),
-            Parameter("clearance", "m", (0.0, 0.004, 0.008, 0.012, 0.02), -0.05, 0.1, step=2e-3),
-            Parameter("direction", "rad", tuple(np.arange(8) * np.pi / 4), -10.0, 10.0, step=0.2))
+    return (
+        Parameter("stiffness", "N/m", (20.0,), 0.0, 1e5, linear=True),
+        Parameter("clearance", "m", (0.0, 0.004, 0.008, 0.012, 0.02), -0.05, 0.1, step=2e-3),
+        Parameter("direction", "rad", tuple(np.arange(8) * np.pi / 4), -10.0, 10.0, step=0.2),
+    )
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:
@@ -26,6 +28,13 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("second_contact", "shape", 32, parameters, "The shaft touches something away from the tip, beyond {clearance} sideways.",
-           "F = -stiffness*max(0, n.x - clearance)*n", apply),
+    Effect(
+        "second_contact",
+        "shape",
+        32,
+        parameters,
+        "The shaft touches something away from the tip, beyond {clearance} sideways.",
+        "F = -stiffness*max(0, n.x - clearance)*n",
+        apply,
+    ),
 )

@@ -29,7 +29,23 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("sensor_bias", "pose", 86, pose, "The tracker reads positions shifted by ({offset_x}, {offset_y}, {offset_z}).", "y = x + offset", apply_pose,
-           forms=("", "tip")),
-    Effect("sensor_bias", "forces", 86, force, "The force sensor reads ({offset_x}, {offset_y}, {offset_z}) too much.", "y = x + offset", apply_force),
+    Effect(
+        "sensor_bias",
+        "pose",
+        86,
+        pose,
+        "The tracker reads positions shifted by ({offset_x}, {offset_y}, {offset_z}).",
+        "y = x + offset",
+        apply_pose,
+        forms=("", "tip"),
+    ),
+    Effect(
+        "sensor_bias",
+        "forces",
+        86,
+        force,
+        "The force sensor reads ({offset_x}, {offset_y}, {offset_z}) too much.",
+        "y = x + offset",
+        apply_force,
+    ),
 )

@@ -10,8 +10,17 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Rate of the drift; second form: level and time constant of a warm-up."""
     if form == "warm_up":
-        return (Parameter("level", s.unit, (s.need,), linear=True),
-                Parameter("time_constant", "s", spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3), 0.01 * s.duration_s, 3 * s.duration_s, log=True))
+        return (
+            Parameter("level", s.unit, (s.need,), linear=True),
+            Parameter(
+                "time_constant",
+                "s",
+                spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3),
+                0.01 * s.duration_s,
+                3 * s.duration_s,
+                log=True,
+            ),
+        )
     return (Parameter("rate", f"{s.unit}/s", (s.need / s.duration_s,), linear=True),)
 
 
@@ -26,7 +35,17 @@ def vector(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Rates along the base axes; second form: levels and time constant of a warm-up."""
     if form == "warm_up":
         level = tuple(Parameter(f"level_{a}", s.unit, (s.need,), linear=True) for a in "xyz")
-        return (*level, Parameter("time_constant", "s", spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3), 0.01 * s.duration_s, 3 * s.duration_s, log=True))
+        return (
+            *level,
+            Parameter(
+                "time_constant",
+                "s",
+                spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3),
+                0.01 * s.duration_s,
+                3 * s.duration_s,
+                log=True,
+            ),
+        )
     return tuple(Parameter(f"rate_{a}", f"{s.unit}/s", (s.need / s.duration_s,), linear=True) for a in "xyz")
 
 
@@ -46,10 +65,37 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("sensor_drift", "pose", 88, vector, "The tracker's positions drift with time, whatever moves.", "y = x + rate*t", apply_pose, timed=True,
-           forms=("", "warm_up")),
-    Effect("sensor_drift", "forces", 88, vector, "The force sensor drifts with time, whatever touches.", "y = x + rate*t", apply_force, timed=True,
-           forms=("", "warm_up")),
-    Effect("sensor_drift", "drift", 80, parameters, "The reading drifts with time, whatever moves.", "y = x + rate*t", apply, timed=True,
-           forms=("", "warm_up")),
+    Effect(
+        "sensor_drift",
+        "pose",
+        88,
+        vector,
+        "The tracker's positions drift with time, whatever moves.",
+        "y = x + rate*t",
+        apply_pose,
+        timed=True,
+        forms=("", "warm_up"),
+    ),
+    Effect(
+        "sensor_drift",
+        "forces",
+        88,
+        vector,
+        "The force sensor drifts with time, whatever touches.",
+        "y = x + rate*t",
+        apply_force,
+        timed=True,
+        forms=("", "warm_up"),
+    ),
+    Effect(
+        "sensor_drift",
+        "drift",
+        80,
+        parameters,
+        "The reading drifts with time, whatever moves.",
+        "y = x + rate*t",
+        apply,
+        timed=True,
+        forms=("", "warm_up"),
+    ),
 )

@@ -23,6 +23,22 @@ def apply_force(force: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("sensor_scale", "pose", 85, parameters, "The tracker reads lengths {gain_error} too large.", "y = x*(1 + gain_error)", apply_pose),
-    Effect("sensor_scale", "forces", 85, parameters, "The force sensor reads {gain_error} too much.", "y = x*(1 + gain_error)", apply_force),
+    Effect(
+        "sensor_scale",
+        "pose",
+        85,
+        parameters,
+        "The tracker reads lengths {gain_error} too large.",
+        "y = x*(1 + gain_error)",
+        apply_pose,
+    ),
+    Effect(
+        "sensor_scale",
+        "forces",
+        85,
+        parameters,
+        "The force sensor reads {gain_error} too much.",
+        "y = x*(1 + gain_error)",
+        apply_force,
+    ),
 )

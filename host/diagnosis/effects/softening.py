@@ -9,7 +9,11 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Relative change of gain per second."""
-    return (Parameter("rate", "1/s", (s.need / (s.span * s.duration_s),), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True),)
+    return (
+        Parameter(
+            "rate", "1/s", (s.need / (s.span * s.duration_s),), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -38,11 +42,44 @@ def apply_contact(law: dict, c: Context, p: Array, form: str) -> dict:
 
 
 EFFECTS = (
-    Effect("softening", "shape", 21, fixed, "The shaft's compliance grows by {rate} of itself as time goes on.", "1/EI = (1 + rate*t)/EI_0", apply_shape,
-           timed=True),
-    Effect("softening", "contact", 25, fixed, "The tissue's stiffness changes by {rate} of itself as time goes on.", "k = k_0 (1 + rate*t)",
-           apply_contact, timed=True),
-    Effect("softening", "motion", 20, parameters, "The gain changes by {rate} of itself as time goes on.", "y = x*(1 + rate*t)", apply, timed=True),
-    Effect("softening", "force", 22, parameters, "The stiffness changes by {rate} of itself as time goes on.", "F = stiffness*rate*t*x",
-           slots=slots, timed=True),
+    Effect(
+        "softening",
+        "shape",
+        21,
+        fixed,
+        "The shaft's compliance grows by {rate} of itself as time goes on.",
+        "1/EI = (1 + rate*t)/EI_0",
+        apply_shape,
+        timed=True,
+    ),
+    Effect(
+        "softening",
+        "contact",
+        25,
+        fixed,
+        "The tissue's stiffness changes by {rate} of itself as time goes on.",
+        "k = k_0 (1 + rate*t)",
+        apply_contact,
+        timed=True,
+    ),
+    Effect(
+        "softening",
+        "motion",
+        20,
+        parameters,
+        "The gain changes by {rate} of itself as time goes on.",
+        "y = x*(1 + rate*t)",
+        apply,
+        timed=True,
+    ),
+    Effect(
+        "softening",
+        "force",
+        22,
+        parameters,
+        "The stiffness changes by {rate} of itself as time goes on.",
+        "F = stiffness*rate*t*x",
+        slots=slots,
+        timed=True,
+    ),
 )

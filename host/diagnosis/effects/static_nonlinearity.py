@@ -9,9 +9,12 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Quadratic and cubic bend, as displacement at the ends of the range."""
-    return (Parameter("quadratic", s.unit, (s.need,), linear=True), Parameter("cubic", s.unit, (s.need,), linear=True),
-            Parameter("middle", s.unit, (0.5 * (s.low + s.high),), 0.5 * (s.low + s.high), 0.5 * (s.low + s.high)),
-            Parameter("half_range", s.unit, (0.5 * s.span,), 0.5 * s.span, 0.5 * s.span))
+    return (
+        Parameter("quadratic", s.unit, (s.need,), linear=True),
+        Parameter("cubic", s.unit, (s.need,), linear=True),
+        Parameter("middle", s.unit, (0.5 * (s.low + s.high),), 0.5 * (s.low + s.high), 0.5 * (s.low + s.high)),
+        Parameter("half_range", s.unit, (0.5 * s.span,), 0.5 * s.span, 0.5 * s.span),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -26,6 +29,13 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("static_nonlinearity", "motion", 31, parameters, "The curve from input to output is bent, the same way up and down.",
-           "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5),  u = (x - middle)/half_range", apply),
+    Effect(
+        "static_nonlinearity",
+        "motion",
+        31,
+        parameters,
+        "The curve from input to output is bent, the same way up and down.",
+        "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5),  u = (x - middle)/half_range",
+        apply,
+    ),
 )

@@ -10,16 +10,22 @@ from host.diagnosis.operators import dahl
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Extra lost motion at rest, and the speed at which it has gone."""
-    return (Parameter("kinetic", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
-            Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
-            Parameter("speed", f"{s.unit}/s", spread(0.1 * s.speed, 1.5 * s.speed, 3), 0.01 * s.speed, 10 * s.speed, log=True))
+    return (
+        Parameter("kinetic", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
+        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
+        Parameter("speed", f"{s.unit}/s", spread(0.1 * s.speed, 1.5 * s.speed, 3), 0.01 * s.speed, 10 * s.speed, log=True),
+    )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Kinetic force, excess of the static force, and the Stribeck speed."""
-    return (Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
-            Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
-            Parameter("speed", f"{s.motion_unit}/s", spread(0.05 * s.speed, 1.0 * s.speed, 4), 0.005 * s.speed, 10 * s.speed, log=True))
+    return (
+        Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
+        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
+        Parameter(
+            "speed", f"{s.motion_unit}/s", spread(0.05 * s.speed, 1.0 * s.speed, 4), 0.005 * s.speed, 10 * s.speed, log=True
+        ),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -34,8 +40,28 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("stribeck_friction", "motion", 48, lost, "The output stays behind most at low speed: by {static_excess} more at rest than when fast.",
-           "y = x - (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", apply, timed=True, contains=("coulomb_friction",), family="dry"),
-    Effect("stribeck_friction", "force", 13, force, "Friction falls from {static_excess} above {kinetic_force} as speed passes {speed}.",
-           "F = (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)", slots=slots, timed=True, contains=("coulomb_friction",), family="dry"),
+    Effect(
+        "stribeck_friction",
+        "motion",
+        48,
+        lost,
+        "The output stays behind most at low speed: by {static_excess} more at rest than when fast.",
+        "y = x - (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)",
+        apply,
+        timed=True,
+        contains=("coulomb_friction",),
+        family="dry",
+    ),
+    Effect(
+        "stribeck_friction",
+        "force",
+        13,
+        force,
+        "Friction falls from {static_excess} above {kinetic_force} as speed passes {speed}.",
+        "F = (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)",
+        slots=slots,
+        timed=True,
+        contains=("coulomb_friction",),
+        family="dry",
+    ),
 )

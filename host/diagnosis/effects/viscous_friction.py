@@ -31,8 +31,25 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 EFFECTS = (
-    Effect("viscous_friction", "motion", 50, lost, "The output stays behind by {lost_motion_per_speed} times the speed.",
-           "y = x - lost_motion_per_speed*v", apply, timed=True),
-    Effect("viscous_friction", "force", 14, force, "A force of {coefficient} per speed acts against the motion.", "F = coefficient*v",
-           slots=slots, timed=True, forms=("", "quadratic")),
+    Effect(
+        "viscous_friction",
+        "motion",
+        50,
+        lost,
+        "The output stays behind by {lost_motion_per_speed} times the speed.",
+        "y = x - lost_motion_per_speed*v",
+        apply,
+        timed=True,
+    ),
+    Effect(
+        "viscous_friction",
+        "force",
+        14,
+        force,
+        "A force of {coefficient} per speed acts against the motion.",
+        "F = coefficient*v",
+        slots=slots,
+        timed=True,
+        forms=("", "quadratic"),
+    ),
 )

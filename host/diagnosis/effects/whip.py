@@ -12,8 +12,10 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitude and phase; none where the axis does not turn by more than a radian."""
     if s.span < 1.0:
         return ()
-    return (Parameter("amplitude", "rad", (0.1, 0.4, 0.9, 1.5), 1e-3, 6.0, log=True),
-            Parameter("phase", "rad", tuple(np.arange(8) * np.pi / 4), -20.0, 20.0, step=0.3))
+    return (
+        Parameter("amplitude", "rad", (0.1, 0.4, 0.9, 1.5), 1e-3, 6.0, log=True),
+        Parameter("phase", "rad", tuple(np.arange(8) * np.pi / 4), -20.0, 20.0, step=0.3),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -32,6 +34,26 @@ SAYS = "The output turns unevenly with roll angle: amplitude {amplitude}."
 EFFECTS = (
     Effect("whip", "turn", 42, parameters, SAYS, "y + amplitude*sin(y + phase) = x", apply),
     Effect("whip", "turn", 42, parameters, SAYS, "y = x + amplitude*sin(x + phase)", apply, forms=("weak",)),
-    Effect("whip", "turn", 74, parameters, SAYS, "y + amplitude*sin(y + phase) = x, behind the gain", apply, side="output", forms=("tip",)),
-    Effect("whip", "turn", 74, parameters, SAYS, "y = x + amplitude*sin(x + phase), behind the gain", apply_weak, side="output", forms=("tip weak",)),
+    Effect(
+        "whip",
+        "turn",
+        74,
+        parameters,
+        SAYS,
+        "y + amplitude*sin(y + phase) = x, behind the gain",
+        apply,
+        side="output",
+        forms=("tip",),
+    ),
+    Effect(
+        "whip",
+        "turn",
+        74,
+        parameters,
+        SAYS,
+        "y = x + amplitude*sin(x + phase), behind the gain",
+        apply_weak,
+        side="output",
+        forms=("tip weak",),
+    ),
 )

@@ -115,7 +115,7 @@ def _transmitted(effect: str, x: np.ndarray, load: np.ndarray, t: np.ndarray) ->
     if effect == "latency":
         return np.interp(t - 0.11, t, x)
     if effect == "unlisted":
-        return x + 0.02 * np.sin(x / 0.04)
+        return x + 0.15 * x * (load - 0.5)
     return x
 
 
@@ -131,10 +131,15 @@ def axis(folder: Path, effect: str, seed: int, sigma: float = 2e-4) -> tuple[Pat
         force = np.sum([np.sin(2 * np.pi * f * t + p) for f, p in zip(lines, phases, strict=True)], axis=0)
         cubic, drag = (150.0 if effect == "cubic" else 0.0), (1.2 if effect == "coulomb" else 0.0)
 
-        def rates(s: float, y: np.ndarray, force: np.ndarray = force, t: np.ndarray = t, cubic: float = cubic, drag: float = drag) -> list[float]:
+        def rates(
+            s: float, y: np.ndarray, force: np.ndarray = force, t: np.ndarray = t, cubic: float = cubic, drag: float = drag
+        ) -> list[float]:
             u = np.interp(s, t, force)
             return [y[1], (u - 1.5 * y[1] - 40 * y[0] - cubic * y[0] ** 3 - drag * np.tanh(y[1] / 2e-3)) / 1.3]
-        x = solve_ivp(rates, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-6, atol=1e-8, max_step=0.01).y[0] + coloured(rng, t.size, sigma)
+
+        x = solve_ivp(rates, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-6, atol=1e-8, max_step=0.01).y[0] + coloured(
+            rng, t.size, sigma
+        )
         path = folder / f"r{k}.csv"
         np.savetxt(path, np.column_stack((t, force, x)), delimiter=",", header="t,force,position", comments="")
         files.append(path)
@@ -155,7 +160,8 @@ def impedance(folder: Path, effect: str, seed: int, sigma: float = 0.02) -> tupl
         if effect == "lugre":
             z = 0.0
             for i in range(1, t.size):
-                z += (x[i] - x[i - 1]) * (1.0 - z / 2e-3 * np.sign(x[i] - x[i - 1]))
+                for _ in range(20):
+                    z += 0.05 * (x[i] - x[i - 1]) * (1.0 - z / 2e-3 * np.sign(x[i] - x[i - 1]))
                 force[i] += 0.3 * z / 2e-3
         path = folder / f"r{k}.csv"
         np.savetxt(path, np.column_stack((t, x, force)), delimiter=",", header="t,position,force", comments="")

@@ -1,4 +1,4 @@
-"""Small recordings of the rig's chain, computed by other means than the finder's: forty rigid pieces and springs between them."""
+"""Small recordings of the rig's chain by other means than the finder's: forty rigid pieces and springs between them."""
 
 from __future__ import annotations
 
@@ -111,11 +111,17 @@ def wander(rng: np.random.Generator, t: Array, low: float, high: float, moves: i
     return out
 
 
-def record(truth: Truth, seed: int, duration_s: float = 30.0, rate_Hz: float = 40.0, contact: bool = True) -> dict[str, Array]:
+def record(
+    truth: Truth, seed: int, duration_s: float = 30.0, rate_Hz: float = 40.0, contact: bool = True
+) -> dict[str, Array]:
     """Columns of one recording."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, duration_s, 1 / rate_Hz)
-    q = {"insertion": wander(rng, t, -0.004, 0.006, 14), "roll": wander(rng, t, -1.0, 1.0, 8), "knob": wander(rng, t, 0.2, 0.8, 10)}
+    q = {
+        "insertion": wander(rng, t, -0.004, 0.006, 14),
+        "roll": wander(rng, t, -1.0, 1.0, 8),
+        "knob": wander(rng, t, 0.2, 0.8, 10),
+    }
     d = truth.insertion(q["insertion"], t) - 0.070
     roll = 0.48 * truth.roll(q["roll"], t)
     kappa = 28.6 * truth.knob(q["knob"], t)
@@ -131,11 +137,16 @@ def record(truth: Truth, seed: int, duration_s: float = 30.0, rate_Hz: float = 4
             p, R = bent(points, frames, -force[:, i], upto)
             poses[k, :3, i] = p + shift[:, i]
             w = 0.5 * np.sqrt(max(1 + np.trace(R), 1e-12))
-            poses[k, 3:, i] = np.array([w, (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)])
+            poses[k, 3:, i] = np.array(
+                [w, (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)]
+            )
     poses[:, :3] += coloured(rng, (6, n), 2.5e-4, 0.4).reshape(2, 3, n)
     poses[:, 4:] += 0.5 * coloured(rng, (6, n), 3.5e-3, 0.4).reshape(2, 3, n)
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    columns: dict[str, Array] = {"time_s": t, **{f"handle_{k}_{u}": q[k] for k, u in (("insertion", "m"), ("roll", "rad"), ("knob", "rad"))}}
+    columns: dict[str, Array] = {
+        "time_s": t,
+        **{f"handle_{k}_{u}": q[k] for k, u in (("insertion", "m"), ("roll", "rad"), ("knob", "rad"))},
+    }
     for name, pose in zip(("tip", "shaft"), poses, strict=True):
         columns |= {f"{name}_{c}": pose[j] for j, c in enumerate(("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"))}
     reading = truth.force_reading(force, t) + coloured(rng, (3, n), 4e-3, 0.3)

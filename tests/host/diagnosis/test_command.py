@@ -15,8 +15,26 @@ from host.cli.diagnose import diagnose
 from tests.host.diagnosis import planted
 
 KEYS = {"verdict", "located", "effects", "fit", "seconds"}
-FIT = {"heldout", "rmse_before", "rmse_after", "noise_floor", "unit", "per_channel", "whiteness_p_before", "whiteness_p_after"}
-EFFECT = {"id", "subsystem", "says", "equation", "parameters", "evidence", "indistinguishable_from", "experiment_to_tell_apart"}
+FIT = {
+    "heldout",
+    "rmse_before",
+    "rmse_after",
+    "noise_floor",
+    "unit",
+    "per_channel",
+    "whiteness_p_before",
+    "whiteness_p_after",
+}
+EFFECT = {
+    "id",
+    "subsystem",
+    "says",
+    "equation",
+    "parameters",
+    "evidence",
+    "indistinguishable_from",
+    "experiment_to_tell_apart",
+}
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +85,9 @@ def test_help_names_every_option() -> None:
 
 def test_progress_goes_to_standard_error(tmp_path: Path) -> None:
     nominal, files = planted.transmission(tmp_path, "none", 0)
-    code = ("import sys; from host.cli.diagnose import diagnose; "
-            f"diagnose({[str(f) for f in files]!r}, {str(nominal)!r}, '-')")
+    code = (
+        f"import sys; from host.cli.diagnose import diagnose; diagnose({[str(f) for f in files]!r}, {str(nominal)!r}, '-')"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["verdict"] == "nothing_missing"
     assert "screening" in done.stderr

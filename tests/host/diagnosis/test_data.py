@@ -83,7 +83,11 @@ def test_a_lone_recording_is_split_into_blocks_and_three_by_recording(tmp_path: 
 
 def test_heldout_patterns_choose_recordings(tmp_path: Path) -> None:
     text = TOML.replace('time = "t"', 'time = "t"\nheldout = ["c*"]')
-    assert [r.heldout.all() for r in read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "abc"], text)] == [False, False, True]
+    assert [r.heldout.all() for r in read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "abc"], text)] == [
+        False,
+        False,
+        True,
+    ]
     with pytest.raises(BadInput, match=r"data\.heldout"):
         read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "ab"], text)
 
@@ -100,10 +104,16 @@ def test_thinning_averages(tmp_path: Path) -> None:
     assert thin(one, 4).channels["motor"][0] == pytest.approx(-0.15) and thin(one, 4).n == 25
 
 
-@pytest.mark.parametrize(("old", "new", "key"), [
-    ('column = "a"', 'column = "zz"', "channels.motor.column"), ("scale = 0.1", "skale = 0.1", "channels.motor.skale"),
-    ('kind = "transmission"', 'kind = "gearbox"', "kind"), ('input = "motor"', 'input = "motr"', "motr"), ('time = "t"', 'time = "tt"', "data.time"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ('column = "a"', 'column = "zz"', "channels.motor.column"),
+        ("scale = 0.1", "skale = 0.1", "channels.motor.skale"),
+        ('kind = "transmission"', 'kind = "gearbox"', "kind"),
+        ('input = "motor"', 'input = "motr"', "motr"),
+        ('time = "t"', 'time = "tt"', "data.time"),
+    ],
+)
 def test_bad_nominals_name_the_key(tmp_path: Path, old: str, new: str, key: str) -> None:
     with pytest.raises(BadInput) as caught:
         read(tmp_path, [table(tmp_path / "x.csv")], TOML.replace(old, new))

@@ -11,17 +11,33 @@ from host.diagnosis.force_kernel import along, run_axis, slot_array
 from tests.host.diagnosis import rig_cases
 
 
-def axis(u: np.ndarray, dt: float, linear: list[float], slots: dict[str, float], begin: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def axis(
+    u: np.ndarray, dt: float, linear: list[float], slots: dict[str, float], begin: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
     """Free run with linear interpolation of u."""
     steps = np.append(np.interp(np.arange(u.size * 4) / 4, np.arange(u.size), u), u[-1])
-    return run_axis(steps, 2, dt, np.array(linear), slot_array([slots]), np.array(begin), np.zeros(u.size), np.zeros(0), np.zeros((1, u.size)), 0.0, 0.0)
+    return run_axis(
+        steps,
+        2,
+        dt,
+        np.array(linear),
+        slot_array([slots]),
+        np.array(begin),
+        np.zeros(u.size),
+        np.zeros(0),
+        np.zeros((1, u.size)),
+        0.0,
+        0.0,
+    )
 
 
 def test_cubic_oscillator_matches_an_adaptive_integrator() -> None:
     dt, t = 0.005, np.arange(0, 4, 0.005)
     u = np.sin(3 * t) + 0.4 * np.sin(7.3 * t)
+
     def rhs(s: float, y: np.ndarray) -> list[float]:
         return [y[1], np.interp(s, t, u) - 0.3 * y[1] - 20 * y[0] - 60 * y[0] ** 3]
+
     wanted = solve_ivp(rhs, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
     assert np.max(np.abs(axis(u, dt, [1.0, 0.3, 20.0, 0.0], {"cubic": 60.0})[0] - wanted)) < 1e-5
 
@@ -49,8 +65,20 @@ def test_forces_along_a_motion_add_up() -> None:
 def shape(d: float, roll: float, kappa: float, force: np.ndarray) -> tuple[np.ndarray, ...]:
     """One sample of the kernel."""
     one = np.ones(1)
-    return shapes(d * one, roll * one, kappa * one, force[:, None], np.zeros((3, 1)), one / rig_cases.EI, rig_cases.EI / rig_cases.GJ,
-                  rig_cases.DISTAL, rig_cases.BEHIND, np.array([0.0, 0.0, 1.0]), NODES, WEIGHTS)
+    return shapes(
+        d * one,
+        roll * one,
+        kappa * one,
+        force[:, None],
+        np.zeros((3, 1)),
+        one / rig_cases.EI,
+        rig_cases.EI / rig_cases.GJ,
+        rig_cases.DISTAL,
+        rig_cases.BEHIND,
+        np.array([0.0, 0.0, 1.0]),
+        NODES,
+        WEIGHTS,
+    )
 
 
 def test_straight_shaft_bends_as_a_cantilever() -> None:

@@ -1,4 +1,4 @@
-"""Nominal models beyond the plain ones: a Python function, effects already known, axes that rest, clocks that do not begin at zero."""
+"""Nominal models beyond the plain: a Python function, effects known already, axes that rest, clocks not begun at zero."""
 
 from __future__ import annotations
 
@@ -100,7 +100,9 @@ def test_what_the_report_says_to_switch_on_is_not_missed_again(tmp_path: Path) -
     assert again.found.best.values[-1] == pytest.approx(0.02, rel=0.05)
 
 
-@pytest.mark.parametrize("text", ["backlash", "backlash@nowhere:width_rad=1", "backlash@cable:width_m=1", "backlash@cable:width_rad=wide"])
+@pytest.mark.parametrize(
+    "text", ["backlash", "backlash@nowhere:width_rad=1", "backlash@cable:width_m=1", "backlash@cable:width_rad=wide"]
+)
 def test_an_effect_that_cannot_be_is_bad_input(tmp_path: Path, text: str) -> None:
     with pytest.raises(BadInput, match="effect"):
         run(*planted.transmission(tmp_path, "none", 1), text)
@@ -126,6 +128,7 @@ def test_an_axis_that_rests_hides_nothing_and_breaks_nothing(tmp_path: Path, axi
 
     def hold(columns: dict[str, np.ndarray], t: np.ndarray) -> None:
         columns[next(name for name in columns if name.startswith(f"handle_{axis}"))][:] = 0.0
+
     truth = rig_cases.Truth(columns=hold, **{axis: still})
     assert run(*rig_cases.write(tmp_path, truth, 1, duration_s=10.0)).verdict == "nothing_missing"
 
@@ -136,6 +139,7 @@ def test_a_noisy_force_channel_bends_no_parameter(tmp_path: Path) -> None:
     def noisy(columns: dict[str, np.ndarray], t: np.ndarray) -> None:
         for axis in "xyz":
             columns[f"force_{axis}_N"] += rig_cases.coloured(rng, (1, t.size), 0.1, 0.3)[0]
+
     result = run(*rig_cases.write(tmp_path, rig_cases.Truth(columns=noisy), 0, duration_s=15.0))
     values = dict(zip([p.name for p in result.model.parameters], result.found.nominal.values, strict=True))
     assert values["bending_stiffness"] == pytest.approx(rig_cases.EI, rel=0.1)

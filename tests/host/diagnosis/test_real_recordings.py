@@ -1,4 +1,4 @@
-"""Recordings that nobody here made: what is named, and how well held-out data are met. Skips where the data folder is absent."""
+"""Recordings that nobody here made: what is named, how well held-out data are met. Skips without the data folder."""
 
 from __future__ import annotations
 
@@ -48,6 +48,9 @@ def test_positioning_system_friction() -> None:
 def test_silverbox_spring() -> None:
     result, verdict = run("silverbox")
     assert verdict["effects"][0]["id"] == "nonlinear_stiffness"
-    left = {p.recording.name: float(np.sqrt(np.nanmean(r[0][p.heldout] ** 2)))
-            for p, r in zip(result.full.pieces, result.found.best_full.residuals, strict=True) if p.heldout.any()}
+    left = {
+        p.recording.name: float(np.sqrt(np.nanmean(r[0][p.heldout] ** 2)))
+        for p, r in zip(result.full.pieces, result.found.best_full.residuals, strict=True)
+        if p.heldout.any()
+    }
     assert left["multisine_10"] < 0.363e-3 and left["arrow"] < 0.523e-3
