@@ -57,14 +57,17 @@ class Problem:
 
     def simulate(self, piece: Piece, terms: tuple[Term, ...], values: Array) -> Array:
         """Outputs (outputs, n) of one recording."""
-        n = len(self.model.parameters)
-        acts: list[Act] = []
-        at = n
+        out = self.model.simulate(piece, *self.parted(terms, values))
+        return np.where(np.abs(out) < 1e150, out, 1e150)
+
+    def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[Act]]:
+        """Nominal parameters, and every effect with its own."""
+        at = len(self.model.parameters)
+        nominal, acts = values[:at], []
         for term in terms:
             acts.append((term.candidate, values[at: at + len(term.parameters)]))
             at += len(term.parameters)
-        out = self.model.simulate(piece, values[:n], acts)
-        return np.where(np.abs(out) < 1e150, out, 1e150)
+        return nominal, acts
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
         """Measured minus simulated, NaN outside the part asked for (`fit`, `heldout` or `all`)."""

@@ -35,6 +35,8 @@ class Known:
         self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.acts}
         if hasattr(inner, "settle"):
             self.settle = lambda piece, theta: inner.settle(piece, theta[: self.own])
+        if hasattr(inner, "begin_anew"):
+            self.begin_anew = lambda piece, theta, acts: inner.begin_anew(piece, theta[: self.own], self.with_known(theta, acts))
         if hasattr(inner, "sensitivity"):
             self.sensitivity = self._sensitivity
             self.change = lambda piece, theta, *rest: inner.change(piece, theta[: self.own], *rest)  # type: ignore[attr-defined]

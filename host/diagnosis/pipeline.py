@@ -159,6 +159,8 @@ def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
         settle = getattr(full.model, "settle", None)
         if settle is not None and not fit.terms:
             settle(piece, fit.values)
+        if "begin" in coarse.extra:
+            piece.extra["begin"] = coarse.extra["begin"]
     again = replace(fit)
     again.residuals = [piece.y - full.simulate(piece, fit.terms, fit.values) for piece in full.pieces]
     return again

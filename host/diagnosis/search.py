@@ -79,6 +79,22 @@ def settle(problem: Problem, values: Array) -> None:
     own = getattr(problem.model, "settle", None)
     for piece in problem.pieces if own is not None else ():
         own(piece, values)  # type: ignore[misc]
+    begin_anew(problem, Fit((), values))
+
+
+def begin_anew(problem: Problem, fit: Fit) -> None:
+    """Lets a model that runs freely from a measured state find that state anew."""
+    own = getattr(problem.model, "begin_anew", None)
+    for piece in problem.pieces if own is not None else ():
+        own(piece, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
+
+
+def refined(problem: Problem, fit: Fit) -> Fit:
+    """`fit` brought to its end on all samples, together with the states that recordings begin from."""
+    for _ in range(2 if hasattr(problem.model, "begin_anew") else 1):
+        begin_anew(problem, fit)
+        fit = minimize(problem, fit.terms, fit.values)
+    return finish(problem, fit)
 
 
 def fit_nominal(problem: Problem) -> Fit:
@@ -239,7 +255,7 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         rivals[winner.candidate.key] = [trial for trial in trials if trial is not winner]
         set_starts(problem, winner.starts)
-        best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
+        best = refined(problem, winner.fit)
         reweigh(problem, best)
         best = _prune(problem, best, floor, steps)
     return Found(nominal, best, steps, rivals)

@@ -20,6 +20,7 @@ Mask = npt.NDArray[np.bool_]
 ROWS = 2500
 LONGEST = 14                  # symbols in an equation
 SEEDS = (1, 2)
+RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Predictable:
 
 
 def predictable(problem: Problem, fit: Fit, port: Port) -> Predictable:
-    """Ridge regression on random tanh features, fitted to the samples to fit and scored on those held out."""
+    """Ridge regression on the features, their products and random tanh of them, fitted to the samples to fit and scored on those held out."""
     rng = np.random.default_rng(0)
     weights = bias = None
     tables: list[Array] = []
@@ -98,7 +99,8 @@ def predictable(problem: Problem, fit: Fit, port: Port) -> Predictable:
         if weights is None:
             weights = rng.normal(size=(F.shape[1], 60)) * rng.choice([0.5, 2.0, 6.0], size=60)
             bias = rng.uniform(-2.0, 2.0, 60)
-        H = np.column_stack([np.ones(len(F)), F, np.tanh(F @ weights + bias)])
+        a, b = np.triu_indices(F.shape[1])
+        H = np.column_stack([np.ones(len(F)), F, F[:, a] * F[:, b], np.tanh(F @ weights + bias)])
         mask = piece.fit & np.isfinite(z)
         tables.append(H[mask])
         targets.append(z[mask])
@@ -106,7 +108,9 @@ def predictable(problem: Problem, fit: Fit, port: Port) -> Predictable:
             held.append((H, z, piece.heldout & np.isfinite(z)))
     H, z = np.concatenate(tables), np.concatenate(targets)
     limit = 6.0 * np.median(np.abs(z - np.median(z))) + 1e-300
-    w = np.linalg.solve(H.T @ H + 1e-2 * len(H) * np.eye(H.shape[1]), H.T @ np.clip(z, -limit, limit))
+    size = np.sqrt(np.mean(H * H, axis=0)) + 1e-12
+    H = H / size
+    w = np.linalg.solve(H.T @ H + RIDGE * len(H) * np.eye(H.shape[1]), H.T @ np.clip(z, -limit, limit)) / size
     before = after = count = total = 0.0
     for table, z, mask in held:
         target = np.clip(z, -limit, limit)

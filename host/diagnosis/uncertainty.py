@@ -22,7 +22,7 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     parameters = problem.parameters(fit.terms)
     sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=True)]
     base = problem.stacked(fit.terms, fit.values)
-    J = jacobian(problem, fit.terms, fit.values, base, sizes)
+    J = np.column_stack([jacobian(problem, fit.terms, fit.values, base, sizes), _by_begin(problem, fit, base)])
     A = J.T @ J
     scale = np.sqrt(np.maximum(np.diag(A), 1e-12 * (np.max(np.diag(A), initial=0.0) + 1e-300)))
     inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-11) / np.outer(scale, scale)
@@ -42,6 +42,20 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
             low, high = value - half * sizes[index], value + half * sizes[index]
         out[index] = (float(max(low, p.low)), float(min(high, p.high)))
     return out
+
+
+def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
+    """Rate of the weighted simulation by the state from which each recording runs freely, where a model has one: it is estimated too."""
+    columns = []
+    for piece in problem.pieces:
+        if piece.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in piece.extra:
+            begin, spread = piece.extra["begin"], piece.extra["measured"][1]
+            for k in range(2):
+                piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+                columns.append(base - problem.stacked(fit.terms, fit.values))
+            piece.extra["begin"] = begin
+    used = [column for column in columns if np.any(column)]
+    return np.array(used).T if used else np.zeros((base.size, 0))
 
 
 def _block_scores(problem: Problem, fit: Fit, J: Array, base: Array) -> Array:

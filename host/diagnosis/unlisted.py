@@ -22,6 +22,9 @@ SURE_LIKELIHOOD = 12.0     # held-out log-likelihood a smooth predictor has to g
 SMALLEST_SHARE = 0.03
 MUCH = 0.15                # share of the mismatch that one known effect may leave; two at a port may leave half of that, and so on:
                            # several effects that pile up and still do not fit stand for something that is in no list
+MEASURED = 2.0             # times a noise level from quiescent parts, beyond which the rest is not noise where effects are named,
+MEASURED_BARE = 3.0        # and where none is;
+GUESSED = 8.0              # times a level guessed from the spectrum, whose colour is not known
 AS_GOOD = 1.2              # error of an equation against that of the known effects it takes the place of
 
 
@@ -32,12 +35,13 @@ class Rest:
     predictable: Predictable | None
     left: float
     doubtful: bool = False     # known effects are named, but they are probably stand-ins
+    loud: bool = False         # more is left than noise can be, foretold or not
 
     @property
     def sure(self) -> bool:
         """Whether there is a mismatch that the finder knows to be there."""
         p = self.predictable
-        return p is not None and p.log_likelihood > SURE_LIKELIHOOD and p.share > SMALLEST_SHARE
+        return self.loud or (p is not None and p.log_likelihood > SURE_LIKELIHOOD and p.share > SMALLEST_SHARE)
 
 
 def left_over(problem: Problem, found: Found, floor: Array) -> float:
@@ -53,8 +57,9 @@ def left_over(problem: Problem, found: Found, floor: Array) -> float:
 
 
 def _above_noise(problem: Problem, found: Found, floor: Array) -> bool:
-    """Whether the best model leaves twice the noise of some output, the noise being known from quiescent parts."""
-    return any(noise.source == "quiescent parts" and _power(problem, found.best.residuals, row) > 4.0 * floor[row] ** 2
+    """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or guessed."""
+    measured = MEASURED if found.best.terms else MEASURED_BARE
+    return any(_power(problem, found.best.residuals, row) > ((measured if noise.source == "quiescent parts" else GUESSED) * floor[row]) ** 2
                for row, noise in enumerate(problem.noise))
 
 
@@ -71,8 +76,7 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
     pairs = [(ports[a], ports[b]) for a, b in problem.model.unlisted_at]
     rest = _rest(problem, found, floor, pairs)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
-    known = rest.sure or (bool(crowd) and _above_noise(problem, found, floor))
-    if not known or rest.predictable is None or (crowd and rest.left < MUCH / crowd[0][1]):
+    if not rest.sure or rest.predictable is None or (crowd and rest.left < MUCH / crowd[0][1]):
         return rest
     port = rest.predictable.port.name
     pair = next(pair for pair in pairs if pair[0].name == port)
@@ -84,7 +88,7 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
 def _rest(problem: Problem, found: Found, floor: Array, pairs: list[tuple[Port, Port]]) -> Rest:
     tried = [predictable(problem, found.best, port) for port, _ in pairs]
     best = max(tried, key=lambda p: p.log_likelihood, default=None)
-    return Rest(best, left_over(problem, found, floor))
+    return Rest(best, left_over(problem, found, floor), loud=_above_noise(problem, found, floor))
 
 
 def _equation_instead(problem: Problem, found: Found, floor: Array, port: Port, target: Port, tell: Tell) -> bool:

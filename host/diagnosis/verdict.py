@@ -13,6 +13,7 @@ from host.diagnosis.experiment import experiment
 from host.diagnosis.locate import joined
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 
+NOT_WHITE = 1e-3       # p-value of held-out whiteness below which the rest is said not to be noise
 PARTLY = 0.05          # share of the mismatch left, from which on a verdict says so
 
 
@@ -68,8 +69,11 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
         at += count
         entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
+    white = result.figures.white_after[result.figures.primary] > NOT_WHITE
     if ranked and result.rest.sure and result.rest.left > PARTLY:
         ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of it is left."
+    elif ranked and not white:
+        ranked[0]["says"] += " What is left on held-out samples is small but not yet white noise."
     return ranked
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Parameter, Port
+from host.diagnosis.evidence import correlation_time
 from host.diagnosis.force_kernel import run_axis, slot_array
 from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
 from host.diagnosis.nominal import NominalSpec
@@ -77,6 +78,7 @@ class Axis:
         reads = {"position": (x, v), "velocity": (np.cumsum(x) * recording.dt_s, x), "acceleration": (np.zeros_like(x), np.zeros_like(x))}
         piece.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
+        piece.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
         piece.extra.update(begin=np.array(begin), x=x, v=v, substeps=self._substeps(piece), tolerance=tolerance_of(motion, float(np.ptp(motion))))
         piece.extra["units"] = {**self.units, name: self.units[spec.input], f"motion:{name}": self.units[spec.output],
                                 f"{name}_drive": self.units[spec.input], f"{name}_reading": self.units[spec.output]}
@@ -145,6 +147,26 @@ class Axis:
         motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
 
+    def begin_anew(self, piece: Piece, theta: Array, acts: list[Act]) -> None:
+        """Position and speed at the first sample, as measured there and as the free run wants them, each by its own variance.
+
+        Only a motion read as position is begun so: its first speed is a derivative of noise, and its error rings on.
+        """
+        if not self.free_run or self.spec.controller is not None or self.spec.reads != "position":
+            return
+        begin, spread, _ = piece.extra["measured"]
+        piece.extra["begin"] = begin
+        r = piece.y[0] - self.simulate(piece, theta, acts)[0]
+        columns = []
+        for k in range(2):
+            piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+            columns.append((piece.y[0] - self.simulate(piece, theta, acts)[0] - r) * -1.0)
+        used = np.isfinite(r)
+        A, b = np.array(columns).T[used], r[used]
+        sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
+        by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
+        piece.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
+
     def _follow(self, piece: Piece, linear: Array, steps: Array, p: Array) -> Array:
         """Force error along the measured motion: recorded input against what the equation of motion needs, both smoothed alike."""
         from host.diagnosis.force_kernel import along
@@ -172,6 +194,15 @@ class Axis:
             return np.asarray(residual[0])
         size = dict(zip(self.spec.terms, theta, strict=False)).get("stiffness", 1.0)
         return np.asarray(residual[0] * size)
+
+
+def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> tuple[Array, float]:
+    """Standard deviations (2,) of position and speed at the first sample, read off a cubic over `window` samples; and the noise."""
+    first = slice(0, min(motion.size, 20 * window))
+    noise = float(np.std((motion - smooth)[first])) * float(np.sqrt(window / max(window - 4.0, 1.0)))
+    t = np.arange(window) * dt_s
+    covariance = np.linalg.inv(np.vander(t / t[-1], 4, increasing=True).T @ np.vander(t / t[-1], 4, increasing=True))
+    return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300), noise
 
 
 def upsample(u: Array, factor: int, hold: str) -> Array:

@@ -9,11 +9,13 @@ from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Parameter, Port
 from host.diagnosis.force_kernel import along, slot_array
 from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.noise import estimate, quiescent
 from host.diagnosis.nominal import NominalSpec
 from host.diagnosis.operators import smooth_derivatives
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
+CLEAN = 0.02             # noise of a motion, in smallest movements, below which it is taken as it is
 
 
 class Impedance:
@@ -65,6 +67,8 @@ class Impedance:
         x, v, a = smooth_derivatives(motion, recording.dt_s, window)
         piece.inputs[f"motion:{self.spec.subsystem}"] = motion
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
+        if estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma < CLEAN * tolerance:
+            x = motion      # smoothing would round its reversals, and friction with them
         piece.extra.update(v=v, a=a, x=x, tolerance=tolerance)
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
         piece.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}

@@ -115,7 +115,7 @@ def _transmitted(effect: str, x: np.ndarray, load: np.ndarray, t: np.ndarray) ->
     if effect == "latency":
         return np.interp(t - 0.11, t, x)
     if effect == "unlisted":
-        return x + 0.02 * np.sin(x / 0.04)
+        return x + 0.15 * x * (load - 0.5)
     return x
 
 
@@ -155,7 +155,8 @@ def impedance(folder: Path, effect: str, seed: int, sigma: float = 0.02) -> tupl
         if effect == "lugre":
             z = 0.0
             for i in range(1, t.size):
-                z += (x[i] - x[i - 1]) * (1.0 - z / 2e-3 * np.sign(x[i] - x[i - 1]))
+                for _ in range(20):
+                    z += 0.05 * (x[i] - x[i - 1]) * (1.0 - z / 2e-3 * np.sign(x[i] - x[i - 1]))
                 force[i] += 0.3 * z / 2e-3
         path = folder / f"r{k}.csv"
         np.savetxt(path, np.column_stack((t, x, force)), delimiter=",", header="t,position,force", comments="")
