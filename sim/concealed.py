@@ -351,10 +351,14 @@ def make(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def _near(system: System, rng: np.random.Generator) -> Array:
-    """Where a rig engineer's calibration starts: near, not at, the rig's own values."""
+    """Where a rig engineer's calibration starts: near the rig's own values, the wall within reach of the presses.
+
+    From behind their reach no force would tell the fit where the wall is.
+    """
     p = system.case.nominal.copy()
     p[[2, 4, 6, 8]] *= 1.0 + 0.05 * rng.standard_normal(4)
-    p[[1, 7]] += 5e-4 * rng.standard_normal(2)
+    p[1] += 5e-4 * rng.standard_normal()
+    p[7] += min(p[1] - system.case.nominal[1], 0.0) - 5e-4 * abs(rng.standard_normal()) - 2e-4
     return p
 
 

@@ -111,6 +111,13 @@ def test_a_mismatch_that_training_does_not_show_is_not_taught() -> None:
     assert not concealed.taught(system, [0.1 * shown, hidden, shown])
 
 
+def test_a_calibration_starts_with_the_wall_in_reach() -> None:
+    for number in range(20):
+        system = concealed_system.rig(concealed_rig.draw(np.random.default_rng(number), False))
+        true, start = system.case.nominal, concealed._near(system, np.random.default_rng(number))
+        assert start[7] - start[1] < true[7] - true[1] - 1e-4 and start[7] < true[7] - 1e-4
+
+
 def test_a_mode_faster_than_the_recordings_is_refused() -> None:
     mode = next(d for d in MENU["rig"] if (d.id, d.port) == ("resonance", "knob"))
     assert mode.make(1.0)["frequency_Hz"] == 4.0
