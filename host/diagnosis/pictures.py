@@ -40,7 +40,7 @@ def chain(result: Diagnosis) -> Picture:
     """The links from input to output; those at fault in red."""
     names = list(dict.fromkeys(port.subsystem for port in result.model.ports))
     if len(names) == 1:
-        names = [result.model.travel[0][0], *names, result.model.outputs[0].channel]
+        names = [result.model.quiet_inputs[0], *names, result.model.outputs[0].channel]
     bad = {location.subsystem for location in result.located}
 
     def draw(figure: Figure, narrow: bool) -> None:
