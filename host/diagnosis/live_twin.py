@@ -1,4 +1,4 @@
-"""The twin of a running rig: a row a tracker frame out of its messages; the chain of kind rig, made exact by the rod model."""
+"""The twin of a running rig: a row a tracker frame out of its messages; the chain of kind rig with the rod model."""
 
 from __future__ import annotations
 
