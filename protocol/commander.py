@@ -7,7 +7,7 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, SupportsFloat
 
 from protocol.topics import Command, Reply, check_name
 
@@ -110,13 +110,14 @@ class Commander:
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
         """Any command (fields as in `protocol.topics.Command`), under the lease, which is renewed before it ends."""
         try:
+            fields = {name: _plain(value) for name, value in fields.items()}
             if action == "stop":
                 return self._stop()
             with self._lock:
                 if self._lease and action not in ("hold", "release"):
                     self._renew()
                 return _said(self._ask(action, target, **fields))
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             return Acknowledgement(False, str(error), "malformed")
 
     def _stop(self) -> Acknowledgement:
@@ -160,6 +161,13 @@ class Commander:
         if reply is not None and (came_ns - sent_ns < _PROMPT_NS or self._ahead_ns is None):
             self._ahead_ns = reply.stamp_ns - (sent_ns + came_ns) // 2
         return reply
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and vectors of any library as Python's own."""
+    if value is None or isinstance(value, (str, bool)):
+        return value
+    return float(value) if isinstance(value, SupportsFloat) else tuple(float(part) for part in value)
 
 
 def _said(reply: Reply | None) -> Acknowledgement:

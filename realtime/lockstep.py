@@ -231,7 +231,9 @@ class LockstepLoop:
     def _log_device(self, event: DeviceEvent) -> None:
         level = _LEVELS.get(event.kind, "info")
         self.log(event.stamp_ns, level, event.device, event.text)
-        words = self.desk.back(event.device) if event.kind is DeviceEventKind.RECONNECTED else ""
+        y, words = self.outputs[0], ""
+        if event.kind is DeviceEventKind.RECONNECTED:
+            words = self.desk.back(event.device, int(y.force_source), int(y.phase))
         if words:
             self.log(event.stamp_ns, "warning", event.device, words)
 

@@ -13,15 +13,18 @@ from protocol.messages import Vector
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
+from realtime.force_source import ESTIMATE
 from realtime.records import (
     COMMAND_CONTACT,
     COMMAND_HOLD,
     COMMAND_POSITION,
     COMMAND_RETRACT,
     COMMAND_STOP,
+    PHASE_CONTACT,
 )
 from realtime.rig_file import Rig
 
+FORCE_BOX = "net_ft"   # as the driver names it in its events
 _KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND_CONTACT, "retract": COMMAND_RETRACT}
 
 
@@ -75,9 +78,13 @@ class OperatorDesk:
         self._rest()
         return ""
 
-    def back(self, device: str) -> str:
-        """`device` was gone and is there again: what was armed is disarmed. Returns words for the log, empty for none."""
-        if not self._record.armed:
+    def back(self, device: str, force_source: int, phase: int) -> str:
+        """`device` was gone and is there again: what was armed is disarmed. Returns words for the log, empty for none.
+
+        Not so for a force sensor whose place the estimate has taken in contact: the loop never lost the force, and lets the
+        sensor in again when both agree (`force_source.py`). force_source, phase: of the loop's last outputs.
+        """
+        if not self._record.armed or (device == FORCE_BOX and force_source == ESTIMATE and phase == PHASE_CONTACT):
             return ""
         self._rest()
         return f"{device} is back: disarmed, to be armed again"

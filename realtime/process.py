@@ -27,6 +27,7 @@ from realtime.drivers.net_ft_calibration import NetFtCalibration
 from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
 from realtime.drivers.stepper_board import EventKind, StepperBoardLink
 from realtime.drivers.transport import open_serial
+from realtime.force_source import SENSOR
 from realtime.intake import Intake
 from realtime.latency import percentiles_us
 from realtime.loop_thread import NativeLoop, input_mailboxes
@@ -60,7 +61,7 @@ class RealtimeProcess:
         self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
         self._gate = CommandGate(self.clock.now_ns, self._obey, roles=rig.access.roles if rig.access else {})
         self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
-        self._phase = PHASE_DISARMED
+        self._phase, self._force_source = PHASE_DISARMED, SENSOR
         self._params = tick_parameters(rig, force_source)
         self._told_board_ns = 0
         self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
@@ -163,7 +164,7 @@ class RealtimeProcess:
 
     def _back(self, device: str) -> None:
         """A device is there again; the link's lock is held."""
-        words = self._desk.back(device)
+        words = self._desk.back(device, self._force_source, self._phase)
         if words:
             self._mailboxes["command"].publish()
             self._send(self._desk.take_frames())
@@ -295,7 +296,7 @@ class RealtimeProcess:
             for record in records:
                 outputs, number = record["outputs"], int(record["loop"]["tick"])
                 view = outputs.reshape(1).view(np.recarray)[0]
-                self._phase = int(view.phase)
+                self._phase, self._force_source = int(view.phase), int(view.force_source)
                 if number % telemetry.STAGE_EVERY == 0:
                     self._publish("stage", telemetry.stage_message(self._params[0], inputs[0], view))
                 if number % telemetry.STATE_EVERY == 0:

@@ -148,7 +148,9 @@ class Scenario:
             outcome.notes.append(f"devices not ready after {START_TIMEOUT_S} s of virtual time")
             return self._closed(outcome)
         self._shape(job)
-        self.command("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+        asked = self.command("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+        if not asked.accepted:
+            outcome.notes.append(f"contact not commanded: {asked.reason}")
         start_ns = self.world.now_ns
 
         def reporting(phase: str, seconds: float, done: Callable[[], bool]) -> bool:

@@ -243,6 +243,7 @@ class Ended:
     steps_commanded: list[int] = field(default_factory=list)
     steps_on_pins: list[int] = field(default_factory=list)
     steps_reported: list[int] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass
