@@ -166,6 +166,10 @@ class RequestServer:
         self._thread = threading.Thread(target=self._serve, name="requests", daemon=True)
         self._thread.start()
 
+    def join(self, timeout_s: float = 2.0) -> None:
+        """Wait for the thread, which ends when the session is closed: one still in zenoh at interpreter's exit aborts."""
+        self._thread.join(timeout_s)
+
     def _serve(self) -> None:
         while True:
             try:
@@ -212,6 +216,7 @@ class Session:
     def __init__(self, rig: str, listen: list[str], connect: list[str], network: Network | None = None) -> None:
         key(rig, "state")
         self.rig = rig
+        self._servers: list[RequestServer] = []
         self.zenoh = _open(configuration(listen, connect, network),
                            listen + list(network.listen if network is not None else ()))
 
@@ -223,7 +228,7 @@ class Session:
         """
         key(rig, "state")
         session = cls.__new__(cls)
-        session.rig = rig
+        session.rig, session._servers = rig, []
         session.zenoh = _open(zenoh.Config.from_json5(json.dumps(client_settings(endpoint, keys))), [])
         return session
 
@@ -241,7 +246,9 @@ class Session:
 
     def serve_requests(self, answer: Callable[[str, bytes], Reply | None]) -> RequestServer:
         """Answer requests with `answer`; see RequestServer."""
-        return RequestServer(self.zenoh, self.rig, answer)
+        server = RequestServer(self.zenoh, self.rig, answer)
+        self._servers.append(server)
+        return server
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
         """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
@@ -256,8 +263,10 @@ class Session:
         return None
 
     def close(self) -> None:
-        """Undeclare everything and close the links."""
+        """Undeclare everything, close the links and end the threads that answer."""
         self.zenoh.close()
+        for server in self._servers:
+            server.join()
 
     def __enter__(self) -> Session:
         return self
