@@ -13,6 +13,7 @@ import numpy.typing as npt
 from host.diagnosis import noise as noise_module
 from host.diagnosis.chains import build, channels_of
 from host.diagnosis.dataset import Recording, load, thin
+from host.diagnosis.dictionary import lay_out
 from host.diagnosis.effect import candidates
 from host.diagnosis.equivalence import Standing, standings
 from host.diagnosis.evidence import whiteness
@@ -23,7 +24,6 @@ from host.diagnosis.model import Model, Piece
 from host.diagnosis.noise import Noise
 from host.diagnosis.nominal import NominalSpec
 from host.diagnosis.search import Found, search
-from host.diagnosis.symbolic import features
 from host.diagnosis.uncertainty import intervals
 from host.diagnosis.unlisted import Rest, explain_rest
 
@@ -118,7 +118,6 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     floor = np.array([n.sigma for n in problem.noise])
     tell("looking at what is left", 0.0)
     rest = explain_rest(problem, found, floor, tell)
-    _features_at_full_rate(full, found)
     tell("weighing what stands in their place", 0.0)
     standing = standings(problem, found, floor)
     tell("intervals", 0.0)
@@ -130,20 +129,9 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
     )
-    if not located and rest.sure and rest.predictable is not None:
-        result.located = [_unexplained(full, found, rest.predictable.port.subsystem)]
+    if not located and rest.sure and rest.foretold is not None:
+        result.located = [_unexplained(full, found, rest.foretold.subsystem)]
     return result
-
-
-def _features_at_full_rate(full: Problem, found: Found) -> None:
-    """Features of an equation found by search, for the recordings at full rate."""
-    pairs = {target: source for source, target in full.model.unlisted_at}
-    ports = {port.name: port for port in full.model.ports}
-    for term in found.best.terms:
-        if term.candidate.effect.id == "unlisted":
-            target = term.candidate.port.name
-            for piece in full.pieces:
-                piece.extra.setdefault("features", {})[target] = features(full, piece, ports[pairs[target]])
 
 
 def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
@@ -200,6 +188,8 @@ def rms(parts: list[Array]) -> float:
 
 def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
     found.nominal_full = at_full_rate(full, found.nominal, coarse)
+    for form in found.forms:
+        lay_out(full.pieces, form)
     found.best_full = at_full_rate(full, found.best, coarse)
     out: list[Location] = []
     for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):

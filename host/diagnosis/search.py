@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.dictionary import Form
 from host.diagnosis.effect import Candidate
 from host.diagnosis.evidence import Gain, compare
 from host.diagnosis.fit import (
@@ -64,12 +65,13 @@ class Step:
 
 @dataclass
 class Found:
-    """Nominal fit, best fit, the moves between, and all trials that were fitted beside the best structure."""
+    """Nominal fit, best fit, the moves between, trials fitted beside the best structure, and its equations."""
 
     nominal: Fit
     best: Fit
     steps: list[Step]
     rivals: dict[str, list[Trial]] = field(default_factory=dict)
+    forms: list[Form] = field(default_factory=list)
     nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
     best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.effect import Candidate, Context, Effect, Parameter, Port, Scale
-from host.diagnosis.evidence import correlation_time
+from host.diagnosis.dictionary import Form
+from host.diagnosis.effect import Port
 from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.model import Piece
 from host.diagnosis.operators import lag, play
 
 Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 ROWS = 2500
 LONGEST = 14  # symbols in an equation
 SEEDS = (1, 2)
-RIDGE = 1e-3
-
-
-@dataclass(frozen=True)
-class Equation:
-    """Text in feature names, and a function of the feature table (n, features) giving (n,)."""
-
-    text: str
-    evaluate: Callable[[Array], Array]
-    length: int
+TELLING = 0.1  # precision of a sample, over the mean, from which it is searched
 
 
 def features(problem: Problem, piece: Piece, port: Port) -> Array:
@@ -79,71 +68,36 @@ def _span(problem: Problem, port: Port) -> float:
     return float(np.ptp(np.concatenate([problem.model.motion(piece, port) for piece in problem.pieces]))) or 1.0
 
 
-def latent(problem: Problem, fit: Fit, piece: Piece, residual: Array, port: Port) -> Array:
-    """What the port would have to add to explain the residual, (n,); NaN where nothing was measured."""
-    need = problem.model.needs(piece, port, fit.values[: len(problem.model.parameters)], residual)
-    seen = np.isfinite(residual).any(axis=0)
-    return np.where(seen, need, np.nan)
-
-
-@dataclass(frozen=True)
-class Predictable:
-    """How much of the latent signal of a port can be foretold on held-out samples by any smooth function of the features."""
-
-    port: Port
-    share: float
-    log_likelihood: float
-
-
-def predictable(problem: Problem, fit: Fit, port: Port) -> Predictable:
-    """Ridge regression on the features, their products and random tanh of them, fitted to the samples to fit and
-    scored on those held out.
+def latent(problem: Problem, fit: Fit, piece: Piece, residual: Array, port: Port) -> tuple[Array, Array]:
+    """What the port would have to add to explain the residual, (n,), NaN where nothing was measured; and its precision (n,),
+    relative.
     """
-    rng = np.random.default_rng(0)
-    weights = bias = None
-    tables: list[Array] = []
-    targets: list[Array] = []
-    held: list[tuple[Array, Array, Mask]] = []
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        F, z = features(problem, piece, port), latent(problem, fit, piece, residual, port)
-        if weights is None:
-            weights = rng.normal(size=(F.shape[1], 60)) * rng.choice([0.5, 2.0, 6.0], size=60)
-            bias = rng.uniform(-2.0, 2.0, 60)
-        a, b = np.triu_indices(F.shape[1])
-        H = np.column_stack([np.ones(len(F)), F, F[:, a] * F[:, b], np.tanh(F @ weights + bias)])
-        mask = piece.fit & np.isfinite(z)
-        tables.append(H[mask])
-        targets.append(z[mask])
-        if (piece.heldout & np.isfinite(z)).sum() > 50:
-            held.append((H, z, piece.heldout & np.isfinite(z)))
-    H, z = np.concatenate(tables), np.concatenate(targets)
-    limit = 6.0 * np.median(np.abs(z - np.median(z))) + 1e-300
-    size = np.sqrt(np.mean(H * H, axis=0)) + 1e-12
-    H = H / size
-    w = np.linalg.solve(H.T @ H + RIDGE * len(H) * np.eye(H.shape[1]), H.T @ np.clip(z, -limit, limit)) / size
-    before = after = count = total = 0.0
-    for table, z, mask in held:
-        target = np.clip(z, -limit, limit)
-        left = target - table @ w
-        before += float(np.sum(target[mask] ** 2))
-        after += float(np.sum(left[mask] ** 2))
-        total += mask.sum()
-        count += mask.sum() / correlation_time(np.where(mask, left, np.nan))
-    gain = 0.5 * count * float(np.log(max(before, 1e-300) / max(after, 1e-300)))
-    return Predictable(port, 1.0 - after / max(before, 1e-300), gain)
+    nominal, acts = problem.parted(fit.terms, fit.values)
+    seen = np.isfinite(residual)
+    slope = getattr(problem.model, "sensitivity", None)
+    if slope is None:
+        need = problem.model.needs(piece, port, nominal, residual)
+        return np.where(seen.any(axis=0), need, np.nan), np.ones(piece.n)
+    unit = np.array([noise.sigma for noise in problem.noise])[:, None]
+    s, r = np.where(seen, slope(piece, nominal, port.name, acts), 0.0) / unit, np.where(seen, residual, 0.0) / unit
+    precision = np.sum(s * s, axis=0)
+    return np.where(precision > 0.0, np.sum(s * r, axis=0) / np.maximum(precision, 1e-300), np.nan), precision
 
 
-def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Equation]:
-    """Equations for the latent signal by genetic programming on thinned samples to fit, short ones first."""
+def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
+    """Equations for the latent signal by genetic programming, on the samples to fit that tell of it; short ones first."""
     from pyoperon.sklearn import SymbolicRegressor
 
-    tables, targets = [], []
+    tables, targets, precisions = [], [], []
     for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        F, z = features(problem, piece, port), latent(problem, fit, piece, residual, port)
+        F, (z, precision) = features(problem, piece, port), latent(problem, fit, piece, residual, port)
         mask = piece.fit & np.isfinite(z)
         tables.append(F[mask])
         targets.append(z[mask])
-    X, z = np.concatenate(tables), np.concatenate(targets)
+        precisions.append(precision[mask])
+    X, z, precision = np.concatenate(tables), np.concatenate(targets), np.concatenate(precisions)
+    telling = precision > TELLING * float(np.mean(precision))
+    X, z = X[telling], z[telling]
     size = float(np.sqrt(np.mean(z**2))) or 1.0
     step = max(1, len(X) // ROWS)
     cut = len(X) // step * step
@@ -160,49 +114,28 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Equation]:
             optimizer_iterations=3,
             n_threads=1,
             random_state=seed,
-            max_time=8,
+            max_time=5,
             objectives=["r2", "length"],
         )
         regressor.fit(X, z)
         front = getattr(regressor, "pareto_front_", [])
         for item in front:
-            found.append(_equation(regressor, item, names, size))
-    unique = {equation.text: equation for equation in found if equation.length <= LONGEST}
-    ranked = sorted(unique.values(), key=lambda e: float(np.mean((e.evaluate(X) / size - z) ** 2)) * (1.0 + 0.02 * e.length))
-    return ranked[:3]
+            found.append(_form(regressor, item, names, size, lambda p: features(problem, p, port)))
+    unique = {form.text: (form, on_table) for form, on_table in found if form.length <= LONGEST}
+    ranked = sorted(unique.values(), key=lambda f: float(np.mean((f[1](X) / size - z) ** 2)) * (1.0 + 0.02 * f[0].length))
+    return [form for form, _ in ranked[:3]]
 
 
-def _equation(regressor: object, item: dict, names: list[str], size: float) -> Equation:
+def _form(
+    regressor: object, item: dict, names: list[str], size: float, table: Callable[[Piece], Array]
+) -> tuple[Form, Callable[[Array], Array]]:
+    """A tree of the search as a form, and as a function of the feature table (n, features)."""
     tree = item["tree"]
     text = regressor.get_model_string(tree, 4)  # type: ignore[attr-defined]
     readable = re.sub(r"X(\d+)", lambda m: names[int(m.group(1)) - 1], text)
 
-    def evaluate(X: Array) -> Array:
+    def on_table(X: Array) -> Array:
         out = np.asarray(regressor.evaluate_model(tree, np.asarray(X, dtype=np.float32)), dtype=np.float64)  # type: ignore[attr-defined]
         return size * np.clip(np.where(np.isfinite(out), out, 0.0), -20.0, 20.0)
 
-    return Equation(readable, evaluate, int(getattr(tree, "Length", LONGEST)))
-
-
-def as_candidate(port: Port, equation: Equation) -> Candidate:
-    """The equation as an effect at `port`: one amplitude, to be refitted with everything else. Its features stand in
-    `Piece.extra`.
-    """
-
-    def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-        return (Parameter("amplitude", "", (1.0,), -5.0, 5.0, linear=True, step=1.0),)
-
-    def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-        return np.asarray(signal + p[0] * equation.evaluate(c.extra["features"][port.name]))
-
-    effect = Effect(
-        "unlisted",
-        port.kind.split("+")[0],
-        76,
-        parameters,
-        "None of the known effects: the mismatch follows an equation found by search.",
-        equation.text,
-        apply,
-        side="input",
-    )
-    return Candidate(effect, port, "", "search")
+    return Form(readable, lambda p: on_table(table(p)), int(getattr(tree, "Length", LONGEST))), on_table
