@@ -40,7 +40,7 @@ Tell = Callable[[str, float], None]
 FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and of these at one port
 FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
 MOST_EFFECTS, MOST_STEPS = 5, 10
-DETOURS, WORTH = 3, 0.4  # rivals of the first effect taken up, and the part of the best one's score they must have
+DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
 SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
 REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 

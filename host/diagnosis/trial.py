@@ -19,7 +19,8 @@ PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was
 SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
 SMALLEST_EXCESS = 0.10  # and this much of what is above noise
 BESIDE, ELSEWHERE = 0.12, 0.06  # likelihood of a further effect against that of those named at its subsystem, and of all,
-FURTHER = 0.05  # and its share of an output's error: modules are idealizations, what they lack is no other effect
+LARGE = 0.3  # but for one that takes this share of an output's error;
+FURTHER = 0.05  # and the least such share: modules are idealizations, what they lack is no other effect
 COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
 INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
 NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
@@ -134,8 +135,9 @@ def _together(trial: Trial, more: int) -> bool:
 def weighty(trial: Trial, earned: dict[str, float]) -> bool:
     """Whether a trial earns enough beside what is named already (likelihood by subsystem); a finer shape is judged alone."""
     least = max(BESIDE * earned.get(trial.candidate.port.subsystem, 0.0), ELSEWHERE * sum(earned.values()))
-    further = not earned or trial.both.share > FURTHER
-    return trial.replaced or (further and trial.both.log_likelihood > least)
+    share = trial.both.share
+    further = not earned or (share > FURTHER and (share > LARGE or trial.both.log_likelihood > least))
+    return trial.replaced or further
 
 
 def _least(trial: Trial, gain: Gain) -> float:
