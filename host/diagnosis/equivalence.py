@@ -11,12 +11,18 @@ from host.diagnosis.effect import Candidate
 from host.diagnosis.evidence import Gain, compare
 from host.diagnosis.fit import Fit, Problem, finish, minimize
 from host.diagnosis.screening import term_of, without
-from host.diagnosis.search import Found, Trial
+from host.diagnosis.search import Found
+from host.diagnosis.trial import SURE, Trial
 
 Array = npt.NDArray[np.float64]
 MOST_RIVALS = 4
-NEAR = 0.6  # a rival must have earned this part of the winner's likelihood
-CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart
+TRIED = 8  # rivals refitted in an effect's place at most
+NEAR = 0.5  # a rival must have earned this part of the winner's likelihood when it was tried first
+SURER = 1e-6  # p-value on all samples that makes up for a held-out one that is not below SURE
+CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart,
+CHANCE = 0.01  # nor above this p-value,
+ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most, and
+PART = 0.25  # what it lacks is less than this part of what the effect earned: the modules themselves are idealized
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,8 @@ class Standing:
     """Evidence of one effect of the best model, and what could stand in its place."""
 
     candidate: Candidate
-    gain: Gain
+    gain: Gain  # on held-out samples
+    both: Gain  # on all samples
     alike: tuple[Candidate, ...]
 
 
@@ -35,31 +42,53 @@ def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
         terms, values = without(found.best, problem, (term.candidate.key,))
         less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
         gain = compare(problem.pieces, "heldout", less.residuals, found.best.residuals, floor)
-        step = next((s for s in reversed(found.steps) if s.key == term.candidate.key), None)
-        rivals = [trial for trial in (step.trials if step else []) if trial.candidate.key != term.candidate.key]
-        alike = _equals(problem, found.best, term.candidate, rivals, less, gain, floor)
-        out.append(Standing(term.candidate, gain, alike))
+        both = compare(problem.pieces, "both", less.residuals, found.best.residuals, floor)
+        out.append(Standing(term.candidate, gain, both, _equals(problem, found, term.candidate, less, both, floor)))
     return out
 
 
+def scanty(standing: list[Standing]) -> bool:
+    """Whether the strongest effect rests on so few events that its name may be chance, sure as the mismatch is."""
+    if not standing:
+        return False
+    strongest = max(standing, key=lambda s: s.both.log_likelihood)
+    return strongest.gain.p_value > SURE and strongest.both.p_value > SURER
+
+
 def _equals(
-    problem: Problem, best: Fit, candidate: Candidate, rivals: list[Trial], less: Fit, gain: Gain, floor: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, floor: Array
 ) -> tuple[Candidate, ...]:
-    found: list[Candidate] = []
-    reach = max((trial.heldout.log_likelihood for trial in rivals), default=0.0)
-    for trial in rivals[: MOST_RIVALS + 2]:
-        if trial.candidate.name == candidate.name or any(c.name == trial.candidate.name for c in found):
-            continue
-        if trial.score < NEAR * max(gain.log_likelihood, 0.2 * reach) or len(found) == MOST_RIVALS:
-            continue
-        if any(trial.candidate.key == term.candidate.key for term in best.terms):
-            continue
+    """Rivals in the place of `candidate` that neither held-out samples nor all together tell from it."""
+    best = found.best
+    kept: list[Candidate] = []
+    for trial in _rivals(found, candidate)[:TRIED]:
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         other = finish(
             problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
         )
-        ahead = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
-        if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > 0.05 and ahead.share < 0.1):
-            found.append(trial.candidate)
-    return tuple(found)
+        ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
+        held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
+        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned):
+            kept.append(trial.candidate)
+    return tuple(kept)
+
+
+def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
+    """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did."""
+    active = {term.candidate.key for term in found.best.terms}
+    names = {candidate.name, *(term.candidate.name for term in found.best.terms)}
+    kept: dict[str, Trial] = {}
+    for step in (s for s in found.steps if any(trial.candidate.key == candidate.key for trial in s.trials)):
+        most = max(trial.score for trial in step.trials)
+        for trial in step.trials:
+            if trial.candidate.key not in active and trial.candidate.name not in names and trial.score > NEAR * most:
+                kept.setdefault(trial.candidate.name, trial)
+    return sorted(kept.values(), key=lambda trial: -trial.score)
+
+
+def _not_told(ahead: Gain, held: Gain, earned: Gain) -> bool:
+    """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
+    if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > CHANCE and held.p_value > CHANCE):
+        return True
+    return ahead.share < ALIKE and ahead.log_likelihood < PART * earned.log_likelihood

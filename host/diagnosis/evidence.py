@@ -60,7 +60,7 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
 
 
 def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array) -> Gain:
-    """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit` or `heldout`).
+    """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit`, `heldout` or `both`).
 
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
     is divided by
@@ -93,13 +93,17 @@ def _p_value(by_output: list[list[float]]) -> float:
     return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
+def _asked(piece: Piece, which: str) -> Mask:
+    return np.asarray(piece.fit | piece.heldout) if which == "both" else np.asarray(getattr(piece, which))
+
+
 def _pooled(
     pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int
 ) -> tuple[float, float, float, list[float]]:
     sum_b = sum_a = count = n_eff = 0.0
     times = []
     for piece, b, a in zip(pieces, before, after, strict=True):
-        mask = getattr(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         n = int(mask.sum())
         if n < 20:
             times.append(1.0)
@@ -118,7 +122,7 @@ def _blocks(
 ) -> list[float]:
     found = []
     for piece, b, a, tau in zip(pieces, before, after, times, strict=True):
-        mask = getattr(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         gained = (b[row][mask] ** 2 - a[row][mask] ** 2) / level
         length = int(max(4.0 * tau, gained.size / 24.0, 8.0))
         parts = max(1, gained.size // length)

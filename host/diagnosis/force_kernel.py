@@ -40,6 +40,7 @@ SLOTS = (
     "stiffness",
     "gap",
     "backward_ratio",
+    "stribeck_distance",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -73,6 +74,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     STIFFNESS,
     GAP,
     BACKWARD,
+    STRIBECK_D,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 
@@ -96,9 +98,15 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
 
 
 @njit(cache=True)
-def hysteresis(z: Array, dx: float, load: float, p: Array) -> float:
-    """Presliding and load-dependent friction after a step dx; `z` (5,) is moved on: four Maxwell elements (or one of
-    Dahl), and the load's.
+def level_at(v: float, p: Array) -> float:
+    """Dry friction's level at speed v: Coulomb's, and what it has more at rest."""
+    return p[COULOMB] + (p[EXCESS] * math.exp(-((v / p[STRIBECK]) ** 2)) if p[STRIBECK] > 0.0 else 0.0)
+
+
+@njit(cache=True)
+def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
+    """Presliding and load-dependent friction after a step dx at speed v; `z` (6,) is moved on: four Maxwell elements (or
+    one of Dahl), the load's, and the bristles of Stribeck friction.
     """
     force = 0.0
     side = 1.0 if dx > 0.0 else -1.0
@@ -115,6 +123,9 @@ def hysteresis(z: Array, dx: float, load: float, p: Array) -> float:
     if p[LOAD] != 0.0:
         z[4] = side + (z[4] - side) * math.exp(-abs(dx) / p[LOAD_DISTANCE])
         force += p[LOAD] * abs(load) * z[4]
+    if p[STRIBECK_D] > 0.0:
+        z[5] = side + (z[5] - side) * math.exp(-abs(dx) / p[STRIBECK_D])
+        force += level_at(v, p) * z[5]
     return force * (1.0 + p[BACKWARD] * (1.0 if force < 0.0 else 0.0))
 
 
@@ -135,7 +146,7 @@ def along(
 ) -> Array:
     """Force of all terms along a measured motion x, v, a (n,)."""
     out = np.empty(x.size)
-    z = np.zeros(5)
+    z = np.zeros(6)
     dry = start_state(z, start, load[0], p)
     slow = x[0]
     decay = math.exp(-dt_s / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
@@ -146,10 +157,8 @@ def along(
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
         dry = min(max(dry + dx / tolerance, -1.0), 1.0)
-        level = p[COULOMB]
-        if p[STRIBECK] > 0.0:
-            level += p[EXCESS] * math.exp(-((v[i] / p[STRIBECK]) ** 2))
-        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + level * dry + hysteresis(z, dx, load[i], p)
+        level = level_at(v[i], p) if p[STRIBECK_D] <= 0.0 else 0.0
+        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + level * dry + hysteresis(z, dx, v[i], load[i], p)
         if p[MASS2] > 0.0:
             k2, c2 = p[OMEGA2] * p[OMEGA2], 2.0 * p[DAMPING2] * p[OMEGA2]
             for _ in range(steps):
@@ -278,14 +287,14 @@ def run_axis(
     out = np.empty((4, n))
     m, offset, h = linear[0], linear[3], dt_s / substeps
     s = (begin[0], begin[1], begin[0], begin[1])
-    z = np.zeros(5)
+    z = np.zeros(6)
     start_state(z, start, load[0], p)
-    held, slow = hysteresis(z, 0.0, load[0], p), begin[0]
+    held, slow = hysteresis(z, 0.0, begin[1], load[0], p), begin[0]
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
     short = polynomial(p)
     q = ((linear[1] + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, linear[2] / m, p[QUADRATIC] / m, p[CUBIC] / m)
-    remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0
+    remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0 or p[STRIBECK_D] > 0.0
     for i in range(n):
         if control.size:
             drive = (
@@ -305,9 +314,7 @@ def run_axis(
                 else (u[place] + more, u[place + 1] + more, u[place + 2] + more)
             )
             x_old, v_old = s[0], s[1]
-            dry = p[COULOMB]
-            if p[STRIBECK] > 0.0:
-                dry += p[EXCESS] * math.exp(-((v_old / p[STRIBECK]) ** 2))
+            dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
             if short:
                 x, v, a = _short_step(x_old, v_old, push[0] / m, push[1] / m, push[2] / m, h, q)
                 x2, v2 = x, v
@@ -322,7 +329,7 @@ def run_axis(
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:
-                held = hysteresis(z, x - x_old, load[i], p)
+                held = hysteresis(z, x - x_old, v, load[i], p)
             if not abs(x) < 1e12:
                 out[:, i:] = 1e12
                 return out

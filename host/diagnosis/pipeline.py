@@ -15,7 +15,7 @@ from host.diagnosis.chains import build, channels_of
 from host.diagnosis.dataset import Recording, load, thin
 from host.diagnosis.dictionary import lay_out
 from host.diagnosis.effect import candidates
-from host.diagnosis.equivalence import Standing, standings
+from host.diagnosis.equivalence import Standing, scanty, standings
 from host.diagnosis.evidence import whiteness
 from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.known import Known
@@ -125,7 +125,7 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
-    named = bool(found.best.terms) and not rest.doubtful
+    named = bool(found.best.terms) and not rest.doubtful and not scanty(standing)
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
     )

@@ -20,6 +20,7 @@ Tell = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
 AT_REST = frozenset({"periodic_disturbance", "sensor_drift"})  # seen without any motion of their port
 GRID = 160  # grid points of one candidate at most
+STEPPED_SAMPLES = 150  # of each output and recording, to look for steps in
 SCAN_SECONDS = 0.4  # time to screen one candidate, about
 
 
@@ -85,6 +86,15 @@ class Screened:
     begin: list[Array]
 
 
+@dataclass
+class Point:
+    """One grid point: energy taken, start values of the term, and what it leaves."""
+
+    taken: float
+    begin: Array
+    left: Array
+
+
 def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
     search).
@@ -93,7 +103,7 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
     r = problem.stacked(fit.terms, fit.values)
     found = []
     bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
-    n_eff = _independent(problem, fit)
+    few = _independent(problem, r)
     slopes = _slopes(problem, fit)
     used = [
         np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
@@ -116,18 +126,19 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
             Q = np.linalg.qr(J)[0] if J.shape[1] else J
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
-        term = term_of(problem, candidate, fit)
+        term = _stepped(problem, fit, term_of(problem, candidate, fit))
         quick = slopes is not None and candidate.port.name in slopes[0]
         if not term.parameters:
             continue
         points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes, lines)
         if not points:
             continue
-        points.sort(key=lambda point: point[0], reverse=True)
+        points.sort(key=lambda point: point.taken, reverse=True)
         reference = float(r @ r)
-        left = max(float(rest @ rest) - points[0][0], 1e-300)
+        left = max(float(rest @ rest) - points[0].taken, 1e-300)
+        n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
         promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters)
-        found.append(Screened(candidate, term, drop, float(promise), [begin for _, begin in points[:3]]))
+        found.append(Screened(candidate, term, drop, float(promise), [point.begin for point in points[:3]]))
     return sorted(found, key=lambda item: item.promise, reverse=True)
 
 
@@ -199,14 +210,43 @@ def _smaller(problem: Problem) -> Problem:
     return replace(problem, pieces=pieces)
 
 
-def _independent(problem: Problem, fit: Fit) -> float:
-    total = 0.0
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        if piece.fit.any():
-            for row in residual:
-                n = int(np.sum(piece.fit & np.isfinite(row)))
-                total += n / correlation_time(np.where(piece.fit, row, np.nan))
+def _independent(problem: Problem, left: Array) -> float:
+    """Independent samples to fit in what would be `left`, weighted and stacked."""
+    total, at, rows = 0.0, 0, len(problem.noise)
+    for piece in problem.pieces:
+        n = int(piece.fit.sum())
+        for row in left[at : at + rows * n].reshape(rows, n) if n else ():
+            used = int(np.count_nonzero(row))
+            total += used / correlation_time(np.where(row != 0.0, row, np.nan)) if used else 0.0
+        at += rows * n
     return total
+
+
+def _stepped(problem: Problem, fit: Fit, term: Term) -> Term:
+    """A quantization with the steps at which the residual goes with the saw tooth of its readings as simulated."""
+    if term.candidate.effect.id != "quantization":
+        return term
+    unit = "N" if term.candidate.port.kind == "forces" else "m"
+    rows = [row for row, output in enumerate(problem.model.outputs) if output.unit == unit]
+    x, r = [], []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        for row in rows:
+            good = piece.fit & np.isfinite(residual[row])
+            every = max(1, int(good.sum()) // STEPPED_SAMPLES)
+            x.append((piece.y[row] - residual[row])[good][::every])
+            r.append(residual[row][good][::every] / problem.scale[row])
+    place, rest = np.concatenate(x), np.concatenate(r)
+    low, high = 1.2 * min(problem.scale[row] for row in rows), 12.0 * max(problem.scale[row] for row in rows)
+    span = float(np.max(np.abs(place))) if place.size else 0.0
+    if not span > high:
+        return replace(term, parameters=tuple(replace(p, grid=()) for p in term.parameters))
+    turns = np.arange(1.0 / high, 1.0 / low, 0.2 / span)
+    goes = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
+    best = turns[np.argsort(goes)[:3]]
+    p = term.parameters[0]
+    return replace(
+        term, parameters=(replace(p, grid=tuple(1.0 / k for k in best), low=0.5 * low, high=2.0 * high, step=0.01 * low),)
+    )
 
 
 def _scan(
@@ -220,9 +260,10 @@ def _scan(
     most: int,
     slopes: Slopes | None,
     lines: Array,
-) -> list[tuple[float, Array]]:
-    """(energy taken, start values of the term) at each grid point; `rest` is orthogonal to the columns of `Q`."""
-    points = []
+) -> list[Point]:
+    """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`."""
+    points: list[Point] = []
+    most_taken = 0.0
     linear = [p for p in term.parameters if p.linear]
     for point in grid_points(tuned(term, lines), max(5, most // max(len(linear), 1))):
         columns = []
@@ -251,5 +292,8 @@ def _scan(
             continue
         taken = float(2.0 * a @ g - a @ G @ a)
         amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
-        points.append((taken, starts(term, amplitude, point)))
+        left = rest
+        if taken > most_taken:
+            most_taken, left = taken, rest - (a @ D - Q @ (B.T @ a))
+        points.append(Point(taken, starts(term, amplitude, point), left))
     return points

@@ -23,34 +23,27 @@ from host.diagnosis.fit import (
 )
 from host.diagnosis.model import Piece
 from host.diagnosis.screening import Screened, enough, screen, without
+from host.diagnosis.trial import (
+    ENOUGH,
+    PRICE,
+    SMALLEST_EXCESS,
+    SMALLEST_SHARE,
+    Trial,
+    at_bound,
+    good_enough,
+    rank,
+    related,
+    weighty,
+)
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-FULL_FITS = 8  # candidates refitted in full at each step
+FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and of these at one port
 FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
-MOST_EFFECTS = 5
-ENOUGH = 6.0  # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
-SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
-SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
-SMALLEST_EXCESS = 0.10  # and this much of what is above noise
-COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
-INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
-NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
+MOST_EFFECTS, MOST_STEPS = 5, 10
+DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
+SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
 REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
-
-
-@dataclass
-class Trial:
-    """A candidate fitted in full, with its gains over the structure it was added to."""
-
-    candidate: Candidate
-    fit: Fit
-    heldout: Gain
-    trained: Gain
-    score: float
-    starts: list[dict[str, float]] = field(default_factory=list)
-    replaced: bool = False
-    period_s: float = 0.0
 
 
 @dataclass
@@ -70,7 +63,6 @@ class Found:
     nominal: Fit
     best: Fit
     steps: list[Step]
-    rivals: dict[str, list[Trial]] = field(default_factory=dict)
     forms: list[Form] = field(default_factory=list)
     nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
     best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
@@ -138,33 +130,17 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     set_starts(problem, begun)
     heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
     trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
-    more = len(fit.values) - len(base.values)
+    both = compare(problem.pieces, "both", base.residuals, fit.residuals, floor)
     return Trial(
         item.candidate,
         fit,
         heldout,
         trained,
-        heldout.log_likelihood - more,
+        both,
+        both.log_likelihood - PRICE * (len(fit.values) - len(base.values)),
         after,
         bool(item.drop),
         problem.pieces[0].recording.dt_s,
-    )
-
-
-def at_bound(fit: Fit) -> bool:
-    """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
-    term = fit.terms[-1]
-    values = fit.values[-len(term.parameters) :]
-    return (
-        any(
-            p.high > p.low
-            and (
-                (np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
-                or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high))
-            )
-            for p, value in zip(term.parameters, values, strict=True)
-        )
-        and term.candidate.effect.id not in NATURAL_BOUNDS
     )
 
 
@@ -220,72 +196,20 @@ def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: floa
     piece.start[port] = best if tried[best] < 0.9999 * tried[old] else old
 
 
-def rank(trials: list[Trial], base: Fit) -> None:
-    """Sorts trials by held-out likelihood, with one effective sample size for all, that of the trial with the least
-    error.
-    """
-    if not trials:
-        return
-    most = np.max([trial.heldout.independent for trial in trials], axis=0)
-    common = max(trials, key=lambda trial: float(most @ trial.heldout.log_ratio)).heldout.independent
-    for trial in trials:
-        more = max(len(trial.fit.values) - len(base.values), 0)
-        trial.score = 0.5 * float(common @ trial.heldout.log_ratio) - more
-    trials.sort(key=lambda trial: trial.score, reverse=True)
-    top = trials[0]
-    coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.heldout.excesses))))
-    near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
-    simpler = [
-        t
-        for t in trials
-        if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)
-    ]
-    if simpler:
-        best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
-        trials.remove(best)
-        trials.insert(0, best)
-
-
-def of_sampling(trial: Trial) -> bool:
-    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples,
-    not physics.
-    """
-    if trial.candidate.effect.id not in ("latency", "rate_lag") or not trial.candidate.port.name.endswith("_drive"):
-        return False
-    return float(trial.fit.values[-1]) < 1.05 * trial.period_s
-
-
-def related(simple: Candidate, general: Candidate) -> bool:
-    """Whether `general` is a finer shape of `simple`, at the same place."""
-    a, b = simple.effect, general.effect
-    return simple.port.name == general.port.name and (
-        a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family)
-    )
-
-
-def good_enough(trial: Trial, base: Fit) -> bool:
-    """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts."""
-    more = max(len(trial.fit.values) - len(base.values), 0)
-    gain = trial.heldout
-    least = max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
-    return (
-        not at_bound(trial.fit)
-        and not of_sampling(trial)
-        and gain.log_likelihood > ENOUGH + more
-        and gain.p_value < SURE
-        and gain.share > least
-        and trial.trained.log_likelihood > ENOUGH + 2.0 * more
-    )
-
-
 def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
-    """Nominal refit, then moves until none is earned."""
+    """Nominal refit, then moves until none is earned; then detours by other first effects, where two may do better."""
     tell("refitting the nominal model", 0.0)
     nominal = fit_nominal(problem)
     floor = np.array([noise.sigma for noise in problem.noise])
-    best, steps = nominal, []
-    rivals: dict[str, list[Trial]] = {}
-    for _ in range(MOST_EFFECTS):
+    found = Found(nominal, nominal, [])
+    _grow(problem, found, pool, floor, {}, tell)
+    return _detour(problem, found, pool, floor, tell)
+
+
+def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: dict[str, float], tell: Tell) -> None:
+    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood by subsystem so far."""
+    best, steps = found.best, found.steps
+    while len(best.terms) < MOST_EFFECTS and len(steps) < MOST_STEPS:
         ranked = screen(problem, best, pool, tell)
         trials = []
         promising = _varied([item for item in ranked if item.promise > 3.0])
@@ -293,26 +217,104 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
             tell(f"fitting {item.candidate.key}", count / len(promising))
             trials.append(try_fit(problem, best, item, floor))
         rank(trials, best)
-        winner = next((trial for trial in trials if good_enough(trial, best)), None)
+        winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
         if winner is None:
             steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
             break
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
-        rivals[winner.candidate.key] = [trial for trial in trials if trial is not winner]
-        set_starts(problem, winner.starts)
-        best = refined(problem, winner.fit)
-        reweigh(problem, best)
+        place = winner.candidate.port.subsystem
+        earned[place] = earned.get(place, 0.0) + winner.both.log_likelihood
+        best = _taken(problem, winner)
+        if len(best.terms) > 1:
+            best = _swap(problem, best, floor, steps)
         best = _prune(problem, best, floor, steps)
-    return Found(nominal, best, steps, rivals)
+    found.best = best
+
+
+def _taken(problem: Problem, trial: Trial) -> Fit:
+    """The fit of a trial brought to its end, memories started and outputs weighed as it has them."""
+    set_starts(problem, trial.starts)
+    best = refined(problem, trial.fit)
+    reweigh(problem, best)
+    return best
+
+
+def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> Found:
+    """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
+    screening promises beside them would outdo all that was found.
+    """
+    if not found.best.terms:
+        return found
+    begun, scale = get_starts(problem), problem.scale.copy()
+    best, first = found, found.steps[0]
+    top = first.trials[0].score
+    for trial in _rivals(first.trials, found.best, found.best.terms[0].candidate)[:DETOURS]:
+        if trial.score < WORTH * top or not good_enough(trial, found.nominal):
+            continue
+        base = _taken(problem, trial)
+        ranked = screen(problem, base, pool, tell)
+        if (
+            not ranked
+            or _total(problem, found.nominal, base, floor) + ranked[0].promise
+            < _total(problem, found.nominal, best.best, floor) + len(best.best.terms) * ENOUGH
+        ):
+            continue
+        other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
+        _grow(problem, other, pool, floor, {trial.candidate.port.subsystem: trial.both.log_likelihood}, tell)
+        ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
+        more = max(len(other.best.values) - len(best.best.values), 0)
+        if ahead.log_likelihood > ENOUGH + PRICE * more and len(other.best.terms) <= len(best.best.terms) + 1:
+            best, begun, scale = other, get_starts(problem), problem.scale.copy()
+    set_starts(problem, begun)
+    problem.scale[:] = scale
+    for piece in problem.pieces:
+        piece.extra["weight"] = problem.scale
+    begin_anew(problem, best.best)
+    return best
+
+
+def _total(problem: Problem, nominal: Fit, fit: Fit, floor: Array) -> float:
+    """Likelihood on all samples that a structure has earned, less the price of its parameters."""
+    gain = compare(problem.pieces, "both", nominal.residuals, fit.residuals, floor)
+    return gain.log_likelihood - PRICE * (len(fit.values) - len(nominal.values))
+
+
+def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+    """Each effect's rivals refitted beside the others: one that only stood in for several has to leave now."""
+    for term in best.terms:
+        step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
+        rest, values = without(best, problem, (term.candidate.key,))
+        for trial in _rivals(step.trials if step else [], best, term.candidate)[:SWAPS]:
+            new = trial.fit.terms[-1]
+            begin = np.concatenate((values, trial.fit.values[-len(new.parameters) :]))
+            other = finish(problem, minimize(problem, (*rest, new), begin, rounds=MORE_ROUNDS, tolerance=1e-4))
+            ahead = compare(problem.pieces, "both", best.residuals, other.residuals, floor)
+            more = len(other.values) - len(best.values)
+            if ahead.log_likelihood > ENOUGH + PRICE * max(more, 0) and not at_bound(other):
+                steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
+                return refined(problem, other)
+    return best
+
+
+def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]:
+    """Trials of other effects, the likeliest of each name first; none that acts already, no finer shape of `candidate`."""
+    active = {term.candidate.key for term in best.terms}
+    kept: dict[str, Trial] = {}
+    for trial in trials:
+        other = trial.candidate
+        if other.key not in active and other.key != candidate.key and not trial.replaced and not related(candidate, other):
+            kept.setdefault(other.name, trial)
+    return list(kept.values())
 
 
 def _varied(items: list[Screened]) -> list[Screened]:
-    """The most promising, at most two of one effect so that rivals of other kinds get their chance."""
+    """The most promising, few of one effect or port so that rivals of other kinds get their chance."""
     kept: list[Screened] = []
     for item in items:
         same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
-        if same < 3:
+        here = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
+        if same < 3 and here < AT_ONE_PORT:
             kept.append(item)
         if len(kept) == FULL_FITS:
             break
@@ -327,9 +329,11 @@ def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
         for term in best.terms:
             terms, values = without(best, problem, (term.candidate.key,))
             less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
-            gain = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
+            gain = compare(problem.pieces, "both", less.residuals, best.residuals, floor)
+            held = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
             least = 0.5 * max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
-            if gain.log_likelihood < 0.5 * ENOUGH + len(term.parameters) or gain.share < least:
+            few = gain.log_likelihood < ENOUGH + PRICE * len(term.parameters)
+            if few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break

@@ -14,8 +14,9 @@ from host.diagnosis.effect import Port
 from host.diagnosis.evidence import compare
 from host.diagnosis.fit import Fit, Problem, finish, minimize, reweigh
 from host.diagnosis.screening import Screened, term_of, without
-from host.diagnosis.search import ENOUGH, SMALLEST_EXCESS, SMALLEST_SHARE, Found, Step, Trial, rank, try_fit
+from host.diagnosis.search import Found, Step, try_fit
 from host.diagnosis.symbolic import search_equation
+from host.diagnosis.trial import ENOUGH, SMALLEST_EXCESS, SMALLEST_SHARE, Trial, rank
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]

@@ -70,7 +70,7 @@ class Rig:
     fit_samples = 6000
     coarsest_s = 0.04
     screen_samples = 4000
-    taken: frozenset[str] = frozenset({"periodic_disturbance:place@roll"})
+    taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.rig is None:
@@ -249,13 +249,18 @@ class Rig:
             "kappa": kappa,
             "flex": np.full(n, 1.0 / theta[6]),
             "extra": np.zeros((3, n)),
+            "load": np.zeros((3, n)),
+            "point": np.zeros((3, n)),
+            "point_at": np.zeros(n),
             "push": piece.extra["force"],
             "shift": np.zeros((3, n)),
             "normal": self.normal,
             "distal": self.spec.distal_length_m,
         }
         state["push"] = 2.0 * state["push"] - _vector(state["push"], acts, "force_sensor", piece)
+        prompt = state["push"]
         state = _changed(state, acts, "shape", piece)
+        slow = state["push"] - prompt
         state = _changed(state, acts, "base", piece)
         tip, tip_R, shaft, shaft_R, free, soft = self._shapes(piece, state)
         run: dict[str, Any] = {
@@ -270,7 +275,7 @@ class Rig:
                 run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
         placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
         law: dict[str, Any] = {
-            "gap": self.normal @ placed - theta[7],
+            "gap": self.normal @ placed - theta[7] - (self.normal @ soft) * (self.normal @ slow),
             "stiffness": np.full(n, theta[8]),
             "exponent": 1.0,
             "reference": 1e-3,
@@ -305,7 +310,7 @@ class Rig:
         """Kernel call; the last two results are kept, since contact and sensors change without the shape."""
         key = tuple(
             hash(np.ascontiguousarray(state[name]).tobytes())
-            for name in ("insertion", "roll", "kappa", "push", "extra", "flex")
+            for name in ("insertion", "roll", "kappa", "push", "extra", "load", "point", "point_at", "flex")
         )
         kept: dict[Any, tuple[Array, ...]] = piece.extra.setdefault("kept", {})
         if key not in kept:
@@ -317,6 +322,9 @@ class Rig:
                 state["kappa"],
                 -state["push"],
                 state["extra"],
+                state["load"],
+                state["point"],
+                state["point_at"],
                 state["flex"],
                 1.0 / self.spec.torsion_to_bending,
                 self.spec.distal_length_m,

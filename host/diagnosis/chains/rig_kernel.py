@@ -11,6 +11,7 @@ from numba import njit
 Array = npt.NDArray[np.float64]
 NODES, WEIGHTS = (np.ascontiguousarray(a) for a in np.polynomial.legendre.leggauss(5))
 SHORTEST_M = 1e-3
+NO_LOAD = (0.0, 0.0, 0.0)
 
 
 @njit(cache=True)
@@ -26,6 +27,18 @@ def _free_point(s: float, straight: float, kappa: float) -> tuple[float, float, 
 
 
 @njit(cache=True)
+def _moments_beyond(s: float, length: float, straight: float, kappa: float) -> tuple[float, float]:
+    """Integrals of (y, z) along the unloaded arc from s to its tip, roll 0."""
+    k = kappa if abs(kappa) > 1e-3 else (1e-3 if kappa >= 0.0 else -1e-3)
+    a, b = max(s - straight, 0.0), length - straight
+    sy = -((b - a) - (math.sin(k * b) - math.sin(k * a)) / k) / k
+    sz = straight * (b - a) + (math.cos(k * a) - math.cos(k * b)) / (k * k)
+    if s < straight:
+        sz += 0.5 * (straight * straight - s * s)
+    return sy, sz
+
+
+@njit(cache=True)
 def _deflection(
     s1: float,
     length: float,
@@ -34,18 +47,20 @@ def _deflection(
     fx: float,
     fy: float,
     fz: float,
+    load: tuple[float, float, float],
     flex: float,
     twist: float,
     nodes: Array,
     weights: Array,
     out: Array,
 ) -> None:
-    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force, roll 0: integrals of curvature change over
-    [0, s1].
+    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force and a load per length, roll 0: integrals of
+    curvature change over [0, s1].
     """
     out[:] = 0.0
     yt, zt, _ = _free_point(length, straight, kappa)
     y1, z1, _ = _free_point(s1, straight, kappa)
+    loaded = load[0] != 0.0 or load[1] != 0.0 or load[2] != 0.0
     for part in range(2):
         a = 0.0 if part == 0 else min(straight, s1)
         b = min(straight, s1) if part == 0 else s1
@@ -57,6 +72,10 @@ def _deflection(
             y, z, theta = _free_point(s, straight, kappa)
             dy, dz = yt - y, zt - z
             mx, my, mz = dy * fz - dz * fy, dz * fx, -dy * fx
+            if loaded:
+                sy, sz = _moments_beyond(s, length, straight, kappa)
+                sy, sz = sy - (length - s) * y, sz - (length - s) * z
+                mx, my, mz = mx + sy * load[2] - sz * load[1], my + sz * load[0], mz - sy * load[0]
             c, sn = math.cos(theta), math.sin(theta)
             about_b = flex * (my * c + mz * sn)
             about_t = twist * (-my * sn + mz * c)
@@ -68,6 +87,31 @@ def _deflection(
             out[3] += kx
             out[4] += ky
             out[5] += kz
+
+
+@njit(cache=True)
+def _add_point(
+    s1: float,
+    at: float,
+    straight: float,
+    kappa: float,
+    force: tuple[float, float, float],
+    flex: float,
+    twist: float,
+    nodes: Array,
+    weights: Array,
+    work: Array,
+    out: Array,
+) -> None:
+    """Adds to `out` (6,) the deflection at s1 by a force at arc length `at`, roll 0; beyond it the shaft only follows."""
+    _deflection(min(s1, at), at, straight, kappa, *force, NO_LOAD, flex, twist, nodes, weights, work)
+    y, z, _ = _free_point(at, straight, kappa)
+    y1, z1, _ = _free_point(max(s1, at), straight, kappa)
+    ey, ez = y1 - y, z1 - z
+    out += work
+    out[0] += work[4] * ez - work[5] * ey
+    out[1] += -work[3] * ez
+    out[2] += work[3] * ey
 
 
 @njit(cache=True)
@@ -105,6 +149,9 @@ def shapes(
     kappa: Array,
     force: Array,
     extra: Array,
+    load: Array,
+    point: Array,
+    point_at: Array,
     flex: Array,
     twist_ratio: float,
     distal: float,
@@ -117,7 +164,7 @@ def shapes(
 
     Arguments:
         insertion, roll, kappa: (n,). force: (3, n) on the tip, base frame; extra: (3, n) further tip force that is there
-        without contact.
+        without contact; load: (3, n) force per exposed length; point: (3, n) a force at arc length point_at (n,).
         flex: (n,) 1/EI. twist_ratio: EI/GJ. distal: length of the arc fully out. offset: of the second sensor behind the
         tip.
         normal: (3,) of the wall.
@@ -136,13 +183,22 @@ def shapes(
         twist = flex[i] * twist_ratio
         fx, fy, fz = force[0, i] + extra[0, i], force[1, i] + extra[1, i], force[2, i] + extra[2, i]
         gx, gy = c * fx + s * fy, -s * fx + c * fy
-        _deflection(length, length, straight, kappa[i], gx, gy, fz, flex[i], twist, nodes, weights, bend)
+        even = (c * load[0, i] + s * load[1, i], -s * load[0, i] + c * load[1, i], load[2, i])
+        _deflection(length, length, straight, kappa[i], gx, gy, fz, even, flex[i], twist, nodes, weights, bend)
+        at = min(point_at[i], length)
+        px, py, pz = point[0, i], point[1, i], point[2, i]
+        pressed = px != 0.0 or py != 0.0 or pz != 0.0
+        press = (c * px + s * py, -s * px + c * py, pz)
+        if pressed:
+            _add_point(length, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
         _pose(length, straight, kappa[i], roll[i], bend, p, R)
         tip[:, i] = p
         tip_R[:, :, i] = R
         s1 = length - offset
         if s1 > 0.0:
-            _deflection(s1, length, straight, kappa[i], gx, gy, fz, flex[i], twist, nodes, weights, bend)
+            _deflection(s1, length, straight, kappa[i], gx, gy, fz, even, flex[i], twist, nodes, weights, bend)
+            if pressed:
+                _add_point(s1, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
             _pose(s1, straight, kappa[i], roll[i], bend, p, R)
         else:
             bend[:] = 0.0
@@ -153,7 +209,7 @@ def shapes(
         y, z, _ = _free_point(length, straight, kappa[i])
         ex, ey, ez = extra[0, i], extra[1, i], extra[2, i]
         bend[:] = 0.0
-        if ex != 0.0 or ey != 0.0 or ez != 0.0:
+        if ex != 0.0 or ey != 0.0 or ez != 0.0 or even[0] != 0.0 or even[1] != 0.0 or even[2] != 0.0:
             _deflection(
                 length,
                 length,
@@ -162,18 +218,20 @@ def shapes(
                 c * ex + s * ey,
                 -s * ex + c * ey,
                 ez,
+                even,
                 flex[i],
                 twist,
                 nodes,
                 weights,
                 bend,
             )
+        if pressed:
+            _add_point(length, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
         x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
         free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z0
         nx, ny, nz = normal[0], normal[1], normal[2]
-        _deflection(
-            length, length, straight, kappa[i], c * nx + s * ny, -s * nx + c * ny, nz, flex[i], twist, nodes, weights, unit
-        )
+        across = (c * nx + s * ny, -s * nx + c * ny)
+        _deflection(length, length, straight, kappa[i], *across, nz, NO_LOAD, flex[i], twist, nodes, weights, unit)
         soft[0, i], soft[1, i], soft[2, i] = c * unit[0] - s * unit[1], s * unit[0] + c * unit[1], unit[2]
     return tip, tip_R, shaft, shaft_R, free, soft
 

@@ -30,7 +30,6 @@ EFFECTS = (
         "{source} moves this channel too, gain {gain}.",
         "y = x + gain*other",
         apply,
-        side="output",
         source="other",
     ),
     Effect(

@@ -22,14 +22,15 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal - np.clip(signal - p[0], -p[1], p[1]))
 
 
-EFFECTS = (
+EFFECTS = tuple(
     Effect(
         "dead_zone",
-        "motion",
+        port,
         30,
         parameters,
         "Nothing happens within {half_width} of {centre}, whichever way it is entered.",
         "y = x - clip(x - centre, -half_width, half_width)",
         apply,
-    ),
+    )
+    for port in ("motion", "limit")
 )

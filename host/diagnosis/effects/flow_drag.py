@@ -17,12 +17,11 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:
-    """Tip force that bends the shaft as an even drag does, pulsing."""
-    exposed = np.maximum(state["distal"] + state["insertion"], 1e-3)
+    """An even drag on the exposed shaft, pulsing."""
     phase = 2.0 * np.pi * p[6] * c.time_s
     wave = np.vstack([np.ones_like(phase), np.sin(phase), np.cos(phase)])
     force = np.vstack([p[0:3] @ wave, p[3:6] @ wave, np.zeros_like(phase)])
-    return {**state, "extra": state["extra"] + 0.375 * force * exposed}
+    return {**state, "load": state["load"] + force}
 
 
 EFFECTS = (
@@ -32,8 +31,9 @@ EFFECTS = (
         31,
         parameters,
         "Flow drags on the exposed shaft and pulses at {frequency}.",
-        "F_tip = 3/8 (steady + pulse)*exposed length",
+        "dF/ds = steady + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply,
         timed=True,
+        contains=("gravity_load",),
     ),
 )

@@ -8,14 +8,15 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Weight per exposed length along the base axes."""
-    return tuple(Parameter(f"weight_{a}", "N/m", (0.05,), linear=True) for a in "xyz")
+    """Weight per exposed length along the base axes, and the length whose weight the tip carries besides."""
+    weights = tuple(Parameter(f"weight_{a}", "N/m", (0.05,), linear=True) for a in "xyz")
+    return (*weights, Parameter("tip_length", "m", (0.0, 0.03), 0.0, 0.5, step=0.01))
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:
-    """Tip force that bends the shaft as its weight does: 3/8 of the weight, which grows with the exposed length."""
-    exposed = np.maximum(state["distal"] + state["insertion"], 1e-3)
-    return {**state, "extra": state["extra"] + 0.375 * p[:, None] * exposed}
+    """An even load on the exposed shaft, and a part of it at the tip."""
+    even = np.ones(c.time_s.size) * p[:3, None]
+    return {**state, "load": state["load"] + even, "extra": state["extra"] + p[3] * even}
 
 
 EFFECTS = (
@@ -25,7 +26,7 @@ EFFECTS = (
         30,
         parameters,
         "The shaft sags under its weight.",
-        "F_tip = 3/8 weight*exposed length",
+        "dF/ds = weight,  F_tip = weight*tip_length",
         apply,
     ),
 )

@@ -6,19 +6,25 @@ import numpy as np
 
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
+PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
+HALF_TURN = np.pi  # pitch of an angle beyond which it is once a turn: that is whip
+
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine, and frequency or pitch."""
     pair = (Parameter("sine", s.unit, (s.need,), linear=True), Parameter("cosine", s.unit, (s.need,), linear=True))
     if form == "place":
+        longest = PERIODS * s.motion_span
+        if (s.motion_unit or s.unit) == "rad":
+            longest = min(longest, HALF_TURN)
         return (
             *pair,
             Parameter(
                 "pitch",
                 s.motion_unit or s.unit,
-                spread(s.motion_span / 40.0, s.motion_span, 60),
+                spread(s.motion_span / 40.0, 0.9 * longest, 54),
                 s.motion_span / 200.0,
-                2.0 * s.motion_span,
+                longest,
                 log=True,
                 step=3e-3,
             ),
@@ -59,7 +65,51 @@ def apply_wall(law: dict, c: Context, p: Array, form: str) -> dict:
     return {**law, "gap": law["gap"] + p[0] * np.sin(phase) + p[1] * np.cos(phase)}
 
 
+def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Amplitudes of sine and cosine along the base axes, and frequency."""
+    pairs = tuple(Parameter(f"{part}_{a}", s.unit, (s.need,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
+    top = min(0.2 / s.dt_s, 5.0)
+    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    return (*pairs, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+
+
+def _wave(c: Context, p: Array) -> Array:
+    phase = 2.0 * np.pi * p[6] * c.time_s
+    return np.outer(p[0:6:2], np.sin(phase)) + np.outer(p[1:6:2], np.cos(phase))
+
+
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Both positions read with a line that no motion makes; turns and forces know nothing of it."""
+    wave = _wave(c, p)
+    return {**run, "tip": run["tip"] + wave, "shaft": run["shaft"] + wave}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """The force reads with a line."""
+    return np.asarray(signal + _wave(c, p))
+
+
 EFFECTS = (
+    Effect(
+        "periodic_disturbance",
+        "pose",
+        87,
+        reading,
+        "The tracker's positions read with a line at {frequency} that no motion makes.",
+        "x = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply_pose,
+        timed=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "forces",
+        87,
+        reading,
+        "The force sensor reads with a line at {frequency} that no contact makes.",
+        "F = F + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
+        apply_force,
+        timed=True,
+    ),
     Effect(
         "periodic_disturbance",
         "contact",

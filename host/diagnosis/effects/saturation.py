@@ -8,13 +8,24 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Limit above (or below)."""
+    """Limit above (or below), or one on each side, reached over a knee."""
+    if form == "both":
+        middle = tuple(s.low + f * s.span for f in (0.5, 0.4, 0.6))
+        return (
+            Parameter("middle", s.unit, middle, s.low, s.high, step=0.05 * s.span),
+            Parameter("limit", s.unit, tuple(f * s.span for f in (0.47, 0.42, 0.35)), 0.0, s.span, step=0.05 * s.span),
+            Parameter("knee", s.unit, (0.005 * s.span, 0.03 * s.span), 1e-3 * s.span, 0.2 * s.span, log=True),
+        )
     share = (0.98, 0.93, 0.85, 0.75) if form == "upper" else (0.02, 0.07, 0.15, 0.25)
     return (Parameter("limit", s.unit, tuple(s.low + f * s.span for f in share), s.low, s.high, step=0.05 * s.span),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Clipped at the limit."""
+    if form == "both":
+        u = (signal - p[0]) / p[2]
+        edge = p[1] / p[2]
+        return np.asarray(p[0] - p[1] + p[2] * (np.logaddexp(0.0, u + edge) - np.logaddexp(0.0, u - edge)))
     return np.asarray(np.minimum(signal, p[0]) if form == "upper" else np.maximum(signal, p[0]))
 
 
@@ -30,17 +41,33 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 SAYS = "Beyond {limit} nothing follows."
-EFFECTS = tuple(
-    Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower"))
-    for port in ("motion", "limit")
-) + (
-    Effect(
-        "saturation",
-        "forces",
-        89,
-        largest,
-        "The force sensor does not read beyond {limit}.",
-        "y = clip(x, -limit, limit)",
-        apply_force,
-    ),
+EFFECTS = (
+    tuple(
+        Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower"))
+        for port in ("motion", "limit")
+    )
+    + tuple(
+        Effect(
+            "saturation",
+            port,
+            34,
+            parameters,
+            "Beyond {limit} to either side of {middle} nothing follows.",
+            "y = clip(x, middle - limit, middle + limit), rounded over the knee",
+            apply,
+            forms=("both",),
+        )
+        for port in ("motion", "limit")
+    )
+    + (
+        Effect(
+            "saturation",
+            "forces",
+            89,
+            largest,
+            "The force sensor does not read beyond {limit}.",
+            "y = clip(x, -limit, limit)",
+            apply_force,
+        ),
+    )
 )

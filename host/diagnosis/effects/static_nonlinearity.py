@@ -1,4 +1,4 @@
-"""Static nonlinearity: any other memoryless curve, traced the same way up and down (cubic polynomial)."""
+"""Static nonlinearity: any other memoryless curve, traced the same way up and down (polynomial)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Quadratic and cubic bend, as displacement at the ends of the range."""
+    """Quadratic and cubic bend, as displacement at the ends of the range; `fine`: up to the sixth power."""
+    powers = ("quartic", "quintic", "sextic") if form == "fine" else ()
     return (
         Parameter("quadratic", s.unit, (s.need,), linear=True),
         Parameter("cubic", s.unit, (s.need,), linear=True),
         Parameter("middle", s.unit, (0.5 * (s.low + s.high),), 0.5 * (s.low + s.high), 0.5 * (s.low + s.high)),
         Parameter("half_range", s.unit, (0.5 * s.span,), 0.5 * s.span, 0.5 * s.span),
+        *(Parameter(name, s.unit, (s.need,), linear=True) for name in powers),
     )
 
 
@@ -25,7 +27,11 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Polynomial of the place in the range; mean and slope stay with the nominal gain."""
     u = (signal - p[2]) / p[3]
-    return np.asarray(signal + p[0] * (u * u - 1.0 / 3.0) + p[1] * (u**3 - 0.6 * u))
+    bend = p[0] * (u * u - 1.0 / 3.0) + p[1] * (u**3 - 0.6 * u)
+    if form == "fine":
+        v = np.clip(u, -1.2, 1.2)
+        bend += np.polynomial.chebyshev.chebval(v, [0.0, 0.0, 0.0, 0.0, *p[4:7]])
+    return np.asarray(signal + bend)
 
 
 EFFECTS = (
@@ -37,5 +43,16 @@ EFFECTS = (
         "The curve from input to output is bent, the same way up and down.",
         "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5),  u = (x - middle)/half_range",
         apply,
+    ),
+    Effect(
+        "static_nonlinearity",
+        "motion",
+        30,
+        parameters,
+        "The curve from input to output is bent more than once, the same way up and down.",
+        "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5) + quartic*T4(u) + quintic*T5(u) + sextic*T6(u),"
+        "  u = (x - middle)/half_range",
+        apply,
+        forms=("fine",),
     ),
 )

@@ -18,12 +18,20 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Kinetic force, excess of the static force, and the Stribeck speed."""
+    """Kinetic force, excess of the static force, the Stribeck speed, and the distance over which the bristles yield."""
     return (
         Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
         Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
         Parameter(
             "speed", f"{s.motion_unit}/s", spread(0.05 * s.speed, 1.0 * s.speed, 4), 0.005 * s.speed, 10 * s.speed, log=True
+        ),
+        Parameter(
+            "distance",
+            s.motion_unit,
+            spread(2e-3 * s.motion_span, 0.05 * s.motion_span, 3),
+            3e-4 * s.motion_span,
+            s.motion_span,
+            log=True,
         ),
     )
 
@@ -35,8 +43,8 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Coulomb level, static excess and Stribeck speed."""
-    return {"coulomb": p[0], "static_excess": p[1], "stribeck_speed": p[2]}
+    """Kinetic level, static excess, Stribeck speed, and the bristles' distance."""
+    return {"coulomb": p[0], "static_excess": p[1], "stribeck_speed": p[2], "stribeck_distance": p[3]}
 
 
 EFFECTS = (
@@ -58,10 +66,10 @@ EFFECTS = (
         13,
         force,
         "Friction falls from {static_excess} above {kinetic_force} as speed passes {speed}.",
-        "F = (kinetic + static_excess*exp(-(v/speed)^2))*sign(v)",
+        "F = (kinetic + static_excess*exp(-(v/speed)^2))*z,  dz = (1 - z*sign(dx))*dx/distance",
         slots=slots,
         timed=True,
-        contains=("coulomb_friction",),
+        contains=("coulomb_friction", "presliding_friction"),
         family="dry",
     ),
 )

@@ -62,7 +62,9 @@ def test_forces_along_a_motion_add_up() -> None:
     assert np.allclose(one + two, both) and np.allclose(one, 2 * v)
 
 
-def shape(d: float, roll: float, kappa: float, force: np.ndarray) -> tuple[np.ndarray, ...]:
+def shape(
+    d: float, roll: float, kappa: float, force: np.ndarray, load: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[np.ndarray, ...]:
     """One sample of the kernel."""
     one = np.ones(1)
     return shapes(
@@ -71,6 +73,9 @@ def shape(d: float, roll: float, kappa: float, force: np.ndarray) -> tuple[np.nd
         kappa * one,
         force[:, None],
         np.zeros((3, 1)),
+        np.array(load)[:, None],
+        np.zeros((3, 1)),
+        np.zeros(1),
         one / rig_cases.EI,
         rig_cases.EI / rig_cases.GJ,
         rig_cases.DISTAL,
@@ -86,6 +91,29 @@ def test_straight_shaft_bends_as_a_cantilever() -> None:
     tip, tip_R, *_ = shape(-0.07, 0.0, 1e-9, np.array([0.0, -force, 0.0]))
     assert tip[1, 0] == pytest.approx(-force * L**3 / (3 * rig_cases.EI), rel=1e-6)
     assert rotation_logs(np.eye(3)[:, :, None], tip_R)[0, 0] == pytest.approx(force * L**2 / (2 * rig_cases.EI), rel=1e-6)
+
+
+def test_straight_shaft_sags_under_an_even_load() -> None:
+    weight, L = 0.3, 0.04
+    tip, tip_R, *_ = shape(-0.07, 0.0, 1e-9, np.zeros(3), (0.0, -weight, 0.0))
+    assert tip[1, 0] == pytest.approx(-weight * L**4 / (8 * rig_cases.EI), rel=1e-6)
+    assert rotation_logs(np.eye(3)[:, :, None], tip_R)[0, 0] == pytest.approx(weight * L**3 / (6 * rig_cases.EI), rel=1e-6)
+
+
+def test_an_even_load_on_a_bent_shaft_is_the_sum_of_point_loads() -> None:
+    roll, kappa, load = 0.6, 14.0, np.array([0.3, -0.2, 0.1])
+    tip, *_, free, _ = shape(-0.06, roll, kappa, np.zeros(3), tuple(load))
+    bare, *_ = shape(-0.06, roll, kappa, np.zeros(3))
+    length, parts = rig_cases.DISTAL - 0.06, 60
+    total = np.zeros(3)
+    for k in range(parts):
+        share = (k + 0.5) / parts
+        at, at_R, *_ = shape(share * length - rig_cases.DISTAL, roll, kappa, load * length / parts)
+        rest, rest_R, *_ = shape(share * length - rig_cases.DISTAL, roll, kappa, np.zeros(3))
+        turned = at_R[:, :, 0] @ rest_R[:, :, 0].T
+        total += at[:, 0] - rest[:, 0] + (turned - np.eye(3)) @ (bare[:, 0] - rest[:, 0])
+    assert np.allclose(tip[:, 0] - bare[:, 0], total, rtol=2e-2, atol=1e-7)
+    assert np.allclose(free, tip)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -1,0 +1,55 @@
+"""Quantization: a reading moves in steps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
+
+HARMONICS = 4  # of the saw tooth: a smooth stand-in, so that a fit can follow it
+
+
+def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Height of a step."""
+    return (Parameter("step", s.unit, (2.0 * s.need, 4.0 * s.need), 0.5 * s.need, 30.0 * s.need, step=0.01 * s.need),)
+
+
+def stepped(x: Array, step: float) -> Array:
+    """`x` rounded to steps, the saw tooth by its first harmonics."""
+    phase = 2.0 * np.pi * x / step
+    wave = np.zeros_like(x)
+    for k in range(1, HARMONICS + 1):
+        wave += (1.0 if k % 2 else -1.0) * np.sin(k * phase) / k
+    return np.asarray(x - step / np.pi * wave)
+
+
+def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
+    """Both positions in steps."""
+    return {**run, "tip": stepped(run["tip"], p[0]), "shaft": stepped(run["shaft"], p[0])}
+
+
+def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Every component in steps."""
+    return stepped(signal, p[0])
+
+
+EFFECTS = (
+    Effect(
+        "quantization",
+        "pose",
+        90,
+        parameters,
+        "The tracker's positions move in steps of {step}.",
+        "y = step*round(x/step)",
+        apply_pose,
+    ),
+    Effect(
+        "quantization",
+        "forces",
+        90,
+        parameters,
+        "The force sensor's readings move in steps of {step}.",
+        "y = step*round(x/step)",
+        apply_force,
+    ),
+)

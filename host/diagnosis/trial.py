@@ -1,0 +1,144 @@
+"""A candidate fitted in full, and what it has to show to earn a place: likelihood, blocks, size, and no bound reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from host.diagnosis.effect import Candidate
+from host.diagnosis.evidence import Gain
+from host.diagnosis.fit import Fit
+
+ENOUGH = 6.0  # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
+SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
+TOGETHER = 11.0  # log-likelihood on all samples that makes up for a held-out part that shows an effect only dimly,
+DIM = 0.12  # with at most this p-value on held-out blocks,
+LITTLE = 1.8  # and at least this log-likelihood there
+PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
+SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
+SMALLEST_EXCESS = 0.10  # and this much of what is above noise
+BESIDE, ELSEWHERE = 0.12, 0.06  # likelihood of a further effect against that of those named at its subsystem, and of all,
+LARGE = 0.3  # but for one that takes this share of an output's error;
+FURTHER = 0.05  # and the least such share: modules are idealizations, what they lack is no other effect
+COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
+INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
+NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
+
+
+@dataclass
+class Trial:
+    """A candidate fitted in full, with its gains over the structure it was added to."""
+
+    candidate: Candidate
+    fit: Fit
+    heldout: Gain
+    trained: Gain
+    both: Gain  # on all samples, fitted and held out
+    score: float
+    starts: list[dict[str, float]] = field(default_factory=list)
+    replaced: bool = False
+    period_s: float = 0.0
+
+
+def at_bound(fit: Fit) -> bool:
+    """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
+    term = fit.terms[-1]
+    values = fit.values[-len(term.parameters) :]
+    return (
+        any(
+            p.high > p.low
+            and (
+                (np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
+                or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high))
+            )
+            for p, value in zip(term.parameters, values, strict=True)
+        )
+        and term.candidate.effect.id not in NATURAL_BOUNDS
+    )
+
+
+def rank(trials: list[Trial], base: Fit) -> None:
+    """Sorts trials by their likelihood on all samples, with one effective sample size for all, that of the trial with
+    the least error.
+    """
+    if not trials:
+        return
+    most = np.max([trial.both.independent for trial in trials], axis=0)
+    common = max(trials, key=lambda trial: float(most @ trial.both.log_ratio)).both.independent
+    for trial in trials:
+        more = max(len(trial.fit.values) - len(base.values), 0)
+        trial.score = 0.5 * float(common @ trial.both.log_ratio) - PRICE * more
+    trials.sort(key=lambda trial: trial.score, reverse=True)
+    top = trials[0]
+    coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.both.excesses))))
+    near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
+    simpler = [
+        t
+        for t in trials
+        if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)
+    ]
+    if simpler:
+        best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
+        trials.remove(best)
+        trials.insert(0, best)
+
+
+def of_sampling(trial: Trial) -> bool:
+    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples,
+    not physics.
+    """
+    if trial.candidate.effect.id not in ("latency", "rate_lag") or not trial.candidate.port.name.endswith("_drive"):
+        return False
+    return float(trial.fit.values[-1]) < 1.05 * trial.period_s
+
+
+def related(simple: Candidate, general: Candidate) -> bool:
+    """Whether `general` is a finer shape of `simple`, at the same place."""
+    a, b = simple.effect, general.effect
+    return simple.port.name == general.port.name and (
+        a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family)
+    )
+
+
+def good_enough(trial: Trial, base: Fit) -> bool:
+    """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts.
+
+    Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
+    samples together have to be surer by far.
+    """
+    more = max(len(trial.fit.values) - len(base.values), 0)
+    return not at_bound(trial.fit) and not of_sampling(trial) and (_alone(trial, more) or _together(trial, more))
+
+
+def _alone(trial: Trial, more: int) -> bool:
+    gain = trial.heldout
+    return (
+        gain.log_likelihood > ENOUGH + more
+        and gain.p_value < SURE
+        and gain.share > _least(trial, gain)
+        and trial.trained.log_likelihood > ENOUGH + 2.0 * more
+    )
+
+
+def _together(trial: Trial, more: int) -> bool:
+    gain = trial.both
+    return (
+        gain.log_likelihood > TOGETHER + PRICE * more
+        and gain.p_value < 0.1 * SURE
+        and gain.share > _least(trial, gain)
+        and trial.heldout.log_likelihood > LITTLE
+        and trial.heldout.p_value < DIM
+    )
+
+
+def weighty(trial: Trial, earned: dict[str, float]) -> bool:
+    """Whether a trial earns enough beside what is named already (likelihood by subsystem); a finer shape is judged alone."""
+    least = max(BESIDE * earned.get(trial.candidate.port.subsystem, 0.0), ELSEWHERE * sum(earned.values()))
+    share = trial.both.share
+    further = not earned or (share > FURTHER and (share > LARGE or trial.both.log_likelihood > least))
+    return trial.replaced or further
+
+
+def _least(trial: Trial, gain: Gain) -> float:
+    return max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
