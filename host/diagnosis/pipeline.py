@@ -74,6 +74,7 @@ class Diagnosis:
 
 def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
+    spec._files = files
     recordings = load(spec, files, *channels_of(spec))
     model = build(spec)
     if spec.effect:
