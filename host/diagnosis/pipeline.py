@@ -16,6 +16,7 @@ from host.diagnosis.dataset import Recording, load, thin
 from host.diagnosis.effect import candidates
 from host.diagnosis.equivalence import Standing, standings
 from host.diagnosis.evidence import whiteness
+from host.diagnosis.experiment import Design, design
 from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.known import Known
 from host.diagnosis.locate import Condition, condition, inside, joined, mismatch_of, windows
@@ -70,6 +71,7 @@ class Diagnosis:
     verdict: str = "nothing_missing"
     rest: Rest = field(default_factory=lambda: Rest(None, 0.0))
     notes: list[str] = field(default_factory=list)
+    designs: list[Design] = field(default_factory=list)
 
 
 def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Problem]:
@@ -127,6 +129,7 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
+    result.designs = design(problem, found, standing, tell)
     named = bool(found.best.terms) and not rest.doubtful
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"

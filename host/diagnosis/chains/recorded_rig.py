@@ -9,12 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from host.cli.contract_io import BadInput
-from host.diagnosis.chains.rig import KEYS, PARAMETERS
+from host.diagnosis.chains.rig import FORCE, HANDLES, KEYS, PARAMETERS
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Port
+from host.diagnosis.excitation import Excitation
+from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.live_twin import Twin
 from host.diagnosis.model import Act, Piece
 from host.diagnosis.nominal import NominalSpec
+from host.diagnosis.rig_experiment import rig_excitations
 from host.diagnosis.rig_recording import knob_gain, rig_of
 from host.mechanics.catheter import Catheter, CosseratParameters
 from host.recording import Recording as RigRecording
@@ -32,6 +35,8 @@ class RecordedRig(Twin):
     Known play and knob curve are taken off the handle beforehand (rig_recording); offsets, slope, gain and bending
     stiffness are refitted.
     """
+
+    scripted = (*HANDLES, *FORCE)
 
     def __init__(self, spec: NominalSpec) -> None:
         rig = rig_of(spec._files)
@@ -73,6 +78,10 @@ class RecordedRig(Twin):
         weight = piece.extra.get("weight", np.ones(POSE_ROWS))[:, None]
         slope = np.where(np.isfinite(residual), slope, 0.0) / weight
         return np.asarray(np.sum(slope * np.nan_to_num(residual) / weight, axis=0) / (np.sum(slope**2, axis=0) + 1e-12))
+
+    def excitations(self, problem: Problem, best: Fit) -> list[tuple[Excitation, dict[str, Array]]]:
+        """Motions that this rig can make in an experiment."""
+        return rig_excitations(self, problem, best)
 
     def settle(self, piece: Piece, theta: Array) -> None:
         """Lets the rod model correct the chain at these nominal parameters."""
