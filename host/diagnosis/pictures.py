@@ -75,7 +75,8 @@ def chain(result: Diagnosis) -> Picture:
             if x == 0 and k > 0:
                 axes.annotate("", (-0.31, y), (-0.48, y), arrowprops=ARROW)
             if k + 1 < len(names) and (name, names[k + 1]) != SIDE_BY_SIDE:
-                axes.annotate("", (min(x + 0.62, per_row - 0.52), y), (x + (0.40 if x < per_row - 1 else 0.31), y), arrowprops=ARROW)
+                last = x == per_row - 1
+                axes.annotate("", (x + (0.48 if last else 0.62), y), (x + (0.31 if last else 0.40), y), arrowprops=ARROW)
 
     words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
     height = 0.55 * np.ceil(len(names) / 4) + 0.1
