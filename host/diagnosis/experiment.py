@@ -235,8 +235,8 @@ def lines(made: list[Design], candidate: Candidate) -> str:
 
 
 def planned(result: Any) -> list[Design]:
-    """Designs of a diagnosis, each excitation once."""
+    """Designs of a diagnosis that are worth recording, each excitation once, the most telling first."""
     seen: dict[str, Design] = {}
-    for one in result.designs:
+    for one in sorted((d for d in result.designs if d.separation > PLAIN), key=lambda d: -d.separation):
         seen.setdefault(f"{one.excitation.channel} {one.excitation.words} {one.excitation.held}", one)
     return list(seen.values())
