@@ -17,6 +17,7 @@ import numpy.typing as npt
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Candidate
 from host.diagnosis.equivalence import Standing
+from host.diagnosis.evidence import correlation_time
 from host.diagnosis.excitation import Excitation, Span, family
 from host.diagnosis.fit import Fit, Problem, jacobian, minimize, size_of
 from host.diagnosis.screening import without
@@ -31,7 +32,7 @@ INSIDE = (0.02, 0.98)  # quantiles of the recorded inputs that a motion stays be
 
 @dataclass(frozen=True)
 class Design:
-    """The best excitation against one rival. `separation`, and `had` by these recordings, in units of noise."""
+    """The best excitation against one rival. `separation`, and `had` by these recordings, in units of what is left."""
 
     candidate: Candidate
     other: Candidate
@@ -48,7 +49,7 @@ class Design:
         return (
             f"{self.excitation.channel.replace('_', ' ')}: {self.excitation.words}{held}. "
             f"Predicted separation of {self.candidate.name} and {self.other.name}: {self.separation:.3g} in units of "
-            f"noise; these recordings: {self.had:.2g}.{doubt}"
+            f"what is left; these recordings: {self.had:.2g}.{doubt}"
         )
 
 
@@ -77,7 +78,7 @@ def rival_fit(problem: Problem, found: Found, candidate: Candidate, other: Candi
 
 def against(problem: Problem, best: Fit, rival: Fit, candidate: Candidate, other: Candidate) -> Design | None:
     """The excitation that separates `best` from `rival` most; None where the model's inputs cannot be moved."""
-    weighted = weighed(problem)
+    weighted = weighed(problem, best)
     known = information(weighted, rival)
     had = float(np.linalg.norm(difference(weighted, best, rival)))
     ranked = []
@@ -97,11 +98,10 @@ def against(problem: Problem, best: Fit, rival: Fit, candidate: Candidate, other
     return Design(candidate, other, top[1], top[0], had, inputs)
 
 
-def weighed(problem: Problem) -> Problem:
-    """`problem` with residuals in units of what is left, correlated samples counted once."""
-    scale = np.array(
-        [s * np.sqrt(noise.correlation_samples) for s, noise in zip(problem.scale, problem.noise, strict=True)]
-    )
+def weighed(problem: Problem, best: Fit) -> Problem:
+    """`problem` with residuals in units of what `best` leaves, correlated samples counted once."""
+    together = [max(correlation_time(r[row]) for r in best.residuals) for row in range(len(problem.noise))]
+    scale = problem.scale * np.sqrt(np.maximum(together, 1.0))
     return Problem(problem.model, problem.pieces, problem.noise, scale, problem.columns)
 
 
