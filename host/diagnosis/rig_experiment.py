@@ -69,7 +69,7 @@ def rig_excitations(model: Any, problem: Problem, best: Fit) -> list[tuple[Excit
             handle = np.repeat(where.base[:, None], time_s.size, axis=1)
             handle[axis] = excitation.values
             tip = tip_path(model, best, handle)
-            if allowed(tip, dt_s, rig, model.normal, where.wall_m) and followed(excitation, reach):
+            if allowed(tip, dt_s, rig, model.normal, where.wall_m) and followed(excitation):
                 out.append((excitation, dict(zip(HANDLES, handle, strict=True)) | still(time_s.size)))
     if where.touch is not None:
         out += pressing(model, where.touch[0], time_s, rig)
@@ -94,11 +94,11 @@ def pressing(model: Any, handle: Array, time_s: Array, rig: Rig) -> list[tuple[E
     return out
 
 
-def followed(excitation: Excitation, reach: float) -> bool:
-    """Whether commands at COMMANDS_HZ, joined by straight lines, are the motion but for a twentieth of its reach."""
+def followed(excitation: Excitation) -> bool:
+    """Whether commands at COMMANDS_HZ, joined by straight lines, are the motion but for a tenth of its size."""
     step = max(1, round(1.0 / (COMMANDS_HZ * (excitation.time_s[1] - excitation.time_s[0]))))
     joined = np.interp(excitation.time_s, excitation.time_s[::step], excitation.values[::step])
-    return bool(np.max(np.abs(joined[:-step] - excitation.values[:-step])) < 0.05 * reach)
+    return bool(np.max(np.abs(joined[:-step] - excitation.values[:-step])) < 0.05 * np.ptp(excitation.values))
 
 
 def tip_path(model: Any, best: Fit, handle: Array) -> Array:
