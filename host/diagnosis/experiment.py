@@ -24,7 +24,7 @@ from host.diagnosis.screening import without
 from host.diagnosis.search import Found
 
 Array = npt.NDArray[np.float64]
-LONGEST_S, MOST_SAMPLES = 40.0, 2000
+LONGEST_S, MOST_SAMPLES = 40.0, 12000
 FINALISTS = 16
 PLAIN = 3.0  # separation from which a recording tells two models apart
 INSIDE = (0.02, 0.98)  # quantiles of the recorded inputs that a motion stays between
@@ -196,7 +196,7 @@ def synthetic(usual: tuple[Recording, dict[str, float]], time_s: Array, channels
 def excitations(problem: Problem) -> list[tuple[Excitation, dict[str, Array]]]:
     """The family for a model of any kind: every input within what was recorded of it; further inputs at three levels."""
     like, _ = at_rest(problem)
-    n = min(MOST_SAMPLES, max(200, round(LONGEST_S / like.dt_s))) if like.timed else MOST_SAMPLES // 2
+    n = min(MOST_SAMPLES, max(200, round(LONGEST_S / like.dt_s))) if like.timed else 1000
     time_s: Array = like.dt_s * np.arange(n, dtype=np.float64)
     names = asked(problem)
     spans = {name: recorded_span(problem, name) for name in names}

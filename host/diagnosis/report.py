@@ -90,7 +90,8 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
         return "No effect of the vocabulary improves the fit of recordings that were not used to fit."
     it = "it" if len(verdict["effects"]) == 1 else "them"
     said = f"With {it} the error on recordings that were not used to fit falls from "
-    said += f"{quantity(fit['rmse_before'], unit)} to {quantity(fit['rmse_after'], unit)}."
+    before, after = (quantity(fit[key], unit).replace(" ", NBSP) for key in ("rmse_before", "rmse_after"))
+    said += f"{before} to {after}."
     if verdict["verdict"] == "mismatch_not_identified":
         return (
             "What was tried stands below; its parts are probably stand-ins for something else."
