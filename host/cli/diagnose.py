@@ -46,6 +46,9 @@ def diagnose(
     nominal: Annotated[str, typer.Option(help="nominal model, a TOML file or the name of one that ships")] = "",
     json: Annotated[str | None, typer.Option(help="where the verdict goes; - for standard output")] = None,
     report: Annotated[str | None, typer.Option(help="where the report page goes (one HTML file)")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="folder for verdict.json, report.html, and the scripts of experiments to tell apart")
+    ] = None,
     data: Annotated[
         str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")
     ] = None,
@@ -85,6 +88,15 @@ def diagnose(
     result = run(spec, files, progress, frozenset(without or []))
     progress.close()
     verdict = as_json(result, time.monotonic() - began)
+    if out is not None:
+        from host.diagnosis.scripts import write_scripts
+
+        out.mkdir(parents=True, exist_ok=True)
+        verdict["scripts"] = [str(path) for path in write_scripts(result, out)]
+        report = report or str(out / "report.html")
+        write_json(verdict, str(out / "verdict.json"))
+        for path in verdict["scripts"]:
+            print(f"script: {path}", file=sys.stderr)
     if report:
         from host.diagnosis.report import write_report
 

@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "calibrate": ("host.cli.calibrate", "calibrate", "Stiffness of a catheter from shapes under known loads."),
     "bench": ("host.cli.bench", "bench", "Times of the kernels, each beside a peer in the same run."),
     "diagnose": ("host.cli.diagnose", "diagnose", "Where recordings and simulation part, and what physics is missing."),
+    "experiment": ("host.cli.experiment", "experiment", "The script of a diagnosis on the rig, or checked only."),
     "prove": ("host.cli.prove", "prove", "The finder on concealed cases, scored against sealed labels."),
     "reproduce": ("host.cli.reproduce", "reproduce", "The thesis' figures again: mechanics or control."),
     "characterize": ("host.cli.characterize", "characterize", "Backlash, slopes and dead zones of a rig, by sweeps."),

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from host.cli.contract_io import BadInput
 from host.diagnosis.nominal import ChannelSpec, NominalSpec
+from host.diagnosis.rig_recording import rig_rows
 from host.diagnosis.tables import is_table, read_table
 
 Array = npt.NDArray[np.float64]
@@ -68,7 +69,8 @@ def find_files(spec: NominalSpec, named: list[str], data_folder: str | None) -> 
 def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
     """Recordings of `files`; `needed` are the channels of the model, those in `optional` may be absent. Raises BadInput."""
     pieces: list[Recording] = []
-    wholes = [_one(spec, path.name, read_table(path), needed, optional) for path in files]
+    read = rig_rows if spec.recorded_rig else read_table
+    wholes = [_one(spec, path.name, read(path), needed, optional) for path in files]
     shared = one_clock(wholes)
     first = min(whole.time_s[0] for whole in wholes)
     for path, whole in zip(files, wholes, strict=True):

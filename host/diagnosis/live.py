@@ -83,6 +83,7 @@ class Watch:
         self._next_ns = 0
         self._since_ns: int | None = None
         self.told = False
+        self.score = 0.0
 
     def hear(self, topic: str, message: Message) -> None:
         """Take in one message of the rig."""
@@ -140,6 +141,7 @@ class Watch:
         """The last window against the baseline."""
         assert self.baseline is not None
         score = self._score(self._residual(-self._rows(self.settings.window_s))[1])
+        self.score = float(np.max(score))
         now_ns = self.listener.stamps_ns[-1]
         if not np.max(score) > 1.0:
             self._since_ns, self.told = None, False

@@ -72,8 +72,8 @@ class Twin(RigChain):
     added, at the nominal parameters, so that effects act through the chain. The wall moves: forces are an input only.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        self.catheter: Catheter = load_catheter(rig.catheter.name)
+    def __init__(self, rig: Rig, catheter: Catheter | None = None) -> None:
+        self.catheter: Catheter = catheter or load_catheter(rig.catheter.name)
         mechanics = self.catheter.cosserat
         if mechanics is None:
             raise ValueError(

@@ -112,6 +112,7 @@ class RigSpec(Request):
     shaft_sensor_offset_m: float = Field(default=0.030, gt=0)
     torsion_to_bending: float = Field(default=0.77, gt=0)
     wall_normal: list[float] = Field(default=[0.0, 0.0, 1.0], min_length=3, max_length=3)
+    recorded: bool = False  # all of it, and the catheter, from the configuration that recordings of a running rig carry
 
 
 class EffectSpec(Request):
@@ -142,6 +143,7 @@ class NominalSpec(Request):
     rig: RigSpec | None = None
     effect: list[EffectSpec] = []
     _folder: str = PrivateAttr(default=".")
+    _files: list[Path] = PrivateAttr(default=[])
 
     @model_validator(mode="after")
     def _section_present(self) -> NominalSpec:
@@ -154,6 +156,11 @@ class NominalSpec(Request):
     def folder(self) -> str:
         """Where the TOML lies: its function is looked for there."""
         return self._folder
+
+    @property
+    def recorded_rig(self) -> bool:
+        """Whether the nominal model is the rig that the recordings describe themselves."""
+        return self.kind == "rig" and self.rig is not None and self.rig.recorded
 
     def start(self, name: str, default: float) -> tuple[float, bool]:
         """Start value of nominal parameter `name`, and whether it may be refitted."""

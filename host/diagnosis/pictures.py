@@ -8,16 +8,20 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from host.diagnosis.effect import Port
 from host.diagnosis.locate import joined
 from host.diagnosis.model import Piece
+from host.diagnosis.people import scaled
 from host.diagnosis.pipeline import Diagnosis
 from host.report_style import ESTIMATED, FAINT, INK, MEASURED, MUTED, TRUTH, Picture, legend_above, picture, thinned
 
 Array = npt.NDArray[np.float64]
 FAULT, SHADE = "#b03a32", "#f6e3da"
+ORDER = ("base", "insertion", "roll", "knob", "shape", "contact", "pose_sensor", "force_sensor")  # along the rig
+ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9}
+SIDE_BY_SIDE = ("pose_sensor", "force_sensor")
 
 
 def shown(result: Diagnosis) -> tuple[Piece, int, int]:
@@ -39,6 +43,7 @@ def shown(result: Diagnosis) -> tuple[Piece, int, int]:
 def chain(result: Diagnosis) -> Picture:
     """The links from input to output; those at fault in red."""
     names = list(dict.fromkeys(port.subsystem for port in result.model.ports))
+    names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
     if len(names) == 1:
         names = [result.model.quiet_inputs[0], *names, result.model.outputs[0].channel]
     bad = {location.subsystem for location in result.located}
@@ -67,8 +72,11 @@ def chain(result: Diagnosis) -> Picture:
                     "ec": colour if name in bad else FAINT,
                 },
             )
-            if k + 1 < len(names) and x < per_row - 1:
-                axes.annotate("", (x + 0.62, y), (x + 0.40, y), arrowprops={"arrowstyle": "->", "color": MUTED, "lw": 0.9})
+            if x == 0 and k > 0:
+                axes.annotate("", (-0.31, y), (-0.48, y), arrowprops=ARROW)
+            if k + 1 < len(names) and (name, names[k + 1]) != SIDE_BY_SIDE:
+                last = x == per_row - 1
+                axes.annotate("", (x + (0.48 if last else 0.62), y), (x + (0.31 if last else 0.40), y), arrowprops=ARROW)
 
     words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
     height = 0.55 * np.ceil(len(names) / 4) + 0.1
@@ -79,13 +87,13 @@ def over_time(result: Diagnosis) -> Picture:
     """Recording and both models, and below what each leaves; windows of the mismatch shaded."""
     piece, index, row = shown(result)
     output = result.model.outputs[row]
-    t = piece.recording.time_s
-    y = piece.y[row]
-    nominal = y - result.found.nominal_full.residuals[index][row]
-    best = y - result.found.best_full.residuals[index][row]
-    begin = piece.recording.begin_s
-    spans = joined([(a - begin, b - begin) for place in result.located for a, b in place.windows_s[piece.recording.name]])
-    floor = result.figures.floor[row]
+    t = piece.recording.time_s + piece.recording.begin_s
+    size, unit = scaled(output.unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
+    y = piece.y[row] / size
+    nominal = y - result.found.nominal_full.residuals[index][row] / size
+    best = y - result.found.best_full.residuals[index][row] / size
+    spans = joined([span for place in result.located for span in place.windows_s[piece.recording.name]])
+    floor = result.figures.floor[row] / size
 
     def draw(figure: Figure, narrow: bool) -> None:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.0))
@@ -104,8 +112,8 @@ def over_time(result: Diagnosis) -> Picture:
         bottom.plot(*thinned(t, y - nominal, bins), color=FAULT, lw=0.9)
         if result.found.best.terms:
             bottom.plot(*thinned(t, y - best, bins), color=INK, lw=0.9)
-        top.set_ylabel(f"{output.channel.replace('_', ' ')} ({output.unit})")
-        bottom.set_ylabel(f"left ({output.unit})")
+        top.set_ylabel(f"{output.channel.replace('_', ' ')} ({unit})")
+        bottom.set_ylabel(f"left ({unit})")
         bottom.set_xlabel("time (s)" if piece.recording.timed else "sample")
         legend_above(top, 2 if narrow else 3)
 
@@ -135,21 +143,22 @@ def loop(result: Diagnosis) -> Picture | None:
     if name is None:
         return None
     port: Port = ports[name]
-    piece, index, row = shown(result)
+    piece, index, _ = shown(result)
+    row = most_moved(result, index, port.subsystem)
+    size, unit = scaled(result.model.outputs[row].unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
     x = result.model.motion(piece, port)
-    left = result.found.nominal_full.residuals[index][row]
-    extra = left - result.found.best_full.residuals[index][row]
+    left = result.found.nominal_full.residuals[index][row] / size
+    extra = left - result.found.best_full.residuals[index][row] / size
     travel = next(
         (f"{words} ({unit})" for words, key, unit in result.model.travel if key.endswith(name)), result.model.travel[0][0]
     )
     if port.kind.startswith("motion") and name not in ("insertion", "roll", "knob"):
         travel = f"{result.model.travel[0][0]} ({result.model.travel[0][2]})"
-    unit = result.model.outputs[row].unit
 
     def draw(figure: Figure, narrow: bool) -> None:
         axes: Axes = figure.add_subplot()
         step = max(1, x.size // 6000)
-        axes.plot(x[::step], left[::step], color=ESTIMATED, lw=0.7, label="recording minus nominal")
+        axes.plot(x[::step], left[::step], ".", color=ESTIMATED, ms=2.0, label="recording minus nominal")
         axes.plot(x[::step], extra[::step], color=INK, lw=1.0, label="what the effects add")
         axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
         legend_above(axes, 1 if narrow else 2)
@@ -162,6 +171,20 @@ def loop(result: Diagnosis) -> Picture | None:
         "Input against what the nominal model leaves, and what the effects add.",
         "A loop means memory or rate; a single curve means neither.",
     )
+
+
+def most_moved(result: Diagnosis, index: int, subsystem: str) -> int:
+    """The output in which the effects at `subsystem` show most, over the noise."""
+    channels = [channel for place in result.located if place.subsystem == subsystem for channel in place.channels]
+    rows = [row for row, output in enumerate(result.model.outputs) if output.channel in channels]
+
+    def weight(row: int) -> float:
+        full = result.found
+        change = full.nominal_full.residuals[index][row] - full.best_full.residuals[index][row]
+        good = change[np.isfinite(change)]
+        return float(np.std(good)) / max(result.figures.floor[row], 1e-300) if good.size else 0.0
+
+    return max(rows, key=weight) if rows else result.figures.primary
 
 
 def before_after(result: Diagnosis) -> Picture:
@@ -180,6 +203,7 @@ def before_after(result: Diagnosis) -> Picture:
         axes.axvline(1.0, color=TRUTH, lw=0.9, ls=":")
         axes.set_xscale("log")
         axes.set_yticks(place, names)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(

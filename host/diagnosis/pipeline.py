@@ -17,6 +17,7 @@ from host.diagnosis.dictionary import lay_out
 from host.diagnosis.effect import candidates
 from host.diagnosis.equivalence import Standing, scanty, standings
 from host.diagnosis.evidence import whiteness
+from host.diagnosis.experiment import Design, design
 from host.diagnosis.fit import Fit, Problem
 from host.diagnosis.known import Known
 from host.diagnosis.locate import Condition, condition, inside, joined, mismatch_of, windows
@@ -70,10 +71,12 @@ class Diagnosis:
     verdict: str = "nothing_missing"
     rest: Rest = field(default_factory=lambda: Rest(None, 0.0))
     notes: list[str] = field(default_factory=list)
+    designs: list[Design] = field(default_factory=list)
 
 
 def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
+    spec._files = files
     recordings = load(spec, files, *channels_of(spec))
     model = build(spec)
     if spec.effect:
@@ -125,6 +128,7 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
+    result.designs = design(problem, found, standing, tell)
     named = bool(found.best.terms) and not rest.doubtful and not scanty(standing)
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from host.diagnosis.people import interval, quantity, short
 from host.diagnosis.pictures import pictures, shown
 from host.diagnosis.pipeline import Diagnosis
 
@@ -49,10 +49,12 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         footer=f"{len(result.full.pieces)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
         lines=lines(result, verdict),
         pictures=pictures(result),
-        effects=[shown_effect(e) for e in verdict["effects"]],
+        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
         nominal=_nominal(result),
         candidates=candidates(result),
-        located=verdict["located"],
+        located=[{**place, "times": times(place)} for place in verdict["located"]],
+        scripts=[Path(path).name for path in verdict.get("scripts", ())],
+        on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
         partly=result.rest.left,
         noises=_noises(result),
         output=result.model.outputs[row].channel.replace("_", " "),
@@ -87,8 +89,9 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
     if verdict["verdict"] == "nothing_missing":
         return "No effect of the vocabulary improves the fit of recordings that were not used to fit."
     it = "it" if len(verdict["effects"]) == 1 else "them"
-    said = f"With {it} the error on recordings that were not used to fit falls from {short(fit['rmse_before'])} "
-    said += f"to {short(fit['rmse_after'])} {unit}."
+    said = f"With {it} the error on recordings that were not used to fit falls from "
+    before, after = (quantity(fit[key], unit).replace(" ", NBSP) for key in ("rmse_before", "rmse_after"))
+    said += f"{before} to {after}."
     if verdict["verdict"] == "mismatch_not_identified":
         return (
             "What was tried stands below; its parts are probably stand-ins for something else."
@@ -98,19 +101,13 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
     return said
 
 
-def short(value: float) -> str:
-    """Three significant digits."""
-    return f"{value:.3g}" if math.isfinite(value) else "–"
-
-
 def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     """Key figures."""
     fit = verdict["fit"]
-    unit = f"{NBSP}{fit['unit']}"
-    found = [
-        Line("held-out error, nominal", short(fit["rmse_before"]) + unit, "refitted"),
-        Line("held-out error, extended", short(fit["rmse_after"]) + unit, f"noise {short(fit['noise_floor'])}{unit}"),
-    ]
+    before, after, noise = (
+        quantity(fit[key], fit["unit"]).replace(" ", NBSP) for key in ("rmse_before", "rmse_after", "noise_floor")
+    )
+    found = [Line("held-out error, nominal", before, "refitted"), Line("held-out error, extended", after, f"noise {noise}")]
     if verdict["located"]:
         found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
     if result.found.best.terms:
@@ -118,12 +115,29 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     return found
 
 
-def shown_effect(effect: dict[str, Any]) -> dict[str, Any]:
+def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
+    """Name and unit of every effect's parameters by their keys."""
+    return {p.key: (p.name, p.unit) for term in result.found.best.terms for p in term.parameters}
+
+
+def times(place: dict[str, Any], most: int = 3) -> str:
+    """When a place is at fault: the longest windows, recording by recording."""
+    told = []
+    for name, spans in place["windows_by_recording"].items():
+        longest = sorted(sorted(spans, key=lambda s: s[0] - s[1])[:most])
+        if spans:
+            more = f" and {len(spans) - most} more" if len(spans) > most else ""
+            told.append(f"{name}: " + ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest) + more)
+    return "; ".join(told[:most]) + (f"; and {len(told) - most} more recordings" if len(told) > most else "")
+
+
+def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
     """An effect with its numbers as text."""
-    rows = [
-        (words(key), short(p["value"]), f"{short(p['ci95'][0])} … {short(p['ci95'][1])}")
-        for key, p in effect["parameters"].items()
-    ]
+    rows = []
+    for key, p in effect["parameters"].items():
+        name, unit = units.get(key, (key, ""))
+        low, high = p["ci95"]
+        rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"])))
     return {
         **effect,
         "name": words(effect["id"]),
@@ -196,13 +210,13 @@ def candidates(result: Diagnosis) -> list[Row]:
 def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
     spans = result.intervals
     return [
-        (words(p.name), f"{short(float(v))} {p.unit}".strip(), f"{short(a)} … {short(b)}" if p.high > p.low else "held")
+        (words(p.name), quantity(float(v), p.unit), interval(a, b, p.unit, float(v)) if p.high > p.low else "held")
         for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)
     ]
 
 
 def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
     return [
-        (words(o.channel), f"{short(n.sigma)} {o.unit}", f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+        (words(o.channel), quantity(n.sigma, o.unit), f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
         for o, n in zip(result.model.outputs, result.full.noise, strict=True)
     ]

@@ -9,7 +9,7 @@ import numpy as np
 
 from host.diagnosis.effect import Candidate, Parameter
 from host.diagnosis.equivalence import Standing
-from host.diagnosis.experiment import experiment
+from host.diagnosis.experiment import lines as experiment_lines
 from host.diagnosis.locate import joined
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 
@@ -129,7 +129,7 @@ def _effect(
         "parameters": shown,
         "evidence": {"heldout_log_likelihood_gain": standing.gain.log_likelihood, "p_value": standing.gain.p_value},
         "indistinguishable_from": [other.name for other in standing.alike],
-        "experiment_to_tell_apart": experiment(result.model, candidate, standing.alike, result.problem),
+        "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
     }
 
 

@@ -23,6 +23,10 @@ def build(spec: NominalSpec) -> Model:
         from host.diagnosis.chains.axis import Axis
 
         return cast(Model, Axis(spec))
+    if spec.recorded_rig:
+        from host.diagnosis.chains.recorded_rig import RecordedRig
+
+        return RecordedRig(spec)
     if spec.kind == "rig":
         from host.diagnosis.chains.rig import Rig
 

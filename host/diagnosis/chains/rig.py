@@ -46,6 +46,7 @@ KEYS = {
     "wall_stiffness": "wall_stiffness_N_per_m",
 }
 AXES = ("insertion", "roll", "knob")
+FAINT = 0.5  # noise of the force sensor over RMS of the force, above which the force is taken from the chain
 
 
 def rig_channels(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:
@@ -197,7 +198,8 @@ class Rig:
         """Recorded force as the shape's input: simulated contact force plus what of the difference is surely not noise.
 
         Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant
-        of contact.
+        of contact. Where the sensor says next to nothing (noise above FAINT of the force), the simulated force goes on
+        following the parameters in the fit, so that force and stiffness cannot drift off together.
         """
         recorded = piece.y[12:15]
         if not np.isfinite(recorded).any():
@@ -208,9 +210,13 @@ class Rig:
             by_steps(row, *s)
             for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)
         ]
-        piece.extra["force"] = simulated + np.vstack(
-            [calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)]
-        )
+        beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
+        piece.extra["force"] = simulated + beyond
+        noise = max(self._force_noise(piece.recording, piece.inputs, recorded))[0]
+        if noise > FAINT * float(np.sqrt(np.mean(np.sum(piece.extra["force"] ** 2, axis=0)))):
+            piece.extra["beyond"] = beyond
+        else:
+            piece.extra.pop("beyond", None)
         piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
 
     def guess(self, pieces: list[Piece]) -> Array:
@@ -262,17 +268,8 @@ class Rig:
         state = _changed(state, acts, "shape", piece)
         slow = state["push"] - prompt
         state = _changed(state, acts, "base", piece)
-        tip, tip_R, shaft, shaft_R, free, soft = self._shapes(piece, state)
-        run: dict[str, Any] = {
-            "tip": tip + state["shift"],
-            "tip_R": tip_R,
-            "shaft": shaft + state["shift"],
-            "shaft_R": shaft_R,
-        }
-        if "turn" in state:
-            for name in ("tip", "shaft"):
-                run[name] = np.einsum("abn,bn->an", state["turn"], run[name])
-                run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
+        shape = self._shapes(piece, state)
+        free, soft = shape[4:]
         placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
         law: dict[str, Any] = {
             "gap": self.normal @ placed - theta[7] - (self.normal @ soft) * (self.normal @ slow),
@@ -300,6 +297,9 @@ class Rig:
             piece.recording.dt_s,
         )
         force = self.normal[:, None] * normal_force
+        if "beyond" in piece.extra:
+            shape = self._shapes(piece, {**state, "push": force + piece.extra["beyond"]})
+        run = _posed(shape, state)
         if law["friction"]:
             along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
             force = force + law["friction"] * normal_force * drag_along(along, law["friction_distance"])
@@ -377,6 +377,17 @@ class Rig:
             moved[2 * index + 1] += sign * step * theta[2 * index]
             out.append(self.simulate(piece, moved, acts or []))
         return np.asarray((out[0] - out[1]) / (2.0 * step))
+
+
+def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:
+    """Tip and shaft of `shape` where the base has moved them."""
+    run: dict[str, Any] = dict(zip(("tip", "tip_R", "shaft", "shaft_R"), shape, strict=False))
+    for name in ("tip", "shaft"):
+        run[name] = run[name] + state["shift"]
+        if "turn" in state:
+            run[name] = np.einsum("abn,bn->an", state["turn"], run[name])
+            run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
+    return run
 
 
 def _changed(state: dict[str, Any], acts: list[Act], port: str, piece: Piece) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from host.diagnosis.nominal import effect_of, read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from host.diagnosis.report import switches
 from host.diagnosis.verdict import as_json
-from tests.host.diagnosis import planted, rig_cases
+from tests.host.diagnosis import noisy_force, planted, rig_cases
 
 CALLABLE = """
 name = "lever"
@@ -145,3 +145,12 @@ def test_a_noisy_force_channel_bends_no_parameter(tmp_path: Path) -> None:
     assert values["bending_stiffness"] == pytest.approx(rig_cases.EI, rel=0.1)
     assert values["wall_stiffness"] == pytest.approx(1000.0, rel=0.1)
     assert result.verdict == "nothing_missing"
+
+
+def test_a_force_that_drowns_in_noise_names_nothing(tmp_path: Path) -> None:
+    drawn = noisy_force.rig(4711, 3)
+    files = noisy_force.write(drawn, 0.1, tmp_path)
+    result = noisy_force.judged(tmp_path, files)
+    assert all("beyond" in piece.extra for piece in result.problem.pieces)
+    assert result.verdict == "nothing_missing"
+    assert result.found.nominal.values[6] == pytest.approx(drawn.system.case.nominal[6], rel=0.3)

@@ -148,7 +148,8 @@ def test_two_workers_on_loopback_and_one_is_lost(built: Built, tmp_path: Path) -
             verdicts[name] = verdict["verdict"]
             if not killed:
                 with distributed.Client(cluster.scheduler_address) as client:
-                    pid = next(iter(client.run(os.getpid).values()))
+                    busy = next(worker for worker, cases in client.processing().items() if cases)
+                    pid = client.run(os.getpid, workers=[busy])[busy]
                 os.kill(pid, 9)
                 killed = True
     assert verdicts == dict.fromkeys(folders, "nothing_missing")
