@@ -39,6 +39,7 @@ def _simulated(rig: Path, directory: Path) -> Iterator[Path]:
     print("starting the simulated rig", file=sys.stderr)
     recording = new_recording_path(directory, "view")
     with Fleet(DemoSettings(rig_file=rig), recording) as fleet:
+        fleet.wait_until_heard()
         yield fleet.rig_file
     print(f"recording: {recording}", file=sys.stderr)
 
