@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
+from types import FrameType
 
 import typer
 
@@ -63,8 +65,17 @@ def _only_listed() -> None:
     """Stands for every command where none is called, so that the overview imports nothing."""
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 def main() -> None:
-    """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else."""
+    """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else.
+
+    SIGTERM ends a command as Ctrl-C does: what it has started is stopped in order.
+    """
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _interrupt)
     try:
         build(sys.argv[1:])()
     except (BadInput, RigFileError) as error:
