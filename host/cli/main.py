@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "faults": ("host.cli.faults", "faults", "Faults in every phase on the simulated rig: what is detected, and when."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
     "check-device": ("host.cli.check_device", "check_device", "Talk to one device of a rig and say what it answers."),
+    "home": ("host.cli.home", "home", "Find an axis' home switch; the stage moves."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
     "install-services": ("host.cli.install_services", "install_services", "systemd units of the rig, and their undo."),
     "keys": ("host.cli.keys", "keys", "Certificates for readers and commanders on other machines."),
