@@ -162,7 +162,7 @@ def page_section(result: SoakResult, minutes: float, seed: int, board: str) -> s
     counts = ", ".join(f"{name} {count}" for name, count in result.counts.items())
     known = bool(result.step_interrupt_share)   # the native board counts no cycles
     return "\n".join([
-        "## Soak", "",
+        "## Soak" if not board.startswith("avr") else "## Soak with the firmware's ELF in simavr", "",
         f"`seldinger soak --minutes {minutes:g} --seed {seed} --board {board} --docs docs/reliability.md`", "",
         f"{result.virtual_s / 60:.1f} minutes of virtual time, {result.edges} step edges.", "",
         "| what | found | wanted |", "|---|---|---|",

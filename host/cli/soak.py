@@ -41,7 +41,7 @@ def soak(
     section = page_section(result, minutes, seed, board + ("" if record else " --no-record"))
     print(section, file=sys.stderr)
     if docs is not None:
-        write_section(docs, "soak", section)
+        write_section(docs, "soak-avr" if board == "avr" else "soak", section)
     if json:
         write_json(result.as_dict())
     raise typer.Exit(1 if result.problems else 0)
