@@ -4,6 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 BOARD  ?= auto
 TEST_ARGS ?= -n 2 --dist loadfile
+INPUTS ?= 10000000
 
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
@@ -62,10 +63,11 @@ faults: setup
 	@$(BIN)/seldinger faults --runs 2000 --seed 1 --jobs 2 --docs docs/reliability.md
 
 fuzz: setup
-	@$(MAKE) -C firmware/fuzz run
+	@$(MAKE) -s -C firmware/fuzz run INPUTS=$(INPUTS) >build/fuzz.json && cat build/fuzz.json
+	@$(BIN)/python -m host.reliability_page docs/reliability.md <build/fuzz.json
 
 soak: setup
-	@$(BIN)/seldinger soak --minutes 30 --docs docs/reliability.md
+	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md
 
 lint: $(VENV)/.ready
 	@$(BIN)/ruff check .

@@ -1,28 +1,39 @@
-"""Subscribers as nobody wants them: one that stops reading, one that floods queries, one that is killed again and again."""
+"""Subscribers of all kinds: one that stops reading, one that floods queries, ones that are killed, a view with its pages."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import zenoh
+from websockets import Origin
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from protocol.topics import request_key
 from protocol.zenoh_session import Session
+from realtime.rig_file import load_rig
 
 KINDS = {"frozen": "a subscriber to everything stops reading", "flooding": "queries as fast as they go",
-         "leaving": "subscribers come and are killed"}
+         "leaving": "subscribers come and are killed", "view": "a view, with a page that reads and two that do not"}
 _LIFE_S = 0.2
+_RIG = Path(__file__).parent / "rigs" / "simulated.toml"
 
 
 def misbehave(kind: str, rig: str, endpoint: str) -> None:
-    """Subscribe to all and read, for ever; `flooding` asks for rubbish as well, as fast as it can."""
+    """Subscribe to all and read, for ever; `flooding` asks for rubbish as well, as fast as it can; `view` serves pages."""
     session = Session(rig, [], [endpoint])
+    if kind == "view":
+        _view(session)
+        return
     everything = session.everything()
     print("up", flush=True)
     rubbish = (b"", b"\0" * 200, os.urandom(60_000))
@@ -34,6 +45,34 @@ def misbehave(kind: str, rig: str, endpoint: str) -> None:
         for junk in rubbish:
             session.zenoh.get(request_key(rig, "flood"), payload=junk, timeout=0.2, handler=zenoh.handlers.RingChannel(1),
                               congestion_control=zenoh.CongestionControl.DROP)
+
+
+def _view(session: Session) -> None:
+    from host.view.live import LiveRig  # the view and its models load for seconds: only for this kind
+    from host.view.server import ADDRESS, ViewServer
+
+    with socket.socket() as probe:
+        probe.bind((ADDRESS, 0))
+        port = int(probe.getsockname()[1])
+    for reads in (True, False, False):
+        threading.Thread(target=_page, args=(port, reads), daemon=True).start()
+    ViewServer(LiveRig(load_rig(_RIG), session), port).serve()
+
+
+def _page(port: int, reads: bool) -> None:
+    """A page's socket, opened when the server is there; says when the first frame has come."""
+    while True:
+        try:
+            with connect(f"ws://127.0.0.1:{port}/rig", origin=Origin(f"http://127.0.0.1:{port}"), proxy=None,
+                         max_queue=16 if reads else 1) as page:
+                page.recv()
+                page.recv()
+                if reads:
+                    print("up", flush=True)
+                while True:
+                    page.recv() if reads else time.sleep(60.0)
+        except (OSError, ConnectionClosed):
+            time.sleep(0.05)
 
 
 class BadSubscriber:

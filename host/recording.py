@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
@@ -25,11 +24,15 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from host.foxglove import PREFIX, SCHEMAS, FoxgloveChannels, plain_schema
+from host.recording_file import GuardedFile
+from host.recording_index import MAGIC, file_end
 from protocol.topics import TOPICS, Message, encode
 
 PROFILE = "seldinger"
 CHUNK_BYTES = 256 * 1024
 CHUNK_NS = 1_000_000_000
+# The library's writer keeps 1 kB for each chunk: after so many chunks another one goes on with the same file.
+CHUNKS_PER_WRITER = 60
 _MAX_RECORD_BYTES = 64 * 1024 * 1024
 _DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, OverflowError, MemoryError)
 
@@ -76,48 +79,6 @@ class Header(NamedTuple):
                 "catheter": {"json": json.dumps(self.catheter)}}
 
 
-class _GuardedFile:
-    """The file under the MCAP writer: the first failed write cuts the file back to its last whole chunk and ends it."""
-
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._position = 0
-        self._whole = 0
-        self.error: OSError | None = None
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        try:
-            while self.error is None and len(view):
-                view = view[os.write(self._fd, view):]
-        except OSError as error:
-            self._fail(error)
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Everything written so far is whole: bring it to the disk."""
-        if self.error is not None:
-            return
-        try:
-            os.fdatasync(self._fd)
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-                self._fail(error)
-                return
-        self._whole = self._position
-
-    def _fail(self, error: OSError) -> None:
-        self.error = error
-        os.ftruncate(self._fd, self._whole)
-
-    def close(self) -> None:
-        os.close(self._fd)
-
-
 def _description(topic: str) -> tuple[str, str, dict[str, str]]:
     """Name and text of a channel's schema, and its metadata."""
     if topic in SCHEMAS:
@@ -138,29 +99,44 @@ class RecordingWriter:
         self.path = Path(path)
         self.failure = ""
         self._on_failure = on_failure
-        self._file = _GuardedFile(self.path)
-        # The library never ends a chunk by itself: `_due` does, by size and by time, so that each chunk is also synced.
-        self._writer = Writer(self._file, chunk_size=1 << 40)  # type: ignore[arg-type]
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._file = GuardedFile(self.path)
+        self._writer = self._new_writer()
+        self._channels: dict[str, Channel] = {}
+        self._schemas: dict[str, Schema] = {}
         self._foxglove = FoxgloveChannels(header.configuration, header.catheter)
         self._sequence: dict[str, int] = {}
-        self._chunk_bytes, self._chunk_start_ns = 0, 0
+        self._chunk_bytes, self._chunk_start_ns, self._chunks = 0, 0, 0
         self._closed = False
         self._writer.start(profile=PROFILE, library=f"seldinger {software_version()}")
         for name, texts in header.sections().items():
             self._writer.add_metadata(name, texts)
         self._sync()
 
+    def _new_writer(self) -> Writer:
+        # The library never ends a chunk by itself: `_sync` does, by size and by time, so that each chunk is also synced.
+        return Writer(self._file, chunk_size=1 << 40)  # type: ignore[arg-type]
+
     def _channel(self, topic: str) -> int:
         known = self._channels.get(topic)
         if known is not None:
-            return known
-        name, schema, metadata = _description(topic)
+            return known.id
+        name, text, metadata = _description(topic)
         if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema.encode())
-        self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name], metadata)
-        return self._channels[topic]
+            number = self._writer.register_schema(name, "jsonschema", text.encode())
+            self._schemas[name] = Schema(id=number, data=text.encode(), encoding="jsonschema", name=name)
+        schema_id = self._schemas[name].id
+        number = self._writer.register_channel(topic, "json", schema_id, metadata)
+        self._channels[topic] = Channel(id=number, topic=topic, message_encoding="json", metadata=metadata,
+                                        schema_id=schema_id)
+        return number
+
+    def _next_writer(self) -> None:
+        """Another writer, told all schemas and channels in the old order, so with the old numbers."""
+        self._writer = self._new_writer()
+        for schema in self._schemas.values():
+            self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        for channel in self._channels.values():
+            self._writer.register_channel(channel.topic, channel.message_encoding, channel.schema_id, channel.metadata)
 
     def write(self, topic: str, message: Message, recorded_ns: int | None = None) -> None:
         """Append `message` of `topic`, numbered here. recorded_ns: the rig's clock now, else the message's own stamp.
@@ -197,6 +173,9 @@ class RecordingWriter:
     def _sync(self) -> None:
         self._writer.flush()
         self._chunk_bytes = 0
+        self._chunks += 1
+        if self._chunks % CHUNKS_PER_WRITER == 0:
+            self._next_writer()
         self._report()
 
     def flush(self) -> None:
@@ -219,7 +198,10 @@ class RecordingWriter:
             return
         self._closed = True
         if not self.failure:
-            self._writer.finish()
+            self._writer.flush()
+            with self._file.read_back() as stream:
+                end = file_end(stream, self._schemas.values(), self._channels.values())
+            self._file.write(end)
             self._file.flush()
             self._report()
         self._file.close()
@@ -264,7 +246,7 @@ class Recording:
 
     def _read(self, stream: Any) -> None:
         magic = stream.read(8)
-        if magic != b"\x89MCAP0\r\n":
+        if magic != MAGIC:
             raise ValueError(f"{self.path}: found {magic!r} at its start, wanted an MCAP recording")
         records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
         self.truncated = True

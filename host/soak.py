@@ -15,7 +15,8 @@ import numpy as np
 from host.demo import SIMULATED_RIG, TARGET_M, simulated_plant
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.estimator_process import header_of
-from host.recording import Recording, RecordingWriter
+from host.recording import RecordingWriter
+from host.recording_index import is_whole
 from protocol.topics import Message
 from realtime.records import PHASE_CONTACT
 from realtime.rig_file import load_rig
@@ -95,7 +96,7 @@ def soak(minutes: float, seed: int = 1, board_kind: str = "native",
                 return result
             _minutes(run, minutes, result, progress)
         result.recording_mb_per_min = path.stat().st_size / 1e6 / (world.now_ns / 60e9)
-        result.recording_readable = not Recording(path).truncated
+        result.recording_readable = is_whole(path)
     _judge(result)
     return result
 
@@ -161,7 +162,7 @@ def page_section(result: SoakResult, minutes: float, seed: int, board: str) -> s
     counts = ", ".join(f"{name} {count}" for name, count in result.counts.items())
     known = bool(result.step_interrupt_share)   # the native board counts no cycles
     return "\n".join([
-        "## Soak", "",
+        "## Soak" if not board.startswith("avr") else "## Soak with the firmware's ELF in simavr", "",
         f"`seldinger soak --minutes {minutes:g} --seed {seed} --board {board} --docs docs/reliability.md`", "",
         f"{result.virtual_s / 60:.1f} minutes of virtual time, {result.edges} step edges.", "",
         "| what | found | wanted |", "|---|---|---|",

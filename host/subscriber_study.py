@@ -1,29 +1,33 @@
-"""Does it matter to the loop who listens? Its timing on the wall clock beside bad subscribers, in turn with none.
+"""Does it matter to the loop who listens? Its timing on the wall clock beside subscribers of all kinds, in turn with none.
 
-`python -m host.subscriber_study` runs the simulated rig, the model process and, here, the realtime process.
+`seldinger latency-check --with ...` runs the simulated rig, the model process and, here, the realtime process.
 """
 
 from __future__ import annotations
 
-import argparse
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from host.bad_subscriber import KINDS, bad_subscriber
 from host.demo import DemoSettings
 from host.wall_clock import Fleet
-from realtime.latency import percentiles_us
+from realtime.latency import percentiles_us, run_cyclictest
 from realtime.native_loop import LATENESS_BIN_NS, WORK_BIN_NS
 from realtime.process import RealtimeProcess
 from realtime.rig_file import load_rig
 
-NOBODY = "nobody"
+NOBODY, IDLE = "nobody", "cyclictest"
 SAYS = {NOBODY: "only the recorder listens"} | KINDS
+ROUNDS = 3
+_SETTLED_S, _OVER_S = 2.0, 1.0
 
 
 @dataclass
@@ -38,10 +42,39 @@ class Measured:
     flooded: int = 0
     threads_s: list[float] = field(default_factory=list)
 
+    def figures(self) -> dict[str, Any]:
+        """For JSON, times in us."""
+        threads = np.percentile(self.threads_s, (50, 99)) * 1e6 if self.threads_s else (0.0, 0.0)
+        return {"ticks": self.ticks, "missed": self.missed, "lateness_us": _of(self.lateness, LATENESS_BIN_NS),
+                "tick_us": _of(self.work, WORK_BIN_NS), "queries_dropped": self.flooded,
+                "threads_late_us": {"p50": float(threads[0]), "p99": float(threads[1])}}
 
-def study(board: str, seconds: float, rounds: int) -> dict[str, Measured]:
-    """Every kind in turn, `rounds` times `seconds` each; the loop runs through."""
-    measured: dict[str, Measured] = {}
+
+@dataclass
+class Study:
+    """By kind, and what cyclictest found in slices between them (None: not installed, or failed)."""
+
+    measured: dict[str, Measured]
+    cyclictest: np.ndarray | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        idle = None if self.cyclictest is None else _of(self.cyclictest, LATENESS_BIN_NS)
+        return {"beside": {kind: one.figures() for kind, one in self.measured.items()}, "cyclictest_us": idle}
+
+
+def _of(histogram: np.ndarray, bin_ns: int) -> dict[str, float]:
+    """The maximum is of the whole run, not of a kind: left out."""
+    return {name: value for name, value in percentiles_us(histogram, bin_ns).items() if name != "max"}
+
+
+def study(kinds: Sequence[str], seconds: float, board: str = "native") -> Study:
+    """None and every kind in turn, ROUNDS times, `seconds` in all; the loop runs through, cyclictest between the rounds.
+
+    Raises OSError where a process does not run.
+    """
+    slice_s = seconds / ROUNDS / (len(kinds) + 2)
+    found = Study({})
     with tempfile.TemporaryDirectory() as folder:
         settings = DemoSettings(board=board, directory=Path(folder))
         with Fleet(settings, Path(folder) / "study.mcap", loop=False) as fleet:
@@ -51,14 +84,15 @@ def study(board: str, seconds: float, rounds: int) -> dict[str, Measured]:
             process.start()
             if process.loop.granted.warning:
                 print(f"seldinger: {process.loop.granted.warning}", file=sys.stderr)
-            time.sleep(2.0)
+            time.sleep(_SETTLED_S)
             try:
-                for _ in range(rounds):
-                    for kind in SAYS:
-                        _slice(process, kind, seconds, measured)
+                for _ in range(ROUNDS):
+                    for kind in (NOBODY, *kinds):
+                        _slice(process, kind, slice_s, found.measured)
+                    _reference(process, slice_s, found)
             finally:
                 process.stop()
-    return measured
+    return found
 
 
 def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[str, Measured]) -> None:
@@ -79,30 +113,41 @@ def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[s
         one.ticks += after["tick"] - before["tick"]
         one.missed += after["missed"] - before["missed"]
         one.flooded += process.counts().flooded - flooded
+    time.sleep(_OVER_S)
 
 
-def page(measured: dict[str, Measured]) -> str:
-    """The result as a table in Markdown, times in us."""
-    lines = ["| beside | ticks | missed | late by p50 | p99 | p99.9 | pass p50 | p99 | p99.9 | threads late p50 | p99 | "
-             "queries dropped |", "|---|" + "---:|" * 11]
-    for kind, one in measured.items():
-        times = [percentiles_us(one.lateness, LATENESS_BIN_NS), percentiles_us(one.work, WORK_BIN_NS)]
-        figures = [part[name] for part in times for name in ("p50", "p99", "p999")]
-        figures += [float(value) * 1e6 for value in np.percentile(one.threads_s, (50, 99))]
-        lines.append(f"| {SAYS[kind]} | {one.ticks} | {one.missed} | " + " | ".join(f"{f:.1f}" for f in figures)
+def _reference(process: RealtimeProcess, seconds: float, found: Study) -> None:
+    """What this machine gives a program that only wakes, with the loop's priority on the loop's processor."""
+    granted = process.loop.granted
+    try:
+        histogram = run_cyclictest(process.rig.control.loop_hz, seconds, granted.cpu, granted.priority or None)
+    except (OSError, RuntimeError, ValueError, KeyError, subprocess.TimeoutExpired) as error:
+        print(f"seldinger: {error}", file=sys.stderr)
+        return
+    found.cyclictest = histogram if found.cyclictest is None else found.cyclictest + histogram
+
+
+def page_section(found: Study, kinds: Sequence[str], seconds: float) -> str:
+    """The section on subscribers in docs/reliability.md, times in us."""
+    lines = [
+        "## Who listens", "",
+        f"`seldinger latency-check --with {','.join(kinds)} --seconds {seconds:g} --docs docs/reliability.md`", "",
+        "The loop at 1 kHz on the wall clock, the model process and the simulated rig on the same machine; kinds in turn,",
+        "so that all share its noise; times in us. In virtual time every step edge is the same beside each of them",
+        "(`pytest tests/host/test_subscribers.py`).", "",
+        "| beside | ticks | missed | late by p50 | p99 | p99.9 | pass p50 | p99 | p99.9 | threads late p50 | p99 | "
+        "queries dropped |", "|---|" + "---:|" * 11]
+    for kind, one in found.measured.items():
+        figures = one.figures()
+        times = [figures[part][name] for part in ("lateness_us", "tick_us") for name in ("p50", "p99", "p999")]
+        times += figures["threads_late_us"].values()
+        lines.append(f"| {SAYS[kind]} | {one.ticks} | {one.missed} | " + " | ".join(f"{value:.1f}" for value in times)
                      + f" | {one.flooded} |")
+    if found.cyclictest is not None:
+        idle = _of(found.cyclictest, LATENESS_BIN_NS)
+        lines.append("| for comparison: cyclictest, which only wakes | | | "
+                     + " | ".join(f"{idle[name]:.1f}" for name in ("p50", "p99", "p999")) + " |" + " |" * 6)
+    lines += ["", "*late by*: how long after its due time the loop woke; *pass*: one pass of its work; *threads late*: how",
+              "late a thread of the same process woke that slept 1 ms, as those that read the devices do. Compare with the",
+              "first row and with cyclictest: what else the machine did is in all of them."]
     return "\n".join(lines)
-
-
-def main() -> None:
-    """Measure and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m host.subscriber_study", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=5.0, help="of one slice")
-    parser.add_argument("--rounds", type=int, default=3, help="how often each kind has its turn")
-    parser.add_argument("--board", choices=("native", "avr"), default="native")
-    options = parser.parse_args()
-    print(page(study(options.board, options.seconds, options.rounds)))
-
-
-if __name__ == "__main__":
-    main()

@@ -23,7 +23,7 @@ from protocol.zenoh_session import Session
 from realtime.rig_file import load_rig
 from sim.scenario import ContactJob, Outcome
 
-_START_TIMEOUT_S = 60.0
+_START_TIMEOUT_S = 120.0     # a first start compiles the loop, beside whatever else this machine does
 _STOP_TIMEOUT_S = 2.0
 
 
@@ -82,6 +82,19 @@ class Fleet:
             process.wait()
             raise OSError(f"{name}: found that it ended at its start, wanted it to run: {self.last_words(name)}")
         return line
+
+    def wait_until_heard(self, seconds: float = _START_TIMEOUT_S) -> None:
+        """Wait for the loop's first state. Raises OSError where a process ends, or none comes in time."""
+        rig, until = load_rig(self.rig_file), time.monotonic() + seconds
+        with Session(rig.name, [], rig.zenoh.connect) as session:
+            states = session.latest("state")
+            while states.take() is None:
+                if self.dead():
+                    raise OSError(f"{self.dead()[0]}: found that it ended at its start, wanted it to run: "
+                                  f"{self.last_words(self.dead()[0])}")
+                if time.monotonic() > until:
+                    raise OSError(f"realtime: found no state after {seconds:g} s, wanted one: {self.last_words('realtime')}")
+                time.sleep(0.02)
 
     def last_words(self, name: str) -> str:
         """The last line that process `name` wrote to its log."""

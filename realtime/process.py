@@ -88,7 +88,10 @@ class RealtimeProcess:
         self.failure: BaseException | None = None
 
     def start(self) -> None:
-        """Compile, start the loop and all threads, begin to answer commands."""
+        """Answer commands, compile, start the loop and all threads."""
+        # Compiling takes a minute and more where no cache is and others use the machine: who asks meanwhile is told so.
+        self._requests = self._session.serve_requests(self._request)
+        self._log("info", "realtime", "starting: the loop is being compiled")
         self.loop.prepare()
         self.loop.start()
         if self.loop.granted.warning:
@@ -97,7 +100,6 @@ class RealtimeProcess:
             thread.start()
         self._tracker.start()
         self._force.start()
-        self._requests = self._session.serve_requests(self._request)
         self._log("info", "realtime", f"loop at {self.rig.control.loop_hz} Hz, disarmed")
 
     def stop(self) -> None:
@@ -268,6 +270,9 @@ class RealtimeProcess:
         return reply
 
     def _obey(self, command: Command, now_ns: int) -> Reply:
+        if command.action != "stop" and not self.loop.alive:
+            return Reply(stamp_ns=now_ns, id=command.id, result="refused",
+                         text=f"{command.action}: found the loop not running yet, wanted it to: it is being compiled")
         with self._link_lock:
             if command.action in ("arm", "clear_fault"):
                 self._supervision.restart()

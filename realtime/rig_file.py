@@ -43,6 +43,9 @@ class Stage(_Section):
     max_accel_unit_per_s2: Positive
     min_unit: float
     max_unit: float
+    home_end: Literal["", "min", "max"] = ""
+    home_unit: float = 0.0
+    home_speed_unit_per_s: Annotated[float, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> Stage:
@@ -52,6 +55,8 @@ class Stage(_Section):
             raise ValueError("at most 20000 steps/s (max_speed_unit_per_s * steps_per_unit), the board's step timer")
         if self.max_speed_unit_per_s / self.max_accel_unit_per_s2 > 0.045:
             raise ValueError("a stop from full speed within 0.045 s (max_speed_unit_per_s / max_accel_unit_per_s2)")
+        if self.home_end and not 0 < self.home_speed_unit_per_s <= 0.2 * self.max_speed_unit_per_s:
+            raise ValueError("home_speed_unit_per_s above 0 and at most a fifth of max_speed_unit_per_s, for home_end")
         return self
 
 

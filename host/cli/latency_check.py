@@ -25,12 +25,20 @@ def latency_check(
     seconds: Annotated[float, typer.Option(help="how long in all; cyclictest, where installed, takes half")] = 20.0,
     hz: Annotated[int, typer.Option(help="ticks per second, 100 to 4000")] = 1000,
     json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    beside: Annotated[str, typer.Option("--with", help="subscribers beside which to measure, by commas: frozen, flooding, "
+                                        "leaving, view, or all; runs the simulated rig")] = "",
+    docs: Annotated[Path | None, typer.Option(help="with --with: page whose section on subscribers is written anew")] = None,
 ) -> None:
     """Run the wall-clock loop with the real tick and say how late it woke and how long it worked."""
     if not RATES_HZ[0] <= hz <= RATES_HZ[1]:
         raise BadInput("hz", hz, f"{RATES_HZ[0]} to {RATES_HZ[1]}")
     if not 0 < seconds <= MAX_SECONDS:
         raise BadInput("seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
+    if beside:
+        _beside(beside, seconds, json, docs)
+        return
+    if docs is not None:
+        raise BadInput("docs", docs, "--with beside it")
     params = tick_parameters(load_rig(_RIG))
     params[0].period_s = 1.0 / hz
     result = check_latency(tick, params, hz, seconds, RealtimeSettings())
@@ -42,6 +50,29 @@ def latency_check(
         write_json(as_contract(result))
     else:
         print(_table(result))
+
+
+def _beside(names: str, seconds: float, json: bool, docs: Path | None) -> None:
+    from host.bad_subscriber import KINDS
+    from host.reliability_page import write_section
+    from host.subscriber_study import page_section, study
+
+    kinds = list(KINDS) if names == "all" else names.split(",")
+    for kind in kinds:
+        if kind not in KINDS:
+            raise BadInput("with", kind, f"all, or some of {', '.join(KINDS)}")
+    try:
+        found = study(kinds, seconds)
+    except OSError as error:
+        print(f"seldinger: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    section = page_section(found, kinds, seconds)
+    if docs is not None:
+        write_section(docs, "subscribers", section)
+    if json:
+        write_json(found.as_dict())
+    else:
+        print(section)
 
 
 def _table(result: LatencyResult) -> str:

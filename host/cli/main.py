@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import signal
 import sys
+from types import FrameType
 
 import typer
 
@@ -28,6 +30,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "faults": ("host.cli.faults", "faults", "Faults in every phase on the simulated rig: what is detected, and when."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
     "check-device": ("host.cli.check_device", "check_device", "Talk to one device of a rig and say what it answers."),
+    "home": ("host.cli.home", "home", "Find an axis' home switch; the stage moves."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
     "install-services": ("host.cli.install_services", "install_services", "systemd units of the rig, and their undo."),
     "keys": ("host.cli.keys", "keys", "Certificates for readers and commanders on other machines."),
@@ -64,8 +67,17 @@ def _only_listed() -> None:
     """Stands for every command where none is called, so that the overview imports nothing."""
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 def main() -> None:
-    """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else."""
+    """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else.
+
+    SIGTERM ends a command as Ctrl-C does: what it has started is stopped in order.
+    """
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _interrupt)
     try:
         build(sys.argv[1:])()
     except (BadInput, RigFileError) as error:

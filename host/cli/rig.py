@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from host.cli.contract_io import BadInput, write_json
+from host.keys_check import keys_problems
 from host.mechanics.catheter import load_catheter
 from realtime.rig_file import Rig, parse_rig, problems_of, read_rig_data
 
@@ -33,7 +34,10 @@ def check(
     data = read_rig_data(file)
     problems = problems_of(data)
     if not problems:
-        problems = catheter_problems(parse_rig(data, str(file)))
+        read = parse_rig(data, str(file))
+        problems = catheter_problems(read)
+        if read.network.listen:
+            problems += keys_problems(Path(read.network.keys), read.network.listen)
     for problem in problems:
         print(f"seldinger: {file}: {problem}", file=sys.stderr)
     if problems:

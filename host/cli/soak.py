@@ -21,7 +21,7 @@ def soak(
     minutes: Annotated[float, typer.Option(help="Of virtual time.")] = 30.0,
     seed: Annotated[int, typer.Option(help="Of all noise.")] = 1,
     board: Annotated[str, typer.Option(help="avr (the ELF in simavr), native, or auto.")] = "native",
-    record: Annotated[bool, typer.Option(help="Record it; a recording's index grows by about 1 kB a second.")] = True,
+    record: Annotated[bool, typer.Option(help="Record it.")] = True,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
     docs: Annotated[Path | None, typer.Option(help="Page whose section on the soak is to be written anew.")] = None,
 ) -> None:
@@ -41,7 +41,7 @@ def soak(
     section = page_section(result, minutes, seed, board + ("" if record else " --no-record"))
     print(section, file=sys.stderr)
     if docs is not None:
-        write_section(docs, "soak", section)
+        write_section(docs, "soak-avr" if board == "avr" else "soak", section)
     if json:
         write_json(result.as_dict())
     raise typer.Exit(1 if result.problems else 0)

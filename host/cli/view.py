@@ -36,11 +36,14 @@ def _simulated(rig: Path, directory: Path) -> Iterator[Path]:
     from host.demo import DemoSettings, new_recording_path
     from host.wall_clock import Fleet
 
-    print("starting the simulated rig", file=sys.stderr)
+    print("starting the simulated rig (the first time it is compiled: a minute or two)", file=sys.stderr)
     recording = new_recording_path(directory, "view")
-    with Fleet(DemoSettings(rig_file=rig), recording) as fleet:
-        yield fleet.rig_file
-    print(f"recording: {recording}", file=sys.stderr)
+    try:
+        with Fleet(DemoSettings(rig_file=rig), recording) as fleet:
+            fleet.wait_until_heard()
+            yield fleet.rig_file
+    finally:
+        print(f"recording: {recording}", file=sys.stderr)
 
 
 def view(

@@ -80,7 +80,10 @@ class LiveRig:
         if press.button != "stop" and not press.confirmed:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
         answer = self._command(press.button)
-        return {"action": press.button, "result": answer.result, "text": answer.reason.removeprefix(f"{answer.result}: ")}
+        text = answer.reason.removeprefix(f"{answer.result}: ")
+        if answer.result == "unanswered" and self._heard_s is None:
+            text = "no answer: nothing has been heard of the rig yet, it may still be starting"
+        return {"action": press.button, "result": answer.result, "text": text}
 
     def _command(self, button: str) -> Acknowledgement:
         """Hold and stop need no lease. Arming takes and keeps it, until the rig is disarmed from here or the page ends."""

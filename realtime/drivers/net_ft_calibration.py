@@ -66,8 +66,9 @@ def fetch_calibration(host: str, port: int = 80, timeout_s: float = 2.0) -> NetF
         connection.request("GET", "/netftapi2.xml")
         response = connection.getresponse()
         page = response.read(MAX_PAGE_BYTES + 1)
-    except http.client.HTTPException as bad:
-        raise OSError(f"{host}:{port}: found no web page ({bad!r}), wanted netftapi2.xml") from bad
+    except (http.client.HTTPException, OSError) as bad:
+        found = getattr(bad, "strerror", None) or str(bad) or type(bad).__name__
+        raise OSError(f"http://{host}:{port}/netftapi2.xml: found no web page ({found}), wanted the box's own") from bad
     finally:
         connection.close()
     if response.status != 200:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from host.cli.contract_io import BadInput
 from host.cli.faults import faults as command
 from host.fault_campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
-from host.reliability_page import write_section
+from host.reliability_page import fuzz_section, write_section
 from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
 
 GOOD = {"detected_s": 0.03, "detected_by": "cause: board_silent", "action": "stop", "board_fault": "1", "causes": [],
@@ -79,6 +79,12 @@ def test_a_section_of_the_page_is_replaced_and_the_rest_stays(tmp_path: Path) ->
     write_section(page, "faults", r"new \1")
     text = page.read_text(encoding="utf-8")
     assert "old" not in text and r"new \1" in text and text.count("kept") == 1
+
+
+def test_the_section_on_fuzzing_has_the_figures_of_the_run() -> None:
+    said = '{"inputs": 10000000, "edges_before": 366, "edges": 368, "corpus": 41, "new_in_corpus": 2, "findings": 0}'
+    text = fuzz_section(json.loads(said))
+    assert "`make fuzz INPUTS=10000000`" in text and "**0 findings**" in text and "368 edges" in text
 
 
 def test_bad_options_are_refused() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,9 +17,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.summary import Summary
+from mcap.writer import Writer
 
 from host import recording as recording_module
 from host.recording import Header, Recording, RecordingWriter
+from host.recording_index import file_end, is_whole
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 
 HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}},
@@ -86,6 +91,58 @@ def test_other_readers_read_it(tmp_path: Path) -> None:
         assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
 
 
+def summary_of(path: Path) -> Summary:
+    with path.open("rb") as stream:
+        found = make_reader(stream, validate_crcs=True).get_summary()
+    assert found is not None
+    return found
+
+
+def test_its_index_is_what_the_library_writes(tmp_path: Path) -> None:
+    by_library, by_us = tmp_path / "library.mcap", tmp_path / "us.mcap"
+    with by_library.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2000)
+        writer.start("seldinger", "library")
+        writer.add_metadata("run", {"rig": "simulated"})
+        schema = writer.register_schema("Stage", "jsonschema", b"{}")
+        channels = [writer.register_channel(topic, "json", schema, {"rate_hz": "1"}) for topic in ("stage", "pose/tip")]
+        for number in range(500):
+            writer.add_message(channels[number % 7 == 3], 1000 - number, b'{"a":%d}' % number, number, number)
+        writer.finish()
+    wanted = summary_of(by_library)
+    last = wanted.chunk_indexes[-1]
+    by_us.write_bytes(by_library.read_bytes()[:last.chunk_start_offset + last.chunk_length + last.message_index_length])
+    with by_us.open("rb") as stream:
+        end = file_end(stream, wanted.schemas.values(), wanted.channels.values())
+    by_us.write_bytes(by_us.read_bytes() + end)
+    found = summary_of(by_us)
+    assert len(found.chunk_indexes) > 5 and vars(found) == vars(wanted)
+
+
+def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(tmp_path: Path,
+                                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fdatasync", lambda fd: None)
+    monkeypatch.setattr(recording_module, "CHUNKS_PER_WRITER", 20)
+    path, held = tmp_path / "a.mcap", []
+    tracemalloc.start()
+    with RecordingWriter(path, HEADER) as writer:
+        for second in range(1001):
+            writer.write("pose/tip", pose(second * 1_000_000_000))
+            if second in (200, 1000):
+                gc.collect()
+                held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert held[1] - held[0] < 400 * 100        # the index of 400 chunks takes 600 bytes and more for each
+    summary = summary_of(path)
+    assert summary.statistics is not None and summary.statistics.chunk_count == len(summary.chunk_indexes) == 501
+    with path.open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["pose/tip"])]
+    assert times == [second * 1_000_000_000 for second in range(1001)]
+    assert is_whole(path) and Recording(path).topics == {"pose/tip": 1001}
+    path.write_bytes(path.read_bytes()[:-20])
+    assert not is_whole(path)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("whole") / "a.mcap", 6000)
@@ -152,7 +209,7 @@ def test_full_disk_is_told_once_and_what_was_there_is_readable(tmp_path: Path, m
             raise OSError(28, "No space left on device")
         return real(fd, data[:taken])
 
-    monkeypatch.setattr(recording_module.os, "write", small_disk)
+    monkeypatch.setattr(os, "write", small_disk)
     for tick in range(20_000):
         writer.write("stage", stage(tick * 1_000_000, value=float(np.sin(tick))))
     writer.close()

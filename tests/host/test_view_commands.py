@@ -13,6 +13,7 @@ import httpx
 import pytest
 
 from host.demo import SIMULATED_RIG
+from host.recording import Recording
 from host.view.server import ADDRESS
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port
@@ -45,6 +46,26 @@ def test_play_serves_a_recording_until_it_is_interrupted(recording: Path) -> Non
     port = free_port()
     status, words = serves("play", str(recording), port=port)
     assert status in (0, 130) and f"http://{ADDRESS}:{port}/" in words and "Traceback" not in words
+
+
+def children_of(parent: int) -> list[int]:
+    return [int(pid) for task in Path(f"/proc/{parent}/task").iterdir() for pid in (task / "children").read_text().split()]
+
+
+@pytest.mark.slow
+def test_sigterm_ends_what_view_has_started(tmp_path: Path) -> None:
+    child = subprocess.Popen([sys.executable, "-m", "host.cli.main", "view", "--simulated", "--dir", str(tmp_path), "--port",
+                              str(free_port())], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert child.stderr is not None
+    lines = iter(child.stderr.readline, "")
+    assert any("rig simulated: http" in line for line in lines)
+    started = children_of(child.pid)
+    assert len(started) == 3
+    child.send_signal(signal.SIGTERM)
+    _, words = child.communicate(timeout=60)
+    (written,) = tmp_path.glob("view-*.mcap")
+    assert f"recording: {written}" in words and "Traceback" not in words and not Recording(written).truncated
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
 
 def test_view_serves_before_the_rig_is_there() -> None:

@@ -133,6 +133,10 @@ class Unanswering:
 
 
 def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
-    _, view, _ = live
+    there, view, _ = live
     view._commander = Commander(Unanswering(), "view")
-    assert view.act('{"button": "stop"}')["result"] == "unanswered"
+    answer = view.act('{"button": "stop"}')
+    assert answer["result"] == "unanswered" and "may still be starting" in answer["text"]
+    publish_until_seen(there, view)
+    answer = view.act('{"button": "stop"}')
+    assert answer["result"] == "unanswered" and "may or may not have heard" in answer["text"]

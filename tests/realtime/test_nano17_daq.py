@@ -1,5 +1,9 @@
 """Gauge voltages to force: the emulator's loads come back, temperature and zero included; what is no reading gives none."""
 
+import dataclasses
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,6 +19,7 @@ from sim.nano17_emulator import Nano17Emulator, Nano17EmulatorConfig
 from sim.sensor_faults import Fault
 
 MS = 1_000_000
+VECTORS = json.loads((Path(__file__).parent / "vectors" / "nano17_daq.json").read_text(encoding="utf-8"))
 
 
 def pair(noise_V: float = 0.0, **faults: Fault) -> tuple[Nano17Client, Nano17Emulator]:
@@ -98,6 +103,22 @@ def test_a_calibration_file_is_read_in_si() -> None:
     calibration = parse_calibration_file(text.encode())
     np.testing.assert_allclose(np.diag(calibration.matrix), [1.5 * 4.4482216152605] * 3 + [1.5e-3] * 3)
     assert calibration.serial == "FT1" and calibration.range_Nm == (0.012,) * 3
+
+
+def test_the_vectors_mean_what_they_say() -> None:
+    parsed = parse_calibration_file(VECTORS["cal"].encode())
+    keys = ("gain_per_K", "reference_C", "thermistor_offset_C", "thermistor_C_per_V")
+    client = Nano17Client(dataclasses.replace(
+        parsed, zero_V=np.array(VECTORS["zero_V"]), zero_V_per_K=tuple(VECTORS["zero_V_per_K"]),
+        **{key: VECTORS[key] for key in keys}))
+    for number, row in enumerate(VECTORS["rows"], 1):
+        samples = client.feed(np.array([row["V"]], float), 1000.0, number * MS)
+        if row["force_N"] is None:
+            assert samples == [], row["meaning"]
+            continue
+        assert client.temperature_C == pytest.approx(row["temperature_C"]), row["meaning"]
+        np.testing.assert_allclose(samples[0].force_N, row["force_N"], atol=1e-12, err_msg=row["meaning"])
+        np.testing.assert_allclose(samples[0].torque_Nm, row["torque_Nm"], atol=1e-12, err_msg=row["meaning"])
 
 
 def test_without_the_extra_the_card_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,86 @@
+"""`seldinger home` on the native board in virtual time: it finds the switch; without one or a yes nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner, Result
+
+import host.cli.home as command
+from realtime.rig_file import load_rig
+from tests.realtime.conftest import RIG_FILE
+from tests.sim.board_rig import BoardRig
+
+SWITCH_STEPS = -120
+
+
+class Port:
+    """The board's port and this computer's clock: to sleep a millisecond is to let the board run for one."""
+
+    def __init__(self) -> None:
+        self.rig = BoardRig("native")
+        self._in, self._out = bytearray(), b""
+
+    def read(self) -> bytes:
+        data, self._in = bytes(self._in), bytearray()
+        return data
+
+    def write(self, data: bytes) -> None:
+        self._out += data
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def monotonic_ns(self) -> int:
+        return self.rig.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        for _ in range(round(seconds * 1000)):
+            self.rig.inputs = {"limit_bits": int(self.rig.position[0] <= SWITCH_STEPS)}
+            self._in += self.rig.slice(self._out).uart_out
+            self._out = b""
+
+
+@pytest.fixture
+def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[Port]:
+    made = Port()
+    monkeypatch.setattr(command, "time", made)
+    monkeypatch.setattr(command, "open_serial", lambda path, baud: made)
+    yield made
+    made.rig.close()
+
+
+def homed(*arguments: str, answer: str = "") -> Result:
+    app = typer.Typer()
+    app.command()(command.home)
+    return CliRunner().invoke(app, ["insertion", *arguments], input=answer)
+
+
+def file_with_a_switch(folder: Path) -> Path:
+    text = RIG_FILE.read_text(encoding="utf-8")
+    for key, value in (("home_end", '"min"'), ("home_unit", "-0.05"), ("home_speed_unit_per_s", "0.002")):
+        old = next(line for line in text.splitlines() if line.startswith(f"{key} "))
+        text = text.replace(old, f"{key} = {value}", 1)
+    path = folder / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_it_finds_the_switch_and_says_so(port: Port, tmp_path: Path) -> None:
+    file = file_with_a_switch(tmp_path)
+    told = homed("--rig", str(file), "--yes", "--json")
+    assert told.exit_code == 0, told.output
+    assert "switch found, called -0.05 m" in told.stderr and '"axis": "insertion"' in told.stdout
+    at_steps = round(load_rig(file).stages.insertion.home_unit * 320_000)
+    assert abs(int(port.rig.position[0]) - int(port.rig.status.position_steps[0]) - (SWITCH_STEPS - at_steps)) <= 2
+    assert port.rig.position[0] > SWITCH_STEPS and port.rig.position[1:].tolist() == [0, 0]
+
+
+def test_without_a_switch_or_without_a_yes_nothing_moves(port: Port, tmp_path: Path) -> None:
+    none = homed("--rig", str(RIG_FILE), "--yes")
+    assert none.exit_code != 0 and "stages.insertion.home_end" in str(none.exception)
+    no = homed("--rig", str(file_with_a_switch(tmp_path)), answer="n\n")
+    assert no.exit_code == 1 and not port.rig.position.any()
