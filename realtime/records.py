@@ -106,7 +106,7 @@ PREDICTIVE_STATE = np.dtype([
     ("normal", "f8", 3), ("offset_m", "f8", 3), ("touch_offset_m", "f8", 3), ("offset_s", "f8"), ("offset_ns", "i8"),
     ("goal_speed", "f8"), ("along_m", "f8"), ("touch_m", "f8"), ("depth_m", "f8"), ("wanted_N", "f8"), ("mean_m", "f8"),
     ("felt_ns", "i8"), ("away_s", "f8"), ("speed", "f8", N_AXES), ("soon", "f8", N_AXES), ("later", "f8", N_AXES),
-    ("point_m", "f8", 3), ("joint", "f8", N_AXES),
+    ("point_m", "f8", 3), ("joint", "f8", N_AXES), ("short_m", "f8"), ("short_s", "f8"),
 ], align=True)
 # Sensor and estimate side by side (`force_source`).
 FORCE_RING = 96
