@@ -13,9 +13,9 @@ import math
 
 from numba import njit
 
-from realtime import backlash, free_tip, inverse_kinematics, target_predictor
+from realtime import backlash, force_source, free_tip, inverse_kinematics, target_predictor
 from realtime.constraint_frame import dot
-from realtime.records import N_AXES, PREDICTIVE_PARAMS, PREDICTIVE_STATE
+from realtime.records import N_AXES, PHASE_APPROACH, PHASE_HOLD, PHASE_POSITION, PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
 Config, State = PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
@@ -30,6 +30,8 @@ _AUTHORITY_m = 0.004
 _AWAY_S = 0.050
 # Least share of the wanted force to press with while the wall's motion is not known yet: enough to keep the touch.
 _GENTLE_SHARE = 0.65
+# By estimates alone the motion is known later, and a touch that is lost is found late.
+_GENTLE_BLIND_SHARE = 0.9
 _SURE_SIGMA = 2.0
 # A reversal must be worth so many standard deviations of the forecasts.
 _DEPTH_SIGMA = 1.0
@@ -110,7 +112,8 @@ def observe(params, state, pose, touching: bool) -> None:  # type: ignore[no-unt
     free_tip.apply(params.kinematics, own.joint, own.point_m)
     dt_s = min(max((pose.stamp_ns - own.offset_ns) * 1e-9, 0.0), 0.1)
     own.offset_ns = pose.stamp_ns
-    if not touching and state.force.smooth_N < params.hybrid.contact_force_N:
+    free = state.phase == PHASE_HOLD or state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH
+    if free and state.force.smooth_N < params.hybrid.contact_force_N:
         _learn_short(params, state, pose.position_m, dt_s)
     memory_s = law.contact_memory_s if touching else law.offset_memory_s
     own.offset_s = min(own.offset_s + dt_s, memory_s)
@@ -259,7 +262,8 @@ def _wanted(params, state, wanted_N: float) -> float:  # type: ignore[no-untyped
     law, own, wall = params.predictive, state.predictive, state.wall
     sure_m2 = max(target_predictor.variance_ahead(wall) - wall.noise_m2, 0.0)
     sure_N = math.sqrt(sure_m2) / law.compliance_m_per_N
-    goal_N = min(wanted_N, max(_GENTLE_SHARE * wanted_N, wanted_N + law.force_margin_N - _SURE_SIGMA * sure_N))
+    gentle = _GENTLE_BLIND_SHARE if params.force_source == force_source.ESTIMATE else _GENTLE_SHARE
+    goal_N = min(wanted_N, max(gentle * wanted_N, wanted_N + law.force_margin_N - _SURE_SIGMA * sure_N))
     step_N = law.force_slew_N_per_s * params.period_s
     own.wanted_N += min(max(goal_N - own.wanted_N, -step_N), step_N)
     return own.wanted_N
