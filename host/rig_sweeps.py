@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 import signal
 import threading
 from collections.abc import Callable, Sequence
@@ -19,7 +18,6 @@ from realtime.scheduling import RealtimeSettings
 from realtime.sweep import MOVE_SPEED, REST_S, Sweep, SweepLoop
 from realtime.sweep_ports import RigPorts, run_sweeps
 
-_EVERY_TURNS = 200
 _UNITS = (("mm", 1e3), ("deg", 57.29577951308232), ("deg", 57.29577951308232))
 
 
@@ -52,52 +50,30 @@ def duration_s(sweeps: Sequence[Sweep]) -> float:
     return total
 
 
-class _Recorder(threading.Thread):
-    """Writes beside the loop, so that no disk holds up a set-point."""
-
-    def __init__(self, recording: RecordingWriter) -> None:
-        super().__init__(name="recorder", daemon=True)
-        self._recording, self._queue = recording, queue.SimpleQueue[tuple[str, Message, int] | None]()
-
-    def put(self, topic: str, message: Message, now_ns: int) -> None:
-        """Takes a message to be written."""
-        self._queue.put((topic, message, now_ns))
-
-    def run(self) -> None:
-        """Until `finish`."""
-        while (item := self._queue.get()) is not None:
-            self._recording.write(*item)
-
-    def finish(self) -> None:
-        """Write what is left, and end."""
-        self._queue.put(None)
-        self.join()
-
-
 def record_on_rig(rig: Rig, sweeps: Sequence[Sweep], path: Path, ports: PortNames = PortNames(),
                   progress: Callable[[float], None] = lambda share: None) -> Path:
-    """Drive `sweeps` on the rig at its ports and record them into `path`. SIGINT and SIGTERM brake the stages and disarm.
+    """Drive `sweeps` on the rig at its ports, then record them into `path`. SIGINT and SIGTERM brake the stages and disarm.
 
+    Nothing is written while the stages move: a disk, or a thread that writes to it, may hold the loop up for longer than
+    the board waits for a set-point. What there is of sweeps broken off is written as well.
     Raises ValueError (sweeps that the stages cannot do) and OSError (a port that does not open, or is held by another
     process) before anything moves; RuntimeError where the sweeps were broken off.
     """
-    told: list[_Recorder] = []
+    heard: list[tuple[str, Message]] = []
 
     def publish(topic: str, message: Message) -> None:
-        told[0].put(topic, message, message.stamp_ns)
+        heard.append((topic, message))
 
     loop = SweepLoop(rig, sweeps, publish)
     with RigPorts(rig, ports.board, ports.tracker, ports.force) as lines, \
             RecordingWriter(path, header_of(rig, "wall", None, {"job": "characterize"})) as recording:
-        told.append(_Recorder(recording))
-        told[0].start()
         try:
             with _stopping() as stop:
                 run_sweeps(loop, lines, each=_told(loop, progress), stop=stop.is_set, settings=RealtimeSettings())
         except OSError as gone:
             loop.break_off(f"board: {gone}")
-        finally:
-            told[0].finish()
+        for topic, message in heard:
+            recording.write(topic, message, message.stamp_ns)
         if not loop.problem and recording.failure:
             loop.problem = recording.failure
     if loop.problem:
@@ -107,13 +83,13 @@ def record_on_rig(rig: Rig, sweeps: Sequence[Sweep], path: Path, ports: PortName
 
 
 def _told(loop: SweepLoop, progress: Callable[[float], None]) -> Callable[[], None]:
-    turns = 0
+    told = -1.0
 
     def each() -> None:
-        nonlocal turns
-        turns += 1
-        if turns % _EVERY_TURNS == 0:
-            progress(loop.progress)
+        nonlocal told
+        if loop.progress != told:
+            told = loop.progress
+            progress(told)
 
     return each
 

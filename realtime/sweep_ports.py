@@ -6,8 +6,10 @@ a realtime process (or another sweep) has it, and neither gets at the board as l
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from realtime.clock import Clock
@@ -114,6 +116,19 @@ class RigPorts:
         self.close()
 
 
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without Python's garbage collector: it may stand still for longer than the board waits for a set-point."""
+    was = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
 class Pace(Protocol):
     """A clock to keep to: `realtime.clock.Clock`, or a world that hands out its own time."""
 
@@ -133,7 +148,7 @@ def run_sweeps(loop: SweepLoop, ports: Ports, clock: Pace | None = None, each: C
     hears nothing more, stops the stages by itself.
     """
     clock = clock or Clock.monotonic()
-    with realtime_thread(settings):
+    with realtime_thread(settings), _no_collection():
         due_ns = clock.now_ns()
         ports.send(loop.step(due_ns, Arriving()))
         while not loop.done:

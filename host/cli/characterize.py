@@ -57,15 +57,16 @@ def characterize(
         raise BadInput("--real", "with --recording", "one of them: a recording moves nothing")
     if not 1 <= force_port <= 65535:
         raise BadInput("--force-port", force_port, "1 to 65535")
-    ports = PortNames(board_port, tracker_port, force_port)
+    ports, loaded = PortNames(board_port, tracker_port, force_port), load_rig(rig)
     try:
-        loaded = load_rig(rig)
         if real:
             source = _record_on_rig(loaded, standard_sweeps(loaded, repeats), ports, yes, directory)
         else:
             source = recording or _record(loaded, repeats, seed, board, directory)
         found = identify(Recording(source), loaded)
-    except (RigFileError, ValueError) as error:
+    except RigFileError:
+        raise
+    except ValueError as error:
         key, _, rest = str(error).partition(": found ")
         what, _, wanted = rest.partition(", wanted ")
         raise BadInput(key, what, wanted) from None
@@ -98,9 +99,7 @@ def _record_on_rig(rig: Rig, sweeps: Sequence[Sweep], ports: PortNames, yes: boo
         print("seldinger: nothing was moved", file=sys.stderr)
         raise typer.Exit(1)
     path = new_recording_path(directory, "characterize")
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("sweeps", total=1.0)
-        return record_on_rig(rig, sweeps, path, ports, lambda share: bar.update(task, completed=share))
+    return record_on_rig(rig, sweeps, path, ports, lambda share: print(f"sweeps: {share:.0%}", file=sys.stderr, flush=True))
 
 
 def _write(found: Characterization, rig: Rig, rig_file: Path, source: Path, directory: Path) -> dict[str, Any]:
