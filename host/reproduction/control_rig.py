@@ -186,7 +186,7 @@ def _first(rig: Rig, hold_s: float, board: str) -> Section:
 
 
 def _gain_effects(rig: Rig, hold_s: float, board: str, quick: bool, progress: Callable[[str], None]) -> list[Section]:
-    factors = (0.5, 2.0) if quick else (0.5, 1.0, 2.0)
+    around, below = ((0.5, 2.0), (0.25, 1.0)) if quick else ((0.5, 1.0, 2.0), (0.25, 0.5, 1.0))
     plan = [("7.22", "force_integral_m_per_N_s", "integral, force", "A higher integral gain lowers the steady "
              "oscillation.", "sd"),
             ("7.23", "force_gain_m_per_N", "proportional, force", "The proportional gain sets the speed at the "
@@ -197,6 +197,7 @@ def _gain_effects(rig: Rig, hold_s: float, board: str, quick: bool, progress: Ca
              "oscillation.", "more")]
     out = []
     for number, key, words, thesis, kind in plan:
+        factors = below if key == "force_gain_m_per_N" else around    # the rig file allows no more of it
         runs = [experiment(with_control(rig, **{key: factor}), ACROSS, f"× {factor:g}", 0.1, hold_s, 1, board=board)
                 for factor in factors]
         progress(f"{number} done")
