@@ -203,3 +203,26 @@ def apply_nearest(config, tip_m, last_joint, out) -> None:  # type: ignore[no-un
     out[0] = insertion
     out[1] = roll
     out[2] = knob_of_curvature(config, math.copysign(curvature, lateral_m))
+
+
+@njit(cache=True)
+def out_of_reach_m(config, tip_m, least_m: float, most_m: float, knob_rad: float) -> float:  # type: ignore[no-untyped-def]
+    """How far (m) a wanted tip (3,) is from the nearest that either branch comes to within the limits.
+
+    least_m, most_m: of the insertion; knob_rad: how far the knob turns either way. Roll is taken as free.
+    """
+    length_m, across_m = config.distal_length_m, math.hypot(tip_m[0], tip_m[1])
+    bend_most = min(config.max_curvature_per_m, abs(curvature_of_knob(config, knob_rad)))
+    off_m = math.inf
+    for beyond in (False, True):
+        found = bend_and_insertion(config, across_m, tip_m[2])
+        if beyond:
+            found = _with_body_out(config, across_m, tip_m[2], True)
+        curvature = min(found[0], bend_most)
+        insertion_m = min(max(found[1], least_m, -length_m), most_m)
+        arc_m = max(length_m + min(insertion_m, 0.0), 0.0)
+        bend = curvature * arc_m
+        lateral_m = 0.5 * bend * arc_m if bend < 1e-5 else (1.0 - math.cos(bend)) / curvature
+        along_m = max(insertion_m, 0.0) + (arc_m if bend < 1e-5 else math.sin(bend) / curvature)
+        off_m = min(off_m, math.hypot(lateral_m - across_m, along_m - tip_m[2]))
+    return off_m

@@ -12,6 +12,8 @@ import numpy as np
 from protocol.messages import Vector
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
+from realtime import inverse_kinematics
+from realtime.configure import tick_parameters
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 from realtime.force_source import ESTIMATE
 from realtime.records import (
@@ -24,6 +26,8 @@ from realtime.records import (
 )
 from realtime.rig_file import Rig
 
+# A target may be out of reach by no more than this: the calibration is not better known.
+REACH_m = 0.001
 FORCE_BOX = "net_ft"   # as the driver names it in its events
 _KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND_CONTACT, "retract": COMMAND_RETRACT}
 
@@ -36,6 +40,7 @@ class OperatorDesk:
         """missing: names the devices that are not there yet, empty when all are; asked before arming."""
         self._rig, self._record, self._link, self._missing = rig, record, link, missing
         self._frames: list[bytes] = []
+        self._kinematics = tick_parameters(rig)[0].kinematics
         record.normal[:] = (0.0, 0.0, -1.0)
 
     def take_frames(self) -> list[bytes]:
@@ -149,4 +154,12 @@ class OperatorDesk:
         for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
             if not least <= value <= most:
                 return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
+        insertion, t = self._rig.stages.insertion, self._rig.transmission
+        least_m, most_m = (t.insertion_at_home_m + t.insertion_slope * unit + 0.5 * side * t.insertion_backlash_m
+                           for unit, side in ((insertion.min_unit, -1.0), (insertion.max_unit, 1.0)))
+        off_m = inverse_kinematics.out_of_reach_m(self._kinematics, np.asarray(target_m, float), least_m, most_m,
+                                                  self._rig.stages.knob.max_unit)
+        if not off_m <= REACH_m:
+            return (f"target_m: found {tuple(target_m)}, wanted a point that the unloaded tip can reach: it comes no nearer "
+                    f"than {off_m * 1e3:.1f} mm")
         return ""

@@ -13,9 +13,9 @@ import math
 
 from numba import njit
 
-from realtime import backlash, free_tip, inverse_kinematics, target_predictor
+from realtime import backlash, force_source, free_tip, inverse_kinematics, target_predictor
 from realtime.constraint_frame import dot
-from realtime.records import N_AXES, PREDICTIVE_PARAMS, PREDICTIVE_STATE
+from realtime.records import N_AXES, PHASE_APPROACH, PHASE_HOLD, PHASE_POSITION, PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
 Config, State = PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
@@ -30,6 +30,8 @@ _AUTHORITY_m = 0.004
 _AWAY_S = 0.050
 # Least share of the wanted force to press with while the wall's motion is not known yet: enough to keep the touch.
 _GENTLE_SHARE = 0.65
+# By estimates alone the motion is known later, and a touch that is lost is found late.
+_GENTLE_BLIND_SHARE = 0.9
 _SURE_SIGMA = 2.0
 # A reversal must be worth so many standard deviations of the forecasts.
 _DEPTH_SIGMA = 1.0
@@ -40,6 +42,8 @@ _NUDGE_m = 1e-5
 _NEVER_m = 1.0
 # A difference of the play learned in contact is believed over this time.
 _PLAY_S = 2.0
+# How far the body is short of the insertion believed is learned over this time, in free space.
+_SHORT_S = 0.8
 
 
 @njit(cache=True)
@@ -65,11 +69,34 @@ def start(state) -> None:  # type: ignore[no-untyped-def]
     """As at arming: nothing learned, standing still."""
     own = state.predictive
     state.history.count = 0
-    own.offset_s = 0.0
+    own.offset_s = own.short_s = own.short_m = 0.0
     for i in range(3):
         own.offset_m[i] = 0.0
     state.wall.started = state.tip_wall.started = 0
     stay(state)
+
+
+@njit(cache=True)
+def _learn_short(params, state, position_m, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+    """How far the body is short of the insertion believed, from a free tip at `position_m` (3,) and the joints then.
+
+    At arming nobody knows where in its play the body stands. The offset above makes up for it, but a force told from
+    the shape needs the insertion itself: 1 mm of it passes for 0.1 N at most, and while nothing is touched it shows.
+    """
+    own, tip_m, more_m = state.predictive, state.work[0], state.work[1]
+    believed_m = own.joint[0]
+    own.joint[0] = believed_m - own.short_m
+    free_tip.apply(params.kinematics, own.joint, tip_m)
+    own.joint[0] += _NUDGE_m
+    free_tip.apply(params.kinematics, own.joint, more_m)
+    own.joint[0] = believed_m
+    further_m = square = 0.0
+    for i in range(3):
+        slope = (more_m[i] - tip_m[i]) / _NUDGE_m
+        further_m += slope * (position_m[i] - tip_m[i])
+        square += slope * slope
+    own.short_s = min(own.short_s + dt_s, _SHORT_S)
+    own.short_m -= dt_s / max(own.short_s, dt_s + 1e-9) * further_m / max(square, 0.1)
 
 
 @njit(cache=True)
@@ -85,6 +112,9 @@ def observe(params, state, pose, touching: bool) -> None:  # type: ignore[no-unt
     free_tip.apply(params.kinematics, own.joint, own.point_m)
     dt_s = min(max((pose.stamp_ns - own.offset_ns) * 1e-9, 0.0), 0.1)
     own.offset_ns = pose.stamp_ns
+    free = state.phase == PHASE_HOLD or state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH
+    if free and state.force.smooth_N < params.hybrid.contact_force_N:
+        _learn_short(params, state, pose.position_m, dt_s)
     memory_s = law.contact_memory_s if touching else law.offset_memory_s
     own.offset_s = min(own.offset_s + dt_s, memory_s)
     share = dt_s / max(own.offset_s, dt_s + 1e-9)
@@ -232,7 +262,8 @@ def _wanted(params, state, wanted_N: float) -> float:  # type: ignore[no-untyped
     law, own, wall = params.predictive, state.predictive, state.wall
     sure_m2 = max(target_predictor.variance_ahead(wall) - wall.noise_m2, 0.0)
     sure_N = math.sqrt(sure_m2) / law.compliance_m_per_N
-    goal_N = min(wanted_N, max(_GENTLE_SHARE * wanted_N, wanted_N + law.force_margin_N - _SURE_SIGMA * sure_N))
+    gentle = _GENTLE_BLIND_SHARE if params.force_source == force_source.ESTIMATE else _GENTLE_SHARE
+    goal_N = min(wanted_N, max(gentle * wanted_N, wanted_N + law.force_margin_N - _SURE_SIGMA * sure_N))
     step_N = law.force_slew_N_per_s * params.period_s
     own.wanted_N += min(max(goal_N - own.wanted_N, -step_N), step_N)
     return own.wanted_N

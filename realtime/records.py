@@ -46,16 +46,24 @@ PREDICTOR_STATE = np.dtype([
 # The wall's motion (`target_predictor`): harmonics of heart and breath, and three models of the same motion.
 HEART_HARMONICS, BREATH_HARMONICS = 3, 2
 TARGET_N = 2 + 2 * (HEART_HARMONICS + BREATH_HARMONICS) + 4
-TARGET_MODELS = 3
+TARGET_MODELS = 4
 BANK_POINTS = 24
 BANK = np.dtype([
     ("low_Hz", "f8"), ("high_Hz", "f8"), ("memory_s", "f8"), ("since_s", "f8"), ("level", "f8"),
     ("phase_rad", "f8", BANK_POINTS), ("first", "f8", (BANK_POINTS, 2)), ("second", "f8", (BANK_POINTS, 2)),
 ], align=True)
+# The grid of `beat_phase`.
+BEAT_PHASES, BEAT_RATES, BEAT_HARMONICS = 48, 15, 3
+BEAT = np.dtype([
+    ("share", "f8", (BEAT_PHASES, BEAT_RATES)), ("moved", "f8", (BEAT_PHASES, BEAT_RATES)),
+    ("wave_m", "f8", 2 * BEAT_HARMONICS), ("told_m", "f8", 2 * BEAT_HARMONICS),
+    ("seen", "f8", (2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)), ("factor", "f8", (2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)),
+    ("moment_m", "f8", (BEAT_RATES, BEAT_HARMONICS, 2)),
+], align=True)
 TARGET_PARAMS = np.dtype([
-    ("horizon_s", "f8"), ("gate_sigma", "f8"), ("stiffness_sd", "f8"), ("play_sd_m", "f8"),
-    ("level_acceleration_m_per_s2", "f8"), ("score_memory_s", "f8"), ("heart_min_Hz", "f8"), ("heart_max_Hz", "f8"),
-    ("breath_min_Hz", "f8"), ("breath_max_Hz", "f8"),
+    ("by_phase", "i8"), ("horizon_s", "f8"), ("gate_sigma", "f8"), ("stiffness_sd", "f8"), ("play_sd_m", "f8"),
+    ("level_acceleration_m_per_s2", "f8"), ("local_acceleration2", "f8"), ("score_memory_s", "f8"),
+    ("heart_min_Hz", "f8"), ("heart_max_Hz", "f8"), ("breath_min_Hz", "f8"), ("breath_max_Hz", "f8"),
 ], align=True)
 TARGET_STATE = np.dtype([
     ("started", "i8"), ("time_ns", "i8"), ("x", "f8", (TARGET_MODELS, TARGET_N)),
@@ -64,6 +72,7 @@ TARGET_STATE = np.dtype([
     ("shot", "f8", (TARGET_MODELS, TARGET_N)), ("heart_found", "i8"), ("breath_found", "i8"), ("mean_rate", "f8"),
     ("worse_s", "f8"), ("bank_value", "f8"), ("bank_s", "f8"), ("bank_n", "i8"), ("heart_bank", BANK),
     ("breath_bank", BANK), ("last_heart_Hz", "f8"), ("agreed", "i8"), ("rejected", "i8"), ("rejected_s", "f8"),
+    ("beat", BEAT), ("beat_shot_m", "f8", (BEAT_RATES, BEAT_HARMONICS, 2)), ("shot_rate", "f8"),
     ("row", "f8", TARGET_N), ("cross", "f8", TARGET_N), ("angle", "f8", (HEART_HARMONICS + BREATH_HARMONICS, 2)),
 ], align=True)
 
@@ -106,7 +115,7 @@ PREDICTIVE_STATE = np.dtype([
     ("normal", "f8", 3), ("offset_m", "f8", 3), ("touch_offset_m", "f8", 3), ("offset_s", "f8"), ("offset_ns", "i8"),
     ("goal_speed", "f8"), ("along_m", "f8"), ("touch_m", "f8"), ("depth_m", "f8"), ("wanted_N", "f8"), ("mean_m", "f8"),
     ("felt_ns", "i8"), ("away_s", "f8"), ("speed", "f8", N_AXES), ("soon", "f8", N_AXES), ("later", "f8", N_AXES),
-    ("point_m", "f8", 3), ("joint", "f8", N_AXES),
+    ("point_m", "f8", 3), ("joint", "f8", N_AXES), ("short_m", "f8"), ("short_s", "f8"),
 ], align=True)
 # Sensor and estimate side by side (`force_source`).
 FORCE_RING = 96

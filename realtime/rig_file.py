@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from protocol.topics import check_name
 from protocol.zenoh_access import Network, check_network_endpoint
+from realtime import loop_margin
 
 AXES = ("insertion", "roll", "knob")
 
@@ -244,8 +245,26 @@ class Rig(_Section):
     @model_validator(mode="after")
     def _calibration_fits(self) -> Rig:
         if self.transmission.catheter != self.catheter.name:
-            raise ValueError(f"transmission.catheter equal to catheter.name ({self.catheter.name}), "
-                             f"found {self.transmission.catheter}: calibrated with another catheter")
+            raise ValueError(f"transmission.catheter: found {self.transmission.catheter}, wanted {self.catheter.name}, as "
+                             "catheter.name: it was calibrated with another catheter")
+        return self
+
+    @model_validator(mode="after")
+    def _gains_hold(self) -> Rig:
+        c, turns_s = self.control, 1.5 / self.control.loop_hz + self.board.setpoint_lead_s
+        if c.law != "thesis":
+            return self
+        gains = (c.position_gain_per_s, c.position_integral_per_s2)
+        late_s = self.tracker.latency_s + 0.5 / self.tracker.rate_hz + turns_s
+        margins = {
+            "position": (loop_margin.position_margin_deg(*gains, late_s), late_s),
+            "force": (loop_margin.force_margin_deg(*gains, c.force_gain_m_per_N, c.force_integral_m_per_N_s,
+                                                   1.0 / c.tip_compliance_m_per_N, turns_s), turns_s)}
+        for loop, (margin_deg, delay_s) in margins.items():
+            if not margin_deg >= loop_margin.LEAST_MARGIN_deg:
+                raise ValueError(f"control: found gains with a phase margin of {margin_deg:.0f} degrees in the {loop} loop "
+                                 f"(at {c.loop_hz} Hz, {delay_s * 1e3:.0f} ms late), wanted at least "
+                                 f"{loop_margin.LEAST_MARGIN_deg:.0f}: less gain, or less integral")
         return self
 
     def stage(self, axis: int) -> Stage:
@@ -291,6 +310,9 @@ def _in_words(error: Any) -> str:
         return f"{key}: found an unknown key, wanted one that the rig file knows{hint}"
     if error["type"] == "missing":
         return f"{key}: found nothing, wanted a value (see host/rigs/simulated.toml for what it means)"
+    said = error["msg"].removeprefix("Value error, ")
+    if ": found " in said:
+        return str(said)
     return f"{key}: found {repr(error['input'])[:80]}, wanted {_bounds(error)}"
 
 

@@ -31,6 +31,7 @@ from realtime.rig_file import AXES, Rig
 MOVE_SPEED = (0.010, 0.8, 0.8)
 REST_S = 0.5
 DEVICES_WITHIN_S = 15.0
+ARMED_WITHIN_S = 1.0
 _LOST = (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
 
 
@@ -79,8 +80,8 @@ class SweepLoop:
     """Brings the devices up, arms, runs the sweeps in turn, disarms. `finished` or `problem` say how it ended.
 
     Publishes `stage` (encoders, stamped with the board's time), `pose/tip`, `pose/shaft`, and a `log` line of source
-    `sweep` with the sweep as JSON at each begin and end. A silent tracker, a fault or a force above
-    safety.over_force_N ends it: the stages brake, the board is disarmed.
+    `sweep` with the sweep as JSON at each begin and end. A silent device, a fault, a force above safety.over_force_N or
+    `break_off` ends it: the stages brake, the board is disarmed.
     """
 
     def __init__(self, rig: Rig, sweeps: Sequence[Sweep], publish: Publish) -> None:
@@ -100,21 +101,29 @@ class SweepLoop:
         self._records = {tracker.tip_handle: ("pose/tip", new(POSE)[0]), tracker.shaft_handle: ("pose/shaft", new(POSE)[0])}
         self._force = new(FORCE)[0]
         self._buffer, self._number = np.zeros(BUFFER_BYTES, np.uint8), 0
-        self._armed_ns, self._rest_ns, self._start_ns, self._stop_ns, self._pose_ns = 0, 0, 0, 0, 0
+        self._armed_ns, self._rest_ns, self._start_ns, self._pose_ns, self._force_ns, self._begin_ns = 0, 0, 0, 0, 0, -1
         self._target = np.zeros(3)
 
     @property
     def done(self) -> bool:
-        """Whether it has ended, one way or the other, and the stages stand."""
-        return (self.finished or bool(self.problem)) and not bool(np.any(np.abs(self._stage.speed) > 1e-9))
+        """Whether it has ended, one way or the other, and the stages stand: brought to rest, or stopped by the board."""
+        moving = self.link.armed and bool(np.any(np.abs(self._stage.speed) > 1e-9))
+        return (self.finished or bool(self.problem)) and not moving
 
     @property
     def progress(self) -> float:
         """Share of the sweeps done, 0 to 1."""
         return min(max(self.current, 0) / max(len(self.sweeps), 1), 1.0)
 
+    def break_off(self, why: str) -> None:
+        """End the sweeps: the stages brake at the next step, and are disarmed when they stand."""
+        if not self.finished:
+            self.problem = self.problem or why
+
     def step(self, now_ns: int, arriving: Arriving) -> Leaving:
         """One period: what arrived goes in, what is to be sent comes out."""
+        if self._begin_ns < 0:
+            self._begin_ns = now_ns
         self._take_board(arriving.board, now_ns)
         self._take_poses(arriving.tracker, now_ns)
         self._take_forces(arriving.force, now_ns)
@@ -133,23 +142,35 @@ class SweepLoop:
                        [request] if request else [])
 
     def _arm_when_ready(self, now_ns: int) -> bytes:
-        if self.link.phase is LinkPhase.READY and self._pose_ns and self.link.status is not None:
+        if self.link.phase is LinkPhase.READY and self._pose_ns and self._force_ns and self.link.status is not None:
+            if self.problem:
+                return b""
+            self._watch(now_ns)
+            if self.problem:
+                return b""
             self._armed_ns = now_ns
             self._stage.position[:] = np.array(self.link.status.position_steps) / self._stage_config.steps_per_unit
             self._target[:] = self._stage.position
             return self.link.arm()
-        if now_ns > DEVICES_WITHIN_S * 1e9 and not self.problem:
-            self.problem = f"devices: found board {self.link.phase.value}, " \
-                           f"{'poses' if self._pose_ns else 'no pose'} after {DEVICES_WITHIN_S:.0f} s, wanted all ready"
+        if now_ns - self._begin_ns > DEVICES_WITHIN_S * 1e9:
+            poses, forces = "poses" if self._pose_ns else "no pose", "forces" if self._force_ns else "no force"
+            self.break_off(f"devices: found board {self.link.phase.value}, {poses}, {forces} after "
+                           f"{DEVICES_WITHIN_S:.0f} s, wanted all ready")
         return b""
 
     def _watch(self, now_ns: int) -> None:
-        limits = self.rig.safety
+        limits, status = self.rig.safety, self.link.status
         force_N = float(np.linalg.norm(self._force.force_N))
-        if now_ns - self._pose_ns > limits.stop_after_s * 1e9:
-            self.problem = f"tracker: found no pose for {(now_ns - self._pose_ns) * 1e-9:.2f} s, wanted one every period"
-        elif not force_N <= limits.over_force_N:
-            self.problem = f"force: found {force_N:.2f} N, wanted free space (safety.over_force_N {limits.over_force_N})"
+        heard_ns = {"tracker": self._pose_ns, "force sensor": self._force_ns,
+                    "board": now_ns if status is None else status.arrival_ns}
+        for device, last_ns in heard_ns.items():
+            if now_ns - last_ns > limits.stop_after_s * 1e9:
+                self.break_off(f"{device}: found it silent for {(now_ns - last_ns) * 1e-9:.2f} s, "
+                               f"wanted at most {limits.stop_after_s} (safety.stop_after_s)")
+        if not force_N <= limits.over_force_N:
+            self.break_off(f"force: found {force_N:.2f} N, wanted free space (safety.over_force_N {limits.over_force_N})")
+        if self._armed_ns and not self.link.armed and now_ns - self._armed_ns > ARMED_WITHIN_S * 1e9:
+            self.break_off(f"board: found it not armed after {ARMED_WITHIN_S:.0f} s, wanted it to obey")
 
     def _follow(self, now_ns: int) -> None:
         """To the centre of the sweep to come, a rest there, the sine, the next; nothing before the board is armed."""
@@ -209,7 +230,7 @@ class SweepLoop:
                 take_status(self._board, self.link, now_ns)
                 self._publish_stage()
             elif event.kind in _LOST:
-                self.problem = self.problem or event.message
+                self.break_off(event.message)
 
     def _publish_stage(self) -> None:
         status = self.link.status
@@ -239,3 +260,4 @@ class SweepLoop:
             sample = self.force_sensor.feed(datagram, now_ns)
             if sample is not None:
                 self._intake.force(self._force, sample.stamp_ns, sample.arrival_ns, sample.force_N)
+                self._force_ns = now_ns

@@ -1,4 +1,4 @@
-"""Three models of one wall's motion as Kalman filters: local, steady and restless, with harmonics that rotate.
+"""Models of one wall's motion as Kalman filters: local, steady, restless, phased; with harmonics that rotate.
 
 In rotating coordinates each harmonic is a pair (p, q) of which p is its part of the position; no amplitude is singular
 (Yuen, Novotny and Howe 2008 use polar ones). Rates are states too: an extended filter, whose F has 2 x 2 blocks only.
@@ -22,15 +22,15 @@ STIFFNESS = BREATH_RATE + 1
 PLAY = STIFFNESS + 1
 N = TARGET_N
 PAIRS = HEART_HARMONICS + BREATH_HARMONICS
-LOCAL, STEADY, RESTLESS = 0, 1, 2
+LOCAL, STEADY, RESTLESS, PHASED = 0, 1, 2, 3
 MODELS = TARGET_MODELS
 
-# Process noise. Local model: acceleration (m/s2 per root Hz) that follows a heart of 1 mm at 2 Hz without knowing it.
-_LOCAL_ACCELERATION2 = 1e-3
-# Per model (steady, restless): share of the level's acceleration^2, relative strength^2 (1/s), rate^2 (rad2/s3).
-_LEVEL_SHARE2 = (0.0, 1.0, 10.0)
-_STRENGTH2 = (0.0, 1e-5, 0.03)
-_RATE2 = (0.0, 1e-4, 10.0)
+# Process noise.
+# Per model, share of the level's acceleration^2, relative strength^2 (1/s), rate^2 (rad2/s3); the phased one's beat is
+# in `beat_phase`, its level and breath are here.
+_LEVEL_SHARE2 = (0.0, 1.0, 10.0, 10.0)
+_STRENGTH2 = (0.0, 1e-5, 0.03, 0.03)
+_RATE2 = (0.0, 1e-4, 10.0, 0.0)
 _FLOOR2 = 1e-13           # m2/s that each harmonic may grow by out of nothing
 _BREATH_RATE2 = 1e-5
 _LEVEL_MEMORY_S = 0.5     # a speed of the level dies out in this time
@@ -56,17 +56,17 @@ def position(x, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def propagate_local(x, P, dt_s: float) -> None:  # type: ignore[no-untyped-def]
-    """The local model (level and speed, the rest of `x` and `P` is zero) by `dt_s`."""
+def propagate_local(x, P, dt_s: float, acceleration2: float) -> None:  # type: ignore[no-untyped-def]
+    """The local model (level and speed, the rest of `x` and `P` is zero) by `dt_s`; acceleration2 (m2/s3): its noise."""
     fade = math.exp(-dt_s / _LEVEL_MEMORY_S)
     reach = _LEVEL_MEMORY_S * (1.0 - fade)
     x[LEVEL] += reach * x[SPEED]
     x[SPEED] *= fade
     p00 = P[0, 0] + reach * (2.0 * P[0, 1] + reach * P[1, 1])
     p01 = fade * (P[0, 1] + reach * P[1, 1])
-    P[0, 0] = p00 + _LOCAL_ACCELERATION2 * dt_s ** 3 / 3.0
-    P[0, 1] = P[1, 0] = p01 + _LOCAL_ACCELERATION2 * dt_s ** 2 / 2.0
-    P[1, 1] = fade * fade * P[1, 1] + _LOCAL_ACCELERATION2 * dt_s
+    P[0, 0] = p00 + acceleration2 * dt_s ** 3 / 3.0
+    P[0, 1] = P[1, 0] = p01 + acceleration2 * dt_s ** 2 / 2.0
+    P[1, 1] = fade * fade * P[1, 1] + acceleration2 * dt_s
 
 
 @njit(cache=True)

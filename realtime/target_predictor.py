@@ -1,9 +1,10 @@
 """Where the wall will be: heart beat and breath learned as rotating harmonics by Kalman filters, from late, noisy samples.
 
-Three models of the same motion run side by side and are judged by how well they foretell it (`horizon_s` ahead):
-a local one (position and speed, knows no heart), a steady one (harmonics of a heart and a breath whose rates hardly
-change) and a restless one (the beat's rate and strength may change from beat to beat). The forecast is their mean,
-weighted by what each has been worth lately.
+Models of the same motion run side by side and are judged by how well they foretell it (`horizon_s` ahead): a local one
+(position and speed, knows no heart), a steady one (harmonics of a heart and a breath whose rates hardly change), a
+restless one (the beat's rate and strength may change from beat to beat), and for slow streams of samples a phased one
+(`beat_phase`: one wave, its phase among many possible). The forecast is their mean, weighted by what each has been
+worth lately.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 
 from numba import njit
 
-from realtime import frequency_bank, target_models
+from realtime import beat_phase, frequency_bank, target_models
 from realtime.frequency_bank import STEP_S
 from realtime.records import BREATH_HARMONICS, HEART_HARMONICS, TARGET_PARAMS, TARGET_STATE
 from realtime.target_models import (
@@ -23,6 +24,7 @@ from realtime.target_models import (
     LEVEL,
     LOCAL,
     MODELS,
+    PHASED,
     PLAY,
     RESTLESS,
     SPEED,
@@ -40,6 +42,7 @@ _SMALLEST_M = 5e-5        # a peak lower than this is no heart
 _TAKE_OVER_S = 2.0
 _RANGE_m = 10.0          # nothing is further off, or wilder, than that
 _MEAN_RATE_S = 5.0
+_BREATHLESS = 100.0       # times the squared acceleration of the level, while its breath is not known
 
 @njit(cache=True)
 def start(config, state, stamp_ns: int, level_m: float) -> None:  # type: ignore[no-untyped-def]
@@ -69,8 +72,23 @@ def ahead(state, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
     value = 0.0
     for m in range(MODELS):
         if state.weight[m] > 1e-3:
-            value += state.weight[m] * target_models.position(state.x[m], ahead_s)
+            value += state.weight[m] * _position(state, m, ahead_s)
     return value
+
+
+@njit(cache=True)
+def _position(state, m: int, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
+    """Position (m) that model `m` has `ahead_s` after (or before) the state's time."""
+    value = target_models.position(state.x[m], ahead_s)
+    return value + beat_phase.ahead(state.beat.moment_m, state.mean_rate, ahead_s) if m == PHASED else value
+
+
+@njit(cache=True)
+def _in_use(config, state) -> int:  # type: ignore[no-untyped-def]
+    """How many of the models, counted in their order, run now."""
+    if state.heart_found == 0 and state.breath_found == 0:
+        return 1
+    return PHASED + 1 if config.by_phase != 0 and state.heart_found != 0 else PHASED
 
 
 @njit(cache=True)
@@ -99,7 +117,8 @@ def variance_ahead(state) -> float:  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def least_score(state) -> float:  # type: ignore[no-untyped-def]
     """Mean square (m2) that the best model's forecasts have been off the samples lately."""
-    return min(state.score_m2[LOCAL], state.score_m2[STEADY], state.score_m2[RESTLESS])
+    least_m2 = min(state.score_m2[LOCAL], state.score_m2[STEADY], state.score_m2[RESTLESS])
+    return min(least_m2, state.score_m2[PHASED]) if state.weight[PHASED] > 0.0 else least_m2
 
 
 @njit(cache=True)
@@ -143,7 +162,13 @@ def credit_play(state, part_m: float) -> None:  # type: ignore[no-untyped-def]
 def _innovation(state, m: int, value_m: float, travel_m: float, flank: float, ago_s: float) -> float:  # type: ignore[no-untyped-def]
     x = state.x[m]
     e, p = (stiffer(state), play(state)) if m == LOCAL else (x[STIFFNESS], x[PLAY])
-    return value_m + e * travel_m + p * flank - target_models.position(x, -ago_s)
+    return value_m + e * travel_m + p * flank - _position(state, m, -ago_s)
+
+
+@njit(cache=True)
+def _spread(state, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:  # type: ignore[no-untyped-def]
+    more_m2 = beat_phase.variance(state.beat) if m == PHASED else 0.0
+    return target_models.innovation_variance(state, m, noise_m2 + more_m2, travel_m, flank, ago_s)
 
 
 @njit(cache=True)
@@ -152,11 +177,14 @@ def _to_time(config, state, stamp_ns: int) -> float:  # type: ignore[no-untyped-
     dt_s = (stamp_ns - state.time_ns) * 1e-9
     if dt_s <= 0.0:
         return -dt_s
-    target_models.propagate_local(state.x[LOCAL], state.P[LOCAL], dt_s)
+    target_models.propagate_local(state.x[LOCAL], state.P[LOCAL], dt_s, config.local_acceleration2)
     if state.heart_found or state.breath_found:
-        for m in (STEADY, RESTLESS):
-            target_models.propagate(state.x[m], state.P[m], state.angle, m, dt_s, state.mean_rate if m == RESTLESS else
-                       state.x[m, HEART_RATE], config.level_acceleration_m_per_s2 ** 2)
+        level2 = config.level_acceleration_m_per_s2 ** 2 * (1.0 if state.breath_found else _BREATHLESS)
+        for m in range(STEADY, _in_use(config, state)):
+            rate = state.mean_rate if m == RESTLESS else state.x[m, HEART_RATE]
+            target_models.propagate(state.x[m], state.P[m], state.angle, m, dt_s, rate, level2)
+            if m == PHASED:
+                beat_phase.propagate(state.beat, state.mean_rate, dt_s)
     state.time_ns = stamp_ns
     return 0.0
 
@@ -183,10 +211,10 @@ def apply(config, state, stamp_ns: int, value_m: float, travel_m: float, flank: 
     ago_s = _to_time(config, state, stamp_ns)
     dt_s = (state.time_ns - before_ns) * 1e-9
     wild = True
-    learning = state.heart_found or state.breath_found
-    for m in range(MODELS if learning else 1):
+    models = _in_use(config, state)
+    for m in range(models):
         v = _innovation(state, m, value_m, travel_m, flank, ago_s)
-        if v * v <= config.gate_sigma ** 2 * target_models.innovation_variance(state, m, noise_m2, travel_m, flank, ago_s):
+        if v * v <= config.gate_sigma ** 2 * _spread(state, m, noise_m2, travel_m, flank, ago_s):
             wild = False
             break
     if wild:
@@ -198,9 +226,13 @@ def apply(config, state, stamp_ns: int, value_m: float, travel_m: float, flank: 
             v = _innovation(state, m, value_m, travel_m, flank, ago_s)
             state.P[m, LEVEL, LEVEL] += v * v
     state.rejected_s = 0.0
-    for m in range(MODELS if learning else 1):
+    for m in range(models):
         v = _innovation(state, m, value_m, travel_m, flank, ago_s)
-        target_models.correct(state, m, v, target_models.innovation_variance(state, m, noise_m2, travel_m, flank, ago_s))
+        spread_m2 = _spread(state, m, noise_m2, travel_m, flank, ago_s)
+        if m == PHASED and ago_s == 0.0:
+            beat_m = value_m - target_models.position(state.x[m], 0.0)
+            beat_phase.correct(state.beat, beat_m, noise_m2 + state.P[m, LEVEL, LEVEL], dt_s)
+        target_models.correct(state, m, v, spread_m2)
     wall_m = value_m + stiffer(state) * travel_m + play(state) * flank
     _judge(config, state, wall_m, ago_s, noise_m2)
     _listen(config, state, wall_m, dt_s)
@@ -213,25 +245,27 @@ def _judge(config, state, wall_m: float, ago_s: float, noise_m2: float) -> None:
     age_s = (state.time_ns - state.shot_ns) * 1e-9 - ago_s
     if age_s < config.horizon_s - 1e-4:
         return
-    learning = state.heart_found or state.breath_found
+    models = _in_use(config, state)
     if age_s < 3.0 * config.horizon_s:
         share = min(age_s / config.score_memory_s, 1.0)
         for m in range(MODELS):
             error = wall_m - target_models.position(state.shot[m], age_s)
+            if m == PHASED:
+                error -= beat_phase.ahead(state.beat_shot_m, state.shot_rate, age_s)
             state.score_m2[m] += share * (error * error - state.score_m2[m])
         state.noise_m2 += share * (noise_m2 - state.noise_m2)
     total = 0.0
     for m in range(MODELS):
-        usable = m == LOCAL or learning
         own_m2 = max(state.score_m2[m] - state.noise_m2, 0.05 * state.noise_m2 + 1e-12)
-        state.weight[m] = 1.0 / own_m2 ** 2 if usable else 0.0
+        state.weight[m] = 1.0 / own_m2 ** 2 if m < models else 0.0
         total += state.weight[m]
     for m in range(MODELS):
         state.weight[m] /= total
         for i in range(N):
             state.shot[m, i] = state.x[m, i]
-    state.shot_ns = state.time_ns
-    if learning:
+    state.shot_ns, state.shot_rate = state.time_ns, state.mean_rate
+    state.beat_shot_m[:] = state.beat.moment_m
+    if models > 1:
         _settle_rates(state, age_s)
 
 
@@ -287,26 +321,35 @@ def _listen(config, state, wall_m: float, dt_s: float) -> None:  # type: ignore[
 
 @njit(cache=True)
 def _begin(state, bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:  # type: ignore[no-untyped-def]
-    """Open the harmonics of heart or breath in both models, as `bank` heard them: at `rate_Hz`, of about `size_m`."""
+    """Open the harmonics of heart or breath in all models, as `bank` heard them: at `rate_Hz`, of about `size_m`."""
     fresh = state.heart_found == 0 and state.breath_found == 0
-    for m in (STEADY, RESTLESS):
+    for m in (STEADY, RESTLESS, PHASED):
         x, P = state.x[m], state.P[m]
-        before_m = target_models.position(x, 0.0)
+        before_m = _position(state, m, 0.0)
         if fresh:
             before_m, x[SPEED] = state.x[LOCAL, LEVEL], 0.0
             for j in range(N):
                 P[LEVEL, j] = P[j, LEVEL] = P[SPEED, j] = P[j, SPEED] = 0.0
         P[LEVEL, LEVEL] += size_m ** 2
         P[SPEED, SPEED] += (2.0 * math.pi * rate_Hz * size_m if rate == BREATH_RATE else 0.3 * size_m) ** 2
-        for i in range(first, first + 2 * count):
-            x[i] = 0.0
-            for j in range(N):
-                P[i, j] = P[j, i] = 0.0
-            P[i, i] = (0.7 * size_m / (1 + (i - first) // 2)) ** 2
-        x[first], x[first + 1] = frequency_bank.pair(bank, rate_Hz)
-        x[LEVEL] += before_m - target_models.position(x, 0.0)
-        for j in range(N):
-            P[rate, j] = P[j, rate] = 0.0
-        x[rate] = 2.0 * math.pi * rate_Hz
-        P[rate, rate] = ((0.05 if rate == HEART_RATE else 0.15) * x[rate]) ** 2
+        if m == PHASED and rate == HEART_RATE:
+            beat_phase.start(state.beat, *frequency_bank.pair(bank, rate_Hz))
+        else:
+            _open(x, P, bank, first, count, rate, rate_Hz, size_m)
+        x[LEVEL] += before_m - _position(state, m, 0.0)
         state.score_m2[m] = 0.5 * state.score_m2[LOCAL]
+
+
+@njit(cache=True)
+def _open(x, P, bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:  # type: ignore[no-untyped-def]
+    """`count` pairs from `first` on, and their rate, in one model's state and covariance."""
+    for i in range(first, first + 2 * count):
+        x[i] = 0.0
+        for j in range(N):
+            P[i, j] = P[j, i] = 0.0
+        P[i, i] = (0.7 * size_m / (1 + (i - first) // 2)) ** 2
+    x[first], x[first + 1] = frequency_bank.pair(bank, rate_Hz)
+    for j in range(N):
+        P[rate, j] = P[j, rate] = 0.0
+    x[rate] = 2.0 * math.pi * rate_Hz
+    P[rate, rate] = ((0.05 if rate == HEART_RATE else 0.15) * x[rate]) ** 2

@@ -335,6 +335,7 @@ def _report(params, state, inputs, outputs, force_N: float, flags: int) -> None:
         outputs.stage_unit[axis] = state.stage.position[axis]
         outputs.position_steps[axis] = round(state.stage.position[axis] * params.stage.steps_per_unit[axis])
         outputs.joint[axis] = state.believed[axis]
+    outputs.joint[0] -= state.predictive.short_m    # for whoever reads forces from the shape; the law has its offset
     for i in range(3):
         outputs.tip_velocity_m_per_s[i] = state.predictor.velocity_m_per_s[i]
         outputs.goal_m[i] = state.hybrid.goal_m[i]

@@ -20,6 +20,7 @@ from sim.board import Board
 from sim.effects import parse
 from sim.plant import Plant, PlantConfig
 from sim.sensor_servers import AuroraPty, NetFtUdp
+from sim.tissue import TissueConfig
 from sim.world import World
 
 SLICE_NS = 1_000_000
@@ -121,12 +122,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--board", default="auto")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--ports-file", type=Path, help="Where to write the ports, for a service's EnvironmentFile.")
+    parser.add_argument("--free", action="store_true", help="No wall within reach, for sweeps.")
     parser.add_argument("--effect", type=parse, action="append", default=[], help="ID@PORT:NAME=VALUE,start_s=VALUE")
     options = parser.parse_args(arguments)
     _ask_for_priority()
     rig = load_rig(options.rig)
     offsets_m = (0.0, rig.tracker.shaft_sensor_offset_m)
-    plant = Plant(PlantConfig(tool_offsets_m=offsets_m, effects=tuple(options.effect)), options.seed)
+    wall = TissueConfig(point_m=(0.0, 0.0, 10.0)) if options.free else TissueConfig()
+    plant = Plant(PlantConfig(tool_offsets_m=offsets_m, tissue=wall, effects=tuple(options.effect)), options.seed)
     with Board(options.board) as board:
         world = World(rig, plant, board, options.seed)
         world.advance(SLICE_NS, b"")

@@ -1,9 +1,10 @@
-"""`seldinger characterize`: sine sweeps of each stage, the transmission identified, a calibration with plots."""
+"""`seldinger characterize`: sine sweeps of each stage, on a simulated or a real rig; a calibration with plots."""
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,8 +26,11 @@ from host.characterization_report import lines_of, write_characterization
 from host.cli.contract_io import BadInput, write_json
 from host.demo import SIMULATED_RIG, new_recording_path
 from host.recording import Recording
+from host.rig_sweeps import PortNames, in_words, record_on_rig
 from host.sweep_fits import Estimate
+from realtime.drivers.net_ft import RDT_PORT
 from realtime.rig_file import Rig, RigFileError, load_rig, parse_rig
+from realtime.sweep import Sweep
 from sim.board import KINDS, BoardUnavailable
 
 
@@ -38,21 +42,35 @@ def characterize(
     seed: Annotated[int, typer.Option(help="Of all noise.")] = 1,
     board: Annotated[str, typer.Option(help="avr (the ELF in simavr), native, or auto.")] = "auto",
     directory: Annotated[Path, typer.Option("--dir", help="Where recording, calibration and page go.")] = Path("runs"),
+    real: Annotated[bool, typer.Option("--real", help="Move the rig at the rig file's ports, not a simulated one.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --real: the tip hangs free, do not ask.")] = False,
+    board_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
+    tracker_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
+    force_port: Annotated[int, typer.Option(help="With --real: UDP port of the force box.")] = RDT_PORT,
 ) -> None:
-    """Characterize the simulated rig in free space: backlash, slopes, dead zones, curves; write its calibration."""
+    """Characterize a rig in free space: backlash, slopes, dead zones, curves; write its calibration."""
     if board not in KINDS:
         raise BadInput("--board", board, " or ".join(KINDS))
     if not 1 <= repeats <= 20:
         raise BadInput("--repeats", repeats, "1 to 20")
+    if real and recording is not None:
+        raise BadInput("--real", "with --recording", "one of them: a recording moves nothing")
+    if not 1 <= force_port <= 65535:
+        raise BadInput("--force-port", force_port, "1 to 65535")
+    ports, loaded = PortNames(board_port, tracker_port, force_port), load_rig(rig)
     try:
-        loaded = load_rig(rig)
-        source = recording or _record(loaded, repeats, seed, board, directory)
+        if real:
+            source = _record_on_rig(loaded, standard_sweeps(loaded, repeats), ports, yes, directory)
+        else:
+            source = recording or _record(loaded, repeats, seed, board, directory)
         found = identify(Recording(source), loaded)
-    except (RigFileError, ValueError) as error:
+    except RigFileError:
+        raise
+    except ValueError as error:
         key, _, rest = str(error).partition(": found ")
         what, _, wanted = rest.partition(", wanted ")
         raise BadInput(key, what, wanted) from None
-    except (BoardUnavailable, RuntimeError) as error:
+    except (BoardUnavailable, RuntimeError, OSError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     result = _write(found, loaded, rig, source, directory)
@@ -70,6 +88,18 @@ def _record(rig: Rig, repeats: int, seed: int, board: str, directory: Path) -> P
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("sweeps", total=1.0)
         return record_simulated(rig, sweeps, path, seed, board, lambda share: bar.update(task, completed=share))
+
+
+def _record_on_rig(rig: Rig, sweeps: Sequence[Sweep], ports: PortNames, yes: bool, directory: Path) -> Path:
+    """Asks first: sweeps swing the tip through free space, and the command cannot see what stands there."""
+    print(f"seldinger: {in_words(sweeps)}", file=sys.stderr)
+    if not yes and not sys.stdin.isatty():
+        raise BadInput("--yes", "missing", "it, or somebody at the terminal who says that the tip hangs free")
+    if not (yes or typer.confirm("Does the catheter's tip hang free, nothing within its reach?", err=True)):
+        print("seldinger: nothing was moved", file=sys.stderr)
+        raise typer.Exit(1)
+    path = new_recording_path(directory, "characterize")
+    return record_on_rig(rig, sweeps, path, ports, lambda share: print(f"sweeps: {share:.0%}", file=sys.stderr, flush=True))
 
 
 def _write(found: Characterization, rig: Rig, rig_file: Path, source: Path, directory: Path) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from host.characterization import load_calibrated_rig
-from host.cli.contract_io import BadInput, read_json, validate, write_json
+from host.cli.contract_io import read_json, validate, write_json
 from host.demo import SIMULATED_RIG
-from realtime.rig_file import RigFileError
 
 
 def plan(
@@ -24,12 +23,7 @@ def plan(
     from host.navigation import PlanRequest
     from host.navigation import plan as search
 
-    try:
-        loaded = load_calibrated_rig(rig, calibration)
-    except RigFileError as error:
-        key, _, rest = str(error).partition(": found ")
-        found, _, wanted = rest.partition(", wanted ")
-        raise BadInput(key, found, wanted) from None
+    loaded = load_calibrated_rig(rig, calibration)
     checked = validate(PlanRequest, _with_tuples(read_json(request)))
     answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:

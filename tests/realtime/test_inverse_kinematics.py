@@ -104,3 +104,15 @@ def test_curvature_of_knob_inverts_the_curve(config: np.record, curvature: float
 def test_a_knob_that_bends_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="wanted a knob that bends"):
         ik.fitted_knob_curve([-1.0, 0.0, 1.0], [0.0, 0.0, 0.0], 45.0)
+
+
+@given(insertion=st.floats(-0.1, 0.02), curvature=st.floats(0.0, 44.0))
+def test_what_the_tip_reaches_is_within_reach(config: np.record, insertion: float, curvature: float) -> None:
+    tip = tip_of(np.array([insertion, 0.3]), curvature)
+    assert ik.out_of_reach_m(config, tip, -0.105, 0.025, 1.6) < 1e-6
+
+
+@pytest.mark.parametrize(("tip_m", "off_m"), [
+    ((0.0, 0.0, 0.2), 0.064), ((0.0, -0.11, 0.05), 0.030), ((0.0, -0.09, -0.01), 0.05)])
+def test_what_it_does_not_reach_is_told_by_how_much(config: np.record, tip_m: tuple, off_m: float) -> None:
+    assert ik.out_of_reach_m(config, np.array(tip_m), -0.105, 0.025, 1.6) > off_m

@@ -45,6 +45,26 @@ def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, 
         assert name in message, message
 
 
+@pytest.mark.parametrize(("gains", "loop"), [
+    ({"position_gain_per_s": 49.0}, "position"), ({"position_integral_per_s2": 100.0}, "position"),
+    ({"position_gain_per_s": 25.0, "loop_hz": 100}, "position"),
+    ({"force_integral_m_per_N_s": 0.5}, "force"), ({"force_gain_m_per_N": 0.0}, "force")])
+def test_gains_that_would_be_unstable_are_refused(gains: dict, loop: str) -> None:
+    data = changed("control.law", "thesis")
+    data["control"].update(gains)
+    with pytest.raises(RigFileError, match=rf"^rig file: control: found gains .* in the {loop} loop .* wanted at least 20"):
+        parse_rig(data)
+
+
+def test_gains_that_hold_at_one_rate_may_not_at_another() -> None:
+    data = changed("control.law", "thesis")
+    data["control"].update(position_gain_per_s=22.0)
+    assert parse_rig(data).control.law == "thesis"
+    data["control"]["loop_hz"] = 100
+    with pytest.raises(RigFileError, match="at 100 Hz"):
+        parse_rig(data)
+
+
 def test_an_unreadable_file_is_one_line(tmp_path) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "rig.toml"
     path.write_text("name = ")
