@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +24,9 @@ from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE, Network, 
 from protocol.zenoh_session import Session
 from realtime.command_gate import CommandGate
 from tests.realtime.conftest import RIG_FILE
+from tests.waiting import free_port, until
 
 PATIENCE_S = 30.0
-
-
-def until(happened: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if happened():
-            return True
-        time.sleep(0.02)
-    return False
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def reading(force_N: float = 0.2) -> ForceSensor:

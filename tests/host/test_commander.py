@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from protocol.commander import Commander as PlainCommander
 from protocol.topics import Command, Reply
 from protocol.zenoh_session import RequestServer, Session
 from realtime.command_gate import CommandGate
+from tests.waiting import until
 
 # The rig's clock is not the one of who commands it.
 AHEAD_NS = 77_000_000_000
@@ -47,15 +48,6 @@ def console(gate: Gate, tmp_path: Path) -> Iterator[Session]:
         probe = PlainCommander(session, "probe")
         assert until(lambda: probe.give("clock").accepted)
         yield session
-
-
-def until(happened: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if happened():
-            return True
-        time.sleep(0.02)
-    return False
 
 
 def test_every_command_comes_back_with_what_became_of_it(gate: Gate, console: Session) -> None:

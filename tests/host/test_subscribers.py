@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import threading
@@ -27,15 +26,10 @@ from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
 from sim.world import World
 from tests.realtime.conftest import RIG_FILE
+from tests.waiting import free_port
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "subscriber.py"
 PATIENCE_S = 30.0
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def test_two_fleets_do_not_meet() -> None:
@@ -47,7 +41,7 @@ def test_two_fleets_do_not_meet() -> None:
 
 def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
     """Hash and number of the step edges of a move whose messages all go out by a real session, beside `kind`."""
-    rig, endpoint = load_rig(RIG_FILE), free_endpoint()
+    rig, endpoint = load_rig(RIG_FILE), f"tcp/127.0.0.1:{free_port()}"
     with Session(rig.name, [endpoint], []) as session, LibraryBoard() as board:
         publishers = {name: session.publisher(name) for name, topic in TOPICS.items() if topic.kind != "query"}
 
@@ -92,7 +86,7 @@ def test_the_step_edges_are_the_same_beside(kind: str, alone: tuple[str, int]) -
 
 
 def test_a_stop_gets_through_a_flood() -> None:
-    endpoint = free_endpoint()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     done: list[str] = []
 
     def obey(command: Command, now_ns: int) -> Reply:
@@ -134,7 +128,7 @@ SHOWN = ["2.500 s  contact  0.123 N  no fresh pose\n"] * 2
 
 
 def test_the_example_reads_on_this_machine() -> None:
-    program, endpoint = EXAMPLE.read_text(encoding="utf-8"), free_endpoint()
+    program, endpoint = EXAMPLE.read_text(encoding="utf-8"), f"tcp/127.0.0.1:{free_port()}"
     assert len(program.splitlines()) <= 15 and "import host" not in program and "protocol" not in program
     assert "tcp/127.0.0.1:7451" in program and load_rig(RIG_FILE).zenoh.listen == ["tcp/127.0.0.1:7451"]
     with Session("simulated", [endpoint], []) as session:
@@ -142,7 +136,7 @@ def test_the_example_reads_on_this_machine() -> None:
 
 
 def test_the_example_reads_from_another_machine_with_its_certificate(tmp_path: Path) -> None:
-    endpoint = free_endpoint().replace("tcp/", "tls/")
+    endpoint = f"tls/127.0.0.1:{free_port()}"
     keys.make_authority(tmp_path / "keys")
     rig = keys.issue(tmp_path / "keys", "rig1", "rig", addresses=["127.0.0.1"])
     reader = keys.issue(tmp_path / "keys", "analysis", "reader", connect=endpoint)

@@ -8,7 +8,7 @@ import select
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +28,7 @@ from sim.scenario import Scenario
 from sim.sensor_faults import Fault
 from sim.world import World
 from tests.realtime.conftest import RIG_FILE
+from tests.waiting import until
 
 PATIENCE_S = 60.0
 TARGET_M = (0.0, -0.0107, 0.025)
@@ -111,14 +112,6 @@ class Cable:
                             os.write(other, data)
                     except (BlockingIOError, OSError):
                         continue
-
-
-def until(happened: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not happened():
-        if time.monotonic() > deadline:
-            pytest.fail(f"waited {PATIENCE_S} s for {what}")
-        time.sleep(0.02)
 
 
 class Door:

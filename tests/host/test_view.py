@@ -29,6 +29,7 @@ from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, t
 from host.view.shape import through, twin
 from realtime import safety
 from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
+from tests.waiting import free_port
 
 MS = 1_000_000
 PORT = 8447
@@ -225,12 +226,6 @@ def test_it_listens_on_loopback_only(port: int) -> None:
 def addresses_of_this_machine() -> list[str]:
     found = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
     return sorted(str(address) for address in found if not str(address).startswith("127."))
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((ADDRESS, 0))
-        return int(probe.getsockname()[1])
 
 
 class running:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,6 +16,7 @@ import pytest
 
 from protocol.topics import Command, ForceSensor, Reply, decode, encode, key
 from protocol.zenoh_session import Session, check_endpoint, configuration
+from tests.waiting import free_port, until
 
 PATIENCE_S = 30.0
 
@@ -65,22 +64,11 @@ def running(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 def endpoint(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "unix":
         return f"unixsock-stream/{tmp_path}/rig.sock"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def reading(force_N: float = 0.2) -> ForceSensor:
     return ForceSensor(stamp_ns=0, arrival_ns=0, force_N=(0.0, 0.0, force_N))
-
-
-def until(happened: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if happened():
-            return True
-        time.sleep(0.01)
-    return False
 
 
 def test_a_reader_that_starts_first_gets_what_comes_later_and_after_a_restart(endpoint: str) -> None:

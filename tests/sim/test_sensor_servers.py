@@ -21,17 +21,9 @@ from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
 from sim.sensor_faults import Fault
 from sim.sensor_servers import AuroraPty, NetFtUdp, SensorServers
+from tests.waiting import until
 
 PATIENCE_S = 60.0
-
-
-def until(condition: object, what: str) -> None:
-    """Wait for `condition()`; a machine that is busy may take long, only one that is stuck fails."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():  # type: ignore[operator]
-        if time.monotonic() > deadline:
-            pytest.fail(f"waited {PATIENCE_S} s for {what}")
-        time.sleep(0.01)
 
 
 @dataclass
