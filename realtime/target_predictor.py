@@ -42,7 +42,7 @@ _SMALLEST_M = 5e-5        # a peak lower than this is no heart
 _TAKE_OVER_S = 2.0
 _RANGE_m = 10.0          # nothing is further off, or wilder, than that
 _MEAN_RATE_S = 5.0
-_BREATHLESS = 100.0       # times the squared acceleration of the level, while its breath is not known
+_BREATHLESS = 100.0       # times the squared acceleration of a slow stream's level, while its breath is not known
 
 @njit(cache=True)
 def start(config, state, stamp_ns: int, level_m: float) -> None:  # type: ignore[no-untyped-def]
@@ -179,7 +179,9 @@ def _to_time(config, state, stamp_ns: int) -> float:  # type: ignore[no-untyped-
         return -dt_s
     target_models.propagate_local(state.x[LOCAL], state.P[LOCAL], dt_s, config.local_acceleration2)
     if state.heart_found or state.breath_found:
-        level2 = config.level_acceleration_m_per_s2 ** 2 * (1.0 if state.breath_found else _BREATHLESS)
+        level2 = config.level_acceleration_m_per_s2 ** 2
+        if config.by_phase != 0 and state.breath_found == 0:
+            level2 *= _BREATHLESS
         for m in range(STEADY, _in_use(config, state)):
             rate = state.mean_rate if m == RESTLESS else state.x[m, HEART_RATE]
             target_models.propagate(state.x[m], state.P[m], state.angle, m, dt_s, rate, level2)

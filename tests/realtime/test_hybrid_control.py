@@ -226,3 +226,17 @@ def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
     softer = replace(run.plant.config, tissue=replace(run.plant.config.tissue, stiffness_N_per_m=300.0))
     trace = IdealRig(rig, softer).press(WANTED_N, WALL_m, 10.0).since_contact()
     assert np.min(trace.force_N) > 0.0 and rms_N(trace) < 0.01
+
+
+@pytest.mark.parametrize("start_in_play", [-1.0, 0.0, 1.0])
+def test_in_free_space_the_insertion_that_forces_are_told_from_is_found(rig: Rig, start_in_play: float) -> None:
+    """Where the body stands in its play is not known at arming, and up to the whole play wrong after the first way out."""
+    plant = PlantConfig(start_stage=(0.045, 0.0, 0.9), vessel=VesselConfig(start_in_play=start_in_play),
+                        tissue=TissueConfig(point_m=(0.0, 0.0, 1.0)), heart=STILL)
+    run = IdealRig(rig, plant, 1)
+    tip = run.plant.sensor_pose(0.0)[0]
+    run.go(tip + (0.0, 0.0, 0.012), 4.0)
+    truth_m = float(run.plant.truth()["insertion_m"])
+    assert run.outputs[0].joint[0] == pytest.approx(truth_m, abs=3e-4)
+    if start_in_play < 0.0:
+        assert run.state[0].believed[0] > truth_m + 2e-3

@@ -27,9 +27,10 @@ class Run:
     """A predictor fed with noisy samples of a motion; errors are RMS (m) of what was foretold AHEAD_S ahead."""
 
     def __init__(self, rig: Rig, wall_m: np.ndarray, step_ms: int, noise_m: float, seed: int = 1, after_s: float = 8.0,
-                 jitter_ms: int = 0, lost: float = 0.0) -> None:
+                 jitter_ms: int = 0, lost: float = 0.0, by_phase: bool = True) -> None:
         parameters = tick_parameters(rig)[0]
         self.config = parameters.wall if step_ms < 10 else parameters.tip_wall
+        self.config.by_phase = int(by_phase and step_ms >= 10)
         self.state, self.wall_m, self.noise_m = new(TARGET_STATE)[0], wall_m, noise_m
         rng = np.random.default_rng(seed)
         times = np.arange(0, len(wall_m) - 60, step_ms)
@@ -74,6 +75,24 @@ def test_rates_are_found_within_seconds(rig: Rig, beats_per_min: int) -> None:
 def test_an_irregular_beat_is_foretold_to_half_of_holding(rig: Rig) -> None:
     run = Run(rig, wall_motion(20.0, irregularity=0.1, premature_share=0.05), **FORCE)
     assert run.error < 0.5 * run.holding and run.error < 0.7 * run.no_heart
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_an_irregular_beat_is_foretold_to_half_of_holding_by_poses(rig: Rig, seed: int) -> None:
+    wall = wall_motion(40.0, seed, irregularity=0.1, premature_share=0.05)
+    run, without = (Run(rig, wall, seed=seed, jitter_ms=2, lost=0.05, by_phase=phased, **POSE) for phased in (True, False))
+    assert run.error < 0.5 * run.holding
+    assert run.error < 0.9 * without.error
+    beat = run.state.beat
+    assert beat.share.min() >= 0.0 and beat.share.sum() == pytest.approx(1.0)
+    assert np.hypot(*beat.wave_m[:2]) == pytest.approx(0.001, rel=0.15)
+
+
+def test_the_phase_knows_any_wave(rig: Rig) -> None:
+    """A second harmonic as strong as half the first is part of the learned wave."""
+    run = Run(rig, wall_motion(40.0, beat_Hz=1.3, second_harmonic=0.5), **POSE)
+    first, second = (float(np.hypot(*run.state.beat.wave_m[2 * h:2 * h + 2])) for h in range(2))
+    assert second == pytest.approx(0.5 * first, rel=0.2)
 
 
 def test_a_change_of_rate_is_followed(rig: Rig) -> None:
