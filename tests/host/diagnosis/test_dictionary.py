@@ -1,0 +1,67 @@
+"""Simple forms foretell what no listed effect explains, where the outputs can show it; noise is foretold by none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.diagnosis.dictionary import Foretold, foretell, forms_at
+from host.diagnosis.fit import Fit, Problem
+from host.diagnosis.nominal import read_nominal
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.search import fit_nominal
+from tests.host.diagnosis import planted, rig_cases
+
+MICROMETRES = 25e-6  # of insertion: a quarter of the poses' noise
+
+
+def fitted(case: tuple[Path, list[Path]]) -> tuple[Problem, Fit]:
+    problem = prepare(read_nominal(case[0]), case[1])[1]
+    return problem, fit_nominal(problem)
+
+
+def places(problem: Problem, fit: Fit) -> list[Foretold]:
+    return foretell(problem, fit, np.array([noise.sigma for noise in problem.noise]))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_noise_is_foretold_by_nothing(tmp_path: Path, seed: int) -> None:
+    assert not any(place.sure for place in places(*fitted(planted.transmission(tmp_path, "", seed))))
+
+
+def test_a_product_of_channels_is_read_off(tmp_path: Path) -> None:
+    (place,) = places(*fitted(planted.transmission(tmp_path, "unlisted", 1)))
+    assert place.sure and place.port is not None and place.port.name == "cable"
+    assert place.forms[0][0].text == "motor*load"
+    assert place.forms[0][1] == pytest.approx(0.15, rel=0.1)  # at the input, before the gain
+
+
+def test_micrometres_that_only_the_force_shows_are_seen(tmp_path: Path) -> None:
+    problem, fit = fitted(rig_cases.write(tmp_path, rig_cases.Truth(), 0, duration_s=12.0))
+    assert not any(place.sure for place in places(problem, fit))
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        roll, knob = piece.inputs["handle_roll"], piece.inputs["handle_knob"]
+        shape = np.sin(roll) * knob
+        moved = MICROMETRES * shape / np.std(shape)
+        residual += problem.model.sensitivity(piece, fit.values, "insertion") * moved  # type: ignore[attr-defined]
+    best = max(places(problem, fit), key=lambda place: place.log_likelihood)
+    assert best.sure and best.subsystem == "insertion"
+    assert "handle_roll" in best.forms[0][0].text and "handle_knob" in best.forms[0][0].text
+
+
+def test_forms_are_told_as_they_are_computed(tmp_path: Path) -> None:
+    problem, fit = fitted(planted.transmission(tmp_path, "", 1))
+    piece, port = problem.pieces[0], problem.model.ports[0]
+    motor, load = piece.inputs["motor"], piece.inputs["load"]
+    forms = {form.text: form.evaluate(piece) for form in forms_at(problem, fit, port)}
+    assert np.array_equal(forms["motor*load"], motor * load)
+    assert np.array_equal(forms["sin(2*motor)*abs(load)"], np.sin(2.0 * motor) * np.abs(load))
+    assert all(np.isfinite(values).all() and values.shape == motor.shape for values in forms.values())
+    assert len({text.replace(" ", "") for text in forms}) == len(forms)
+
+
+def test_data_without_time_have_no_rates(tmp_path: Path) -> None:
+    problem, fit = fitted(planted.transmission(tmp_path, "", 1, timed=False))
+    assert not any("rate" in form.text or "lag" in form.text for form in forms_at(problem, fit, problem.model.ports[0]))
