@@ -312,7 +312,7 @@ def _in_words(error: Any) -> str:
         return f"{key}: found nothing, wanted a value (see host/rigs/simulated.toml for what it means)"
     said = error["msg"].removeprefix("Value error, ")
     if ": found " in said:
-        return str(said)
+        return said if not error["loc"] or said.startswith(f"{error['loc'][0]}") else f"{key}: {said}"
     return f"{key}: found {repr(error['input'])[:80]}, wanted {_bounds(error)}"
 
 

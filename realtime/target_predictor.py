@@ -15,7 +15,7 @@ from numba import njit
 
 from realtime import beat_phase, frequency_bank, target_models
 from realtime.frequency_bank import STEP_S
-from realtime.records import BREATH_HARMONICS, HEART_HARMONICS, TARGET_PARAMS, TARGET_STATE
+from realtime.records import BEAT_HARMONICS, BEAT_RATES, BREATH_HARMONICS, HEART_HARMONICS, TARGET_PARAMS, TARGET_STATE
 from realtime.target_models import (
     BREATH,
     BREATH_RATE,
@@ -266,7 +266,10 @@ def _judge(config, state, wall_m: float, ago_s: float, noise_m2: float) -> None:
         for i in range(N):
             state.shot[m, i] = state.x[m, i]
     state.shot_ns, state.shot_rate = state.time_ns, state.mean_rate
-    state.beat_shot_m[:] = state.beat.moment_m
+    for j in range(BEAT_RATES):  # elementwise: an array assigned to another may be copied first
+        for h in range(BEAT_HARMONICS):
+            for k in range(2):
+                state.beat_shot_m[j, h, k] = state.beat.moment_m[j, h, k]
     if models > 1:
         _settle_rates(state, age_s)
 

@@ -228,6 +228,8 @@ def _stepped(problem: Problem, fit: Fit, term: Term) -> Term:
         return term
     unit = "N" if term.candidate.port.kind == "forces" else "m"
     rows = [row for row, output in enumerate(problem.model.outputs) if output.unit == unit]
+    if not rows:
+        return term
     x, r = [], []
     for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
         for row in rows:

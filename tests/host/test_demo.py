@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import host.recording as recording_module
 from host.cli.main import build
 from host.recording import Recording
 
@@ -24,7 +23,7 @@ def test_a_disk_that_fills_up_is_told_and_the_job_is_still_done(tmp_path: Path, 
             raise OSError(28, "No space left on device")
         return real(fd, data[:taken])
 
-    monkeypatch.setattr(recording_module.os, "write", small_disk)
+    monkeypatch.setattr(os, "write", small_disk)
     words = ["demo", "--fast", "--board", "native", "--hold", "3", "--json", "--dir", str(tmp_path)]
     told = CliRunner().invoke(build(words), words)
     monkeypatch.undo()
