@@ -83,6 +83,9 @@ def main() -> None:
     except (BadInput, RigFileError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         sys.exit(2)
+    finally:
+        if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server hands it on as it ends: nothing is left to do
+            signal.signal(signal.SIGTERM, lambda number, frame: None)
 
 
 if __name__ == "__main__":
