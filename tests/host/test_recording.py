@@ -24,6 +24,7 @@ from host import recording as recording_module
 from host.recording import Header, Recording, RecordingWriter
 from host.recording_index import file_end, is_whole
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
+from tests.small_disk import fill_up
 
 HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}},
                 catheter={"name": "blazer_prime_xp"}, seed=7)
@@ -200,16 +201,7 @@ def test_full_disk_is_told_once_and_what_was_there_is_readable(tmp_path: Path, m
     told: list[str] = []
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path, HEADER, on_failure=told.append)
-    real, room = os.write, [10_000]
-
-    def small_disk(fd: int, data: bytes) -> int:
-        taken = min(len(data), room[0])
-        room[0] -= taken
-        if taken == 0:
-            raise OSError(28, "No space left on device")
-        return real(fd, data[:taken])
-
-    monkeypatch.setattr(os, "write", small_disk)
+    fill_up(monkeypatch, 10_000)
     for tick in range(20_000):
         writer.write("stage", stage(tick * 1_000_000, value=float(np.sin(tick))))
     writer.close()

@@ -115,12 +115,6 @@ def _add_point(
 
 
 @njit(cache=True)
-def _turn(v: Array, c: float, s: float) -> tuple[float, float, float]:
-    """Rz v."""
-    return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
-
-
-@njit(cache=True)
 def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p: Array, R: Array) -> None:
     """Position p (3,) and rotation R (3, 3) at s1 in the base frame after deflection `bend`."""
     y, z, theta = _free_point(s1, straight, kappa)
