@@ -137,6 +137,60 @@ def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p:
 
 
 @njit(cache=True)
+def _free_tip(
+    length: float,
+    straight: float,
+    kappa: float,
+    c: float,
+    s: float,
+    always: tuple[float, float, float],
+    even: tuple[float, float, float],
+    press: tuple[float, float, float],
+    at: float,
+    flex: float,
+    twist: float,
+    nodes: Array,
+    weights: Array,
+    work: Array,
+    bend: Array,
+    out: Array,
+) -> None:
+    """Where the tip (3,) would be without contact, base frame; c, s: cosine and sine of the roll; even, press: at roll 0."""
+    y, z, _ = _free_point(length, straight, kappa)
+    ex, ey, ez = always
+    bend[:] = 0.0
+    if ex != 0.0 or ey != 0.0 or ez != 0.0 or even[0] != 0.0 or even[1] != 0.0 or even[2] != 0.0:
+        gx, gy = c * ex + s * ey, -s * ex + c * ey
+        _deflection(length, length, straight, kappa, gx, gy, ez, even, flex, twist, nodes, weights, bend)
+    if press[0] != 0.0 or press[1] != 0.0 or press[2] != 0.0:
+        _add_point(length, at, straight, kappa, press, flex, twist, nodes, weights, work, bend)
+    x0, y0 = bend[0], y + bend[1]
+    out[0], out[1], out[2] = c * x0 - s * y0, s * x0 + c * y0, z + bend[2]
+
+
+@njit(cache=True)
+def _softness(
+    length: float,
+    straight: float,
+    kappa: float,
+    c: float,
+    s: float,
+    normal: Array,
+    flex: float,
+    twist: float,
+    nodes: Array,
+    weights: Array,
+    bend: Array,
+    out: Array,
+) -> None:
+    """Displacement (3,) of the tip by a unit force along `normal`, base frame."""
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    gx, gy = c * nx + s * ny, -s * nx + c * ny
+    _deflection(length, length, straight, kappa, gx, gy, nz, NO_LOAD, flex, twist, nodes, weights, bend)
+    out[0], out[1], out[2] = c * bend[0] - s * bend[1], s * bend[0] + c * bend[1], bend[2]
+
+
+@njit(cache=True)
 def shapes(
     insertion: Array,
     roll: Array,
@@ -200,33 +254,11 @@ def shapes(
             p[2] = s1
         shaft[:, i] = p
         shaft_R[:, :, i] = R
-        y, z, _ = _free_point(length, straight, kappa[i])
-        ex, ey, ez = extra[0, i], extra[1, i], extra[2, i]
-        bend[:] = 0.0
-        if ex != 0.0 or ey != 0.0 or ez != 0.0 or even[0] != 0.0 or even[1] != 0.0 or even[2] != 0.0:
-            _deflection(
-                length,
-                length,
-                straight,
-                kappa[i],
-                c * ex + s * ey,
-                -s * ex + c * ey,
-                ez,
-                even,
-                flex[i],
-                twist,
-                nodes,
-                weights,
-                bend,
-            )
-        if pressed:
-            _add_point(length, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
-        x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
-        free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z0
-        nx, ny, nz = normal[0], normal[1], normal[2]
-        across = (c * nx + s * ny, -s * nx + c * ny)
-        _deflection(length, length, straight, kappa[i], *across, nz, NO_LOAD, flex[i], twist, nodes, weights, unit)
-        soft[0, i], soft[1, i], soft[2, i] = c * unit[0] - s * unit[1], s * unit[0] + c * unit[1], unit[2]
+        always = (extra[0, i], extra[1, i], extra[2, i])
+        _free_tip(length, straight, kappa[i], c, s, always, even, press, at, flex[i], twist, nodes, weights, unit, bend, p)
+        free[:, i] = p
+        _softness(length, straight, kappa[i], c, s, normal, flex[i], twist, nodes, weights, unit, p)
+        soft[:, i] = p
     return tip, tip_R, shaft, shaft_R, free, soft
 
 
