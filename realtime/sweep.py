@@ -107,7 +107,7 @@ class SweepLoop:
         self._compile()
 
     def _compile(self) -> None:
-        """Call the kernels once, on nothing: the first call loads or compiles them, for longer than a device may be silent."""
+        """Call the kernels once, on nothing: their first call takes longer than a device may be silent."""
         config, nowhere = self._stage_config, new(STAGE_STATE)[0]
         stage_limiter.apply(config, nowhere, 0, 0.0, self.period_ns * 1e-9)
         stage_limiter.brake(config, nowhere, 0, self.period_ns * 1e-9)
