@@ -102,7 +102,16 @@ class SweepLoop:
         self._force = new(FORCE)[0]
         self._buffer, self._number = np.zeros(BUFFER_BYTES, np.uint8), 0
         self._armed_ns, self._rest_ns, self._start_ns, self._pose_ns, self._force_ns, self._begin_ns = 0, 0, 0, 0, 0, -1
+        self._step_ns = 0
         self._target = np.zeros(3)
+        self._compile()
+
+    def _compile(self) -> None:
+        """Call the kernels once, on nothing: their first call takes longer than a device may be silent."""
+        config, nowhere = self._stage_config, new(STAGE_STATE)[0]
+        stage_limiter.apply(config, nowhere, 0, 0.0, self.period_ns * 1e-9)
+        stage_limiter.brake(config, nowhere, 0, self.period_ns * 1e-9)
+        encode_setpoint(self._buffer, 0, 0, 0, 0, np.zeros(3, np.int64))
 
     @property
     def done(self) -> bool:
@@ -123,7 +132,8 @@ class SweepLoop:
     def step(self, now_ns: int, arriving: Arriving) -> Leaving:
         """One period: what arrived goes in, what is to be sent comes out."""
         if self._begin_ns < 0:
-            self._begin_ns = now_ns
+            self._begin_ns = self._step_ns = now_ns
+        self._own_gap(now_ns)
         self._take_board(arriving.board, now_ns)
         self._take_poses(arriving.tracker, now_ns)
         self._take_forces(arriving.force, now_ns)
@@ -157,6 +167,13 @@ class SweepLoop:
             self.break_off(f"devices: found board {self.link.phase.value}, {poses}, {forces} after "
                            f"{DEVICES_WITHIN_S:.0f} s, wanted all ready")
         return b""
+
+    def _own_gap(self, now_ns: int) -> None:
+        """Before any device is blamed for it: whether this loop itself stood still."""
+        gap_ns, self._step_ns = now_ns - self._step_ns, now_ns
+        if self._armed_ns > 0 and gap_ns > self.rig.safety.stop_after_s * 1e9:
+            self.break_off(f"computer: found that the sweeps' own loop stood still for {gap_ns * 1e-9:.2f} s, wanted a "
+                           f"turn every {self.period_ns * 1e-6:g} ms")
 
     def _watch(self, now_ns: int) -> None:
         limits, status = self.rig.safety, self.link.status

@@ -119,6 +119,19 @@ def test_a_wish_to_stop_brakes_and_disarms(rig: Rig) -> None:
     assert bench.loop.problem.startswith("operator") and not bench.loop.link.armed
 
 
+def test_a_computer_that_stood_still_is_blamed_itself(rig: Rig) -> None:
+    bench = Bench(rig)
+    turns = iter(range(10_000_000))
+
+    def pause_once() -> None:
+        if bench.loop.link.armed and next(turns) == 500:
+            bench.ports.sleep_until(bench.world.now_ns + 700_000_000)
+
+    bench.run(each=pause_once)
+    assert bench.loop.problem.startswith("computer: found that the sweeps' own loop stood still for 0.7")
+    assert not bench.loop.finished
+
+
 def test_an_emergency_stop_ends_the_sweeps(rig: Rig) -> None:
     bench = Bench(rig)
 
