@@ -126,7 +126,7 @@ def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Arr
     return np.array(columns).T if columns else np.zeros((base.size, 0))
 
 
-def _robust(r: Array) -> tuple[float, Array]:
+def robust(r: Array) -> tuple[float, Array]:
     """Huber cost and square-root weights."""
     size = np.abs(r)
     inside = size <= HUBER
@@ -139,7 +139,7 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
     parameters = problem.parameters(terms)
     values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])
     r = problem.stacked(terms, values)
-    cost, w = _robust(r)
+    cost, w = robust(r)
     damping = 1e-3
     J = np.zeros((r.size, 0))
     moving = free(parameters)
@@ -160,7 +160,7 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
                     else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
                 )
             r_new = problem.stacked(terms, trial)
-            cost_new, w_new = _robust(r_new)
+            cost_new, w_new = robust(r_new)
             if cost_new < cost:
                 better = True
                 break

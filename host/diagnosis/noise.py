@@ -12,6 +12,8 @@ from host.diagnosis.operators import fill, quantum
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 ORDER = 3
+SHORTEST = 30  # samples of a stretch that counts
+SETTLING = 3.0  # first halves' variance against that of the second ones, from which on an output is still settling
 
 
 @dataclass(frozen=True)
@@ -71,12 +73,15 @@ def runs(mask: Mask, shortest: int) -> list[slice]:
 
 def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     """Noise of one channel from several recordings. `outputs[i]` (n_i,), `still[i]` its quiescent samples."""
+    stretches = [
+        values[part]
+        for values, mask in zip(outputs, still, strict=True)
+        for part in runs(mask & np.isfinite(values), SHORTEST)
+    ]
     pieces = []
-    for values, mask in zip(outputs, still, strict=True):
-        for part in runs(mask & np.isfinite(values), 30):
-            piece = values[part]
-            line = np.polynomial.polynomial.polyfit(np.arange(piece.size), piece, 1)
-            pieces.append(piece - np.polynomial.polynomial.polyval(np.arange(piece.size), line))
+    for piece in _settled(stretches):
+        line = np.polynomial.polynomial.polyfit(np.arange(piece.size), piece, 1)
+        pieces.append(piece - np.polynomial.polynomial.polyval(np.arange(piece.size), line))
     step = max((quantum(values) for values in outputs), default=0.0)
     floor = step / np.sqrt(12.0)
     if sum(piece.size for piece in pieces) < 100:
@@ -93,6 +98,18 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     if sigma <= floor:
         return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
     return Noise(sigma, _autoregression(lags), "quiescent parts")
+
+
+def _settled(stretches: list[Array]) -> list[Array]:
+    """Without their first halves as long as these vary far more than the second ones, as they do where the inputs stand
+    but the output is still on its way; too few to judge by are left as they are.
+    """
+    while len(stretches) >= 4:
+        halves = [(piece[: piece.size // 2], piece[piece.size // 2 :]) for piece in stretches]
+        if np.median([np.var(first) / (np.var(second) + 1e-300) for first, second in halves]) < SETTLING:
+            break
+        stretches = [second for _, second in halves if second.size >= SHORTEST]
+    return stretches
 
 
 def _typical(table: Array, sizes: Array) -> Array:

@@ -229,11 +229,15 @@ def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) ->
 
 
 def quantum(values: Array) -> float:
-    """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized."""
+    """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized.
+
+    Steps of a twentieth of the range and more are a signal that switches between levels, no resolution.
+    """
     good = values[np.isfinite(values)]
     levels = np.unique(good)
     if levels.size < 3 or levels.size > 0.5 * good.size:
         return 0.0
     steps = np.diff(levels)
     dust = 1e-9 * (levels[-1] - levels[0])
-    return float(np.min(steps[steps > dust])) if np.any(steps > dust) else 0.0
+    smallest = float(np.min(steps[steps > dust], initial=np.inf))
+    return smallest if smallest < 0.05 * (levels[-1] - levels[0]) else 0.0

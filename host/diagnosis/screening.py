@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
 
@@ -77,13 +77,17 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
 
 @dataclass
 class Screened:
-    """A candidate with its promise by projection and the start values that earned it."""
+    """A candidate with its promise by projection and the start values that earned it.
+
+    nominal: nominal parameters to start from beside each of `begin`, where they are not those of the fit so far.
+    """
 
     candidate: Candidate
     term: Term
     drop: tuple[str, ...]
     promise: float
     begin: list[Array]
+    nominal: list[Array] = field(default_factory=list)
 
 
 @dataclass

@@ -22,6 +22,7 @@ from host.diagnosis.fit import (
     set_starts,
 )
 from host.diagnosis.model import Piece
+from host.diagnosis.restart import hidden
 from host.diagnosis.screening import Screened, enough, screen, without
 from host.diagnosis.trial import (
     ENOUGH,
@@ -114,11 +115,10 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     """Full joint refit of one candidate from its best starts."""
     terms, values = without(base, problem, item.drop)
     few = enough(problem)
-    begins = item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]
-    fits = [
-        minimize(few, (*terms, item.term), np.concatenate((values, begin)), rounds=FIRST_ROUNDS, tolerance=1e-4)
-        for begin in begins
-    ]
+    begins = [np.concatenate((values, b)) for b in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]]
+    if item.nominal:
+        begins = [np.concatenate(both) for both in zip(item.nominal, item.begin, strict=True)]
+    fits = [minimize(few, (*terms, item.term), begin, rounds=FIRST_ROUNDS, tolerance=1e-4) for begin in begins]
     fit = min(fits, key=lambda f: f.cost)
     fit = minimize(few, fit.terms, fit.values, rounds=MORE_ROUNDS, tolerance=1e-4)
     if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
@@ -213,6 +213,8 @@ def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, e
         ranked = screen(problem, best, pool, tell)
         trials = []
         promising = _varied([item for item in ranked if item.promise > 3.0])
+        if not best.terms:
+            promising += hidden(problem, best, pool)
         for count, item in enumerate(promising):
             tell(f"fitting {item.candidate.key}", count / len(promising))
             trials.append(try_fit(problem, best, item, floor))

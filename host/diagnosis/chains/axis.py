@@ -48,7 +48,7 @@ class Axis:
         self.outputs = tuple(outputs)
         self.ports = (
             Port(name, "force", name, tuple(o.channel for o in outputs)),
-            Port(f"{name}_drive", "timing+limit", name, (self.spec.output,)),
+            Port(f"{name}_drive", "timing+limit+mode", name, (self.spec.output,)),
             Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
         )
         defaults = {
@@ -139,6 +139,36 @@ class Axis:
             for term, value, f, p in zip(self.spec.terms, given, found, self.parameters, strict=True)
         ]
         return np.array(pick)
+
+    def restarts(self, pieces: list[Piece]) -> list[Array]:
+        """Nominal parameters over a range of time constants and dampings, each with the gain that gives the measured RMS.
+
+        Parameters that the TOML holds keep their values.
+        """
+        used = [piece for piece in pieces if piece.fit.any()] if self.free_run and self.spec.controller is None else []
+        if not used:
+            return []
+        slowest_s = max(float(piece.recording.time_s[-1]) for piece in used) / 8.0
+        times_s = np.geomspace(3.0 * used[0].recording.dt_s, slowest_s, 9)
+        measured = np.sqrt(np.nanmean(np.concatenate([piece.y[0][piece.fit] for piece in used]) ** 2))
+        found = []
+        for law in [law for time_s in times_s for law in self._laws(float(time_s))]:
+            theta = np.array([law[term] for term in self.spec.terms])
+            run = np.concatenate([self.simulate(piece, theta, [])[0][piece.fit] for piece in used])
+            rms = float(np.sqrt(np.mean(run**2)))
+            if np.isfinite(rms) and rms > 0.0:
+                theta = theta * rms / measured
+                held = [p.grid[0] if p.high <= p.low else t for p, t in zip(self.parameters, theta, strict=True)]
+                found.append(np.array(held))
+        return found
+
+    def _laws(self, time_s: float) -> list[dict[str, float]]:
+        """Laws of unit gain and one time constant: oscillators where a spring holds a position, else slowing down."""
+        if self.spec.reads == "position" and "stiffness" in self.spec.terms:
+            slowed = [{"mass": time_s**2, "damping": 2.0 * ratio * time_s, "stiffness": 1.0} for ratio in (0.1, 0.4, 1.0)]
+        else:
+            slowed = [{"mass": time_s, "damping": 1.0, "stiffness": spring / time_s} for spring in (1e-9, 1.0)]
+        return [{**law, "offset": 0.0} for law in slowed]
 
     def _substeps(self, piece: Piece) -> int:
         return 2 if self.spec.controller is not None or "stiffness" not in self.spec.terms else 3

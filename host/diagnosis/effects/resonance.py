@@ -1,4 +1,4 @@
-"""Resonance: a mode of vibration, or added mass behind a spring."""
+"""Resonance: a mode of vibration between drive and reading, or added mass behind a spring."""
 
 from __future__ import annotations
 
@@ -46,6 +46,17 @@ EFFECTS = (
         63,
         parameters,
         "The output rings at {frequency}, damping ratio {damping_ratio}.",
+        "y'' + 2 z w y' + w^2 y = w^2 x",
+        apply,
+        timed=True,
+        contains=("rate_lag",),
+    ),
+    Effect(
+        "resonance",
+        "mode",
+        63,
+        parameters,
+        "What drives reaches what is read through a spring, and rings at {frequency}, damping ratio {damping_ratio}.",
         "y'' + 2 z w y' + w^2 y = w^2 x",
         apply,
         timed=True,
