@@ -41,6 +41,8 @@ SLOTS = (
     "gap",
     "backward_ratio",
     "stribeck_distance",
+    "moment_sine",
+    "moment_cosine",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -75,6 +77,8 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     GAP,
     BACKWARD,
     STRIBECK_D,
+    MOMENT_S,
+    MOMENT_C,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 
@@ -91,6 +95,8 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
         force += p[SINE] * math.sin(TWO_PI * x / p[PITCH]) + p[COSINE] * math.cos(TWO_PI * x / p[PITCH])
     if p[FREQUENCY] > 0.0:
         force += p[SINE] * math.sin(TWO_PI * t * p[FREQUENCY]) + p[COSINE] * math.cos(TWO_PI * t * p[FREQUENCY])
+    if p[MOMENT_S] != 0.0 or p[MOMENT_C] != 0.0:
+        force += p[MOMENT_S] * math.sin(x) + p[MOMENT_C] * math.cos(x)
     depth = x - p[CONTACT_X]
     if p[CONTACT_N] > 0.0 and depth > 0.0:
         force += depth ** p[CONTACT_N] * (p[CONTACT_K] + p[CONTACT_C] * v)
@@ -220,6 +226,8 @@ def polynomial(p: Array) -> bool:
         and p[FREQUENCY] <= 0.0
         and p[CONTACT_N] <= 0.0
         and p[MASS2] <= 0.0
+        and p[MOMENT_S] == 0.0
+        and p[MOMENT_C] == 0.0
     )
 
 

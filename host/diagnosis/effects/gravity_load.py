@@ -1,4 +1,4 @@
-"""Gravity: weight of the shaft or a sensor; follows orientation."""
+"""Gravity: weight of the shaft, a sensor or an arm; follows orientation."""
 
 from __future__ import annotations
 
@@ -19,6 +19,18 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
     return {**state, "load": state["load"] + even, "extra": state["extra"] + p[3] * even}
 
 
+def on_an_angle(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Moments of the weight at angles of a quarter turn and of zero; only where the motion is an angle."""
+    if s.motion_unit != "rad":
+        return ()
+    return tuple(Parameter(f"moment_{part}", s.unit, (s.need,), linear=True) for part in ("sine", "cosine"))
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """Moment of a weight that turns with the angle."""
+    return {"moment_sine": p[0], "moment_cosine": p[1]}
+
+
 EFFECTS = (
     Effect(
         "gravity_load",
@@ -28,5 +40,14 @@ EFFECTS = (
         "The shaft sags under its weight.",
         "dF/ds = weight,  F_tip = weight*tip_length",
         apply,
+    ),
+    Effect(
+        "gravity_load",
+        "force",
+        15,
+        on_an_angle,
+        "A weight on an arm pulls with {moment_sine} at a quarter turn and {moment_cosine} at zero.",
+        "M = moment_sine*sin(x) + moment_cosine*cos(x)",
+        slots=slots,
     ),
 )
