@@ -81,6 +81,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     MOMENT_C,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
+FOOT = 1.0 / (math.sqrt(10.0) - 1.0)  # of a parabola before its height is 0.1, in the time it takes from there to 1
 
 
 @njit(cache=True)
@@ -147,13 +148,40 @@ def start_state(z: Array, start: float, load: float, p: Array) -> float:
 
 
 @njit(cache=True)
+def sides(x: Array, tolerance: float) -> Array:
+    """Direction (n,) of the movement that each sample belongs to, +1 or -1, 0 before the first.
+
+    A movement has turned where it goes back by more than `tolerance`. It did so not there but where it set off: at the
+    foot of the parabola through the last sample within a tenth of `tolerance` and the first beyond it.
+    """
+    out = np.zeros(x.size)
+    high, low, at_high, at_low, begun, side = x[0], x[0], 0, 0, 0, 0.0
+    for i in range(1, x.size):
+        high, low = max(high, x[i]), min(low, x[i])
+        at_high = i if x[i] > high - 0.1 * tolerance else at_high
+        at_low = i if x[i] < low + 0.1 * tolerance else at_low
+        if side >= 0.0 and x[i] < high - tolerance:
+            foot = max(at_high - int(FOOT * (i - at_high) + 0.5), begun)
+            out[begun + 1 : foot + 1] = side
+            begun, side, low, at_low = foot, -1.0, x[i], i
+        elif side <= 0.0 and x[i] > low + tolerance:
+            foot = max(at_low - int(FOOT * (i - at_low) + 0.5), begun)
+            out[begun + 1 : foot + 1] = side
+            begun, side, high, at_high = foot, 1.0, x[i], i
+    out[begun + 1 :] = side
+    return out
+
+
+@njit(cache=True)
 def along(
     x: Array, v: Array, a: Array, load: Array, t: Array, dt_s: float, tolerance: float, start: float, p: Array
 ) -> Array:
     """Force of all terms along a measured motion x, v, a (n,)."""
     out = np.empty(x.size)
     z = np.zeros(6)
-    dry = start_state(z, start, load[0], p)
+    rest = start_state(z, start, load[0], p)
+    dry = p[COULOMB] != 0.0 or p[EXCESS] != 0.0
+    side = sides(x, tolerance) if dry and p[STRIBECK_D] <= 0.0 else z
     slow = x[0]
     decay = math.exp(-dt_s / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     x2, v2 = x[0], 0.0
@@ -162,9 +190,9 @@ def along(
     for i in range(x.size):
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
-        dry = min(max(dry + dx / tolerance, -1.0), 1.0)
-        level = level_at(v[i], p) if p[STRIBECK_D] <= 0.0 else 0.0
-        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + level * dry + hysteresis(z, dx, v[i], load[i], p)
+        out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
+        if dry and p[STRIBECK_D] <= 0.0:
+            out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
         if p[MASS2] > 0.0:
             k2, c2 = p[OMEGA2] * p[OMEGA2], 2.0 * p[DAMPING2] * p[OMEGA2]
             for _ in range(steps):

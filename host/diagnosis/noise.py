@@ -97,7 +97,7 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     sigma = float(np.sqrt(max(lags[0], 0.0)))
     if sigma <= floor:
         return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
-    return Noise(sigma, _autoregression(lags), "quiescent parts")
+    return Noise(sigma, autoregression(lags), "quiescent parts")
 
 
 def _settled(stretches: list[Array]) -> list[Array]:
@@ -123,7 +123,8 @@ def _typical(table: Array, sizes: Array) -> Array:
     return np.asarray(np.average(table[middle], axis=0, weights=sizes[middle]))
 
 
-def _autoregression(lags: Array) -> Array:
+def autoregression(lags: Array) -> Array:
+    """Coefficients (p,) of the autoregressive process with the autocovariances `lags` (p + 1,)."""
     from scipy.linalg import solve_toeplitz
 
     damped = lags.copy()

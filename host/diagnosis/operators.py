@@ -192,6 +192,24 @@ def fill(values: Array) -> Array:
     return np.interp(index, index[good], values[good])
 
 
+def smoothing_window(x: Array, dt_s: float, sigma: float, least_s: float, bands: float = 2.0) -> int:
+    """Samples (odd) of a local cubic that passes `bands` times the band in which the motion `x` (n,) stands out of white
+    noise `sigma`, and no less than `least_s`.
+
+    The band ends where the power spectrum comes within three times the noise's; cut-off of the cubic after Schafer (2011).
+    """
+    from scipy.signal import medfilt, welch
+
+    least = max(7, round(least_s / dt_s) | 1)
+    if sigma <= 0.0 or x.size < 8 * least:
+        return least
+    frequency, power = welch(x, fs=1.0 / dt_s, nperseg=min(x.size, 1024), window="blackman")
+    out = np.flatnonzero(medfilt(power, 9) > 3.0 * 2.0 * sigma * sigma * dt_s)
+    band = bands * frequency[out[-1]] if out.size else frequency[1]
+    half = (4.0 * 0.5 / (band * dt_s) + 4.6) / 3.2
+    return int(min(max(least, 2 * int(half) + 1), x.size // 8))
+
+
 def smooth_derivatives(x: Array, dt_s: float, window: int) -> tuple[Array, Array, Array]:
     """Position, velocity, acceleration of a measured motion by a local cubic over `window` samples (odd), without phase."""
     from scipy.signal import savgol_filter

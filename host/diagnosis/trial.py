@@ -85,12 +85,14 @@ def rank(trials: list[Trial], base: Fit) -> None:
 
 
 def of_sampling(trial: Trial) -> bool:
-    """Whether a delay or lag of an axis' input is within one sample: that is how the input was held between samples,
-    not physics.
+    """Whether a delay or lag of an axis' input, all of a drifting one, is within one sample: that is how the input was
+    held between samples, not physics.
     """
-    if trial.candidate.effect.id not in ("latency", "rate_lag") or not trial.candidate.port.name.endswith("_drive"):
+    if not trial.candidate.port.name.endswith("_drive"):
         return False
-    return float(trial.fit.values[-1]) < 1.05 * trial.period_s
+    longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
+    times = {"latency": 1.0, "rate_lag": 1.0, "clock_drift": longest_s}.get(trial.candidate.effect.id)
+    return times is not None and abs(float(trial.fit.values[-1])) * times < 1.05 * trial.period_s
 
 
 def related(simple: Candidate, general: Candidate) -> bool:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.chains import balance
 from host.diagnosis.dataset import Recording
 from host.diagnosis.effect import Parameter, Port
 from host.diagnosis.evidence import correlation_time
@@ -110,6 +111,7 @@ class Axis:
         if not self.free_run:
             piece.y = np.zeros_like(y)
             piece.y[:, ~np.isfinite(recording.channels[spec.output])] = np.nan
+            balance.prepare(piece, motion, SMOOTHING_S, spec.hold, piece.extra["steps"])
         return piece
 
     def guess(self, pieces: list[Piece]) -> Array:
@@ -200,7 +202,7 @@ class Axis:
         else:
             control, reference = np.zeros(0), load[None, :]
         if not self.free_run:
-            return self._follow(piece, linear, steps, p)
+            return balance.error(piece, linear, steps, spec.hold, p, piece.start.get(spec.subsystem, 0.0))
         run = run_axis(
             steps,
             extra["substeps"],
@@ -238,31 +240,6 @@ class Axis:
         sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
         by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
         piece.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
-
-    def _follow(self, piece: Piece, linear: Array, steps: Array, p: Array) -> Array:
-        """Force error along the measured motion: recorded input against what the equation of motion needs, both
-        smoothed alike.
-        """
-        from host.diagnosis.force_kernel import along
-
-        extra, dt = piece.extra, piece.recording.dt_s
-        window = max(7, round(SMOOTHING_S / dt) | 1)
-        x, v = extra["x"], extra["v"]
-        a = np.gradient(v, dt)
-        need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
-        need = need + along(
-            x,
-            v,
-            a,
-            np.zeros(piece.n),
-            piece.recording.time_s,
-            dt,
-            extra["tolerance"],
-            piece.start.get(self.spec.subsystem, 0.0),
-            p,
-        )
-        force = smooth_derivatives(steps[:: 2 * extra["substeps"]][: piece.n], dt, window)[0]
-        return np.asarray(need - force)[None, :]
 
     def motion(self, piece: Piece, port: Port) -> Array:
         """Motion at the force port, force at the drive, reading at the sensor."""

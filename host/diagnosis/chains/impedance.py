@@ -11,7 +11,7 @@ from host.diagnosis.force_kernel import along, slot_array
 from host.diagnosis.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
 from host.diagnosis.noise import estimate, quiescent
 from host.diagnosis.nominal import NominalSpec
-from host.diagnosis.operators import smooth_derivatives
+from host.diagnosis.operators import smooth_derivatives, smoothing_window
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
@@ -75,11 +75,12 @@ class Impedance:
             filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]),
         )
         motion = piece.inputs[self.spec.input]
-        window = max(7, round(SMOOTHING_S / recording.dt_s) | 1) if recording.timed else 7
+        noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
+        window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
         x, v, a = smooth_derivatives(motion, recording.dt_s, window)
         piece.inputs[f"motion:{self.spec.subsystem}"] = motion
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
-        if estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma < CLEAN * tolerance:
+        if noise < CLEAN * tolerance:
             x = motion  # smoothing would round its reversals, and friction with them
         piece.extra.update(v=v, a=a, x=x, tolerance=tolerance)
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]

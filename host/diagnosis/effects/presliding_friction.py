@@ -23,8 +23,8 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
         Parameter(
             "distance",
             s.motion_unit,
-            spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 6),
-            3e-4 * s.motion_span,
+            spread(1e-3 * s.motion_span, 0.3 * s.motion_span, 6),
+            1e-5 * s.motion_span,
             3.0 * s.motion_span,
             log=True,
         ),

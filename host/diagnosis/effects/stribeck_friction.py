@@ -29,7 +29,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
             "distance",
             s.motion_unit,
             spread(2e-3 * s.motion_span, 0.05 * s.motion_span, 3),
-            3e-4 * s.motion_span,
+            1e-5 * s.motion_span,
             s.motion_span,
             log=True,
         ),
