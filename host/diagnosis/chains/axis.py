@@ -18,17 +18,14 @@ from host.diagnosis.operators import fill, smooth_derivatives
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
-FOLLOWER_RAD_S = 20.0
 
 
 class Axis:
     """Nominal model of kind `axis`.
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
-    without a spring, the
-    axis would run away from any recording: then it is held to the recorded motion by a soft follower, and the force the
-    follower needs
-    (zero if nothing is missing) is compared instead.
+    without a spring, the axis would run away from any recording: then the force that its measured motion needs is
+    compared with the input instead (`balance.py`).
     """
 
     kind = "axis"
