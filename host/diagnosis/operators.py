@@ -25,6 +25,21 @@ def play(x: Array, radius: float, start: float) -> Array:
 
 
 @njit(cache=True)
+def capstan(x: Array, exponent: float, start: float) -> Array:
+    """Pull behind a rope round a post: it stays between x exp(-exponent) and x exp(exponent), which is mu times the angle
+    (Euler, Eytelwein); `start`: beyond x at first.
+    """
+    out = np.empty(x.size)
+    low, high = math.exp(-exponent), math.exp(exponent)
+    y = x[0] + start
+    for i in range(x.size):
+        a, b = (x[i] * low, x[i] * high) if x[i] >= 0.0 else (x[i] * high, x[i] * low)
+        y = min(max(y, a), b)
+        out[i] = y
+    return out
+
+
+@njit(cache=True)
 def jenkins(x: Array, distance: float, start: float) -> Array:
     """Elastic-plastic element in [-1, 1]: rises over `distance` after a reversal, then slides (Jenkin 1922)."""
     out = np.empty(x.size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.operators import dahl
+from host.diagnosis.operators import capstan, dahl
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -38,12 +38,33 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal - p[0] * np.abs(c.load) * dahl(c.motion, p[1], -c.start / level if level > 0.0 else 0.0))
 
 
+def wrapped(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Friction coefficient times wrap angle; only where a pull is handed on."""
+    return (Parameter("exponent", "", (0.05, 0.15, 0.4, 1.0), 0.0, 5.0, step=0.05),) if s.unit in ("N", "N m") else ()
+
+
+def apply_wrapped(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """The pull behind the wrap, between signal exp(-p[0]) and signal exp(p[0])."""
+    return capstan(signal, p[0], c.start)
+
+
 def slots(p: Array, form: str) -> dict[str, float]:
     """Coefficient and distance of the hysteretic force that follows the load."""
     return {"load_friction": p[0], "load_friction_distance": p[1]}
 
 
 EFFECTS = (
+    Effect(
+        "load_dependent_friction",
+        "motion",
+        47,
+        wrapped,
+        "Friction grows with the pull itself, as of a rope round a post: coefficient times wrap angle is {exponent}.",
+        "x*exp(-exponent) <= y <= x*exp(exponent), y standing between",
+        apply_wrapped,
+        contains=("backlash", "coulomb_friction"),
+        family="dry",
+    ),
     Effect(
         "load_dependent_friction",
         "motion",

@@ -1,4 +1,4 @@
-"""Machines as other laboratories have them: an arm with weight and dry friction, a free stage on bristles under control."""
+"""Machines as other laboratories have them: an arm with weight, a free stage on bristles, a cable in its sheath."""
 
 from __future__ import annotations
 
@@ -47,6 +47,23 @@ output = "position"
 terms = ["mass", "damping", "offset"]
 """
 
+SHEATH = """
+name = "cable in a sheath"
+kind = "transmission"
+[data]
+time = "time_s"
+[channels.pull]
+column = "x"
+unit = "N"
+[channels.far_pull]
+column = "f"
+unit = "N"
+[[link]]
+subsystem = "sheath"
+input = "pull"
+output = "far_pull"
+"""
+
 
 def tones(rng: np.random.Generator, t: np.ndarray, sizes: tuple[float, float], hertz: tuple[float, float]) -> np.ndarray:
     """Five tones of random size, frequency and phase, (n,)."""
@@ -89,6 +106,16 @@ def stage(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return t, np.round(motion / 2e-6) * 2e-6, force + 0.02 * rng.normal(size=t.size)
 
 
+def sheath(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A pull of some 8 N behind a wrap of 0.4 (friction times angle), both read with 10 mN of noise."""
+    t = np.arange(3000) / 100.0
+    pull = np.maximum(8.0 + tones(rng, t, (0.5, 2.5), (0.05, 0.5)), 0.5)
+    far = pull.copy()
+    for i in range(1, t.size):
+        far[i] = min(max(far[i - 1], pull[i] * np.exp(-0.4)), pull[i] * np.exp(0.4))
+    return t, pull + 0.01 * rng.normal(size=t.size), far + 0.01 * rng.normal(size=t.size)
+
+
 def test_an_arm_has_weight_and_dry_friction(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     nominal, files = written(tmp_path, ARM, [arm(rng) for _ in range(4)])
@@ -109,6 +136,14 @@ def test_a_free_stage_on_bristles(tmp_path: Path) -> None:
     assert friction["parameters"]["force_N"]["value"] == pytest.approx(3.0, rel=0.05)
     assert friction["parameters"]["distance_m"]["value"] == pytest.approx(2e-5, rel=0.3)
     assert verdict["fit"]["nominal_parameters"]["mass_N_s2_per_m"]["value"] == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_cable_is_held_by_its_sheath(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    nominal, files = written(tmp_path, SHEATH, [sheath(rng) for _ in range(4)])
+    (friction,) = as_json(diagnose(read_nominal(nominal), files, lambda what, part: None), 0.0)["effects"]
+    assert friction["id"] == "load_dependent_friction"
+    assert friction["parameters"]["exponent"]["value"] == pytest.approx(0.4, rel=0.03)
 
 
 def test_a_movement_ends_where_the_next_sets_off() -> None:
