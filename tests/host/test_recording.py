@@ -25,6 +25,7 @@ from host.recording import Header, Recording, RecordingWriter
 from host.recording_index import file_end, is_whole
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 from tests.small_disk import fill_up
+from tests.waiting import PATIENCE_S
 
 HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}},
                 catheter={"name": "blazer_prime_xp"}, seed=7)
@@ -230,7 +231,7 @@ def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
                                  cwd=Path(__file__).parents[2])
         assert child.stdout is not None and child.stdout.readline() == b"ready\n"
         child.send_signal(number)
-        child.wait(timeout=20)
+        child.wait(timeout=PATIENCE_S)
         child.stdout.close()
         recording = Recording(path)
         assert recording.truncated is not whole

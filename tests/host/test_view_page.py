@@ -19,6 +19,7 @@ from host.view.replay import Findings, Replay, Window
 from host.view.server import ADDRESS, ViewServer
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port, running
+from tests.waiting import PATIENCE_S, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -44,6 +45,7 @@ class OpenPage:
         self.complaints: list[str] = []
         self.page.on("console", lambda message: self._hear(message.type, message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.set_default_timeout(1e3 * PATIENCE_S)
         self.page.goto(f"http://{ADDRESS}:{port}/")
         self.wait(lambda: self.page.evaluate("window.seldinger.frames > 10 && Boolean(window.seldinger.scene)"))
 
@@ -53,12 +55,13 @@ class OpenPage:
             self.complaints.append(text)
 
     @staticmethod
-    def wait(until: Callable[[], bool], seconds: float = 20.0) -> None:
-        for _ in range(int(seconds * 20)):
-            if until():
-                return
-            time.sleep(0.05)
-        raise AssertionError("waited in vain")
+    def wait(happened: Callable[[], bool]) -> None:
+        until(happened, "the page")
+
+    def confirm(self, button: str) -> None:
+        """Press a button that asks once more; from the first press on where it has waited too long for that."""
+        self.page.locator(f'[data-button="{button}"]').evaluate(
+            "b => { if (!b.classList.contains('asks')) b.click(); b.click(); }")
 
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
@@ -142,7 +145,7 @@ def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, 
         assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], "Stop is on the screen without scrolling"
         page.click('[data-button="arm"]')
         assert fake.asked == [] and "press again" in open_page.text("#answer")
-        page.click('[data-button="arm"]')
+        open_page.confirm("arm")
         open_page.wait(lambda: open_page.text("#answer") == "Arm: refused. no board")
         page.click('[data-button="stop"]')
         open_page.wait(lambda: len(fake.asked) == 2)
