@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
+from host.demo import SIMULATED_RIG
 from host.fault_campaign import DELAYS_S, HOLD_AFTER_S, RunResult, summary_of
+from realtime.rig_file import load_rig
+from realtime.stage_limiter import crossing_time_s
 from realtime.supervision import FORCE_APART_N
-from sim.fault_table import FAULTS, LINK_REST_S, PEAK_N, FaultKind
+from sim.fault_table import BY_NAME, FAULTS, LINK_REST_S, PEAK_N, STEPS_TO_FIND, FaultKind
 
 MOST_EXAMPLES = 12
 
@@ -29,6 +32,8 @@ Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {li
 
 - *had to be found*: runs in which the fault was large or long enough to matter (`sim/fault_table.py`); the others may be
   found or not. *first found by*: a cause of the failsafe, a line in the log, or a count of a driver or of the board.
+  Of a jam or slip what was really lost counts, and the time from when it was more than {steps_to_find} steps for good
+  ({lost_s:g} s or longer).
 - *into the tissue after*: how far the insertion stage went on after the fault was found, where the action was hold,
   retract or stop.
 - After a lost link, reset or power cycle all stages must be at rest within {rest_ms:.0f} ms: longest {longest_ms:.0f} ms.
@@ -38,7 +43,9 @@ Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {li
 Not in lock step, so not here: loss of the zenoh router, processes killed with SIGKILL and real disks
 (`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that stands while its axis stands is not
 found until the axis moves. A force sensor that drifts is found by its distance from the model, so only once it has been off
-by {apart_N} N for about a second.
+by {apart_N} N for about a second. A knob that slipped faster than `slipped_steps` has it, up to the stage's full speed,
+would straighten the catheter before the insertion stage is through the play ({crossing_ms:.0f} ms), and press it above the
+limit.
 """
 
 
@@ -54,7 +61,8 @@ def page_section(results: list[RunResult], seed: int, board: str) -> str:
         rows="\n".join(_row(fault, [r for r in results if r.plan.fault == fault.name]) for fault in FAULTS
                        if any(r.plan.fault == fault.name for r in results)),
         rest_ms=1e3 * LINK_REST_S, longest_ms=_longest_rest_ms(results), violations="\n".join(_violations(bad)),
-        apart_N=FORCE_APART_N)
+        apart_N=FORCE_APART_N, steps_to_find=STEPS_TO_FIND, lost_s=BY_NAME["missed_steps"].within_s,
+        crossing_ms=_crossing_ms())
 
 
 def _row(fault: FaultKind, results: list[RunResult]) -> str:
@@ -75,6 +83,14 @@ def _what(found: str) -> str:
     """The kind of finding and its source, without the particulars."""
     kind, _, rest = found.partition(": ")
     return f"{kind}: " + (rest.split(":")[0] if kind == "log" else rest.split(",")[0])
+
+
+def _crossing_ms() -> float:
+    """Time that the insertion stage of the simulated rig takes through the play."""
+    rig = load_rig(SIMULATED_RIG)
+    insertion = rig.stages.insertion
+    return 1e3 * crossing_time_s(rig.transmission.insertion_backlash_m, insertion.max_speed_unit_per_s,
+                                 insertion.max_accel_unit_per_s2)
 
 
 def _longest_rest_ms(results: list[RunResult]) -> float:

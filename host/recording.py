@@ -17,13 +17,15 @@ import msgpack
 import numpy as np
 import orjson
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Header as McapHeader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import Writer
 
 from host.foxglove import PREFIX, SCHEMAS, FoxgloveChannels, plain_schema
+from host.recording_chunk import ChunkBuilder
 from host.recording_file import GuardedFile
 from host.recording_index import MAGIC, file_end
 from protocol.topics import TOPICS, Message, encode
@@ -31,8 +33,8 @@ from protocol.topics import TOPICS, Message, encode
 PROFILE = "seldinger"
 CHUNK_BYTES = 256 * 1024
 CHUNK_NS = 1_000_000_000
-# The library's writer keeps 1 kB for each chunk: after so many chunks another one goes on with the same file.
-CHUNKS_PER_WRITER = 60
+# Schemas and channels are said again after so many chunks: a damaged one does not cost what follows for ever.
+CHUNKS_PER_DESCRIPTION = 60
 _MAX_RECORD_BYTES = 64 * 1024 * 1024
 _DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, OverflowError, MemoryError)
 
@@ -100,21 +102,24 @@ class RecordingWriter:
         self.failure = ""
         self._on_failure = on_failure
         self._file = GuardedFile(self.path)
-        self._writer = self._new_writer()
+        self._chunk = ChunkBuilder()
         self._channels: dict[str, Channel] = {}
         self._schemas: dict[str, Schema] = {}
         self._foxglove = FoxgloveChannels(header.configuration, header.catheter)
         self._sequence: dict[str, int] = {}
         self._chunk_bytes, self._chunk_start_ns, self._chunks = 0, 0, 0
         self._closed = False
-        self._writer.start(profile=PROFILE, library=f"seldinger {software_version()}")
+        self._file.write(MAGIC)
+        self._record(McapHeader(profile=PROFILE, library=f"seldinger {software_version()}"))
         for name, texts in header.sections().items():
-            self._writer.add_metadata(name, texts)
+            self._record(Metadata(name=name, metadata=texts))
         self._sync()
 
-    def _new_writer(self) -> Writer:
-        # The library never ends a chunk by itself: `_sync` does, by size and by time, so that each chunk is also synced.
-        return Writer(self._file, chunk_size=1 << 40)  # type: ignore[arg-type]
+    def _record(self, record: McapRecord) -> None:
+        """A record outside the chunks."""
+        out = RecordBuilder()
+        record.write(out)
+        self._file.write(out.end())
 
     def _channel(self, topic: str) -> int:
         known = self._channels.get(topic)
@@ -122,21 +127,14 @@ class RecordingWriter:
             return known.id
         name, text, metadata = _description(topic)
         if name not in self._schemas:
-            number = self._writer.register_schema(name, "jsonschema", text.encode())
-            self._schemas[name] = Schema(id=number, data=text.encode(), encoding="jsonschema", name=name)
-        schema_id = self._schemas[name].id
-        number = self._writer.register_channel(topic, "json", schema_id, metadata)
-        self._channels[topic] = Channel(id=number, topic=topic, message_encoding="json", metadata=metadata,
-                                        schema_id=schema_id)
-        return number
-
-    def _next_writer(self) -> None:
-        """Another writer, told all schemas and channels in the old order, so with the old numbers."""
-        self._writer = self._new_writer()
-        for schema in self._schemas.values():
-            self._writer.register_schema(schema.name, schema.encoding, schema.data)
-        for channel in self._channels.values():
-            self._writer.register_channel(channel.topic, channel.message_encoding, channel.schema_id, channel.metadata)
+            schema = Schema(id=len(self._schemas) + 1, data=text.encode(), encoding="jsonschema", name=name)
+            self._schemas[name] = schema
+            self._chunk.describe(schema)
+        channel = Channel(id=len(self._channels) + 1, topic=topic, message_encoding="json", metadata=metadata,
+                          schema_id=self._schemas[name].id)
+        self._channels[topic] = channel
+        self._chunk.describe(channel)
+        return channel.id
 
     def write(self, topic: str, message: Message, recorded_ns: int | None = None) -> None:
         """Append `message` of `topic`, numbered here. recorded_ns: the rig's clock now, else the message's own stamp.
@@ -164,18 +162,22 @@ class RecordingWriter:
 
     def _add(self, topic: str, body: dict[str, Any], stamp_ns: int, sequence: int, now_ns: int) -> None:
         data = orjson.dumps(body)
-        self._writer.add_message(self._channel(topic), log_time=now_ns, publish_time=stamp_ns, data=data,
-                                 sequence=sequence & 0xFFFFFFFF)
+        self._chunk.add(McapMessage(channel_id=self._channel(topic), log_time=now_ns, publish_time=stamp_ns, data=data,
+                                    sequence=sequence & 0xFFFFFFFF))
         if self._chunk_bytes == 0:
             self._chunk_start_ns = now_ns
         self._chunk_bytes += len(data) + 31
 
     def _sync(self) -> None:
-        self._writer.flush()
+        if not self._chunk.empty:
+            self._file.write(self._chunk.end())
+            self._chunks += 1
+            if self._chunks % CHUNKS_PER_DESCRIPTION == 0:
+                records: list[Schema | Channel] = [*self._schemas.values(), *self._channels.values()]
+                for record in records:
+                    self._chunk.describe(record)
+        self._file.flush()
         self._chunk_bytes = 0
-        self._chunks += 1
-        if self._chunks % CHUNKS_PER_WRITER == 0:
-            self._next_writer()
         self._report()
 
     def flush(self) -> None:
@@ -198,7 +200,8 @@ class RecordingWriter:
             return
         self._closed = True
         if not self.failure:
-            self._writer.flush()
+            self._sync()
+        if not self.failure:
             with self._file.read_back() as stream:
                 end = file_end(stream, self._schemas.values(), self._channels.values())
             self._file.write(end)

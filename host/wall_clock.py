@@ -23,12 +23,14 @@ from protocol.zenoh_session import Session
 from realtime.rig_file import load_rig
 from sim.scenario import ContactJob, Outcome
 
+_BEFORE_S = 6.0              # to come before the tissue
+_TOUCH_TIMEOUT_S = 60.0      # for all attempts to touch it
 _START_TIMEOUT_S = 120.0     # a first start compiles the loop, beside whatever else this machine does
-_STOP_TIMEOUT_S = 2.0
+_STOP_TIMEOUT_S = 20.0       # for all to end of themselves; a recorder that is killed leaves a truncated recording
 
 
 class Fleet:
-    """The three processes. Use as a context: leaving it stops everything in order, within two seconds.
+    """The three processes. Use as a context: leaving it stops everything in order.
 
     loop: with the realtime process; without it whoever asks runs the loop, on `ports`. endpoint: where it is heard, one
     of its own, so that fleets do not meet.
@@ -171,6 +173,34 @@ class Operator:
 
         return self.wait(_START_TIMEOUT_S, armed, each)
 
+    def touch(self, job: ContactJob, seconds: float, each: Callable[[str, float], None] = lambda part, share: None) -> bool:
+        """Arm, go before the tissue, press, until the rig says that it is in contact.
+
+        Tried again while nothing was touched and `seconds` are not over: where the machine stands still for a moment,
+        the board's dead-man switch stops the rig, and the next command finds it disarmed.
+        """
+        until = time.monotonic() + seconds
+        before = np.array(job.target_m) - job.clearance_m * np.array(job.into)
+
+        def there() -> bool:
+            return self.stands() or bool(self.state and self.state.tip_m and
+                                         np.linalg.norm(np.array(self.state.tip_m) - before) < 5e-4)
+
+        while time.monotonic() < until and self.arm(lambda share: each("start", share)):
+            self.commander.target(tuple(map(float, before)))
+            self.wait(_BEFORE_S, there)
+            if self.commander.press(job.target_m, job.into, job.force_N).accepted:
+                self.wait(job.approach_s, lambda: self.mode() == "contact" or self.stands(),
+                          lambda share: each("approach", share))
+                if not self.stands():
+                    return self.mode() == "contact"
+            self.commander.clear_fault()
+        return False
+
+    def stands(self) -> bool:
+        """Whether the rig was stopped or disarmed."""
+        return self.mode() in ("stopped", "disarmed")
+
     def mode(self) -> str:
         """The loop's phase, empty before it was heard of."""
         return self.state.mode if self.state else ""
@@ -208,18 +238,11 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     def force() -> float:
         return operator.state.force_N or 0.0 if operator.state else 0.0
 
-    if not operator.arm(lambda share: progress("start", share, 0.0)):
-        outcome.notes.append(f"devices not ready after {_START_TIMEOUT_S} s")
-        return
-    before = np.array(job.target_m) - job.clearance_m * np.array(job.into)
-    operator.commander.target(tuple(map(float, before)))
-    operator.wait(6.0, lambda: bool(operator.state and operator.state.tip_m and
-                                    np.linalg.norm(np.array(operator.state.tip_m) - before) < 5e-4))
-    operator.commander.press(job.target_m, job.into, job.force_N)
-    outcome.contact = operator.wait(job.approach_s, lambda: operator.mode() in ("contact", "stopped"),
-                                    lambda share: progress("approach", share, force())) and operator.mode() == "contact"
+    outcome.contact = operator.touch(job, _TOUCH_TIMEOUT_S, lambda part, share: progress(part, share, force()))
     if outcome.contact:
         operator.wait(job.hold_s, lambda: operator.mode() == "stopped", lambda share: progress("hold", share, force()))
+    else:
+        outcome.notes.append(f"no contact; the rig is {operator.mode() or 'silent'}")
     outcome.stopped = operator.mode() == "stopped"
     operator.commander.retract()
     operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from protocol.topics import check_name
 from protocol.zenoh_access import Network, check_network_endpoint
-from realtime import loop_margin
+from realtime import board_pins, loop_margin
 
 AXES = ("insertion", "roll", "knob")
 
@@ -134,11 +134,35 @@ class ForceSensor(_Section):
         return self
 
 
+class Pins(_Section):
+    """A port each of the board's processor for outputs, encoders and switches (realtime/board_pins.py)."""
+
+    mcu: Literal["atmega2560", "atmega328p"] = "atmega2560"
+    outputs: str
+    output_shift: Annotated[int, Field(ge=0, le=7)]
+    encoders: str
+    switches: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual(cls, data: Any) -> Any:
+        chip = board_pins.PROCESSORS.get(data.get("mcu", "atmega2560")) if isinstance(data, dict) else None
+        return {**chip.usual, **data} if chip else data
+
+    @model_validator(mode="after")
+    def _free(self) -> Pins:
+        problem = board_pins.problem_of(**self.model_dump())
+        if problem:
+            raise ValueError(problem)
+        return self
+
+
 class Board(_Section):
     port: str
     baud: Annotated[int, Field(gt=9600, le=1_000_000)]
     setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
     setpoint_expiry_s: Annotated[float, Field(ge=0.001, le=0.02)]
+    pins: Pins = Pins.model_validate({})
 
 
 class Control(_Section):

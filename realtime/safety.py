@@ -21,7 +21,7 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
     ("board_silent", STOP, True, "no status from the stepper board: stopped; check cable and power, then clear"),
     ("board_fault", STOP, True, "the stepper board latched a fault: stopped; see its fault code, then clear"),
     ("operator_stop", STOP, True, "stopped by the operator"),
-    ("steps_lost", STOP, True, "encoder and commanded steps have parted: stopped; look for a jam or a loose encoder plug, "
+    ("steps_lost", RETRACT, True, "encoder and steps have parted: retracting; look for a jam or a loose encoder plug, "
      "clear, and home the axes"),
     ("force_disagrees", RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
     ("force_handover", WARN, False, "the force sensor is silent, frozen or off: the model's estimate closes the loop"),
@@ -33,8 +33,8 @@ POSE_REJECTED, FORCE_REJECTED, POSE_STALE, POSES_WILD, FORCE_STALE, OVER_FORCE, 
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 
 _HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE
-_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES
-_STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP | STEPS_LOST
+_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST
+_STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
 
 
 @njit(cache=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -79,10 +80,14 @@ class FaultyScenario(Scenario):
 
 @dataclass
 class FaultOutcome:
-    """What came of one fault. Times in s from its injection; None: did not happen."""
+    """What came of one fault. Times in s from its injection; None: did not happen.
+
+    large_s: since when it was so large, as long as `within_s` without a break, that it had to be found.
+    """
 
     detected_s: float | None = None
     detected_by: str = ""
+    large_s: float | None = None
     action: str = "none"
     board_fault: str = ""
     causes: list[str] = field(default_factory=list)
@@ -99,11 +104,15 @@ class Watcher:
     """Stands beside a run from the moment of the fault on and notes what happens. `close` gives the outcome.
 
     Detected is: a cause of the failsafe that did not stand before, a logged warning or error, or a driver's or the
-    board's count of bad frames or readings that has grown; whichever is first.
+    board's count of bad frames or readings that has grown; whichever is first. `large` and `within_s` are the fault's
+    own (`sim.fault_table.FaultKind`).
     """
 
-    def __init__(self, run: FaultyScenario) -> None:
+    def __init__(self, run: FaultyScenario, large: Callable[[FaultyScenario], bool] | None = None,
+                 within_s: float = 0.0) -> None:
         self.run, self.outcome = run, FaultOutcome()
+        self._large, self._within_s = large, within_s
+        self._large_since_s: float | None = None
         self._begin_ns = run.world.now_ns
         self._causes = int(run.loop.outputs[0].cause)
         self._counts = _bad_counts(run)
@@ -141,6 +150,18 @@ class Watcher:
             if self._from_m is None:
                 self._from_m = insertion_m
             outcome.moved_after_m = max(outcome.moved_after_m, insertion_m - self._from_m)
+        self._see_size()
+
+    def _see_size(self) -> None:
+        """Whether the fault has been too large for too long to be overlooked."""
+        if self._large is None or self.outcome.large_s is not None:
+            return
+        if not self._large(self.run):
+            self._large_since_s = None
+        elif self._large_since_s is None:
+            self._large_since_s = self.now_s
+        elif self.now_s - self._large_since_s > self._within_s:
+            self.outcome.large_s = self._large_since_s
 
     def see_loop(self) -> None:
         """After each period of the loop."""

@@ -16,6 +16,12 @@ Inject = Callable[[FaultyScenario, float, float], None]
 
 # The limits that hold for every fault: true force, and rest after a lost link.
 PEAK_N, LINK_REST_S = 0.55, 0.050
+# Steps of a rotor behind its field that have to be noticed: 0.5 mm of insertion, 4.5 degrees of handle or knob.
+STEPS_TO_FIND = 160
+KNOB = 2
+# What turns a rotor back is its load, and a stepper is chosen for twice the load's torque or more: against the same
+# friction that leaves half of the speed to which the motor takes the stage.
+SLIP_SHARE = 0.5
 PHASES = ("approach", "contact", "hold")
 
 
@@ -25,8 +31,9 @@ class FaultKind:
 
     size: least and greatest of what is drawn (log-uniform where both have one sign), in `unit`; seconds: how long it
     lasts, drawn alike; inject(run, size, seconds) puts it in at once. must_detect(size, seconds): whether it has to be
-    noticed within `within_s`. rest_s: the stages must be at rest so long after a fault of the link, 0: no such demand.
-    stops: it must end with the rig stopped (by the loop or by the board).
+    noticed within `within_s`; or, where what is drawn does not say how bad it gets, large(run): whether it is so bad by
+    now that it has to be noticed `within_s` from here. rest_s: the stages must be at rest so long after a fault of the
+    link, 0: no such demand. stops: it must end with the rig stopped (by the loop or by the board).
     """
 
     name: str
@@ -37,6 +44,7 @@ class FaultKind:
     seconds: tuple[float, float] = (0.2, 1.0)
     within_s: float = 0.2
     must_detect: Callable[[float, float], bool] = lambda size, seconds: True
+    large: Callable[[FaultyScenario], bool] | None = None
     rest_s: float = 0.0
     stops: bool = False
     tail_s: float = 0.6
@@ -82,6 +90,24 @@ def _on_board(what: str) -> Inject:
 def _axis(size: float) -> int:
     """An axis out of a drawn size: its whole part modulo three, so that one number says both."""
     return int(abs(size)) % 3
+
+
+def _jam(run: FaultyScenario, size: float, seconds: float) -> None:
+    run.world.stages.jam(_axis(size), size, seconds)
+
+
+def _slip(run: FaultyScenario, size: float, seconds: float) -> None:
+    """The load turns a rotor at `SLIP_SHARE` of the stage's full speed; the bent catheter its knob until it is straight."""
+    axis, stages = _axis(size), run.world.stages
+    stage = run.loop.rig.stage(axis)
+    if axis == KNOB:
+        bent_steps = stages.position[KNOB] * stage.steps_per_unit
+        size = math.copysign(min(abs(size), abs(bent_steps)), bent_steps)
+    stages.slip(axis, size, seconds, SLIP_SHARE * stage.max_speed_unit_per_s)
+
+
+def _steps_apart(run: FaultyScenario) -> bool:
+    return bool(np.abs(run.world.stages.lost_steps).max() > STEPS_TO_FIND)
 
 
 def _host(state: str) -> Inject:
@@ -138,9 +164,10 @@ FAULTS: tuple[FaultKind, ...] = (
               rest_s=LINK_REST_S),
     FaultKind("encoder_loss", "one encoder's plug out: its count stands", lambda run, size, seconds:
               run.world.stages.unplug_encoder(_axis(size)), (1.0, 3.99), "axis", must_detect=_never, seconds=(1.0, 1.0)),
-    FaultKind("missed_steps", "a jam: one rotor falls behind", lambda run, size, seconds:
-              run.world.stages.lose_steps(_axis(size), size), (20.0, 2000.0), "steps", within_s=0.1, seconds=(0.4, 0.4),
-              must_detect=lambda size, seconds: size > 160),
+    FaultKind("missed_steps", "a jam: one rotor stands, and what is commanded meanwhile is lost", _jam, (20.0, 2000.0),
+              "steps at most", seconds=(0.05, 1.0), within_s=0.1, large=_steps_apart),
+    FaultKind("slipped_steps", "motor too weak or its supply sags: the load turns one rotor, at half its full speed",
+              _slip, (-2000.0, 2000.0), "steps at most", seconds=(0.05, 1.0), within_s=0.1, large=_steps_apart),
     FaultKind("tracker_dropout", "tools missing for some time", _on_tracker("missing"), seconds=(0.01, 5.0),
               must_detect=_long(0.03), within_s=0.12),
     FaultKind("tracker_silent", "tracker unplugged", _on_tracker("silent"), seconds=(0.1, 2.0)),

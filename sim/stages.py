@@ -30,8 +30,33 @@ class StagesConfig:
     rotor_damping_ratio: float = 0.4
 
 
+@dataclass
+class _Trouble:
+    """A rotor that does not follow its field until `until_s`, or until it has lost `steps`: `lost` of them so far.
+
+    steps_per_s above 0: it is set back at this speed; 0: it stands.
+    """
+
+    axis: int
+    steps: float
+    until_s: float
+    steps_per_s: float = 0.0
+    lost: float = 0.0
+
+    def lose(self, dt_s: float, turned: float) -> float:
+        """Steps lost in `dt_s`, in which the field turned by `turned` steps."""
+        new = self.lost + (math.copysign(self.steps_per_s * dt_s, self.steps) if self.steps_per_s > 0.0 else turned)
+        most = abs(self.steps)
+        before, self.lost = self.lost, min(max(new, -most), most)
+        return self.lost - before
+
+    def over(self, now_s: float) -> bool:
+        """Whether the rotor follows again."""
+        return now_s >= self.until_s or abs(self.lost) >= abs(self.steps)
+
+
 class Stages:
-    """Positions of the stages from step edges; loses steps where an effect `missed_steps` says so."""
+    """Positions of the stages from step edges; loses steps where an effect `missed_steps`, a jam or a slip says so."""
 
     def __init__(self, config: StagesConfig | None = None, effects: Sequence[Effect] = ()) -> None:
         """At step zero, at rest. Of `effects` only missed_steps is used here; the plant takes the others."""
@@ -42,6 +67,7 @@ class Stages:
         self._rotor, self._speed = np.zeros(3), np.zeros(3)
         self._time_s = 0.0
         self._encoder_stands: dict[int, int] = {}
+        self._troubles: list[_Trouble] = []
         self._losses = [(PORTS.index(e.port), e.start_s, e.says()["parameters"]) for e in effects if e.id == "missed_steps"]
         self._next_loss_s = [start for _, start, _ in self._losses]
 
@@ -52,8 +78,9 @@ class Stages:
         """
         self._time_s += dt_s
         axes = np.asarray(edge_axis, np.int64)
-        self._counts += np.rint(np.bincount(axes, np.asarray(edge_sign, float), minlength=3)).astype(np.int64)
-        self._lose()
+        turned = np.rint(np.bincount(axes, np.asarray(edge_sign, float), minlength=3)).astype(np.int64)
+        self._counts += turned
+        self._lose(dt_s, turned)
         field = self._counts - self._lost
         for axis, frequency_Hz in enumerate(self.config.rotor_Hz):
             if frequency_Hz > 0.0:
@@ -70,8 +97,11 @@ class Stages:
         self._rotor[axis] += 0.5 * (speed + new)
         self._speed[axis] = new
 
-    def _lose(self) -> None:
-        """Steps lost that are due by now."""
+    def _lose(self, dt_s: float, turned: Array) -> None:
+        """Steps lost that are due by now, of edges `turned` (3,) in the last `dt_s`."""
+        for trouble in self._troubles:
+            self._lost[trouble.axis] += trouble.lose(dt_s, float(turned[trouble.axis]))
+        self._troubles = [trouble for trouble in self._troubles if not trouble.over(self._time_s)]
         for i, (axis, _, parameters) in enumerate(self._losses):
             assert isinstance(parameters, dict)
             if self._time_s >= self._next_loss_s[i]:
@@ -79,9 +109,18 @@ class Stages:
                 every = parameters["every_s"]
                 self._next_loss_s[i] += every if every > 0.0 else math.inf
 
-    def lose_steps(self, axis: int, steps: float) -> None:
-        """The rotor of `axis` falls behind its field by `steps` now, as after a jam."""
-        self._lost[axis] += steps
+    def jam(self, axis: int, steps: float, seconds: float) -> None:
+        """The rotor of `axis` stands, whatever is commanded, until `steps` are lost or `seconds` are over."""
+        self._troubles.append(_Trouble(axis, steps, self._time_s + seconds))
+
+    def slip(self, axis: int, steps: float, seconds: float, speed_unit_per_s: float) -> None:
+        """The rotor of `axis` falls behind its field (`steps` below 0: runs ahead), at this speed, by at most `steps`."""
+        self._troubles.append(_Trouble(axis, steps, self._time_s + seconds, speed_unit_per_s * self._per_unit[axis]))
+
+    @property
+    def lost_steps(self) -> Array:
+        """Steps (3,) that the rotors are behind their fields, less what a heavy rotor will still swing."""
+        return self._lost.copy()
 
     def unplug_encoder(self, axis: int) -> None:
         """The encoder of `axis` shows the same count from now on."""

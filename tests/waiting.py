@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-PATIENCE_S = 60.0  # a busy machine may take long; only one that is stuck fails
+PATIENCE_S = 120.0  # a busy machine may take long; only one that is stuck fails
 
 
 def until(happened: Callable[[], bool], what: str = "", patience_s: float = PATIENCE_S) -> bool:

@@ -1,6 +1,7 @@
 /* Pins and limits of the boards. One word a port: the port's letter; the simulated board reads the same words.
  *
  * Inputs have ports of their own: an input with a pull-up beside outputs is rewritten by simavr with every output.
+ * Other ports come from the rig file's [board.pins]: the Makefile's PINS defines these words before.
  * All switches are normally closed to ground with the pull-up on: an open line, hit or broken wire, reads 1.
  *
  *                 ATmega2560 (Arduino Mega)                 ATmega328P (Uno, Nano)
@@ -14,16 +15,32 @@
 #ifndef BOARD_H
 #define BOARD_H
 
+#ifndef ATMEGA2560_OUTPUTS
 #define ATMEGA2560_OUTPUTS A
+#endif
+#ifndef ATMEGA2560_OUTPUT_SHIFT
 #define ATMEGA2560_OUTPUT_SHIFT 0
+#endif
+#ifndef ATMEGA2560_ENCODERS
 #define ATMEGA2560_ENCODERS C
+#endif
+#ifndef ATMEGA2560_SWITCHES
 #define ATMEGA2560_SWITCHES L
+#endif
 #define ATMEGA2560_SHARED_LIMITS 0
 
+#ifndef ATMEGA328P_OUTPUTS
 #define ATMEGA328P_OUTPUTS D
+#endif
+#ifndef ATMEGA328P_OUTPUT_SHIFT
 #define ATMEGA328P_OUTPUT_SHIFT 2
+#endif
+#ifndef ATMEGA328P_ENCODERS
 #define ATMEGA328P_ENCODERS C
+#endif
+#ifndef ATMEGA328P_SWITCHES
 #define ATMEGA328P_SWITCHES B
+#endif
 #define ATMEGA328P_SHARED_LIMITS 1
 
 #define BOARD_CPU_HZ 16000000UL

@@ -1,4 +1,4 @@
-"""`seldinger flash --port PORT --mcu MCU`: builds the firmware and writes it to the stepper board through avrdude."""
+"""`seldinger flash --port PORT --rig FILE`: builds the firmware for the rig's board and writes it through avrdude."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import Annotated, NamedTuple
 import typer
 
 from host.cli.contract_io import BadInput
-from sim.board import BUILD_DIR, FIRMWARE_DIR
+from host.demo import SIMULATED_RIG
+from realtime.board_pins import definitions
+from realtime.rig_file import Pins, load_rig
+from sim.board import FIRMWARE_DIR
 
 
 class Programmer(NamedTuple):
@@ -28,22 +31,26 @@ TIMEOUT_S = 180
 
 def flash(
     port: Annotated[str, typer.Option(help="Serial port of the board, as /dev/ttyACM0 or /dev/serial/by-id/...")],
-    mcu: Annotated[str, typer.Option(help="atmega2560 or atmega328p.")] = "atmega2560",
+    rig: Annotated[Path, typer.Option(help="Rig file; its [board.pins] are built in.")] = SIMULATED_RIG,
+    mcu: Annotated[str, typer.Option(help="atmega2560 or atmega328p; another than the rig file's: its usual pins.")] = "",
     baud: Annotated[int, typer.Option(help="Of the boot loader; 0: the usual one of this board.")] = 0,
     image: Annotated[Path | None, typer.Option(help="ELF file to write, instead of building one.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Build, and show the command only.")] = False,
 ) -> None:
     """Build the firmware and write it to the board. The stages must be free to stand still: the board resets."""
-    if mcu not in PROGRAMMERS:
+    if mcu and mcu not in PROGRAMMERS:
         raise BadInput("--mcu", mcu, " or ".join(PROGRAMMERS))
+    pins = load_rig(rig).board.pins
+    if mcu and mcu != pins.mcu:
+        pins = Pins.model_validate({"mcu": mcu})
     if shutil.which("avrdude") is None:
         raise BadInput("avrdude", "no such program", "avrdude on the PATH (Debian: apt install avrdude)")
     if not Path(port).exists() and not dry_run:
         raise BadInput("--port", port, f"a serial port that is there; found {', '.join(ports()) or 'none on this machine'}")
-    elf = image or _built(mcu)
+    elf = image or built(pins)
     if not elf.is_file():
         raise BadInput("--image", str(elf), "an ELF file of the firmware")
-    command = avrdude_command(mcu, port, elf, baud)
+    command = avrdude_command(pins.mcu, port, elf, baud)
     print("seldinger: " + " ".join(command), file=sys.stderr)
     if dry_run:
         return
@@ -53,8 +60,8 @@ def flash(
         print(f"seldinger: avrdude did not end within {TIMEOUT_S} s; is another program holding {port}?", file=sys.stderr)
         raise typer.Exit(1) from None
     if status:
-        print(f"seldinger: avrdude ended with status {status}: nothing else may hold {port}, and --mcu must be the board's",
-              file=sys.stderr)
+        print(f"seldinger: avrdude ended with status {status}: nothing else may hold {port}, and the board must have an "
+              f"{pins.mcu}", file=sys.stderr)
         raise typer.Exit(1)
     print("seldinger: written and verified; now `seldinger check-device board`", file=sys.stderr)
 
@@ -72,15 +79,19 @@ def avrdude_command(mcu: str, port: str, elf: Path, baud: int = 0) -> list[str]:
             "-D", "-U", f"flash:w:{elf}:e"]
 
 
-def _built(mcu: str) -> Path:
-    """The firmware's ELF for `mcu`, built if stale. Raises BadInput where that cannot be."""
+def built(pins: Pins) -> Path:
+    """The firmware's ELF for these pins, built if stale. Raises BadInput where that cannot be."""
     for tool in ("make", "avr-gcc"):
         if shutil.which(tool) is None:
             raise BadInput(tool, "no such program", "the AVR tool chain (Debian: gcc-avr avr-libc make), or --image FILE")
-    target = f"build/seldinger-{mcu}.elf"
-    command = ["make", "--silent", "-C", str(FIRMWARE_DIR), target]
+    folder, options = "build", list[str]()
+    if pins != Pins.model_validate({"mcu": pins.mcu}):
+        folder = f"build/pins-{pins.outputs}{pins.output_shift}{pins.encoders}{pins.switches}"
+        options = [f"BUILD={folder}", f"PINS={' '.join(definitions(**pins.model_dump()))}"]
+    target = f"{folder}/seldinger-{pins.mcu}.elf"
+    command = ["make", "--silent", "-C", str(FIRMWARE_DIR), target, *options]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         said = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]
         raise BadInput("firmware", said[0], f"sources that build (`make -C firmware {target}`)")
-    return BUILD_DIR / f"seldinger-{mcu}.elf"
+    return FIRMWARE_DIR / target

@@ -19,14 +19,12 @@ from cryptography import x509
 from host import keys
 from host.commander import Commander
 from host.wall_clock import with_endpoint
-from protocol.topics import Command, ForceSensor, Reply, encode, key, request_key
+from protocol.topics import Command, ForceSensor, Message, Reply, encode, key, request_key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE, Network, client_settings
 from protocol.zenoh_session import Session
 from realtime.command_gate import CommandGate
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import free_port, until
-
-PATIENCE_S = 30.0
 
 
 def reading(force_N: float = 0.2) -> ForceSensor:
@@ -90,12 +88,13 @@ def test_a_right_certificate_reads(laboratory: Laboratory, name: str) -> None:
 def test_a_commander_takes_the_lease_and_commands_in_its_own_name_only(laboratory: Laboratory) -> None:
     with Session.remote("simulated", laboratory.endpoint, laboratory.folder / "console") as session:
         commander = Commander(session, "console", timeout_s=1.0)
-        assert until(lambda: commander.take().accepted) and commander.arm().accepted and commander.release().accepted
+        assert until(lambda: commander.take().accepted and commander.arm().accepted)
+        assert until(lambda: commander.release().accepted)
         before = len(laboratory.asked)
         for other in ("second", "local"):
             assert Commander(session, other, timeout_s=0.4).stop().result == "unanswered"
         assert list(session.zenoh.get(request_key("simulated", "*"), payload=b"x", timeout=0.4)) == []
-        assert len(laboratory.asked) == before
+        assert set(laboratory.asked[before:]) <= {"console"}
 
 
 @pytest.mark.parametrize("name", ["analysis", "dismissed", "promoted"])
@@ -138,11 +137,19 @@ def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory,
             session.delete(key("simulated", topic))
         session.put(request_key("simulated", "console"), b"x")
         local = Commander(laboratory.host, "local", timeout_s=2.0)
-        assert local.hold().accepted
+        assert until(lambda: local.hold().accepted)
+        messages: list[list[Message]] = [[], []]
+
+        def all_heard() -> bool:
+            for everything, mine in zip(inside, messages, strict=True):
+                mine += [message for _, message, _ in everything.take()]
+            return all(messages)
+
+        until(all_heard, "a message inside")
         time.sleep(0.3)
-        messages = [message for everything in inside for _, message, _ in everything.take()]
-        assert len(messages) >= 2 and set(messages) == {dataclasses.replace(reading(), sequence=message.sequence)
-                                                        for message in messages}
+        assert all_heard()
+        for message in messages[0] + messages[1]:
+            assert message == dataclasses.replace(reading(), sequence=message.sequence)
         assert not any(everything.malformed for everything in inside)
         assert not hijacked and taken is not None
 
@@ -176,8 +183,13 @@ def refused(settings: dict[str, Any]) -> bool:
     return False
 
 
+def let_in(settings: dict[str, Any]) -> bool:
+    """Whether a session is opened, sooner or later."""
+    return until(lambda: not refused(settings))
+
+
 def test_the_open_way_in_is_open_to_the_right_certificate(laboratory: Laboratory) -> None:
-    assert not refused(client_settings(laboratory.endpoint, laboratory.folder / "analysis"))
+    assert let_in(client_settings(laboratory.endpoint, laboratory.folder / "analysis"))
 
 
 def test_no_certificate_gets_no_session(laboratory: Laboratory) -> None:
@@ -228,7 +240,7 @@ def test_a_certificate_of_a_reader_cannot_stand_for_a_rig(laboratory: Laboratory
         endpoint = f"tls/127.0.0.1:{free_port()}"
         network = Network("simulated", (endpoint,), laboratory.folder / name, ("analysis",))
         with Session("simulated", [], [], network):
-            assert refused(client_settings(endpoint, laboratory.folder / "analysis")) is not stands
+            assert (let_in if stands else refused)(client_settings(endpoint, laboratory.folder / "analysis"))
 
 
 def test_a_rig_at_an_address_it_was_not_made_for_is_not_believed(laboratory: Laboratory) -> None:
@@ -238,7 +250,7 @@ def test_a_rig_at_an_address_it_was_not_made_for_is_not_believed(laboratory: Lab
         settings = client_settings(endpoint, laboratory.folder / "analysis")
         assert refused(settings)
         settings["transport"]["link"]["tls"]["verify_name_on_connect"] = False
-        assert not refused(settings)
+        assert let_in(settings)
 
 
 def test_keys_are_private_and_certificates_say_what_they_are_for(laboratory: Laboratory) -> None:

@@ -18,6 +18,7 @@ from host.recording import Recording
 from protocol.topics import ForceSensor, Pose, Stage
 from protocol.zenoh_session import Session
 from realtime.rig_file import Rig, load_rig
+from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
 RIG = ROOT / "host" / "rigs" / "simulated.toml"
@@ -165,18 +166,19 @@ def test_process_estimates_records_and_ends_in_order(tmp_path: Path) -> None:
             poses, stages = session.publisher("pose/tip"), session.publisher("stage")
             forces, sensor = session.latest("force/estimate"), session.publisher("force/sensor")
             answers = []
-            deadline = time.monotonic() + 30
-            while len(answers) < 20 and time.monotonic() < deadline:
+
+            def answered() -> bool:
                 now_ns = time.monotonic_ns()
                 stages.put(stage(now_ns))
                 poses.put(pose(now_ns))
                 sensor.put(ForceSensor(stamp_ns=now_ns, arrival_ns=now_ns, force_N=(0.0, 0.0, 0.1)))
-                time.sleep(0.02)
                 if (answer := forces.take()) is not None:
                     answers.append(answer)
-        assert len(answers) == 20
+                return len(answers) == 20
+
+            until(answered, "20 estimates")
         child.send_signal(signal.SIGTERM)
-        assert child.wait(timeout=20) == 0
+        assert child.wait(timeout=PATIENCE_S) == 0
     finally:
         child.kill()
         child.communicate()
@@ -195,5 +197,5 @@ def test_process_refuses_what_it_cannot_start_with(tmp_path: Path) -> None:
     for options, says in ((["--estimator", "no.such:thing"], "wanted module:function"),
                           (["--record", str(tmp_path / "there.mcap")], "exists")):
         child = start(rig_path, *options)
-        _, complaint = child.communicate(timeout=60)
+        _, complaint = child.communicate(timeout=PATIENCE_S)
         assert child.returncode == 1 and says in complaint and "Traceback" not in complaint

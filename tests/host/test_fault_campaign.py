@@ -2,8 +2,11 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -11,6 +14,8 @@ from host.cli.contract_io import BadInput
 from host.cli.faults import faults as command
 from host.fault_campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
 from host.reliability_page import fuzz_section, write_section
+from protocol.serial_codec import StreamDecoder
+from sim.fault_run import Watcher
 from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
 
 GOOD = {"detected_s": 0.03, "detected_by": "cause: board_silent", "action": "stop", "board_fault": "1", "causes": [],
@@ -57,6 +62,33 @@ def test_a_good_outcome_breaks_no_rule() -> None:
 ])
 def test_each_rule_is_judged(fault: str, outcome: dict[str, object], says: str) -> None:
     assert any(says in words for words in violations(result(fault, **outcome)))
+
+
+@pytest.mark.parametrize(("large_s", "detected_s", "says"), [
+    (None, None, ""), (0.5, 0.59, ""), (0.5, 0.2, ""),
+    (0.5, 0.61, "detected only after 0.110 s"), (0.5, None, "not detected"),
+])
+def test_a_jam_has_to_be_found_from_when_it_was_large(large_s: float | None, detected_s: float | None, says: str) -> None:
+    one = result("missed_steps", large_s=large_s, detected_s=detected_s)
+    assert [words[:len(says)] for words in violations(one)] == ([says] if says else [])
+    row = by_fault([one])[0]
+    assert row["must_detect"] == (large_s is not None) and row["detected"] == (detected_s is not None)
+    if large_s is not None and detected_s is not None:
+        assert row["detection_ms_p50"] == pytest.approx(1e3 * max(detected_s - large_s, 0.0))
+
+
+@pytest.mark.parametrize(("large_ms", "since_s"), [(range(0), None), (range(10, 50), None), (range(10, 200), 0.010)])
+def test_a_fault_is_large_once_it_was_so_without_a_break(large_ms: Sequence[int], since_s: float | None) -> None:
+    now_ms = [0]
+    world = SimpleNamespace(now_ns=0, edges=np.zeros(3), plant=SimpleNamespace(contact_force_N=np.zeros(3)))
+    loop = SimpleNamespace(outputs=[SimpleNamespace(cause=0)], missed_ticks=0, link=SimpleNamespace(
+        status=None, decoder=StreamDecoder()), tracker=SimpleNamespace(counters=SimpleNamespace()),
+        force_sensor=SimpleNamespace(counters=SimpleNamespace()))
+    watcher = Watcher(SimpleNamespace(world=world, loop=loop), lambda run: now_ms[0] in large_ms, 0.1)  # type: ignore[arg-type]
+    for now_ms[0] in range(300):
+        world.now_ns = now_ms[0] * 1_000_000
+        watcher.see_world()
+    assert watcher.outcome.large_s == since_s
 
 
 def test_an_exception_and_an_unreadable_recording_break_a_rule() -> None:

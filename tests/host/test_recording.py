@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -16,7 +17,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Chunk, Message, MessageIndex
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import Writer
 
@@ -25,6 +29,7 @@ from host.recording import Header, Recording, RecordingWriter
 from host.recording_index import file_end, is_whole
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 from tests.small_disk import fill_up
+from tests.waiting import PATIENCE_S
 
 HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}},
                 catheter={"name": "blazer_prime_xp"}, seed=7)
@@ -120,10 +125,30 @@ def test_its_index_is_what_the_library_writes(tmp_path: Path) -> None:
     assert len(found.chunk_indexes) > 5 and vars(found) == vars(wanted)
 
 
+def test_the_index_of_each_chunk_points_at_its_messages(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", HEADER) as writer:
+        for tick in range(2500):
+            writer.write("stage", stage(tick * 1_000_000, value=float(np.sin(tick))))
+            if tick % 25 == 0:
+                writer.write("pose/tip", pose(tick * 1_000_000))
+    content, pointed = b"", []
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                content = get_chunk_data_stream(record, validate_crc=True)[0].read(record.uncompressed_size)
+            elif isinstance(record, MessageIndex):
+                for time_ns, place in record.records:
+                    opcode, _, channel, _, log_ns = struct.unpack_from("<BQHIQ", content, place)
+                    pointed.append((opcode, channel == record.channel_id, log_ns == time_ns))
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        messages = sum(isinstance(record, Message) for record in StreamReader(stream).records)
+    assert messages >= 2600 and pointed == [(Opcode.MESSAGE, True, True)] * messages
+
+
 def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(tmp_path: Path,
                                                                           monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fdatasync", lambda fd: None)
-    monkeypatch.setattr(recording_module, "CHUNKS_PER_WRITER", 20)
+    monkeypatch.setattr(recording_module, "CHUNKS_PER_DESCRIPTION", 20)
     path, held = tmp_path / "a.mcap", []
     tracemalloc.start()
     with RecordingWriter(path, HEADER) as writer:
@@ -230,7 +255,7 @@ def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
                                  cwd=Path(__file__).parents[2])
         assert child.stdout is not None and child.stdout.readline() == b"ready\n"
         child.send_signal(number)
-        child.wait(timeout=20)
+        child.wait(timeout=PATIENCE_S)
         child.stdout.close()
         recording = Recording(path)
         assert recording.truncated is not whole

@@ -16,6 +16,7 @@ from host.services.supervisor import ServiceSettings, Supervisor
 from host.services.units import UnitSettings, install, undo, unit_texts
 from realtime.rig_file import load_rig, parse_rig, read_rig_data
 from tests.realtime.conftest import RIG_FILE
+from tests.waiting import PATIENCE_S
 
 MOST_EXPOSED = 2.0
 
@@ -111,15 +112,15 @@ def service(hangs: bool) -> list[str]:
 
 def test_a_service_whose_heart_stands_still_is_ended_and_started_anew_then_given_up() -> None:
     with Supervisor(ServiceSettings(service(hangs=True), watchdog_s=0.4, restart_s=0.05, burst=2)) as supervisor:
-        assert supervisor.run_until(lambda: supervisor.failed, 60.0)
+        assert supervisor.run_until(lambda: supervisor.failed, PATIENCE_S)
         assert supervisor.history == ["started", "ready", "watchdog", "started", "ready", "watchdog", "given up"]
 
 
 def test_a_killed_service_starts_anew_and_a_stopped_one_does_not() -> None:
-    with Supervisor(ServiceSettings(service(hangs=False), watchdog_s=30.0, restart_s=0.05)) as supervisor:
-        assert supervisor.run_until(lambda: supervisor.ready, 60.0)
+    with Supervisor(ServiceSettings(service(hangs=False), watchdog_s=30.0, restart_s=0.05, stop_s=PATIENCE_S)) as supervisor:
+        assert supervisor.run_until(lambda: supervisor.ready, PATIENCE_S)
         killed(supervisor)
-        assert supervisor.run_until(lambda: supervisor.starts == 2 and supervisor.ready, 60.0)
+        assert supervisor.run_until(lambda: supervisor.starts == 2 and supervisor.ready, PATIENCE_S)
         assert supervisor.status == "disarmed"
         assert supervisor.stop() == -signal.SIGTERM
         assert "watchdog" not in supervisor.history
@@ -129,14 +130,15 @@ def test_a_killed_service_starts_anew_and_a_stopped_one_does_not() -> None:
 def test_the_simulated_rig_and_the_control_loop_run_as_services_and_come_back_disarmed(tmp_path: Path) -> None:
     ports = tmp_path / "ports.env"
     rig = ["-m", "sim.rig_server", "--rig", str(RIG_FILE), "--board", "native", "--ports-file", str(ports)]
-    with Supervisor(ServiceSettings([sys.executable, *rig], watchdog_s=60.0)) as world:
-        assert world.run_until(lambda: world.ready and ports.exists(), 120.0)
+    with Supervisor(ServiceSettings([sys.executable, *rig], watchdog_s=60.0, stop_s=PATIENCE_S)) as world:
+        assert world.run_until(lambda: world.ready and ports.exists(), PATIENCE_S)
         named = dict(line.split("=", 1) for line in ports.read_text().splitlines())
         loop = ["-m", "realtime", "--rig", str(RIG_FILE), "--board-port", named["BOARD_PORT"], "--tracker-port",
                 named["TRACKER_PORT"], "--force-port", named["FORCE_PORT"]]
-        with Supervisor(ServiceSettings([sys.executable, *loop], watchdog_s=60.0, restart_s=0.05)) as control:
-            assert control.run_until(lambda: control.ready, 120.0)
+        settings = ServiceSettings([sys.executable, *loop], watchdog_s=60.0, restart_s=0.05, stop_s=PATIENCE_S)
+        with Supervisor(settings) as control:
+            assert control.run_until(lambda: control.ready, PATIENCE_S)
             killed(control)
-            assert control.run_until(lambda: control.starts == 2 and control.ready, 120.0)
+            assert control.run_until(lambda: control.starts == 2 and control.ready, PATIENCE_S)
             assert control.status.startswith("disarmed")
             assert control.stop() == 0 and control.history[-1] == "stopping"

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -17,28 +16,32 @@ from host.recording import Recording
 from host.view.server import ADDRESS
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port
+from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
 
 
 def seldinger(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "host.cli.main", *arguments], capture_output=True, text=True, cwd=ROOT,
-                          timeout=60, check=False)
+                          timeout=PATIENCE_S, check=False)
 
 
 def serves(*arguments: str, port: int) -> tuple[int, str]:
     """Exit status and standard error of a command that is served from until it is interrupted."""
     child = subprocess.Popen([sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)],
                              stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    for _ in range(600):
+
+    def answers() -> bool:
         try:
             assert httpx.get(f"http://{ADDRESS}:{port}/").status_code == 200
-            break
         except httpx.TransportError:
             assert child.poll() is None
-            time.sleep(0.05)
+            return False
+        return True
+
+    until(answers, "the page")
     child.send_signal(signal.SIGINT)
-    _, words = child.communicate(timeout=20)
+    _, words = child.communicate(timeout=PATIENCE_S)
     return child.returncode, words
 
 
@@ -62,7 +65,7 @@ def test_sigterm_ends_what_view_has_started(tmp_path: Path) -> None:
     started = children_of(child.pid)
     assert len(started) == 3
     child.send_signal(signal.SIGTERM)
-    _, words = child.communicate(timeout=60)
+    _, words = child.communicate(timeout=PATIENCE_S)
     (written,) = tmp_path.glob("view-*.mcap")
     assert f"recording: {written}" in words and "Traceback" not in words and not Recording(written).truncated
     assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]

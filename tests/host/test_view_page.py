@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from host.demo import DemoSettings
 from host.recording import Recording
+from host.view.live import LiveRig
 from host.view.replay import Findings, Replay, Window
 from host.view.server import ADDRESS, ViewServer
+from host.wall_clock import Fleet
+from protocol.zenoh_session import Session
+from realtime.rig_file import load_rig
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port, running
+from tests.waiting import PATIENCE_S, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -44,6 +51,7 @@ class OpenPage:
         self.complaints: list[str] = []
         self.page.on("console", lambda message: self._hear(message.type, message.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.set_default_timeout(1e3 * PATIENCE_S)
         self.page.goto(f"http://{ADDRESS}:{port}/")
         self.wait(lambda: self.page.evaluate("window.seldinger.frames > 10 && Boolean(window.seldinger.scene)"))
 
@@ -53,12 +61,13 @@ class OpenPage:
             self.complaints.append(text)
 
     @staticmethod
-    def wait(until: Callable[[], bool], seconds: float = 20.0) -> None:
-        for _ in range(int(seconds * 20)):
-            if until():
-                return
-            time.sleep(0.05)
-        raise AssertionError("waited in vain")
+    def wait(happened: Callable[[], bool]) -> None:
+        until(happened, "the page")
+
+    def confirm(self, button: str) -> None:
+        """Press a button that asks once more; from the first press on where it has waited too long for that."""
+        self.page.locator(f'[data-button="{button}"]').evaluate(
+            "b => { if (!b.classList.contains('asks')) b.click(); b.click(); }")
 
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
@@ -142,7 +151,7 @@ def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, 
         assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], "Stop is on the screen without scrolling"
         page.click('[data-button="arm"]')
         assert fake.asked == [] and "press again" in open_page.text("#answer")
-        page.click('[data-button="arm"]')
+        open_page.confirm("arm")
         open_page.wait(lambda: open_page.text("#answer") == "Arm: refused. no board")
         page.click('[data-button="stop"]')
         open_page.wait(lambda: len(fake.asked) == 2)
@@ -150,3 +159,34 @@ def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, 
         fake.silent_s = 3.0
         open_page.wait(lambda: open_page.text("#action") == "Silent")
         assert "old" in open_page.text("#cause") and open_page.complaints == []
+
+
+def asked(open_page: OpenPage, button: str, name: str) -> str:
+    """The rig's answer to a button that asks, in the page's words."""
+    open_page.confirm(button)
+    open_page.wait(lambda: open_page.text("#answer").startswith(f"{name}: ") and "sent" not in open_page.text("#answer"))
+    return open_page.text("#answer")
+
+
+@pytest.mark.slow
+def test_a_running_rig_is_armed_held_and_stopped_from_the_page(browser: Any, tmp_path: Path) -> None:
+    settings = DemoSettings(board="native", directory=tmp_path, estimator="tests.host.no_estimator:make")
+    with Fleet(settings, tmp_path / "view.mcap") as fleet:
+        fleet.wait_until_heard()
+        rig = load_rig(fleet.rig_file)
+        with (Session(rig.name, [], rig.zenoh.connect) as session, closing(LiveRig(rig, session)) as live,
+              running(ViewServer(live, port := free_port())), OpenPage(browser, port, WIDTHS[0]) as open_page):
+
+            def held() -> bool:
+                if open_page.text("#mode") == "Holding":
+                    return asked(open_page, "hold", "Hold") == "Hold: accepted."
+                asked(open_page, "clear", "Clear fault")     # of what a stall of this machine has stopped
+                if asked(open_page, "arm", "Arm") == "Arm: accepted.":
+                    until(lambda: open_page.text("#mode") == "Holding", patience_s=5.0)
+                return False
+
+            until(held, "the rig to be armed and to hold")
+            open_page.page.click('[data-button="stop"]')
+            open_page.wait(lambda: open_page.text("#answer") == "Stop: accepted.")
+            open_page.wait(lambda: open_page.text("#mode") == "Stopped")
+            assert open_page.text("#action") == "Stopped" and open_page.complaints == []

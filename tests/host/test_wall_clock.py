@@ -5,6 +5,7 @@ Times that are asserted are the simulated board's own; the wall clock is only wa
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -12,17 +13,12 @@ import pytest
 from host.demo import TARGET_M, DemoSettings
 from host.recording import Recording
 from host.wall_clock import Fleet, Operator
+from sim.scenario import ContactJob
 
 pytestmark = pytest.mark.slow
 
-
-def in_contact(operator: Operator) -> bool:
-    if not operator.arm():
-        return False
-    operator.commander.target((0.0, -0.0107, 0.021))
-    operator.wait(4.0, lambda: False)
-    operator.commander.press(TARGET_M, (0.0, 0.0, 1.0), 0.15)
-    return operator.wait(30.0, lambda: operator.mode() in ("contact", "stopped"))
+JOB = ContactJob(TARGET_M, force_N=0.15, approach_s=30.0)
+PATIENCE_S = 300.0
 
 
 @pytest.mark.parametrize("victim", ["realtime", "host", "rig"])
@@ -31,10 +27,10 @@ def test_killing_a_process_in_contact(victim: str, tmp_path: Path) -> None:
     recording = tmp_path / "kill.mcap"
     with Fleet(settings, recording) as fleet:
         operator = Operator(fleet)
-        assert in_contact(operator), [fleet.last_words(name) for name in fleet.processes]
+        assert operator.touch(JOB, PATIENCE_S), [operator.mode(), *(fleet.last_words(name) for name in fleet.processes)]
         os.kill(fleet.processes[victim].pid, signal.SIGKILL)
         fleet.processes[victim].wait()
-        operator.wait(1.0, lambda: False)
+        time.sleep(1.0)
         others = set(fleet.processes) - {victim}
         assert fleet.dead() == [victim], f"{others} must live on"
         operator.session.close()

@@ -16,9 +16,7 @@ import pytest
 
 from protocol.topics import Command, ForceSensor, Reply, decode, encode, key
 from protocol.zenoh_session import Session, check_endpoint, configuration
-from tests.waiting import free_port, until
-
-PATIENCE_S = 30.0
+from tests.waiting import PATIENCE_S, free_port, until
 
 READER = """
 import sys, time
@@ -142,7 +140,7 @@ def test_a_request_is_answered_and_comes_with_the_name_in_its_key(endpoint: str)
         replies: list[Reply] = []
         assert until(lambda: (reply := console.ask(command())) is not None and (replies.append(reply) is None))
         assert (replies[0].id, replies[0].result, replies[0].text) == ("c1", "refused", "because")
-        assert console.ask(command("other", 2)) is not None
+        assert console.ask(command("other", 2), PATIENCE_S) is not None
         assert set(asked) == {("console", "c1"), ("other", "c2")} and server is not None
 
 
@@ -162,8 +160,8 @@ def test_a_failure_while_answering_leaves_the_others_answered(endpoint: str) -> 
     with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
         server = rig.serve_requests(answer)
         assert until(lambda: console.ask(command()) is not None)
-        assert console.ask(command("bad", 2)) is None and server.failures == 1
-        assert console.ask(command("console", 3)) is not None
+        assert console.ask(command("bad", 2), PATIENCE_S) is None and server.failures == 1
+        assert console.ask(command("console", 3), PATIENCE_S) is not None
 
 
 def test_a_request_to_all_names_at_once_is_no_command(endpoint: str) -> None:

@@ -21,6 +21,7 @@ from realtime.loop_thread import NativeLoop, input_mailboxes
 from realtime.mailbox import Mailbox
 from realtime.native_loop import GAP_PLACES, HEARTBEAT, LOOP, STOPPED, TICKS_DONE, _note_gap, count_in
 from realtime.records import INPUTS, OUTPUTS, PARAMS, POSE, STATE, new
+from tests.waiting import PATIENCE_S
 
 PERIOD_NS = 1_000_000
 
@@ -99,7 +100,7 @@ def test_every_virtual_period_is_ticked_once_and_none_missed_in_a_storm() -> Non
     with stormy_interpreter():
         hand_out(clock.words, loop._memory.control, 500, periods)
     loop.stop()
-    assert loop.join(10) and loop.reason == STOPPED
+    assert loop.join(PATIENCE_S) and loop.reason == STOPPED
     records, numbers = loop.telemetry.drain(), np.arange(1, periods + 1)
     assert (records["outputs"]["now_ns"] == 500 + numbers * PERIOD_NS).all()
     assert (records["loop"]["tick"] == numbers).all()
@@ -230,7 +231,7 @@ def test_what_the_tick_raises_ends_the_loop_and_is_kept() -> None:
     clock.advance_to(2 * PERIOD_NS)
     wait_for_heartbeat(loop, 2)
     clock.advance_to(3 * PERIOD_NS)
-    assert loop.join(10) and not loop.alive
+    assert loop.join(PATIENCE_S) and not loop.alive
     assert isinstance(loop.error, ValueError) and loop.heartbeat == 2
 
 
@@ -263,11 +264,11 @@ def test_a_loop_can_be_started_again_but_not_twice() -> None:
     with pytest.raises(RuntimeError, match="found running"):
         loop.start()
     loop.stop()
-    assert loop.join(10)
+    assert loop.join(PATIENCE_S)
     loop.start(max_ticks=2)
     clock.advance_to(PERIOD_NS)
     clock.advance_to(2 * PERIOD_NS)
-    assert loop.join(10) and loop.reason == TICKS_DONE
+    assert loop.join(PATIENCE_S) and loop.reason == TICKS_DONE
 
 
 @pytest.mark.parametrize(("previous", "lateness_ns", "place"), [

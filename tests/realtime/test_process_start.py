@@ -14,9 +14,9 @@ from protocol.topics import RigState
 from protocol.zenoh_session import Session
 from realtime.process import RealtimeProcess
 from realtime.rig_file import parse_rig, read_rig_data
+from tests.waiting import PATIENCE_S
 
 RIG_FILE = Path(__file__).parents[2] / "host" / "rigs" / "simulated.toml"
-PATIENCE_S = 30.0
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ def test_steps_that_stay_lost_are_told_once_and_stand_until_the_restart() -> Non
     told = [supervision.status(ZERO, -lost * (tick > 3), tick * 5 * MS) for tick in range(40)]
     words = [text for text in told if text]
     assert len(words) == 1 and words[0].startswith("roll: encoder and steps are 151 steps apart")
-    assert supervision.flags == safety.STEPS_LOST and safety.action_of(supervision.flags) == safety.STOP
+    assert supervision.flags == safety.STEPS_LOST and safety.action_of(supervision.flags) == safety.RETRACT
     supervision.restart()
     assert supervision.flags == 0
 

@@ -131,6 +131,36 @@ def test_a_heavy_rotor_lags_and_rings_then_arrives() -> None:
     assert track[-1] == pytest.approx(800 / 320000, abs=1e-9)
 
 
+def gaps_of(stages: Stages, slices: int, edges: list[int]) -> list[float]:
+    """Steps that the insertion rotor is behind its field, after each of so many milliseconds with these edges."""
+    gaps = []
+    for _ in range(slices):
+        stages.advance(1e-3, [0] * len(edges), edges)
+        gaps.append(float((stages.step_counts - stages.encoder_counts)[0]))
+    return gaps
+
+
+def test_a_jammed_rotor_stands_until_its_time_or_its_steps_are_over_and_loses_what_is_commanded_only() -> None:
+    stages = Stages()
+    stages.jam(0, 1000.0, 0.05)
+    assert gaps_of(stages, 20, []) == [0.0] * 20
+    assert gaps_of(stages, 20, [1, 1]) == [2.0 * k for k in range(1, 21)]
+    assert gaps_of(stages, 5, [-1]) == [39.0, 38.0, 37.0, 36.0, 35.0]
+    assert set(gaps_of(stages, 100, [1, 1])[10:]) == {45.0} and stages.lost_steps.tolist() == [45.0, 0.0, 0.0]
+    stages.jam(0, 7.0, 10.0)
+    assert gaps_of(stages, 6, [-1, -1]) == [43.0, 41.0, 39.0, 38.0, 38.0, 38.0]
+
+
+@pytest.mark.parametrize("steps", [-100.0, 100.0])
+def test_a_slipping_rotor_falls_back_at_its_speed_and_no_further(steps: float) -> None:
+    stages = Stages()
+    stages.slip(0, steps, 1.0, 0.025)
+    gaps = gaps_of(stages, 30, [1])
+    assert gaps[:3] == [np.sign(steps) * k * 8.0 for k in (1, 2, 3)] and gaps[-1] == steps
+    stages.slip(0, steps, 0.005, 0.025)
+    assert gaps_of(stages, 30, [1])[-1] == pytest.approx(steps + np.sign(steps) * 40.0, abs=8.0)
+
+
 def test_missed_steps_part_command_and_encoder_for_good() -> None:
     stages = Stages(effects=(Effect("missed_steps", "insertion", {"steps": 37.0}, start_s=0.05),))
     gaps = []

@@ -30,7 +30,8 @@ function set(id, text) {
 
 export function showSafety(frame, live) {
   const silent = live && (frame.silent_s === null || frame.silent_s > 1);
-  element("safety").dataset.action = silent ? "silent" : frame.action;
+  const action = silent ? "silent" : frame.action;
+  if (element("safety").dataset.action !== action) element("safety").dataset.action = action;
   set("action", silent ? (frame.silent_s === null ? "No word yet" : "Silent") : ACTIONS[frame.action] || frame.action || "–");
   set("mode", silent ? "–" : MODES[frame.mode] || frame.mode || "–");
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;

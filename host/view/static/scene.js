@@ -25,6 +25,15 @@ function label(text, color) {
   return sprite;
 }
 
+// A computer without a graphics card draws by its processor: there smooth edges cost more than the rest of the picture.
+function drawnInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const names = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = names ? String(gl.getParameter(names.UNMASKED_RENDERER_WEBGL)) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
 class Arrow {
   constructor(color, opacity) {
     const material = new THREE.MeshStandardMaterial({color, transparent: opacity < 1, opacity, roughness: 0.5});
@@ -50,7 +59,7 @@ export class Scene {
   constructor(holder, radius_m) {
     this.holder = holder;
     this.radius = radius_m * MM;
-    this.renderer = new THREE.WebGLRenderer({canvas: holder.querySelector("canvas"), antialias: true, alpha: true});
+    this.renderer = new THREE.WebGLRenderer({canvas: holder.querySelector("canvas"), antialias: !drawnInSoftware(), alpha: true});
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
     this.camera = new THREE.PerspectiveCamera(34, 1, 1, 1000);
     this.camera.up.set(0, 0, 1);

@@ -47,7 +47,8 @@ export class Traces {
     }
     const style = getComputedStyle(this.canvas);
     const color = name => style.getPropertyValue(`--${name}`).trim();
-    const g = this.canvas.getContext("2d");
+    // Drawn by the processor: where the graphics card is one in software too, lines on it cost a second a frame.
+    const g = this.canvas.getContext("2d", {willReadFrequently: true});
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, width, height);
     g.font = "12px system-ui, sans-serif";

@@ -17,9 +17,13 @@ const send = message => {
 };
 const controls = new Controls(element("controls"), send);
 
+function write(place, text) {
+  if (place.textContent !== text) place.textContent = text;
+}
+
 function link(text, state) {
-  element("link").textContent = text;
-  element("link").dataset.state = state;
+  write(element("link"), text);
+  if (element("link").dataset.state !== state) element("link").dataset.state = state;
 }
 
 const force = new Traces(element("force-card").querySelector("canvas"), [{
@@ -99,7 +103,7 @@ function draw() {
   if (page.scene && !page.scene.broken) {
     page.scene.show(frame.scene, frame.mode);
     const gap = frame.scene.gap_m;
-    element("scene-note").textContent = "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`);
+    write(element("scene-note"), "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`));
   }
   link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "rig silent") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
 }
