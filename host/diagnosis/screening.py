@@ -95,9 +95,11 @@ class Point:
     left: Array
 
 
-def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
+def screen(
+    problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell, known_Hz: tuple[float, ...] = ()
+) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
-    search).
+    search). `known_Hz`: frequencies to try besides those that stand out.
     """
     problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
@@ -108,7 +110,7 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
     used = [
         np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
     ]
-    lines = lines_of(used, problem.pieces[0].recording.dt_s)
+    lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
     resting = _resting(problem)
     began = perf_counter()
     problem.stacked(fit.terms, fit.values)

@@ -15,6 +15,7 @@ SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
 TOGETHER = 11.0  # log-likelihood on all samples that makes up for a held-out part that shows an effect only dimly,
 DIM = 0.12  # with at most this p-value on held-out blocks,
 LITTLE = 1.8  # and at least this log-likelihood there
+OVERWHELMING = 25.0  # log-likelihood on all samples that needs no blocks to agree: few episodes may hold all of it
 PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
 SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
 SMALLEST_EXCESS = 0.10  # and this much of what is above noise
@@ -108,7 +109,9 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     samples together have to be surer by far.
     """
     more = max(len(trial.fit.values) - len(base.values), 0)
-    return not at_bound(trial.fit) and not of_sampling(trial) and (_alone(trial, more) or _together(trial, more))
+    if at_bound(trial.fit) or of_sampling(trial):
+        return False
+    return _alone(trial, more) or _together(trial, more) or _plainly(trial, more)
 
 
 def _alone(trial: Trial, more: int) -> bool:
@@ -129,6 +132,16 @@ def _together(trial: Trial, more: int) -> bool:
         and gain.share > _least(trial, gain)
         and trial.heldout.log_likelihood > LITTLE
         and trial.heldout.p_value < DIM
+    )
+
+
+def _plainly(trial: Trial, more: int) -> bool:
+    """Likelihood so large that noise cannot be its cause, gained in both parts, in however few episodes."""
+    return (
+        trial.both.log_likelihood > OVERWHELMING + PRICE * more
+        and trial.both.share > _least(trial, trial.both)
+        and trial.heldout.log_likelihood > LITTLE
+        and trial.trained.log_likelihood > LITTLE
     )
 
 
