@@ -43,7 +43,7 @@ FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and 
 FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
 MOST_EFFECTS, MOST_STEPS = 5, 10
 DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
-EXCHANGES, RIVALS, RIVAL = 2, 5, 0.3  # rounds, rivals fitted in each place, and the least part of the best one's promise
+EXCHANGES, RIVALS, RIVAL = 2, 4, 0.4  # rounds, rivals fitted in each place, and the least part of the best one's promise
 SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
 REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 
@@ -204,14 +204,14 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
     nominal = fit_nominal(problem)
     floor = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
-    _grow(problem, found, pool, floor, {}, tell)
+    _grow(problem, found, pool, floor, 0.0, tell)
     found = _detour(problem, found, pool, floor, tell)
     _exchange(problem, found, pool, floor, tell)
     return found
 
 
-def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: dict[str, float], tell: Tell) -> None:
-    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood by subsystem so far."""
+def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
+    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
     while len(best.terms) < MOST_EFFECTS and len(steps) < MOST_STEPS:
         ranked = screen(problem, best, pool, tell)
@@ -227,8 +227,7 @@ def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, e
             break
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
-        place = winner.candidate.port.subsystem
-        earned[place] = earned.get(place, 0.0) + winner.both.log_likelihood
+        earned += winner.both.log_likelihood
         best = _taken(problem, winner)
         if len(best.terms) > 1:
             best = _swap(problem, best, floor, steps)
@@ -265,7 +264,7 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
         ):
             continue
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
-        _grow(problem, other, pool, floor, {trial.candidate.port.subsystem: trial.both.log_likelihood}, tell)
+        _grow(problem, other, pool, floor, trial.both.log_likelihood, tell)
         ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
         more = max(len(other.best.values) - len(best.best.values), 0)
         if ahead.log_likelihood > ENOUGH + PRICE * more and len(other.best.terms) <= len(best.best.terms) + 1:

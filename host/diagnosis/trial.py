@@ -19,9 +19,8 @@ OVERWHELMING = 25.0  # log-likelihood on all samples that needs no blocks to agr
 PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
 SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
 SMALLEST_EXCESS = 0.10  # and this much of what is above noise
-BESIDE, ELSEWHERE = 0.12, 0.06  # likelihood of a further effect against that of those named at its subsystem, and of all,
-LARGE = 0.3  # but for one that takes this share of an output's error;
-FURTHER = 0.05  # and the least such share: modules are idealizations, what they lack is no other effect
+BESIDE = 0.2  # likelihood of a further effect against that of those named,
+FURTHER = 0.05  # and its least share of an output's error: modules are idealizations, what they lack is no other effect
 COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
 INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
 NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
@@ -145,12 +144,10 @@ def _plainly(trial: Trial, more: int) -> bool:
     )
 
 
-def weighty(trial: Trial, earned: dict[str, float]) -> bool:
-    """Whether a trial earns enough beside what is named already (likelihood by subsystem); a finer shape is judged alone."""
-    least = max(BESIDE * earned.get(trial.candidate.port.subsystem, 0.0), ELSEWHERE * sum(earned.values()))
-    share = trial.both.share
-    further = not earned or (share > FURTHER and (share > LARGE or trial.both.log_likelihood > least))
-    return trial.replaced or further
+def weighty(trial: Trial, earned: float) -> bool:
+    """Whether a trial earns enough beside the likelihood of what is named already; a finer shape is judged alone."""
+    enough = trial.both.share > FURTHER and trial.both.log_likelihood > BESIDE * earned
+    return trial.replaced or earned == 0.0 or enough
 
 
 def _least(trial: Trial, gain: Gain) -> float:

@@ -372,8 +372,20 @@ class Rig:
 
 def _pressed(law: dict[str, Any], soft: Array, dt_s: float) -> Array:
     """Normal force (n,) of the contact law on a shaft of compliance `soft` (n,) along the normal."""
-    names = ("stiffness", "exponent", "reference", "damping", "crossley", "relax", "relax_time")
-    return np.asarray(contact(law["gap"], soft, *(law[name] for name in names), dt_s))
+    return np.asarray(
+        contact(
+            law["gap"],
+            soft,
+            law["stiffness"],
+            law["exponent"],
+            law["reference"],
+            law["damping"],
+            law["crossley"],
+            law["relax"],
+            law["relax_time"],
+            dt_s,
+        )
+    )
 
 
 def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:

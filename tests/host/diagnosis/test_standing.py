@@ -48,19 +48,16 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
 
 
 @pytest.mark.parametrize(
-    ("likelihood", "share", "place", "enough"),
+    ("likelihood", "share", "enough"),
     [
-        (50.0, 0.2, "cable", False),  # less than an eighth of what is named there
-        (200.0, 0.2, "cable", True),
-        (50.0, 0.2, "elsewhere", False),  # and than a sixteenth of all
-        (70.0, 0.2, "elsewhere", True),
-        (200.0, 0.03, "cable", False),  # hardly anything of any output
-        (50.0, 0.4, "cable", True),  # a third of what an output has left
+        (150.0, 0.4, False),  # less than a fifth of what is named
+        (250.0, 0.2, True),
+        (250.0, 0.03, False),  # hardly anything of any output
     ],
 )
-def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, place: str, enough: bool) -> None:
-    assert weighty(trial(likelihood, share), {place: 1000.0}) is enough
-    assert weighty(trial(likelihood, share), {})
+def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, enough: bool) -> None:
+    assert weighty(trial(likelihood, share), 1000.0) is enough
+    assert weighty(trial(likelihood, share), 0.0)
 
 
 def test_steps_by_their_saw_tooth() -> None:
