@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -112,9 +112,9 @@ def screen(
     ]
     lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
     resting = _resting(problem)
-    began = perf_counter()
+    began = process_time()
     problem.stacked(fit.terms, fit.values)
-    most = int(np.clip(SCAN_SECONDS / max(perf_counter() - began, 1e-5), 12, GRID))
+    most = int(np.clip(SCAN_SECONDS / max(process_time() - began, 1e-5), 12, GRID))
     for count, candidate in enumerate(pool):
         tell("screening", count / len(pool))
         drop = replaced_by(fit, candidate)
