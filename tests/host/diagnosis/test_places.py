@@ -25,11 +25,11 @@ def silent(text: str, share: float) -> None:
 
 
 def late(x: Array, t: Array) -> Array:
-    return np.interp(t - 0.003, t, x)
+    return np.interp(t - 0.0015, t, x)
 
 
 def drifting(x: Array, t: Array) -> Array:
-    return np.interp(t * (1.0 - 2e-4), t, x)
+    return np.interp(t * (1.0 - 6e-5), t, x)
 
 
 def slack(x: Array, t: Array) -> Array:
