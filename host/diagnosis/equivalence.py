@@ -22,7 +22,8 @@ TRIED = 8  # rivals refitted in an effect's place at most
 NEAR = 0.5  # a rival must have earned this part of the winner's likelihood when it was tried first
 CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart,
 CHANCE = 0.01  # nor above this p-value,
-ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most, and
+ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most,
+MISFIT = 0.05  # or by less than this part of the mismatch there, and
 PART = 0.25  # what it lacks is less than this part of what the effect earned: the modules themselves are idealized
 
 
@@ -88,7 +89,8 @@ def _equals(
         )
         ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
         held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
-        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned):
+        rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
+        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned, rival):
             kept.append(trial.candidate)
     return tuple(kept)
 
@@ -106,8 +108,11 @@ def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
     return sorted(kept.values(), key=lambda trial: -trial.score)
 
 
-def _not_told(ahead: Gain, held: Gain, earned: Gain) -> bool:
+def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain) -> bool:
     """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
     if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > CHANCE and held.p_value > CHANCE):
         return True
-    return ahead.share < ALIKE and ahead.log_likelihood < PART * earned.log_likelihood
+    top = int(np.argmax(earned.independent * earned.log_ratio))
+    best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
+    near = ahead.share < ALIKE or best - other < MISFIT * best
+    return bool(near and ahead.log_likelihood < PART * earned.log_likelihood)

@@ -19,8 +19,9 @@ OVERWHELMING = 25.0  # log-likelihood on all samples that needs no blocks to agr
 PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
 SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
 SMALLEST_EXCESS = 0.10  # and this much of what is above noise
-BESIDE = 0.2  # likelihood of a further effect against that of those named,
-FURTHER = 0.05  # and its least share of an output's error: modules are idealizations, what they lack is no other effect
+FURTHER = 0.05  # of some output's error a further effect has to take: what idealized modules lack is no effect;
+BESIDE = 0.2  # and of the likelihood of those named, but for one that takes
+LARGE, SURER = 0.3, 1e-6  # this share of what is left, with blocks held out that agree so well
 COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
 INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
 NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
@@ -146,7 +147,8 @@ def _plainly(trial: Trial, more: int) -> bool:
 
 def weighty(trial: Trial, earned: float) -> bool:
     """Whether a trial earns enough beside the likelihood of what is named already; a finer shape is judged alone."""
-    enough = trial.both.share > FURTHER and trial.both.log_likelihood > BESIDE * earned
+    large = trial.both.share > LARGE and trial.heldout.p_value < SURER
+    enough = trial.both.share > FURTHER and (large or trial.both.log_likelihood > BESIDE * earned)
     return trial.replaced or earned == 0.0 or enough
 
 

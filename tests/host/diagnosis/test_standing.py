@@ -48,16 +48,18 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
 
 
 @pytest.mark.parametrize(
-    ("likelihood", "share", "enough"),
+    ("likelihood", "share", "held", "enough"),
     [
-        (150.0, 0.4, False),  # less than a fifth of what is named
-        (250.0, 0.2, True),
-        (250.0, 0.03, False),  # hardly anything of any output
+        (150.0, 0.4, 1e-3, False),  # less than a fifth of what is named
+        (150.0, 0.4, 1e-9, True),  # but a third of what is left, to be seen all along
+        (250.0, 0.2, 1e-3, True),
+        (250.0, 0.03, 1e-9, False),  # hardly anything of any output
     ],
 )
-def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, enough: bool) -> None:
-    assert weighty(trial(likelihood, share), 1000.0) is enough
-    assert weighty(trial(likelihood, share), 0.0)
+def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, held: float, enough: bool) -> None:
+    tried = replace(trial(likelihood, share), heldout=Gain(0.5 * likelihood, held, share))
+    assert weighty(tried, 1000.0) is enough
+    assert weighty(tried, 0.0)
 
 
 def test_steps_by_their_saw_tooth() -> None:
