@@ -56,6 +56,7 @@ class Foretold:
     share: float
     trained: float
     forms: tuple[tuple[Form, float], ...] = ()
+    power: float = 0.0  # fall of the held-out squared error, over noise, summed over outputs
 
     @property
     def sure(self) -> bool:
@@ -192,18 +193,22 @@ def lay_out(pieces: list[Piece], form: Form) -> None:
         piece.extra.setdefault("equations", {})[form.text] = form.evaluate(piece)
 
 
-def foretell(problem: Problem, fit: Fit, floor: Array) -> list[Foretold]:
-    """The best forms at each port where an equation may stand, and, if the model has many outputs, in each of them alone."""
+def foretell(problem: Problem, fit: Fit, floor: Array, only: str = "") -> list[Foretold]:
+    """The best forms at each port where an equation may stand, and, if the model has many outputs, in each of them alone;
+    or at the port `only`.
+    """
     ports = {port.name: port for port in problem.model.ports}
     used = _measured(fit)
     rates = [_slopes(problem, fit, piece) for piece in problem.pieces]
     found = []
     for name, target in problem.model.unlisted_at:
+        if only not in ("", name):
+            continue
         forms = forms_at(problem, fit, ports[name])
         if forms:
             responses = _responses(problem, fit, ports[target], forms)
             found.append(_best(problem, fit, floor, rates, forms, responses, ports[name].subsystem, ports[name]))
-            if hasattr(problem.model, "sensitivity"):
+            if hasattr(problem.model, "sensitivity") and not only:
                 table = [r.table for r in responses]
                 found += [
                     _best(problem, fit, floor, rates, forms, _alone(problem, row, table), output.subsystem, None)
@@ -308,8 +313,20 @@ def _best(
         trained = compare(problem.pieces, "fit", fit.residuals, after, floor)
         likelihood = held.log_likelihood - len(chosen)
         if likelihood > best.log_likelihood:
-            best = Foretold(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth)
+            power = fallen(problem, fit.residuals, after, floor)
+            best = Foretold(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
     return replace(best, forms=worth)
+
+
+def fallen(problem: Problem, before: list[Array], after: list[Array], floor: Array) -> float:
+    """Fall of the mean squared error on held-out samples, over each output's noise, summed over those where it fell."""
+    total = 0.0
+    for row in range(floor.size):
+        pairs = [(b[row][p.heldout], a[row][p.heldout]) for p, b, a in zip(problem.pieces, before, after, strict=True)]
+        change = np.concatenate([b**2 - a**2 for b, a in pairs])
+        change = change[np.isfinite(change)]
+        total += max(float(np.mean(change)), 0.0) / floor[row] ** 2 if change.size else 0.0
+    return total
 
 
 def _by_gain(gain: Array, forms: list[Form]) -> list[int]:

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.dictionary import equation_at
 from host.diagnosis.effect import Candidate
 from host.diagnosis.evidence import Gain, compare
 from host.diagnosis.fit import Fit, Problem, finish, minimize
 from host.diagnosis.screening import term_of, without
 from host.diagnosis.search import Found
-from host.diagnosis.trial import SURE, Trial
+from host.diagnosis.trial import Trial
+from host.diagnosis.unlisted import Rest, equations_for
 
 Array = npt.NDArray[np.float64]
 MOST_RIVALS = 4
 TRIED = 8  # rivals refitted in an effect's place at most
 NEAR = 0.5  # a rival must have earned this part of the winner's likelihood when it was tried first
-SURER = 1e-6  # p-value on all samples that makes up for a held-out one that is not below SURE
 CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart,
 CHANCE = 0.01  # nor above this p-value,
-ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most, and
+ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most,
+MISFIT = 0.05  # or by less than this part of the mismatch there, and
 PART = 0.25  # what it lacks is less than this part of what the effect earned: the modules themselves are idealized
 
 
@@ -43,16 +45,34 @@ def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
         less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
         gain = compare(problem.pieces, "heldout", less.residuals, found.best.residuals, floor)
         both = compare(problem.pieces, "both", less.residuals, found.best.residuals, floor)
-        out.append(Standing(term.candidate, gain, both, _equals(problem, found, term.candidate, less, both, floor)))
+        alike = _equals(problem, found, term.candidate, less, both, floor)
+        alike += _better_said(problem, found, term.candidate, less, floor)
+        out.append(Standing(term.candidate, gain, both, alike))
     return out
 
 
-def scanty(standing: list[Standing]) -> bool:
-    """Whether the strongest effect rests on so few events that its name may be chance, sure as the mismatch is."""
-    if not standing:
-        return False
-    strongest = max(standing, key=lambda s: s.both.log_likelihood)
-    return strongest.gain.p_value > SURE and strongest.both.p_value > SURER
+def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
+    """`standing` where known effects leave a rest that is no noise: the strongest may stand for something in no list."""
+    if not standing or not rest.doubtful:
+        return standing
+    first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
+    named = standing[first]
+    forms = rest.foretold.forms if rest.foretold is not None else ()
+    if not forms or any(other.effect.id == "unlisted" for other in named.alike):
+        return standing
+    unknown = equation_at(named.candidate.port, *forms[0])
+    return [*standing[:first], replace(named, alike=(*named.alike, unknown)), *standing[first + 1 :]]
+
+
+def _better_said(problem: Problem, found: Found, candidate: Candidate, less: Fit, floor: Array) -> tuple[Candidate, ...]:
+    """An equation of no listed effect that does plainly better in the place of `candidate`: this may be a stand-in."""
+    if candidate.effect.id == "unlisted":
+        return ()
+    for trial in equations_for(problem, less, candidate.port, floor):
+        ahead = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
+        if ahead.log_likelihood > CANNOT_TELL:
+            return (trial.candidate,)
+    return ()
 
 
 def _equals(
@@ -69,7 +89,8 @@ def _equals(
         )
         ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
         held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
-        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned):
+        rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
+        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned, rival):
             kept.append(trial.candidate)
     return tuple(kept)
 
@@ -87,8 +108,11 @@ def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
     return sorted(kept.values(), key=lambda trial: -trial.score)
 
 
-def _not_told(ahead: Gain, held: Gain, earned: Gain) -> bool:
+def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain) -> bool:
     """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
     if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > CHANCE and held.p_value > CHANCE):
         return True
-    return ahead.share < ALIKE and ahead.log_likelihood < PART * earned.log_likelihood
+    top = int(np.argmax(earned.independent * earned.log_ratio))
+    best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
+    near = ahead.share < ALIKE or best - other < MISFIT * best
+    return bool(near and ahead.log_likelihood < PART * earned.log_likelihood)

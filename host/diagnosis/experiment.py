@@ -54,10 +54,12 @@ class Design:
 
 
 def design(problem: Problem, found: Found, standing: list[Standing], tell: Callable[[str, float], None]) -> list[Design]:
-    """For each pair that the recordings cannot tell apart, the motion that would."""
+    """For each pair that the recordings cannot tell apart, the motion that would; none where an equation of recorded
+    signals is in play, since motions that nobody recorded have no such signals.
+    """
     out = []
-    for stands in standing:
-        for other in stands.alike:
+    for stands in standing if all(term.candidate.effect.id != "unlisted" for term in found.best.terms) else ():
+        for other in (other for other in stands.alike if other.effect.id != "unlisted"):
             tell(f"how to tell {stands.candidate.key} from {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)

@@ -116,15 +116,13 @@ def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float) -> A
 
 @njit(cache=True)
 def shift(x: Array, dt_s: float, delay_s: Array) -> Array:
-    """`x` as it was `delay_s[i]` seconds earlier, by cubic interpolation (Catmull-Rom); held at the ends."""
+    """`x` as it was `delay_s[i]` seconds earlier, straight between samples as `lag` has it; held at the ends."""
     n = x.size
     out = np.empty(n)
     for i in range(n):
         place = min(max(i - delay_s[i] / dt_s, 0.0), n - 1.0)
         k = min(int(place), n - 2)
-        f = place - k
-        x0, x1, x2, x3 = x[max(k - 1, 0)], x[k], x[k + 1], x[min(k + 2, n - 1)]
-        out[i] = x1 + 0.5 * f * (x2 - x0 + f * (2.0 * x0 - 5.0 * x1 + 4.0 * x2 - x3 + f * (3.0 * (x1 - x2) + x3 - x0)))
+        out[i] = x[k] + (place - k) * (x[k + 1] - x[k])
     return out
 
 

@@ -15,7 +15,7 @@ from host.diagnosis.chains import build, channels_of
 from host.diagnosis.dataset import Recording, load, thin
 from host.diagnosis.dictionary import lay_out
 from host.diagnosis.effect import candidates
-from host.diagnosis.equivalence import Standing, scanty, standings
+from host.diagnosis.equivalence import Standing, beside_unlisted, standings
 from host.diagnosis.evidence import whiteness
 from host.diagnosis.experiment import Design, design
 from host.diagnosis.fit import Fit, Problem
@@ -30,6 +30,9 @@ from host.diagnosis.unlisted import Rest, explain_rest
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
+
+
+MOST_PARTLY = 2  # effects that may be named where they leave a rest: more that pile up are no names
 
 
 @dataclass
@@ -124,14 +127,15 @@ def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozens
     tell("looking at what is left", 0.0)
     rest = explain_rest(problem, found, floor, tell)
     tell("weighing what stands in their place", 0.0)
-    standing = standings(problem, found, floor)
+    standing = beside_unlisted(standings(problem, found, floor), rest)
     tell("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
     result.designs = design(problem, found, standing, tell)
-    named = bool(found.best.terms) and not rest.doubtful and not scanty(standing)
+    piled = rest.doubtful and len(found.best.terms) > MOST_PARTLY
+    named = bool(found.best.terms) and not piled
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
     )

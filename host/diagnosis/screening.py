@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -99,9 +99,11 @@ class Point:
     left: Array
 
 
-def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> list[Screened]:
+def screen(
+    problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell, known_Hz: tuple[float, ...] = ()
+) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
-    search).
+    search). `known_Hz`: frequencies to try besides those that stand out.
     """
     problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
@@ -112,11 +114,11 @@ def screen(problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell) -> lis
     used = [
         np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
     ]
-    lines = lines_of(used, problem.pieces[0].recording.dt_s)
+    lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
     resting = _resting(problem)
-    began = perf_counter()
+    began = process_time()
     problem.stacked(fit.terms, fit.values)
-    most = int(np.clip(SCAN_SECONDS / max(perf_counter() - began, 1e-5), 12, GRID))
+    most = int(np.clip(SCAN_SECONDS / max(process_time() - began, 1e-5), 12, GRID))
     for count, candidate in enumerate(pool):
         tell("screening", count / len(pool))
         drop = replaced_by(fit, candidate)

@@ -14,6 +14,7 @@ from host.diagnosis.evidence import Gain, compare
 from host.diagnosis.fit import (
     Fit,
     Problem,
+    Term,
     finish,
     first_needs,
     get_starts,
@@ -43,6 +44,7 @@ FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and 
 FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
 MOST_EFFECTS, MOST_STEPS = 5, 10
 DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
+EXCHANGES, RIVALS, RIVAL = 2, 4, 0.4  # rounds, rivals fitted in each place, and the least part of the best one's promise
 SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
 REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 
@@ -202,12 +204,14 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
     nominal = fit_nominal(problem)
     floor = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
-    _grow(problem, found, pool, floor, {}, tell)
-    return _detour(problem, found, pool, floor, tell)
+    _grow(problem, found, pool, floor, 0.0, tell)
+    found = _detour(problem, found, pool, floor, tell)
+    _exchange(problem, found, pool, floor, tell)
+    return found
 
 
-def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: dict[str, float], tell: Tell) -> None:
-    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood by subsystem so far."""
+def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
+    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
     while len(best.terms) < MOST_EFFECTS and len(steps) < MOST_STEPS:
         ranked = screen(problem, best, pool, tell)
@@ -225,8 +229,7 @@ def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, e
             break
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
-        place = winner.candidate.port.subsystem
-        earned[place] = earned.get(place, 0.0) + winner.both.log_likelihood
+        earned += winner.both.log_likelihood
         best = _taken(problem, winner)
         if len(best.terms) > 1:
             best = _swap(problem, best, floor, steps)
@@ -263,7 +266,7 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
         ):
             continue
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
-        _grow(problem, other, pool, floor, {trial.candidate.port.subsystem: trial.both.log_likelihood}, tell)
+        _grow(problem, other, pool, floor, trial.both.log_likelihood, tell)
         ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
         more = max(len(other.best.values) - len(best.best.values), 0)
         if ahead.log_likelihood > ENOUGH + PRICE * more and len(other.best.terms) <= len(best.best.terms) + 1:
@@ -297,6 +300,48 @@ def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
                 steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
                 return refined(problem, other)
     return best
+
+
+def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+    """Each of several effects taken out, and all candidates screened anew for its place: what was the best beside nothing
+    may not be the best beside the others.
+    """
+    for _ in range(EXCHANGES):
+        before = found.best.names
+        for term in found.best.terms:
+            if len(found.best.terms) > 1 or _frequencies(found.best, term):
+                _in_place_of(problem, found, term, pool, floor, tell)
+        found.best = _prune(problem, found.best, floor, found.steps)
+        if found.best.names == before or len(found.best.terms) < 2:
+            return
+
+
+def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
+    """Frequencies (Hz) that were fitted for `term`: no rival should miss them for lack of a start."""
+    at = len(fit.values) - sum(len(t.parameters) for t in fit.terms[fit.terms.index(term) :])
+    pairs = zip(term.parameters, fit.values[at : at + len(term.parameters)], strict=True)
+    return tuple(float(value) for p, value in pairs if p.name == "frequency" and p.unit == "Hz")
+
+
+def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+    known = _frequencies(found.best, term)
+    terms, values = without(found.best, problem, (term.candidate.key,))
+    less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+    ranked = [item for item in screen(problem, less, pool, tell, known) if item.promise > 3.0 and not item.drop]
+    own = [item for item in ranked if item.candidate.key == term.candidate.key]
+    top = max((item.promise for item in ranked), default=0.0)
+    others = [item for item in ranked if item not in own and item.promise > RIVAL * top]
+    trials = [try_fit(problem, less, item, floor) for item in [*own, *_varied(others)[:RIVALS]]]
+    rank(trials, less)
+    found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+    winner = next((trial for trial in trials if good_enough(trial, less)), None)
+    if winner is None or winner.candidate.key == term.candidate.key:
+        return
+    ahead = compare(problem.pieces, "both", found.best.residuals, winner.fit.residuals, floor)
+    more = len(winner.fit.values) - len(found.best.values)
+    if ahead.log_likelihood > (ENOUGH if more >= 0 else -PRICE) + PRICE * more:
+        found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
+        found.best = _taken(problem, winner)
 
 
 def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]:

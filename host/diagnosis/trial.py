@@ -15,12 +15,13 @@ SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
 TOGETHER = 11.0  # log-likelihood on all samples that makes up for a held-out part that shows an effect only dimly,
 DIM = 0.12  # with at most this p-value on held-out blocks,
 LITTLE = 1.8  # and at least this log-likelihood there
+OVERWHELMING = 25.0  # log-likelihood on all samples that needs no blocks to agree: few episodes may hold all of it
 PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
 SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
 SMALLEST_EXCESS = 0.10  # and this much of what is above noise
-BESIDE, ELSEWHERE = 0.12, 0.06  # likelihood of a further effect against that of those named at its subsystem, and of all,
-LARGE = 0.3  # but for one that takes this share of an output's error;
-FURTHER = 0.05  # and the least such share: modules are idealizations, what they lack is no other effect
+FURTHER = 0.05  # of some output's error a further effect has to take: what idealized modules lack is no effect;
+BESIDE = 0.2  # and of the likelihood of those named, but for one that takes
+LARGE, SURER = 0.3, 1e-6  # this share of what is left, with blocks held out that agree so well
 COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
 INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
 NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
@@ -110,7 +111,9 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     samples together have to be surer by far.
     """
     more = max(len(trial.fit.values) - len(base.values), 0)
-    return not at_bound(trial.fit) and not of_sampling(trial) and (_alone(trial, more) or _together(trial, more))
+    if at_bound(trial.fit) or of_sampling(trial):
+        return False
+    return _alone(trial, more) or _together(trial, more) or _plainly(trial, more)
 
 
 def _alone(trial: Trial, more: int) -> bool:
@@ -134,12 +137,21 @@ def _together(trial: Trial, more: int) -> bool:
     )
 
 
-def weighty(trial: Trial, earned: dict[str, float]) -> bool:
-    """Whether a trial earns enough beside what is named already (likelihood by subsystem); a finer shape is judged alone."""
-    least = max(BESIDE * earned.get(trial.candidate.port.subsystem, 0.0), ELSEWHERE * sum(earned.values()))
-    share = trial.both.share
-    further = not earned or (share > FURTHER and (share > LARGE or trial.both.log_likelihood > least))
-    return trial.replaced or further
+def _plainly(trial: Trial, more: int) -> bool:
+    """Likelihood so large that noise cannot be its cause, gained in both parts, in however few episodes."""
+    return (
+        trial.both.log_likelihood > OVERWHELMING + PRICE * more
+        and trial.both.share > _least(trial, trial.both)
+        and trial.heldout.log_likelihood > LITTLE
+        and trial.trained.log_likelihood > LITTLE
+    )
+
+
+def weighty(trial: Trial, earned: float) -> bool:
+    """Whether a trial earns enough beside the likelihood of what is named already; a finer shape is judged alone."""
+    large = trial.both.share > LARGE and trial.heldout.p_value < SURER
+    enough = trial.both.share > FURTHER and (large or trial.both.log_likelihood > BESIDE * earned)
+    return trial.replaced or earned == 0.0 or enough
 
 
 def _least(trial: Trial, gain: Gain) -> float:

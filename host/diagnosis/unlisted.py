@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.dictionary import Foretold, Form, equation_at, foretell, lay_out
+from host.diagnosis.dictionary import Foretold, Form, equation_at, fallen, foretell, lay_out
 from host.diagnosis.effect import Port
 from host.diagnosis.evidence import compare
 from host.diagnosis.fit import Fit, Problem, finish, minimize, reweigh
@@ -24,7 +24,9 @@ MUCH = 0.15  # share of the mismatch that one known effect may leave; two at a p
 # several effects that pile up and still do not fit stand for something that is in no list
 MEASURED = 2.0  # times a noise level from quiescent parts, beyond which the rest is not noise where effects are named,
 MEASURED_BARE = 3.0  # and where none is;
+BLURRED = 1.15  # and this is how well it is known: what is left within it may be noise
 GUESSED = 8.0  # times a level guessed from the spectrum, whose colour is not known
+TRIED_FORMS = 3  # refitted in the place of an effect that is named
 CHOSEN = 15.0  # log-likelihood an equation has to gain on samples to fit
 UNLIKELY = 0.1  # p-value it has to reach on held-out blocks
 NEAR = 0.7  # of the gain of an equation, at which a known effect refused by the search keeps it from being named
@@ -49,12 +51,12 @@ class Rest:
 
 def left_over(problem: Problem, found: Found, floor: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
-    mattered most.
+    mattered most; noise may be larger than its estimate by BLURRED.
     """
     shares, weights = [], []
     for row in range(floor.size):
         before = _power(problem, found.nominal.residuals, row) - floor[row] ** 2
-        after = _power(problem, found.best.residuals, row) - floor[row] ** 2
+        after = _power(problem, found.best.residuals, row) - (BLURRED * floor[row]) ** 2
         if before > 0.0:
             shares.append(float(np.clip(after / before, 0.0, 1.0)))
             weights.append(before / floor[row] ** 2)
@@ -99,7 +101,10 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
 
 def _rest(problem: Problem, found: Found, floor: Array, places: list[Foretold]) -> Rest:
     best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
-    return Rest(best, left_over(problem, found, floor), loud=_above_noise(problem, found, floor))
+    explained = fallen(problem, found.nominal.residuals, found.best.residuals, floor)
+    told = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
+    left = max(left_over(problem, found, floor), told)
+    return Rest(best, left, loud=_above_noise(problem, found, floor))
 
 
 def _equation_instead(
@@ -131,6 +136,17 @@ def _equation_instead(
     found.best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
     reweigh(problem, found.best)
     return True
+
+
+def equations_for(problem: Problem, less: Fit, port: Port, floor: Array) -> list[Trial]:
+    """The best forms of the library at `port`, or at the one whose reading it is, each refitted beside `less`."""
+    target = next((b for a, b in problem.model.unlisted_at if port.name in (a, b)), None)
+    if target is None:
+        return []
+    ports = {p.name: p for p in problem.model.ports}
+    name = next(a for a, b in problem.model.unlisted_at if b == target)
+    sized = [form for place in foretell(problem, less, floor, name) for form in place.forms]
+    return [_tried(problem, less, floor, ports[target], form, size) for form, size in sized[:TRIED_FORMS]]
 
 
 def _earned(trial: Trial) -> bool:

@@ -284,25 +284,16 @@ class Rig:
             "friction_distance": 1e-3,
         }
         law = _changed(law, acts, "contact", piece)
-        normal_force = contact(
-            law["gap"],
-            self.normal @ soft,
-            law["stiffness"],
-            law["exponent"],
-            law["reference"],
-            law["damping"],
-            law["crossley"],
-            law["relax"],
-            law["relax_time"],
-            piece.recording.dt_s,
-        )
+        normal_force = _pressed(law, self.normal @ soft, piece.recording.dt_s)
         force = self.normal[:, None] * normal_force
         if "beyond" in piece.extra:
             shape = self._shapes(piece, {**state, "push": force + piece.extra["beyond"]})
         run = _posed(shape, state)
         if law["friction"]:
             along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
-            force = force + law["friction"] * normal_force * drag_along(along, law["friction_distance"])
+            drag = law["friction"] * drag_along(along, law["friction_distance"])
+            normal_force = _pressed(law, self.normal @ soft + np.sum(soft * drag, axis=0), piece.recording.dt_s)
+            force = (self.normal[:, None] + drag) * normal_force
         run["force"] = _vector(force, acts, "force_sensor", piece)
         return _changed(run, acts, "pose_sensor", piece)
 
@@ -377,6 +368,24 @@ class Rig:
             moved[2 * index + 1] += sign * step * theta[2 * index]
             out.append(self.simulate(piece, moved, acts or []))
         return np.asarray((out[0] - out[1]) / (2.0 * step))
+
+
+def _pressed(law: dict[str, Any], soft: Array, dt_s: float) -> Array:
+    """Normal force (n,) of the contact law on a shaft of compliance `soft` (n,) along the normal."""
+    return np.asarray(
+        contact(
+            law["gap"],
+            soft,
+            law["stiffness"],
+            law["exponent"],
+            law["reference"],
+            law["damping"],
+            law["crossley"],
+            law["relax"],
+            law["relax_time"],
+            dt_s,
+        )
+    )
 
 
 def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:

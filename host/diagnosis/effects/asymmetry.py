@@ -9,10 +9,11 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Relative difference of gain on the two sides of a centre."""
-    centre = 0.0 if s.low < 0.0 < s.high else 0.5 * (s.low + s.high)
+    inside = tuple(s.low + f * s.span for f in (0.5, 0.2, 0.35, 0.65, 0.8))
+    centre = (0.0, *inside) if s.low < 0.0 < s.high else inside
     return (
         Parameter("ratio", "", (s.need / s.span,), -2.0, 2.0, linear=True),
-        Parameter("centre", s.unit, (centre,), s.low, s.high, step=0.1 * s.span),
+        Parameter("centre", s.unit, centre, s.low, s.high, step=0.1 * s.span),
     )
 
 

@@ -10,7 +10,8 @@ from host.diagnosis.operators import shift
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Rate of one clock against the other."""
     size = s.dt_s / s.duration_s
-    return (Parameter("rate", "s/s", (-5.0 * size, -size, size, 5.0 * size), -0.05, 0.05, step=size),)
+    rates = tuple(sign * times * size for times in (0.04, 0.2, 1.0, 5.0) for sign in (-1.0, 1.0))
+    return (Parameter("rate", "s/s", rates, -0.05, 0.05, step=size),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

@@ -7,7 +7,7 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Exponent of the depth."""
-    return (Parameter("exponent", "", (0.7, 1.3, 1.7, 2.2), 0.3, 5.0, log=True),)
+    return (Parameter("exponent", "", (0.7, 0.93, 1.07, 1.3, 1.7, 2.2), 0.3, 5.0, log=True),)
 
 
 def apply(law: dict, c: Context, p: Array, form: str) -> dict:

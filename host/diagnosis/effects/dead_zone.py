@@ -11,9 +11,11 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Centre and half-width of the band."""
     inside = tuple(s.low + f * s.span for f in (0.15, 0.3, 0.5, 0.7, 0.85))
     centre = inside + ((0.0,) if s.low < 0.0 < s.high else ())
+    narrow = min(max(2.0 * s.need, 2e-3 * s.span), 0.01 * s.span)
+    widths = spread(narrow, 0.25 * s.span, 6)
     return (
         Parameter("centre", s.unit, centre, s.low, s.high, step=0.1 * s.span),
-        Parameter("half_width", s.unit, spread(0.01 * s.span, 0.25 * s.span, 5), 1e-3 * s.span, 0.5 * s.span, log=True),
+        Parameter("half_width", s.unit, widths, min(1e-3 * s.span, 0.2 * narrow), 0.5 * s.span, log=True),
     )
 
 

@@ -11,9 +11,8 @@ from host.diagnosis.operators import shift
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Delay."""
     size = max(2.0 * s.dt_s, 1e-3 * s.duration_s)
-    return (
-        Parameter("delay", "s", (0.5 * s.dt_s, 2.0 * s.dt_s, 6.0 * s.dt_s, size), 0.0, 0.05 * s.duration_s, step=s.dt_s),
-    )
+    delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, 6.0 * s.dt_s, size)
+    return (Parameter("delay", "s", delays, 0.0, 0.05 * s.duration_s, step=s.dt_s),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

@@ -10,11 +10,8 @@ from host.diagnosis.operators import lag
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Time constant."""
-    return (
-        Parameter(
-            "time_constant", "s", spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6), 0.02 * s.dt_s, 0.3 * s.duration_s, log=True
-        ),
-    )
+    times = (0.1 * s.dt_s, *spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6))
+    return (Parameter("time_constant", "s", times, 0.02 * s.dt_s, 0.3 * s.duration_s, log=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

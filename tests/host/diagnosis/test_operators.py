@@ -66,10 +66,17 @@ def test_second_order_rings_at_its_frequency() -> None:
     assert np.max(np.abs(op.second_order(x, 0.005, w, z) - wanted)) < 0.04
 
 
-def test_shift_delays_a_sine() -> None:
+def test_shift_delays_a_sine_but_for_the_chords_between_samples() -> None:
     t = np.arange(0, 5, 0.02)
     late = op.shift(np.sin(2 * t), 0.02, np.full(t.size, 0.137))
-    assert np.allclose(late[20:], np.sin(2 * (t - 0.137))[20:], atol=1e-5)
+    assert np.max(np.abs(late[20:] - np.sin(2 * (t - 0.137))[20:])) < 0.02**2 / 8 * 4
+
+
+def test_shift_is_exact_where_the_motion_is_straight_between_samples() -> None:
+    t = np.arange(0, 5, 0.02)
+    late = op.shift(np.maximum(t - 1.0, 0.0), 0.02, np.full(t.size, 0.137))
+    assert np.allclose(late[20:], np.interp(t - 0.137, t, np.maximum(t - 1.0, 0.0))[20:], atol=1e-12)
+    assert late.min() == 0.0  # no undershoot before the jump of speed
 
 
 def test_overload_leaves_a_set_only_beyond_the_yield_level() -> None:

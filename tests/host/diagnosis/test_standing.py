@@ -1,53 +1,65 @@
-"""What a name needs to stand: weight beside others, events enough, and readings in steps told by their saw tooth."""
+"""What a name needs to stand: evidence enough, weight beside others, and readings in steps told by their saw tooth."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from host.diagnosis.effect import Candidate, Port, library
+from host.diagnosis.dictionary import Foretold, Form
+from host.diagnosis.effect import Candidate, Parameter, Port, library
 from host.diagnosis.effects.quantization import stepped
-from host.diagnosis.equivalence import Standing, scanty
+from host.diagnosis.equivalence import Standing, beside_unlisted
 from host.diagnosis.evidence import Gain
-from host.diagnosis.fit import Fit
-from host.diagnosis.trial import Trial, weighty
+from host.diagnosis.fit import Fit, Term
+from host.diagnosis.trial import Trial, good_enough, weighty
+from host.diagnosis.unlisted import Rest
 
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
 NOTHING = Gain(0.0, 1.0, 0.0)
-
-
-def standing(held_p: float, both_p: float, likelihood: float = 50.0) -> Standing:
-    return Standing(BACKLASH, Gain(likelihood, held_p, 0.2), Gain(2.0 * likelihood, both_p, 0.2), ())
 
 
 def trial(likelihood: float, share: float) -> Trial:
     return Trial(BACKLASH, Fit((), np.zeros(0)), NOTHING, NOTHING, Gain(likelihood, 1e-9, share), likelihood)
 
 
-@pytest.mark.parametrize(("held", "both", "doubted"), [(1e-4, 1e-3, False), (0.03, 1e-4, True), (0.03, 1e-9, False)])
-def test_a_name_that_rests_on_few_events_is_doubted(held: float, both: float, doubted: bool) -> None:
-    assert scanty([standing(held, both)]) is doubted
+@pytest.mark.parametrize(
+    ("held", "both", "taken"),
+    [
+        (Gain(100.0, 0.07, 0.2), Gain(700.0, 1e-3, 0.4), True),  # one episode held out: no block test can be sure
+        (Gain(10.0, 0.07, 0.2), Gain(20.0, 1e-3, 0.4), False),  # what chance may bring about
+        (Gain(1.0, 0.07, 0.2), Gain(700.0, 1e-3, 0.4), False),  # not seen held out
+        (Gain(10.0, 1e-4, 0.2), Gain(20.0, 1e-6, 0.4), True),  # many episodes agree
+    ],
+)
+def test_evidence_is_likelihood_or_agreement_of_blocks(held: Gain, both: Gain, taken: bool) -> None:
+    term = Term(BACKLASH, (Parameter("width", "rad", (0.1,), 0.0, 1.0),))
+    alone = Trial(BACKLASH, Fit((term,), np.array([0.1])), held, Gain(15.0, 1e-3, 0.2), both, 0.0)
+    assert good_enough(alone, Fit((), np.zeros(0))) is taken
 
 
-def test_the_strongest_effect_decides_whether_a_name_is_doubted() -> None:
-    assert not scanty([standing(0.3, 0.01, 10.0), standing(1e-6, 1e-9, 80.0)])
-    assert not scanty([])
+def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
+    form = Form("angle^2", lambda piece: piece.y[0] ** 2, 2)
+    rest = Rest(Foretold("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
+    weak, strong = (Standing(BACKLASH, Gain(gain, 1e-9, 0.2), Gain(gain, 1e-9, 0.2), ()) for gain in (10.0, 80.0))
+    assert [[c.name for c in s.alike] for s in beside_unlisted([weak, strong], rest)] == [[], ["unlisted@cable"]]
+    assert beside_unlisted([weak, strong], replace(rest, doubtful=False)) == [weak, strong]
 
 
 @pytest.mark.parametrize(
-    ("likelihood", "share", "place", "enough"),
+    ("likelihood", "share", "held", "enough"),
     [
-        (50.0, 0.2, "cable", False),  # less than an eighth of what is named there
-        (200.0, 0.2, "cable", True),
-        (50.0, 0.2, "elsewhere", False),  # and than a sixteenth of all
-        (70.0, 0.2, "elsewhere", True),
-        (200.0, 0.03, "cable", False),  # hardly anything of any output
-        (50.0, 0.4, "cable", True),  # a third of what an output has left
+        (150.0, 0.4, 1e-3, False),  # less than a fifth of what is named
+        (150.0, 0.4, 1e-9, True),  # but a third of what is left, to be seen all along
+        (250.0, 0.2, 1e-3, True),
+        (250.0, 0.03, 1e-9, False),  # hardly anything of any output
     ],
 )
-def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, place: str, enough: bool) -> None:
-    assert weighty(trial(likelihood, share), {place: 1000.0}) is enough
-    assert weighty(trial(likelihood, share), {})
+def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, held: float, enough: bool) -> None:
+    tried = replace(trial(likelihood, share), heldout=Gain(0.5 * likelihood, held, share))
+    assert weighty(tried, 1000.0) is enough
+    assert weighty(tried, 0.0)
 
 
 def test_steps_by_their_saw_tooth() -> None:

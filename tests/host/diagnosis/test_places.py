@@ -1,0 +1,92 @@
+"""Small effects have starts, wrong partners are exchanged, a stand-in lists the equation that does better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.diagnosis.effect import candidates
+from host.diagnosis.equivalence import standings
+from host.diagnosis.fit import Fit, Problem, finish, minimize
+from host.diagnosis.nominal import read_nominal
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.screening import screen
+from host.diagnosis.search import Found, _exchange, _grow, fit_nominal
+from tests.host.diagnosis import planted
+
+Array = np.ndarray
+
+
+def silent(text: str, share: float) -> None:
+    """No progress is shown."""
+
+
+def late(x: Array, t: Array) -> Array:
+    return np.interp(t - 0.0015, t, x)
+
+
+def drifting(x: Array, t: Array) -> Array:
+    return np.interp(t * (1.0 - 6e-5), t, x)
+
+
+def slack(x: Array, t: Array) -> Array:
+    return np.sign(x) * np.maximum(np.abs(x) - 0.003, 0.0)
+
+
+@pytest.mark.parametrize(("effect", "act"), [("latency", late), ("clock_drift", drifting), ("dead_zone", slack)])
+def test_effects_far_below_a_sample_or_the_span_are_not_overlooked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, effect: str, act: Callable[[Array, Array], Array]
+) -> None:
+    monkeypatch.setattr(planted, "_transmitted", lambda _, x, load, t: act(x, t))
+    problem, nominal = fitted(planted.transmission(tmp_path, "", 1))
+    ranked = screen(problem, nominal, candidates(problem.model.ports, True), silent)
+    promise = {item.candidate.effect.id: item.promise for item in reversed(ranked)}
+    assert promise[effect] > 0.9 * ranked[0].promise > 10.0
+
+
+def fitted(case: tuple[Path, list[Path]]) -> tuple[Problem, Fit]:
+    problem = prepare(read_nominal(case[0]), case[1])[1]
+    return problem, fit_nominal(problem)
+
+
+def found_by(problem: Problem, nominal: Fit, *ids: str) -> Found:
+    """What a search that knows only these effects finds."""
+    pool = [c for c in candidates(problem.model.ports, True) if c.effect.id in ids]
+    found = Found(nominal, nominal, [])
+    _grow(problem, found, pool, floor_of(problem), 0.0, silent)
+    return found
+
+
+def floor_of(problem: Problem) -> Array:
+    return np.array([noise.sigma for noise in problem.noise])
+
+
+def test_a_wrong_partner_is_exchanged_for_the_right_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    backlash = planted._transmitted
+    monkeypatch.setattr(planted, "_transmitted", lambda _, x, load, t: backlash("backlash", x, load, t))
+    problem, nominal = fitted(planted.transmission(tmp_path, "compliance", 1))
+    found = found_by(problem, nominal, "compliance", "rate_lag")
+    assert {name.partition("@")[0] for name in found.best.names} == {"compliance", "rate_lag"}
+    _exchange(problem, found, candidates(problem.model.ports, True), floor_of(problem), silent)
+    assert {name.partition("@")[0] for name in found.best.names} == {"compliance", "backlash"}
+
+
+@pytest.mark.parametrize(
+    ("effect", "named", "equal"), [("unlisted", "asymmetry", True), ("compliance", "compliance", False)]
+)
+def test_an_equation_that_does_better_is_listed_beside_a_stand_in(
+    tmp_path: Path, effect: str, named: str, equal: bool
+) -> None:
+    problem, nominal = fitted(planted.transmission(tmp_path, effect, 1))
+    term = next(
+        item.term
+        for item in screen(problem, nominal, candidates(problem.model.ports, True), silent)
+        if item.candidate.effect.id == named
+    )
+    begin = [*nominal.values, *(p.grid[0] for p in term.parameters)]
+    best = finish(problem, minimize(problem, (term,), np.array(begin)))
+    (standing,) = standings(problem, Found(nominal, best, []), floor_of(problem))
+    assert ("unlisted@cable" in [other.name for other in standing.alike]) is equal
