@@ -43,10 +43,12 @@ Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {li
 Not in lock step, so not here: loss of the zenoh router, processes killed with SIGKILL and real disks
 (`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that stands while its axis stands is not
 found until the axis moves. A force sensor that drifts is found by its distance from the model, so only once it has been off
-by {apart_N} N for about a second. **A knob that slips at the stage's full speed breaks the limit**, which is why
-`slipped_steps` draws it at half: tried at full speed, towards straight, 3 of 48 runs went above it where the loop stopped on lost
-steps and 1 of 48 where it retracts, as it does now; single ones reached 0.68 N. The catheter straightens before the insertion stage
-is through its play ({crossing_ms:.0f} ms). A motor with torque to spare over its load does not slip so fast; check that yours has it.
+by {apart_N} N for about a second.
+
+**A knob that slips at the stage's full speed breaks the limit**; `slipped_steps` therefore draws half of it. At full
+speed, towards straight, 3 of 48 runs went above the limit where the loop stopped on lost steps, 1 of 48 where it
+retracts, as it does now, and single ones reached 0.68 N: the catheter straightens before the insertion stage is
+through its play ({crossing_ms:.0f} ms). A motor with torque to spare over its load slips more slowly; see that yours has it.
 """
 
 

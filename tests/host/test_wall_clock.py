@@ -17,7 +17,7 @@ from sim.scenario import ContactJob
 
 pytestmark = pytest.mark.slow
 
-JOB = ContactJob(TARGET_M, force_N=0.15, approach_s=30.0)
+JOB = ContactJob(TARGET_M, force_N=0.15, approach_s=120.0)
 PATIENCE_S = 300.0
 
 
