@@ -207,6 +207,8 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
     _grow(problem, found, pool, floor, 0.0, tell)
     found = _detour(problem, found, pool, floor, tell)
     _exchange(problem, found, pool, floor, tell)
+    if found.best.terms:
+        found.best = refined(problem, found.best)
     return found
 
 
