@@ -143,6 +143,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
         after,
         bool(item.drop),
         problem.pieces[0].recording.dt_s,
+        any(piece.heldout.any() and not piece.fit.any() for piece in problem.pieces),
     )
 
 
