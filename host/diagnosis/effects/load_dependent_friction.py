@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.effects.presliding_friction import build_up, yielding
 from host.diagnosis.operators import capstan, dahl
 
