@@ -112,10 +112,16 @@ def _dead_zone(x: float, half: float) -> float:
 
 @njit(cache=True)
 def _lag(e, i: int, x: float, time_constant_s: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """First-order lag of x in state i, exact for a held input."""
+    """First-order lag of x in state i, exact for an input that runs straight between steps; state i + _PLAYS: that input.
+
+    Held over the step, the newest input would lead by half a step, which a short time constant does not forgive.
+    """
+    before = e.s[i + _PLAYS] if e.began else x
+    behind = (x - before) * time_constant_s / dt_s
     if not e.began:
         e.s[i] = x
-    e.s[i] = x + (e.s[i] - x) * math.exp(-dt_s / time_constant_s)
+    e.s[i] = x - behind + (e.s[i] - before + behind) * math.exp(-dt_s / time_constant_s)
+    e.s[i + _PLAYS] = x
     return e.s[i]
 
 

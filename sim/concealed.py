@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sim import concealed_generic, concealed_rig, concealed_system
-from sim.concealed_menu import MENU, UNLISTED, Dish
+from sim.concealed_menu import MENU, UNLISTED, Dish, equivalents
 from sim.concealed_rig import Session
 from sim.concealed_signals import tidy, windows
 from sim.concealed_system import Planted, System
@@ -320,6 +320,8 @@ def label(drawn: Drawn, recorded: Session) -> dict[str, Any]:
                 "start_s": p.start_s,
                 "parameters": p.parameters,
                 "compared": list(p.dish.compared),
+                "equivalent": equivalents(p.dish, p.parameters, _gain(system, p.dish.port), p.start_s),
+                "gain": _gain(system, p.dish.port),
             }
             for p in drawn.planted
         ],
@@ -331,6 +333,12 @@ def label(drawn: Drawn, recorded: Session) -> dict[str, Any]:
         "noise_rms_heldout": dict(zip(system.channels, noise.tolist(), strict=True)),
         "plan": asdict(plan),
     }
+
+
+def _gain(system: System, port: str) -> float:
+    """True gain of the link at `port`; 1 where there is none."""
+    at = {"rig": {"insertion": 0, "roll": 2, "knob": 4}, "transmission": {"roll": 0, "knob": 2}}.get(system.kind, {})
+    return float(system.case.nominal[at[port]]) if port in at else 1.0
 
 
 def _place(kind: str, dish: Dish) -> str:

@@ -133,7 +133,7 @@ def move(
     out: Array,
     used: Array,
 ) -> None:
-    """Axis: position out (n,) under drive (n,) N, semi-implicit; gains (2,) above zero close a loop on the late position.
+    """Axis: position out (n,) under drive (n,) N, midpoint rule; gains (2,) above zero close a loop on the late position.
 
     p: mass, damping, stiffness, offset. used (n,): the force that drove it; in closed loop `drive` is the wanted position.
     """
@@ -149,13 +149,15 @@ def move(
             force = p[2] * drive[i] + gains[0] * error + gains[1] * total
         used[i] = force
         for k in range(INSIDE if i > 0 else 0):
-            u = last if gains[0] > 0.0 else last + (force - last) * (k + 1.0) / INSIDE
+            u = last if gains[0] > 0.0 else last + (force - last) * (k + 0.5) / INSIDE
             h = dt_s / INSIDE
             against = 0.0
             for j in range(codes.size):
                 against += extra(codes[j], q[j], state[j], x, v, times[i - 1] + k * h, h, p[2])
-            v = (v + h / p[0] * (u + p[3] - p[2] * x - against)) / (1.0 + h * p[1] / p[0] + h * h * p[2] / p[0])
-            x += h * v
+            still = 0.5 * h * p[1] / p[0] + 0.25 * h * h * p[2] / p[0]
+            before = v
+            v = (v * (1.0 - still) + h / p[0] * (u + p[3] - p[2] * x - against)) / (1.0 + still)
+            x += 0.5 * h * (before + v)
         out[i] = x
         last = force
 

@@ -1,7 +1,8 @@
 """What can be planted in a concealed case: for every family of cases the effects, how each grows with its size, its label.
 
 A size of 1 is middling; the generator scales it until the mismatch has the wanted rho. `parameters` are the planted ones;
-`compared` names those whose meaning does not depend on the formula, so that a finder's values can be held against them.
+`compared` names those whose meaning does not depend on the formula, so that a finder's values can be held against them;
+`equivalents` are what other words than the generator's would say.
 """
 
 from __future__ import annotations
@@ -35,6 +36,19 @@ class Dish:
     def names(self) -> tuple[str, ...]:
         """All ids that say the truth."""
         return (self.id, *self.same)
+
+
+def equivalents(dish: Dish, planted: Mapping[str, float], gain: float, start_s: float) -> dict[str, float]:
+    """Planted values in the words of docs/diagnosis.md where those are not the generator's. `gain`: of the place's link."""
+    if dish.id == "compliance":
+        return {"compliance_rad_per_Nm": gain * planted["compliance_rad_per_Nm"]}
+    if dish.id == "sensor_scale":
+        return {"gain_error": planted["gain"] - 1.0}
+    if dish.id == "stribeck_friction" and "static_force_N" in planted:
+        return {"static_excess_N": planted["static_force_N"] - planted["kinetic_force_N"]}
+    if dish.id == "sensor_bias" and start_s == 0.0:
+        return {f"offset_{name}": value for name, value in planted.items()}
+    return {}
 
 
 def _one(name: str, size: float, **fixed: float) -> Make:
@@ -158,7 +172,7 @@ _SENSORS = [
         "pose_sensor",
         lambda s: {"amplitude_m": min(1.5e-3 * s, 0.1), "x_m": 0.02, "y_m": 0.01, "z_m": 0.05, "reach_m": 0.025},
     ),
-    Dish("sensor_scale", "pose_sensor", lambda s: {"gain": 1.0 + 0.03 * s}, ("gain",), signed=True),
+    Dish("sensor_scale", "pose_sensor", lambda s: {"gain": 1.0 + 0.03 * s}, signed=True),
     Dish(
         "periodic_disturbance",
         "pose_sensor",
@@ -171,7 +185,6 @@ _SENSORS = [
         "sensor_bias",
         "force_sensor",
         lambda s: {"x_N": 2e-3 * s, "y_N": 1e-3 * s, "z_N": 3e-3 * s},
-        ("x_N", "y_N", "z_N"),
         signed=True,
         late=True,
     ),
@@ -222,7 +235,7 @@ _SENSORS = [
 RIG = [*_INSERTION, *_ROLL, *_ROLL_ONLY, *_KNOB, *_KNOB_ONLY, *_COUPLED, *_LOADS, *_CONTACT, *_SENSORS]
 
 _LOADED = [
-    Dish("compliance", "roll", _one("compliance_rad_per_Nm", 100.0), ("compliance_rad_per_Nm",)),
+    Dish("compliance", "roll", _one("compliance_rad_per_Nm", 100.0)),
     Dish("load_dependent_friction", "roll", lambda s: {"coefficient": min(0.2 * s, 5.0), "stiffness_Nm_per_rad": 1.25e-3}),
 ]
 TRANSMISSION = [
@@ -237,12 +250,12 @@ TRANSMISSION = [
 
 _DRY = [
     Dish("coulomb_friction", "", _one("force_N", 0.3), ("force_N",)),
-    Dish("presliding_friction", "", _one("force_N", 0.4, distance_m=4e-3), ("force_N",)),
+    Dish("presliding_friction", "", _one("force_N", 0.4, distance_m=4e-3)),
     Dish(
         "stribeck_friction",
         "",
         lambda s: {"static_force_N": 0.5 * s, "kinetic_force_N": 0.25 * s, "speed_m_per_s": 0.01},
-        ("static_force_N", "kinetic_force_N"),
+        ("kinetic_force_N",),
     ),
 ]
 _PLAIN = [
@@ -255,7 +268,7 @@ AXIS = [
     *_PLAIN,
     Dish("nonlinear_stiffness", "", _one("cubic_N_per_m3", 6e3), ("cubic_N_per_m3",), ("static_nonlinearity",), signed=True),
     Dish("dead_zone", "", _one("half_width_N", 0.2), ("half_width_N",)),
-    Dish("saturation", "", lambda s: {"limit_N": 2.6 / (1.0 + 0.4 * s)}, ("limit_N",)),
+    Dish("saturation", "", lambda s: {"limit_N": 2.6 / (1.0 + 0.4 * s)}),
 ]
 IMPEDANCE = [
     *_DRY,

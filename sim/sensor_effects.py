@@ -201,16 +201,16 @@ def _reading(e, rig, at: int, x: Array, n: int) -> None:  # type: ignore[no-unty
 
 @njit(cache=True)
 def _slow(e, rig, at: int, x: Array, n: int) -> None:  # type: ignore[no-untyped-def]
-    """A first-order lag, or a slow tail of part of the reading, over the time since this reading's last sample."""
+    """A first-order lag, or a slow tail of part of the reading, which runs straight between this and its last sample."""
     elapsed = rig.time_s - e.s[at + 3]
+    constant = e.p[0] if e.code == code.RATE_LAG else e.p[1]
     for i in range(n):
         if e.s[at + 4] == 0.0:
-            e.s[at + i] = x[i]
-        if e.code == code.RATE_LAG:
-            e.s[at + i] = x[i] + (e.s[at + i] - x[i]) * math.exp(-elapsed / e.p[0])
-            x[i] = e.s[at + i]
-        else:
-            e.s[at + i] = x[i] + (e.s[at + i] - x[i]) * math.exp(-elapsed / e.p[1])
-            x[i] += e.p[0] * (e.s[at + i] - x[i])
+            e.s[at + i] = e.s[at + 5 + i] = x[i]
+        before, reading = e.s[at + 5 + i], x[i]
+        behind = (reading - before) * constant / elapsed if elapsed > 0.0 else 0.0
+        e.s[at + i] = reading - behind + (e.s[at + i] - before + behind) * math.exp(-elapsed / constant)
+        e.s[at + 5 + i] = reading
+        x[i] = e.s[at + i] if e.code == code.RATE_LAG else reading + e.p[0] * (e.s[at + i] - reading)
     e.s[at + 3] = rig.time_s
     e.s[at + 4] = 1.0

@@ -134,7 +134,7 @@ def robust(r: Array) -> tuple[float, Array]:
     return cost, np.sqrt(np.where(inside, 1.0, HUBER / np.maximum(size, 1e-300)))
 
 
-def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: int = 25, tolerance: float = 1e-5) -> Fit:
+def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: int = 40, tolerance: float = 1e-7) -> Fit:
     """Values that minimize the Huber cost of the weighted simulation error, from `start`."""
     parameters = problem.parameters(terms)
     values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])

@@ -14,6 +14,7 @@ Mask = npt.NDArray[np.bool_]
 ORDER = 3
 SHORTEST = 30  # samples of a stretch that counts
 SETTLING = 3.0  # first halves' variance against that of the second ones, from which on an output is still settling
+QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
 
 @dataclass(frozen=True)
@@ -133,15 +134,23 @@ def autoregression(lags: Array) -> Array:
 
 
 def _high_frequency(outputs: list[Array]) -> float:
-    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum."""
+    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum.
+
+    A mean of few periodograms scatters, and its quietest twentieth lies below the noise even if that is white: it is
+    put where a twentieth of chi-squared is (Welch 1967).
+    """
     from scipy.signal import welch
+    from scipy.stats import chi2
 
     spread = []
     for values in outputs:
         if np.count_nonzero(np.isfinite(values)) > 64:
             line = fill(values)
-            _, power = welch(line, fs=1.0, nperseg=min(256, line.size), window="blackman")
-            spread.append(np.sqrt(0.5 * np.quantile(power[1:-1], 0.05)))
+            size = min(256, line.size // 4)
+            freedom = 2.0 * (1 + (line.size - size) // (size - size // 2))
+            _, power = welch(line, fs=1.0, nperseg=size, window="blackman")
+            low = chi2.ppf(QUIETEST, freedom) / freedom
+            spread.append(np.sqrt(0.5 * np.quantile(power[1:-1], QUIETEST) / low))
     return float(np.median(spread)) if spread else 0.0
 
 

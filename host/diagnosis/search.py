@@ -143,6 +143,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
         after,
         bool(item.drop),
         problem.pieces[0].recording.dt_s,
+        any(piece.heldout.any() and not piece.fit.any() for piece in problem.pieces),
     )
 
 
@@ -207,6 +208,8 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
     _grow(problem, found, pool, floor, 0.0, tell)
     found = _detour(problem, found, pool, floor, tell)
     _exchange(problem, found, pool, floor, tell)
+    if found.best.terms:
+        found.best = refined(problem, found.best)
     return found
 
 

@@ -40,6 +40,7 @@ class Trial:
     starts: list[dict[str, float]] = field(default_factory=list)
     replaced: bool = False
     period_s: float = 0.0
+    apart: bool = True  # whether whole recordings are held out, not blocks between the fitted ones
 
 
 def at_bound(fit: Fit) -> bool:
@@ -108,12 +109,12 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts.
 
     Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
-    samples together have to be surer by far.
+    samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
     more = max(len(trial.fit.values) - len(base.values), 0)
     if at_bound(trial.fit) or of_sampling(trial):
         return False
-    return _alone(trial, more) or _together(trial, more) or _plainly(trial, more)
+    return _alone(trial, more) or (trial.apart and _together(trial, more)) or _plainly(trial, more)
 
 
 def _alone(trial: Trial, more: int) -> bool:

@@ -13,6 +13,8 @@ from host.proof.equation_form import right_form
 
 Array = np.ndarray
 SILENT_BELOW = 0.19  # rho under which nothing is promised: silence is no fault there
+FROM_THE_BEGIN = {"clock_drift"}
+BEHIND = "behind the gain"  # in the equation of an effect that acts on the output of its link
 _UNITS = {"m", "rad", "N", "Nm", "s", "Hz", "per", "m2", "m3", "N2", "s2", "square", "share", "kg"}
 
 
@@ -172,11 +174,10 @@ def parameters(label: dict[str, Any], effects: list[dict[str, Any]]) -> tuple[tu
     """(relative errors, whether the 95 % interval holds the truth) of all comparable parameters of truly named effects."""
     errors, covered = [], []
     for planted, names in zip(label["planted"], label["names"], strict=True):
-        effect = next((e for e in effects if e.get("id") in names), None)
-        found = {_base(k): v for k, v in ((effect or {}).get("parameters") or {}).items()}
-        for name in planted["compared"]:
+        effect = next((e for e in effects if e.get("id") in names), None) or {}
+        found = {_base(k): v for k, v in (effect.get("parameters") or {}).items()}
+        for name, true in comparable(planted, effect).items():
             value = found.get(_base(name))
-            true = float(planted["parameters"][name])
             if not isinstance(value, dict) or true == 0.0 or not isinstance(value.get("value"), (int, float)):
                 continue
             errors.append(abs(float(value["value"]) - true) / abs(true))
@@ -184,6 +185,18 @@ def parameters(label: dict[str, Any], effects: list[dict[str, Any]]) -> tuple[tu
             if isinstance(ends, list) and len(ends) == 2 and None not in ends:
                 covered.append(bool(ends[0] <= true <= ends[1]))
     return tuple(errors), tuple(covered)
+
+
+def comparable(planted: dict[str, Any], effect: dict[str, Any]) -> dict[str, float]:
+    """True values that the parameters of `effect` can be held against, by name, as the label or its equivalents have them.
+
+    An amplitude that the effect counts behind the gain is turned there; a drift that began later than the recordings is
+    none whose rate counts from their begin.
+    """
+    if planted["id"] in FROM_THE_BEGIN and planted["start_s"] > 0.0:
+        return {}
+    gain = planted.get("gain", 1.0) if BEHIND in str(effect.get("equation", "")) else 1.0
+    return {name: gain * float(planted["parameters"][name]) for name in planted["compared"]} | planted.get("equivalent", {})
 
 
 def gap_closed(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:

@@ -109,6 +109,13 @@ def test_lag_levels_off_where_delay_does_not() -> None:
         assert abs(response(delay, frequency) - np.exp(-2j * np.pi * frequency * 0.05)) < 0.02
 
 
+def test_a_ramp_comes_late_by_the_whole_time_constant_however_short() -> None:
+    x = np.arange(0.0, 1.0, DT)
+    for constant in (0.5 * DT, 2.0 * DT, 0.05):
+        lag = x - drive(Effect("rate_lag", "insertion", {"time_constant_s": constant}), x)
+        assert lag[-1] == pytest.approx(constant, rel=1e-6)
+
+
 def test_clock_drift_delays_more_and_more() -> None:
     x = np.arange(0.0, 20.0, DT)
     lost = x - drive(Effect("clock_drift", "insertion", {"rate": 0.01}), x)

@@ -101,7 +101,7 @@ def test_the_axis_is_recorded_when_it_moves_not_a_sample_later() -> None:
     exact = lsim(([1.0], p[:3]), drive, time)[1]
     moved = concealed_generic.predict("axis", p, drive[:, None], period)[:, 0]
     late = np.interp(time - period, time, exact)
-    assert np.sqrt(np.mean((moved - exact) ** 2)) < 0.2 * np.sqrt(np.mean((late - exact) ** 2))
+    assert np.sqrt(np.mean((moved - exact) ** 2)) < 0.01 * np.sqrt(np.mean((late - exact) ** 2))
 
 
 def test_a_mismatch_that_training_does_not_show_is_not_taught() -> None:

@@ -36,6 +36,7 @@ PARAMETERS = (
     ("wall_distance", "m", 0.04),
     ("wall_stiffness", "N/m", 1000.0),
 )
+TOUCH_M = 1e-3  # natural size of a place: slopes by its thousandth stay within the depth of a press
 KEYS = {
     "insertion_offset": "insertion_offset_m",
     "roll_offset": "roll_offset_rad",
@@ -86,7 +87,8 @@ class Rig:
             value, free = spec.start(KEYS.get(name, name), default)
             positive = name in ("bending_stiffness", "wall_stiffness")
             low, high = (value, value) if not free else (0.02 * value, 50.0 * value) if positive else (-np.inf, np.inf)
-            parameters.append(Parameter(name, unit, (value,), low, high, log=positive and free, step=abs(value) or 1.0))
+            step = TOUCH_M if unit == "m" else abs(value) or 1.0
+            parameters.append(Parameter(name, unit, (value,), low, high, log=positive and free, step=step))
         self.parameters = tuple(parameters)
         self.outputs = tuple(
             [

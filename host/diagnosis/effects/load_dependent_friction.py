@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.effects.presliding_friction import build_up, yielding
 from host.diagnosis.operators import capstan, dahl
 
 
@@ -12,7 +13,7 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
     return (
         Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        Parameter("distance", s.unit, spread(0.01 * s.span, 0.3 * s.span, 4), 1e-3 * s.span, 3.0 * s.span, log=True),
+        build_up(s, 0.3, 4),
     )
 
 
@@ -21,14 +22,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     unit = "" if s.unit == s.source_unit else f"{s.unit}/{s.source_unit}"
     return (
         Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        Parameter(
-            "distance",
-            s.motion_unit,
-            spread(3e-3 * s.motion_span, 0.3 * s.motion_span, 5),
-            3e-4 * s.motion_span,
-            3.0 * s.motion_span,
-            log=True,
-        ),
+        yielding(s, 5),
     )
 
 

@@ -8,11 +8,25 @@ from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spre
 from host.diagnosis.operators import dahl, maxwell_slip
 
 
+def build_up(s: Scale, longest: float, count: int) -> Parameter:
+    """Distance over which lost motion builds up: `count` starts up to `longest` of the span."""
+    return Parameter(
+        "distance", s.unit, spread(0.01 * s.span, longest * s.span, count), 1e-3 * s.span, 3.0 * s.span, log=True
+    )
+
+
+def yielding(s: Scale, count: int, first: float = 3e-3, least: float = 3e-4) -> Parameter:
+    """Distance over which a friction force builds up: `count` starts from `first` of the span on, no less than `least`."""
+    span = s.motion_span
+    grid = spread(first * span, 0.3 * span, count)
+    return Parameter("distance", s.motion_unit, grid, least * span, 3.0 * span, log=True)
+
+
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion when fully built up, and the distance over which that happens."""
     return (
         Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        Parameter("distance", s.unit, spread(0.01 * s.span, 0.6 * s.span, 5), 1e-3 * s.span, 3.0 * s.span, log=True),
+        build_up(s, 0.6, 5),
     )
 
 
@@ -20,14 +34,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction force when fully built up, and the distance over which that happens."""
     return (
         Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        Parameter(
-            "distance",
-            s.motion_unit,
-            spread(1e-3 * s.motion_span, 0.3 * s.motion_span, 6),
-            1e-5 * s.motion_span,
-            3.0 * s.motion_span,
-            log=True,
-        ),
+        yielding(s, 6, 1e-3, 1e-5),
     )
 
 

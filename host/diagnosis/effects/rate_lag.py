@@ -20,8 +20,9 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
-    """Every row of every pose through the low pass."""
-    return {**run, **{name: rows(run[name], c, p[0]) for name in ("tip", "shaft", "tip_R", "shaft_R")}}
+    """Every row of every pose through the low pass; form `positions`: turns are read promptly."""
+    names = ("tip", "shaft") if form == "positions" else ("tip", "shaft", "tip_R", "shaft_R")
+    return {**run, **{name: rows(run[name], c, p[0]) for name in names}}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -49,6 +50,7 @@ EFFECTS = tuple(
         "time_constant*dy/dt + y = x",
         apply_pose,
         timed=True,
+        forms=("", "positions"),
     ),
     Effect(
         "rate_lag",

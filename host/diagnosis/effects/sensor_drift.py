@@ -7,19 +7,18 @@ import numpy as np
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
+def warming(s: Scale) -> Parameter:
+    """Time constant of a warm-up."""
+    d = s.duration_s
+    return Parameter("time_constant", "s", spread(0.05 * d, 0.7 * d, 3), 0.01 * d, 3 * d, log=True)
+
+
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Rate of the drift; second form: level and time constant of a warm-up."""
     if form == "warm_up":
         return (
             Parameter("level", s.unit, (s.need,), linear=True),
-            Parameter(
-                "time_constant",
-                "s",
-                spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3),
-                0.01 * s.duration_s,
-                3 * s.duration_s,
-                log=True,
-            ),
+            warming(s),
         )
     return (Parameter("rate", f"{s.unit}/s", (s.need / s.duration_s,), linear=True),)
 
@@ -37,14 +36,7 @@ def vector(s: Scale, form: str) -> tuple[Parameter, ...]:
         level = tuple(Parameter(f"level_{a}", s.unit, (s.need,), linear=True) for a in "xyz")
         return (
             *level,
-            Parameter(
-                "time_constant",
-                "s",
-                spread(0.05 * s.duration_s, 0.7 * s.duration_s, 3),
-                0.01 * s.duration_s,
-                3 * s.duration_s,
-                log=True,
-            ),
+            warming(s),
         )
     return tuple(Parameter(f"rate_{a}", f"{s.unit}/s", (s.need / s.duration_s,), linear=True) for a in "xyz")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-TRANSMISSION = """
+CABLE = """
 name = "planted"
 kind = "transmission"
 [data]
@@ -15,9 +15,6 @@ TIME
 [channels.motor]
 column = "motor"
 unit = "rad"
-[channels.load]
-column = "load"
-unit = "N m"
 [channels.tip]
 column = "tip"
 unit = "rad"
@@ -25,7 +22,11 @@ unit = "rad"
 subsystem = "cable"
 input = "motor"
 output = "tip"
-load = ["load"]
+"""
+TRANSMISSION = f"""{CABLE}load = ["load"]
+[channels.load]
+column = "load"
+unit = "N m"
 """
 AXIS = """
 name = "planted"

@@ -12,24 +12,8 @@ import pytest
 
 from host.cli.diagnose import diagnose
 from host.diagnosis.excitation import SHAPES, Span, family
-from tests.host.diagnosis.planted import coloured
+from tests.host.diagnosis.planted import CABLE, coloured
 
-TOML = """
-name = "cable"
-kind = "transmission"
-[data]
-time = "t"
-[channels.motor]
-column = "motor"
-unit = "rad"
-[channels.tip]
-column = "tip"
-unit = "rad"
-[[link]]
-subsystem = "cable"
-input = "motor"
-output = "tip"
-"""
 Array = np.ndarray
 
 
@@ -68,7 +52,7 @@ def verdict_of(folder: Path, files: list[Path], out: str) -> dict[str, Any]:
 def test_the_set_gets_smaller_with_the_recording_of_the_script(
     tmp_path: Path, plant: Callable[[Array, Array], Array], name: str
 ) -> None:
-    (tmp_path / "n.toml").write_text(TOML)
+    (tmp_path / "n.toml").write_text(CABLE.replace("TIME", 'time = "t"'))
     files = [record(tmp_path / f"r{k}.csv", *slow(k), plant, k) for k in range(3)]
     first = verdict_of(tmp_path, files, "first")
     alike = first["effects"][0]["indistinguishable_from"]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from host.diagnosis.chains.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
+from host.diagnosis.fit import free, jacobian, size_of
 from host.diagnosis.force_kernel import along, run_axis, slot_array
+from host.diagnosis.nominal import read_nominal
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.search import fit_nominal
 from tests.host.diagnosis import rig_cases
 
 
@@ -142,3 +148,17 @@ def test_contact_is_the_equilibrium_of_two_springs() -> None:
 def test_quaternions_become_rotations() -> None:
     q = np.array([[np.cos(0.2)], [0.0], [0.0], [np.sin(0.2)]])
     assert rotation_logs(np.eye(3)[:, :, None], matrices(q))[:, 0] == pytest.approx([0, 0, 0.4])
+
+def test_slopes_of_the_nominal_parameters_are_those_of_the_smallest_step(tmp_path: Path) -> None:
+    nominal, files = rig_cases.write(tmp_path, rig_cases.Truth(), 3, recordings=1)
+    model, problem, _ = prepare(read_nominal(nominal), files)
+    fit = fit_nominal(problem)
+    base = problem.stacked((), fit.values)
+    J = jacobian(problem, (), fit.values, base, [size_of(p, v) for p, v in zip(model.parameters, fit.values, strict=True)])
+    for name in ("insertion_offset", "wall_distance"):
+        index = [p.name for p in model.parameters].index(name)
+        moved = fit.values.copy()
+        moved[index] += 1e-8
+        slope = (base - problem.stacked((), moved)) / 1e-8 * model.parameters[index].step
+        place = free(list(model.parameters)).index(index)
+        assert np.linalg.norm(J[:, place] - slope) < 0.05 * np.linalg.norm(slope)

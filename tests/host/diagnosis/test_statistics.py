@@ -12,6 +12,7 @@ from host.diagnosis.dataset import Recording
 from host.diagnosis.evidence import compare, correlation_time, whiteness
 from host.diagnosis.locate import inside, joined, windows
 from host.diagnosis.model import Piece
+from host.diagnosis.uncertainty import _jackknife
 
 
 def ar1(rng: np.random.Generator, n: int, phi: float, sigma: float = 1.0) -> np.ndarray:
@@ -114,3 +115,21 @@ def test_noise_by_steps_is_not_misled_by_a_slow_signal_or_by_jumps() -> None:
     sigma, correlation = noise.by_steps(rough + 0.2 * np.sin(0.3 * t) + 0.5 * (t > 30.0), 1e-4, 1.0)
     assert sigma == pytest.approx(0.05, rel=0.1) and 1.3 < correlation < 2.6
     assert noise.by_steps(rough, 0.3, 4.0) == (0.3, 4.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_jackknife_knows_when_few_blocks_carry_a_parameter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spread, freedom = [], []
+    for _ in range(300):
+        J = np.column_stack([np.ones(600), np.where(np.arange(600) < 30, 1.0, 0.01)])
+        r = rng.standard_normal(600)
+        r -= J @ np.linalg.lstsq(J, r, rcond=None)[0]
+        blocks = [(J[k : k + 10].T @ J[k : k + 10], J[k : k + 10].T @ r[k : k + 10]) for k in range(0, 600, 10)]
+        each = _jackknife(blocks)
+        spread.append(each[0])
+        freedom.append(each[1])
+    true = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    assert np.sqrt(np.mean(np.square(spread), axis=0))[0] == pytest.approx(true[0], rel=0.1)
+    assert np.all(np.sqrt(np.mean(np.square(spread), axis=0)) > 0.95 * true)
+    assert np.mean(freedom, axis=0)[1] < 5.0 < 40.0 < np.mean(freedom, axis=0)[0]

@@ -143,6 +143,28 @@ def test_parameters_by_meaning_and_intervals() -> None:
     assert parameters(LABEL, [effect | {"id": "whip"}]) == ((), ())
 
 
+def held(planted: dict, equation: str, **found: float) -> tuple[bool, ...]:  # type: ignore[type-arg]
+    """Whether intervals of a hundredth about what was found hold what was planted."""
+    parts = {k: {"value": v, "ci95": sorted((0.99 * v, 1.01 * v))} for k, v in found.items()}
+    label = LABEL | {"planted": [PLANTED | planted], "names": [[planted["id"]]]}
+    return parameters(label, [{"id": planted["id"], "equation": equation, "parameters": parts}])[1]
+
+
+def test_values_are_compared_in_the_words_that_the_finder_has_for_them() -> None:
+    whip = {"id": "whip", "parameters": {"amplitude_rad": 0.2}, "compared": ["amplitude_rad"], "gain": 0.5}
+    assert held(whip, "y + amplitude*sin(y + phase) = x", amplitude_rad=0.2) == (True,)
+    assert held(whip, "y + amplitude*sin(y + phase) = x, behind the gain", amplitude_rad=0.1) == (True,)
+    assert held(whip, "y + amplitude*sin(y + phase) = x, behind the gain", amplitude_rad=0.2) == (False,)
+    scale = {"id": "sensor_scale", "parameters": {"gain": 1.1}, "compared": [], "equivalent": {"gain_error": 0.1}}
+    assert held(scale, "", gain_error=0.1) == (True,)
+
+
+def test_a_drift_that_begins_late_has_no_rate_since_the_begin() -> None:
+    drift = {"id": "clock_drift", "parameters": {"rate": 1e-4}, "compared": ["rate"]}
+    assert held(drift, "", rate=1e-4) == (True,)
+    assert held(drift | {"start_s": 9.0}, "", rate=1e-4) == ()
+
+
 def test_gap_closed_between_nominal_and_noise() -> None:
     def fit(before: float, after: float) -> dict:  # type: ignore[type-arg]
         return {"fit": {"per_channel": {"tip_turn_z": {"rmse_before": before, "rmse_after": after}}}}
