@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+
+BRISTLES = 2e-3  # of the travel: friction that builds up over less is dry friction, over more presliding
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -13,8 +15,12 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Friction force."""
-    return (Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),)
+    """Friction force; second form: and the distance, far below the travel, over which what touches yields."""
+    level = Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True)
+    if form == "":
+        return (level,)
+    low, high = 1e-5 * s.motion_span, BRISTLES * s.motion_span
+    return (level, Parameter("distance", s.motion_unit, spread(3.0 * low, 0.6 * high, 3), low, high, log=True))
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -23,8 +29,8 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Level of the sliding force."""
-    return {"coulomb": p[0]}
+    """Level of the sliding force, and the distance of its bristles."""
+    return {"presliding": p[0], "presliding_distance": p[1]} if form == "bristles" else {"coulomb": p[0]}
 
 
 EFFECTS = (
@@ -46,6 +52,7 @@ EFFECTS = (
         "A constant force of {force} acts against the motion.",
         "F = force*sign(v)",
         slots=slots,
+        forms=("", "bristles"),
         family="dry",
     ),
 )

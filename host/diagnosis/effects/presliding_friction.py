@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.effects.coulomb_friction import BRISTLES
 from host.diagnosis.operators import dahl, maxwell_slip
 
 
@@ -34,7 +35,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction force when fully built up, and the distance over which that happens."""
     return (
         Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        yielding(s, 6, 1e-3, 1e-5),
+        yielding(s, 6, 2.0 * BRISTLES, BRISTLES),
     )
 
 

@@ -132,7 +132,7 @@ def test_a_free_stage_on_bristles(tmp_path: Path) -> None:
     nominal, files = written(tmp_path, STAGE, [stage(rng) for _ in range(3)])
     verdict = as_json(diagnose(read_nominal(nominal), files, lambda what, part: None), 0.0)
     (friction,) = verdict["effects"]
-    assert friction["id"] == "presliding_friction"
+    assert friction["id"] == "coulomb_friction"  # the bristles are a five-thousandth of the travel
     assert friction["parameters"]["force_N"]["value"] == pytest.approx(3.0, rel=0.05)
     assert friction["parameters"]["distance_m"]["value"] == pytest.approx(2e-5, rel=0.3)
     assert verdict["fit"]["nominal_parameters"]["mass_N_s2_per_m"]["value"] == pytest.approx(2.0, rel=0.05)
