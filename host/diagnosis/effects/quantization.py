@@ -14,6 +14,14 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (Parameter("step", s.unit, (2.0 * s.need, 4.0 * s.need), 0.5 * s.need, 30.0 * s.need, step=0.01 * s.need),)
 
 
+def of_a_force(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Height of a step, a quarter of the recorded range at most: a coarser one would say that nothing was read."""
+    grid = tuple(size for size in (2.0 * s.need, 4.0 * s.need) if size < 0.25 * s.span)
+    if not grid:
+        return ()
+    return (Parameter("step", s.unit, grid, 0.5 * s.need, min(30.0 * s.need, 0.25 * s.span), step=0.01 * s.need),)
+
+
 def stepped(x: Array, step: float) -> Array:
     """`x` rounded to steps, the saw tooth by its first harmonics."""
     phase = 2.0 * np.pi * x / step
@@ -47,7 +55,7 @@ EFFECTS = (
         "quantization",
         "forces",
         90,
-        parameters,
+        of_a_force,
         "The force sensor's readings move in steps of {step}.",
         "y = step*round(x/step)",
         apply_force,
