@@ -64,7 +64,7 @@ faults: setup
 
 fuzz: setup
 	@$(MAKE) -s -C firmware/fuzz run INPUTS=$(INPUTS) >build/fuzz.json && cat build/fuzz.json
-	@$(BIN)/python -m host.reliability_page docs/reliability.md <build/fuzz.json
+	@$(BIN)/python -m host.studies.reliability_page docs/reliability.md <build/fuzz.json
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md

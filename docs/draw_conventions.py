@@ -14,9 +14,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.rotations import rotation_matrix
+from protocol.catheter import load_catheter
 
 TARGET = Path(__file__).parent / "pictures" / "conventions.svg"
 INSERTION_m, CURVATURE_per_m, FORCE_N = 0.03, 18.0, np.array([0.06, 0.02, -0.05])
@@ -70,12 +70,20 @@ def plane(axes: Any) -> None:
     axes.plot([-18, 0], [0, 0], color="0.6", linewidth=10, solid_capstyle="butt")
     angle = k * 70.0
     for name, direction, colour in (("x = e3", (1, 0), COLOURS[2]), ("y = -e2", (0, 1), COLOURS[1])):
-        axes.annotate("", xy=(22 * direction[0], 22 * direction[1]), xytext=(0, 0),
-                      arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.8})
+        axes.annotate(
+            "",
+            xy=(22 * direction[0], 22 * direction[1]),
+            xytext=(0, 0),
+            arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.8},
+        )
         axes.text(22 * direction[0] + 1, 22 * direction[1] + 2, name, color=colour, fontsize=10)
     axes.plot([x[-1], x[-1] + 22], [y[-1], y[-1]], color="0.6", linestyle=":")
-    axes.annotate("", xy=(x[-1] + 18 * np.cos(angle), y[-1] + 18 * np.sin(angle)), xytext=(x[-1], y[-1]),
-                  arrowprops={"arrowstyle": "->", "color": "black"})
+    axes.annotate(
+        "",
+        xy=(x[-1] + 18 * np.cos(angle), y[-1] + 18 * np.sin(angle)),
+        xytext=(x[-1], y[-1]),
+        arrowprops={"arrowstyle": "->", "color": "black"},
+    )
     sweep = np.linspace(0.0, angle, 30)
     axes.plot(x[-1] + 12 * np.cos(sweep), y[-1] + 12 * np.sin(sweep), color="black", linewidth=1)
     axes.text(x[-1] + 12, y[-1] + 8, "angle_rad", fontsize=9)

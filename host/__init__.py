@@ -1,4 +1,4 @@
-"""Top floor: mechanics, estimation, identification, diagnosis, recording and the command line. May import all rooms."""
+"""What may take its time: mechanics, estimation, identification, diagnosis, recordings, reports and the command line."""
 
 from protocol import kernel_cache
 

@@ -44,9 +44,15 @@ class Commander:
     Raises ValueError for a bad name.
     """
 
-    def __init__(self, session: Asker, name: str, *, timeout_s: float = 1.0,
-                 clock_ns: Callable[[], int] = time.monotonic_ns,
-                 new_id: Callable[[], str] = lambda: uuid.uuid4().hex) -> None:
+    def __init__(
+        self,
+        session: Asker,
+        name: str,
+        *,
+        timeout_s: float = 1.0,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        new_id: Callable[[], str] = lambda: uuid.uuid4().hex,
+    ) -> None:
         self.name = check_name(name)
         self._session, self._timeout_s, self._clock_ns, self._new_id = session, timeout_s, clock_ns, new_id
         self._ahead_ns: int | None = None
@@ -154,9 +160,19 @@ class Commander:
     def _send(self, action: str, target: str, sequence: int, **fields: Any) -> Reply | None:
         issued_ns, sent_ns = self._now_ns(), self._clock_ns()
         reply = self._session.ask(
-            Command(stamp_ns=issued_ns, sequence=sequence, id=self._new_id(), commander=self.name,
-                    lease=self._lease, expires_ns=issued_ns + LIFE_NS, action=action, target=target, **fields),
-            self._timeout_s)
+            Command(
+                stamp_ns=issued_ns,
+                sequence=sequence,
+                id=self._new_id(),
+                commander=self.name,
+                lease=self._lease,
+                expires_ns=issued_ns + LIFE_NS,
+                action=action,
+                target=target,
+                **fields,
+            ),
+            self._timeout_s,
+        )
         came_ns = self._clock_ns()
         if reply is not None and (came_ns - sent_ns < _PROMPT_NS or self._ahead_ns is None):
             self._ahead_ns = reply.stamp_ns - (sent_ns + came_ns) // 2

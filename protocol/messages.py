@@ -37,15 +37,16 @@ def _field(spec: Spec, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
-def number(unit: str, doc: str, *, minimum: float | None = None, maximum: float | None = None,
-           default: Any = dataclasses.MISSING) -> Any:
+def number(
+    unit: str, doc: str, *, minimum: float | None = None, maximum: float | None = None, default: Any = dataclasses.MISSING
+) -> Any:
     """A finite float. With default None it may be nil (NaN in a table); NaN itself never travels."""
     return _field(Spec("float", unit, doc, (), default is None, minimum, maximum), default)
 
 
 def integer(unit: str, doc: str, *, bits: int = 63, default: Any = dataclasses.MISSING) -> Any:
     """An integer; `bits` > 0: 0 .. 2^bits - 1, `bits` < 0: two's complement of that many bits."""
-    low, high = (0, 2 ** bits - 1) if bits > 0 else (-(2 ** (-bits - 1)), 2 ** (-bits - 1) - 1)
+    low, high = (0, 2**bits - 1) if bits > 0 else (-(2 ** (-bits - 1)), 2 ** (-bits - 1) - 1)
     return _field(Spec("integer", unit, doc, (), False, low, high), default)
 
 
@@ -56,7 +57,7 @@ def vector(unit: str, doc: str, columns: tuple[str, ...], *, default: Any = data
 
 def integers(unit: str, doc: str, columns: tuple[str, ...], *, bits: int = -32) -> Any:
     """Integers, one for each column name, bounded as in `integer`."""
-    low, high = (0, 2 ** bits - 1) if bits > 0 else (-(2 ** (-bits - 1)), 2 ** (-bits - 1) - 1)
+    low, high = (0, 2**bits - 1) if bits > 0 else (-(2 ** (-bits - 1)), 2 ** (-bits - 1) - 1)
     return _field(Spec("integer", unit, doc, columns, False, low, high))
 
 
@@ -78,8 +79,9 @@ def choice(doc: str, choices: tuple[str, ...]) -> Any:
 ClassType = TypeVar("ClassType")
 
 
-@dataclass_transform(kw_only_default=True, frozen_default=True,
-                     field_specifiers=(number, integer, vector, integers, flag, text, choice))
+@dataclass_transform(
+    kw_only_default=True, frozen_default=True, field_specifiers=(number, integer, vector, integers, flag, text, choice)
+)
 def message(cls: type[ClassType]) -> type[ClassType]:
     """Declares a message class: frozen, by keyword only, every field made by one of the functions above."""
     return dataclasses.dataclass(frozen=True, slots=True, kw_only=True)(cls)
@@ -107,8 +109,12 @@ def specs(message_class: type[Message]) -> dict[str, Spec]:
 def _wanted(spec: Spec) -> str:
     if spec.choices:
         return "one of " + ", ".join(spec.choices)
-    what = {"float": "a finite number", "integer": "an integer", "bool": "true or false",
-            "text": f"a text of at most {MAX_TEXT} characters"}[spec.kind]
+    what = {
+        "float": "a finite number",
+        "integer": "an integer",
+        "bool": "true or false",
+        "text": f"a text of at most {MAX_TEXT} characters",
+    }[spec.kind]
     if spec.columns:
         what = f"{len(spec.columns)} of " + what.removeprefix("a ").removeprefix("an ") + "s"
     if spec.minimum is not None:
@@ -164,7 +170,7 @@ def _plain(spec: Spec, value: Any) -> Any:
     elif spec.columns and value is not None:
         value = list(value)
     if spec.kind == "text" and isinstance(value, str) and len(value) > MAX_TEXT and not spec.choices:
-        return value[:MAX_TEXT - 3] + "..."
+        return value[: MAX_TEXT - 3] + "..."
     if spec.kind == "float" and spec.optional and value is not None:
         numbers = value if spec.columns else (value,)
         if not all(map(math.isfinite, numbers)):
@@ -178,8 +184,9 @@ _plans: dict[type[Message], tuple[tuple[str, Spec, _Check], ...]] = {}
 def _plan(message_class: type[Message]) -> tuple[tuple[str, Spec, _Check], ...]:
     plan = _plans.get(message_class)
     if plan is None:
-        plan = tuple((name, spec, _reader(f"{message_class.__name__}.{name}", spec))
-                     for name, spec in specs(message_class).items())
+        plan = tuple(
+            (name, spec, _reader(f"{message_class.__name__}.{name}", spec)) for name, spec in specs(message_class).items()
+        )
         _plans[message_class] = plan
     return plan
 
@@ -219,8 +226,17 @@ def _unpack(payload: bytes) -> dict[str, Any]:
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload: found {len(payload)} bytes, wanted at most {MAX_PAYLOAD_BYTES}")
     try:
-        body = msgpack.unpackb(payload, raw=False, strict_map_key=True, object_pairs_hook=_no_twins, max_bin_len=0,
-                               max_ext_len=0, max_array_len=256, max_map_len=64, max_str_len=4 * MAX_TEXT)
+        body = msgpack.unpackb(
+            payload,
+            raw=False,
+            strict_map_key=True,
+            object_pairs_hook=_no_twins,
+            max_bin_len=0,
+            max_ext_len=0,
+            max_array_len=256,
+            max_map_len=64,
+            max_str_len=4 * MAX_TEXT,
+        )
     except (ValueError, TypeError, msgpack.exceptions.UnpackException) as error:
         raise ValueError(f"payload: found {str(error) or type(error).__name__}, wanted one msgpack map") from None
     if not isinstance(body, dict):
@@ -272,13 +288,24 @@ def json_schema(message_class: type[Message]) -> str:
         if spec.choices:
             item["enum"] = list(spec.choices)
         if spec.columns:
-            item = {"type": "array", "items": item, "minItems": len(spec.columns), "maxItems": len(spec.columns),
-                    "columns": list(spec.columns)}
+            item = {
+                "type": "array",
+                "items": item,
+                "minItems": len(spec.columns),
+                "maxItems": len(spec.columns),
+                "columns": list(spec.columns),
+            }
         if spec.optional:
             item["type"] = [item["type"], "null"]
         properties[name] = {**item, "unit": spec.unit, "description": spec.doc}
-    return json.dumps({
-        "$schema": "https://json-schema.org/draft/2020-12/schema", "title": message_class.__name__,
-        "description": (message_class.__doc__ or "").strip(), "type": "object", "properties": properties,
-        "required": list(properties), "additionalProperties": False,
-    })
+    return json.dumps(
+        {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": message_class.__name__,
+            "description": (message_class.__doc__ or "").strip(),
+            "type": "object",
+            "properties": properties,
+            "required": list(properties),
+            "additionalProperties": False,
+        }
+    )

@@ -59,7 +59,7 @@ def cobs_decode(data: bytes) -> bytes:
         end = at + code
         if code == 0 or end > len(data):
             raise ValueError(f"COBS code at byte {at}: found {code}, wanted 1 to {len(data) - at}")
-        out += data[at + 1:end]
+        out += data[at + 1 : end]
         if code < 255 and end < len(data):
             out.append(0)
         at = end
@@ -107,7 +107,8 @@ def decode_body(body: bytes) -> Message:
         raise ValueError(f"frame: found id {body[0]:#04x} with {len(body) - 4} bytes of payload")
     flat: Iterator[int] = iter(_LAYOUTS[frame.name].unpack_from(body, 2))
     fields: dict[str, Any] = {
-        f.name: next(flat) if f.count == 1 else tuple(next(flat) for _ in range(f.count)) for f in frame.fields}
+        f.name: next(flat) if f.count == 1 else tuple(next(flat) for _ in range(f.count)) for f in frame.fields
+    }
     return Message(frame.name, body[1], fields)
 
 

@@ -151,68 +151,113 @@ _BOOT = Field("boot_count", "u16", "count", "starts of the processor, kept in EE
 _HASH = Field("protocol_hash", "u32", "code", "PROTOCOL_HASH of the sender")
 
 FRAMES: tuple[Frame, ...] = (
-    Frame("HELLO", 0x01, "mcu", (_HASH,),
-          "Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both."),
-    Frame("CONFIGURE", 0x02, "mcu", (
-        _AXIS,
-        Field("max_speed_steps_per_s", "u32", "steps/s", "set-points that need more are rejected"),
-        Field("max_accel_steps_per_s2", "u32", "steps/s^2", "deceleration of every stop"),
-        Field("soft_min_steps", "i32", "steps", "lowest position accepted"),
-        Field("soft_max_steps", "i32", "steps", "highest position accepted"),
-    ), "Sets the limits of one axis; only DISARMED."),
+    Frame(
+        "HELLO",
+        0x01,
+        "mcu",
+        (_HASH,),
+        "Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both.",
+    ),
+    Frame(
+        "CONFIGURE",
+        0x02,
+        "mcu",
+        (
+            _AXIS,
+            Field("max_speed_steps_per_s", "u32", "steps/s", "set-points that need more are rejected"),
+            Field("max_accel_steps_per_s2", "u32", "steps/s^2", "deceleration of every stop"),
+            Field("soft_min_steps", "i32", "steps", "lowest position accepted"),
+            Field("soft_max_steps", "i32", "steps", "highest position accepted"),
+        ),
+        "Sets the limits of one axis; only DISARMED.",
+    ),
     Frame("ARM", 0x03, "mcu", (_BOOT,), "DISARMED to ARMED, if the boot count is the one the host knows."),
     Frame("DISARM", 0x04, "mcu", (), "Decelerates, then DISARMED."),
-    Frame("CLEAR_FAULT", 0x05, "mcu", (Field("fault", "u8", "code", "the Fault to clear"),),
-          "FAULT to DISARMED on an operator's word, never by a program alone."),
-    Frame("SETPOINT", 0x06, "mcu", (
-        Field("number", "u16", "count", "rises by one a set-point (wraps)"),
-        _us("execute_us", "board time at which the position is reached"),
-        _us("expiry_us", "after execute_us + expiry_us it is never executed", "u16"),
-        _per_axis("position_steps", "steps", "position at execute_us"),
-    ), "One timed target for all axes; positions in between are interpolated linearly. Not acknowledged."),
-    Frame("SET_POSITION", 0x07, "mcu", (_AXIS, Field("position_steps", "i32", "steps", "new value of the counter")),
-          "Renames the present position of one axis (step and encoder counter); only DISARMED."),
+    Frame(
+        "CLEAR_FAULT",
+        0x05,
+        "mcu",
+        (Field("fault", "u8", "code", "the Fault to clear"),),
+        "FAULT to DISARMED on an operator's word, never by a program alone.",
+    ),
+    Frame(
+        "SETPOINT",
+        0x06,
+        "mcu",
+        (
+            Field("number", "u16", "count", "rises by one a set-point (wraps)"),
+            _us("execute_us", "board time at which the position is reached"),
+            _us("expiry_us", "after execute_us + expiry_us it is never executed", "u16"),
+            _per_axis("position_steps", "steps", "position at execute_us"),
+        ),
+        "One timed target for all axes; positions in between are interpolated linearly. Not acknowledged.",
+    ),
+    Frame(
+        "SET_POSITION",
+        0x07,
+        "mcu",
+        (_AXIS, Field("position_steps", "i32", "steps", "new value of the counter")),
+        "Renames the present position of one axis (step and encoder counter); only DISARMED.",
+    ),
     Frame("PING", 0x08, "mcu", (), "Answered by ACK; measures the round trip."),
-    Frame("IDENTITY", 0x81, "host", (
-        _HASH,
-        Field("firmware_version", "u16", "code", "major * 256 + minor"),
-        _BOOT,
-        Field("reset_cause", "u8", "code", "a ResetCause"),
-        Field("mcu", "u8", "code", "a Mcu"),
-        Field("timer_hz", "u16", "Hz", "rate of the step timer"),
-        Field("axes", "u8", "count", "axes driven"),
-        Field("queue_capacity", "u8", "count", "set-points the queue holds"),
-        _us("deadman_us", "silence that stops the axes"),
-        _us("horizon_us", "furthest execution time accepted"),
-    ), "Answer to HELLO: who is there."),
-    Frame("STATUS", 0x82, "host", (
-        _us("mcu_time_us", "board time of this snapshot (wraps)"),
-        Field("last_setpoint", "u16", "count", "number of the last accepted set-point"),
-        _per_axis("position_steps", "steps", "steps made"),
-        _per_axis("encoder_counts", "counts", "quadrature counts seen"),
-        Field("state", "u8", "code", "a State"),
-        Field("fault", "u8", "code", "the latched Fault"),
-        Field("inputs", "u8", "bits", "an InputBit each"),
-        Field("queue_depth", "u8", "count", "set-points waiting"),
-        Field("deadman_age_ms", "u8", "ms", "time since the last valid set-point while RUNNING (stays at 255)", 1e-3),
-        Field("last_reject", "u8", "code", "Reject of the last refused set-point"),
-        _BOOT,
-        _counter("crc_errors", "damaged frames received"),
-        _counter("sequence_errors", "frames lost, repeated or out of order"),
-        _counter("underruns", "the queue ran dry while RUNNING"),
-        _counter("rejected", "set-points refused, but for those expired or overflowed"),
-        _counter("expired", "set-points that came after their expiry"),
-        _counter("overflows", "set-points that found the queue full"),
-        _counter("late", "set-points executed after their time, before their expiry"),
-        _counter("rx_overruns", "bytes lost in the receiver"),
-        _counter("encoder_errors", "impossible quadrature transitions"),
-    ), "Sent at 200 Hz."),
-    Frame("ACK", 0x83, "host", (
-        Field("command", "u8", "code", "frame id answered"),
-        Field("command_sequence", "u8", "count", "its sequence number"),
-        Field("result", "u8", "code", "a Result"),
-        _us("mcu_time_us", "board time of the answer"),
-    ), "Answer to every command but HELLO and SETPOINT."),
+    Frame(
+        "IDENTITY",
+        0x81,
+        "host",
+        (
+            _HASH,
+            Field("firmware_version", "u16", "code", "major * 256 + minor"),
+            _BOOT,
+            Field("reset_cause", "u8", "code", "a ResetCause"),
+            Field("mcu", "u8", "code", "a Mcu"),
+            Field("timer_hz", "u16", "Hz", "rate of the step timer"),
+            Field("axes", "u8", "count", "axes driven"),
+            Field("queue_capacity", "u8", "count", "set-points the queue holds"),
+            _us("deadman_us", "silence that stops the axes"),
+            _us("horizon_us", "furthest execution time accepted"),
+        ),
+        "Answer to HELLO: who is there.",
+    ),
+    Frame(
+        "STATUS",
+        0x82,
+        "host",
+        (
+            _us("mcu_time_us", "board time of this snapshot (wraps)"),
+            Field("last_setpoint", "u16", "count", "number of the last accepted set-point"),
+            _per_axis("position_steps", "steps", "steps made"),
+            _per_axis("encoder_counts", "counts", "quadrature counts seen"),
+            Field("state", "u8", "code", "a State"),
+            Field("fault", "u8", "code", "the latched Fault"),
+            Field("inputs", "u8", "bits", "an InputBit each"),
+            Field("queue_depth", "u8", "count", "set-points waiting"),
+            Field("deadman_age_ms", "u8", "ms", "time since the last valid set-point while RUNNING (stays at 255)", 1e-3),
+            Field("last_reject", "u8", "code", "Reject of the last refused set-point"),
+            _BOOT,
+            _counter("crc_errors", "damaged frames received"),
+            _counter("sequence_errors", "frames lost, repeated or out of order"),
+            _counter("underruns", "the queue ran dry while RUNNING"),
+            _counter("rejected", "set-points refused, but for those expired or overflowed"),
+            _counter("expired", "set-points that came after their expiry"),
+            _counter("overflows", "set-points that found the queue full"),
+            _counter("late", "set-points executed after their time, before their expiry"),
+            _counter("rx_overruns", "bytes lost in the receiver"),
+            _counter("encoder_errors", "impossible quadrature transitions"),
+        ),
+        "Sent at 200 Hz.",
+    ),
+    Frame(
+        "ACK",
+        0x83,
+        "host",
+        (
+            Field("command", "u8", "code", "frame id answered"),
+            Field("command_sequence", "u8", "count", "its sequence number"),
+            Field("result", "u8", "code", "a Result"),
+            _us("mcu_time_us", "board time of the answer"),
+        ),
+        "Answer to every command but HELLO and SETPOINT.",
+    ),
 )
 
 FRAME_BY_NAME = {frame.name: frame for frame in FRAMES}
@@ -228,8 +273,9 @@ def wire_bytes(frame: Frame) -> int:
 
 
 def _protocol_hash() -> int:
-    lines = [f"{f.name} {f.id} {f.to} " + ",".join(f"{x.name}:{x.wire}:{x.unit}:{x.count}" for x in f.fields)
-             for f in FRAMES]
+    lines = [
+        f"{f.name} {f.id} {f.to} " + ",".join(f"{x.name}:{x.wire}:{x.unit}:{x.count}" for x in f.fields) for f in FRAMES
+    ]
     lines += [f"{e.__name__} " + ",".join(f"{m.name}={m.value}" for m in e) for e in ENUMS]
     lines.append(f"baud {BAUD} timer {TIMER_HZ} deadman {DEADMAN_US} horizon {HORIZON_US} stop {STOP_US}")
     return zlib.crc32("\n".join(lines).encode("ascii"))

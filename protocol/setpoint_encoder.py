@@ -43,8 +43,9 @@ def _stuff(buffer: np.ndarray, stop: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def encode_setpoint(buffer: np.ndarray, sequence: int, number: int, execute_us: int, expiry_us: int,
-                    steps: np.ndarray) -> int:
+def encode_setpoint(
+    buffer: np.ndarray, sequence: int, number: int, execute_us: int, expiry_us: int, steps: np.ndarray
+) -> int:
     """Writes one SETPOINT frame with its delimiter; same bytes as serial_codec.encode.
 
     buffer: u1[>= SETPOINT_WIRE_BYTES], overwritten from the start. sequence, number, execute_us: taken modulo

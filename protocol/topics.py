@@ -27,9 +27,32 @@ from protocol.messages import (
 )
 
 __all__ = [
-    "MAX_PAYLOAD_BYTES", "SCHEMA_VERSION", "TOPICS", "Alarm", "BoardCounters", "Command", "CommandCounts",
-    "ForceEstimate", "ForceSensor", "Log", "LoopTiming", "Message", "Pose", "Reply", "RigState", "SimulatedTruth", "Stage",
-    "Topic", "check_name", "columns", "decode", "encode", "histogram_bucket", "json_schema", "key", "request_key",
+    "MAX_PAYLOAD_BYTES",
+    "SCHEMA_VERSION",
+    "TOPICS",
+    "Alarm",
+    "BoardCounters",
+    "Command",
+    "CommandCounts",
+    "ForceEstimate",
+    "ForceSensor",
+    "Log",
+    "LoopTiming",
+    "Message",
+    "Pose",
+    "Reply",
+    "RigState",
+    "SimulatedTruth",
+    "Stage",
+    "Topic",
+    "check_name",
+    "columns",
+    "decode",
+    "encode",
+    "histogram_bucket",
+    "json_schema",
+    "key",
+    "request_key",
     "topic_of",
 ]
 
@@ -90,7 +113,8 @@ class Pose(Message):
     missing: bool = flag("the tool was not seen; position and quaternion are nil")
     position_m: Vector | None = vector("m", "position of the sensor", _XYZ_m, default=None)
     quaternion_wxyz: Vector | None = vector(
-        "", "rotation sensor to base, scalar first", ("qw", "qx", "qy", "qz"), default=None)
+        "", "rotation sensor to base, scalar first", ("qw", "qx", "qy", "qz"), default=None
+    )
     quality_m: float | None = number("m", "the tracker's own error indicator", default=None)
 
     def check(self) -> None:
@@ -146,10 +170,11 @@ class RigState(Message):
     target_m: Vector | None = vector("m", "tip wanted, base frame", _triple("target", "m"), default=None)
     tip_m: Vector | None = vector("m", "tip predicted for now, base frame", _triple("tip", "m"), default=None)
     tip_velocity_m_per_s: Vector | None = vector(
-        "m/s", "tip velocity predicted for now", _triple("tip_velocity", "m_per_s"), default=None)
+        "m/s", "tip velocity predicted for now", _triple("tip_velocity", "m_per_s"), default=None
+    )
     force_direction: Vector | None = vector(
-        "", "unit vector along which force is controlled, nil if none is", _triple("force_direction"),
-        default=None)
+        "", "unit vector along which force is controlled, nil if none is", _triple("force_direction"), default=None
+    )
     target_force_N: float | None = number("N", "force wanted along that direction", default=None)
     force_N: float | None = number("N", "force along that direction that the loop steers by", default=None)
     pose_age_ns: int = integer("ns", "age of the newest accepted pose", default=0)
@@ -223,7 +248,8 @@ class Command(Message):
     target: str = choice("kind of the target; none unless action is target", TARGETS)
     target_m: Vector | None = vector("m", "tip position, base frame", _triple("target", "m"), default=None)
     normal: Vector | None = vector(
-        "", "unit vector into the tissue, base frame, along which to press", _triple("normal"), default=None)
+        "", "unit vector into the tissue, base frame, along which to press", _triple("normal"), default=None
+    )
     force_N: float | None = number("N", "force to hold along the normal", default=None, minimum=0, maximum=1)
     fault: int = integer("", "fault code that clear_fault clears, 0 for all", bits=8, default=0)
 
@@ -235,14 +261,17 @@ class Command(Message):
         if self.expires_ns < self.stamp_ns:
             raise ValueError("Command.expires_ns: found a time before stamp_ns, wanted a later one")
         if (self.action == "target") == (self.target == "none"):
-            raise ValueError(f"Command.target: found {self.target} with action {self.action}, "
-                             "wanted a kind with action target, none without")
+            raise ValueError(
+                f"Command.target: found {self.target} with action {self.action}, "
+                "wanted a kind with action target, none without"
+            )
         if self.action == "force" and self.force_N is None:
             raise ValueError("Command.force_N: found nil, wanted a force for action force")
         if self.target in ("position", "contact") and self.target_m is None:
             raise ValueError(f"Command.target_m: found nil, wanted a position for {self.target}")
         if self.target == "contact" and (
-                self.force_N is None or self.normal is None or abs(math.hypot(*self.normal) - 1) > 1e-3):
+            self.force_N is None or self.normal is None or abs(math.hypot(*self.normal) - 1) > 1e-3
+        ):
             raise ValueError("Command: found no force_N or no unit normal, wanted both for contact")
 
 
@@ -367,8 +396,15 @@ def as_markdown() -> str:
         rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "when it happens"
         lines.append(f"| `{topic.name}` | {topic.message.__name__} | {rate} | {topic.direction} | {topic.doc} |")
     for declared in dict.fromkeys(topic.message for topic in _TABLE):
-        lines += ["", f"### {declared.__name__}", "", (declared.__doc__ or "").strip(), "",
-                  "| field | type | unit | what |", "|---|---|---|---|"]
+        lines += [
+            "",
+            f"### {declared.__name__}",
+            "",
+            (declared.__doc__ or "").strip(),
+            "",
+            "| field | type | unit | what |",
+            "|---|---|---|---|",
+        ]
         for name, spec in specs(declared).items():
             kind = f"{spec.kind}[{len(spec.columns)}]" if spec.columns else spec.kind
             lines.append(f"| `{name}` | {kind}{' or nil' if spec.optional else ''} | {spec.unit or '-'} | {spec.doc} |")

@@ -55,6 +55,7 @@ def client_settings(endpoint: str, folder: Path) -> dict[str, Any]:
 
     Raises ValueError for an endpoint that is not TLS, OSError where the keys cannot be read.
     """
+
     def packed(name: str) -> str:
         return base64.b64encode((folder / name).read_bytes()).decode()
 
@@ -62,9 +63,17 @@ def client_settings(endpoint: str, folder: Path) -> dict[str, Any]:
         "mode": "client",
         "connect": {"endpoints": [check_network_endpoint(endpoint)]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"link": {"protocols": ["tls"], "tls": _TLS_WAYS | {
-            "root_ca_certificate_base64": packed(CA_FILE), "connect_private_key_base64": packed(KEY_FILE),
-            "connect_certificate_base64": packed(CERTIFICATE_FILE)}}},
+        "transport": {
+            "link": {
+                "protocols": ["tls"],
+                "tls": _TLS_WAYS
+                | {
+                    "root_ca_certificate_base64": packed(CA_FILE),
+                    "connect_private_key_base64": packed(KEY_FILE),
+                    "connect_certificate_base64": packed(CERTIFICATE_FILE),
+                },
+            }
+        },
     }
 
 
@@ -72,12 +81,17 @@ def network_settings(network: Network) -> dict[str, Any]:
     """Configuration keys of zenoh for the session that listens to other machines."""
     missing = [name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE) if not (network.keys / name).is_file()]
     if missing:
-        raise ValueError(f"network.keys: found {network.keys} without {', '.join(missing)}, wanted a folder made by "
-                         "`seldinger keys issue RIG --role rig`")
+        raise ValueError(
+            f"network.keys: found {network.keys} without {', '.join(missing)}, wanted a folder made by "
+            "`seldinger keys issue RIG --role rig`"
+        )
     return {
-        "transport/link/tls": _TLS_WAYS | {
-            "root_ca_certificate": str(network.keys / CA_FILE), "listen_private_key": str(network.keys / KEY_FILE),
-            "listen_certificate": str(network.keys / CERTIFICATE_FILE)},
+        "transport/link/tls": _TLS_WAYS
+        | {
+            "root_ca_certificate": str(network.keys / CA_FILE),
+            "listen_private_key": str(network.keys / KEY_FILE),
+            "listen_certificate": str(network.keys / CERTIFICATE_FILE),
+        },
         "transport/unicast/max_sessions": 64,
         "access_control": access_control(network),
     }
@@ -97,8 +111,22 @@ def access_control(network: Network) -> dict[str, Any]:
     for name in network.readers + network.commanders:
         check_name(name)
     rules: list[dict[str, Any]] = [
-        _rule("local", ["put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
-                        "declare_liveliness_subscriber", "liveliness_query"], ["ingress", "egress"], ["**"]),
+        _rule(
+            "local",
+            [
+                "put",
+                "delete",
+                "declare_subscriber",
+                "query",
+                "reply",
+                "declare_queryable",
+                "liveliness_token",
+                "declare_liveliness_subscriber",
+                "liveliness_query",
+            ],
+            ["ingress", "egress"],
+            ["**"],
+        ),
         # To subscribe is to wish: what is sent is decided by the next rule, key by key.
         _rule("subscribe", ["declare_subscriber"], ["ingress"], ["seldinger/**"]),
         _rule("receive", ["put"], ["egress"], readable(network.rig)),
@@ -112,8 +140,10 @@ def access_control(network: Network) -> dict[str, Any]:
             may = ["subscribe", "receive"]
             if role == "commander":
                 own = [request_key(network.rig, name)]
-                rules += [_rule(f"ask as {name}", ["query"], ["ingress"], own),
-                          _rule(f"answer {name}", ["reply", "declare_queryable"], ["egress"], own)]
+                rules += [
+                    _rule(f"ask as {name}", ["query"], ["ingress"], own),
+                    _rule(f"answer {name}", ["reply", "declare_queryable"], ["egress"], own),
+                ]
                 may += [f"ask as {name}", f"answer {name}"]
             policies.append({"rules": may, "subjects": [subject]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies}

@@ -41,8 +41,15 @@ _SETTINGS: dict[str, Any] = {
     "transport/link/tx/keep_alive": 4,
     # Zenoh would gather a message of 1 GiB before anyone can refuse it; and what no reader takes is not passed on.
     "transport/link/rx/max_message_size": 1_048_576,
-    "low_pass_filter": [{"id": "longest", "flows": ["ingress"], "messages": ["put", "query", "reply"],
-                         "key_exprs": ["**"], "size_limit": 4 * MAX_PAYLOAD_BYTES}],
+    "low_pass_filter": [
+        {
+            "id": "longest",
+            "flows": ["ingress"],
+            "messages": ["put", "query", "reply"],
+            "key_exprs": ["**"],
+            "size_limit": 4 * MAX_PAYLOAD_BYTES,
+        }
+    ],
 }
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
@@ -93,7 +100,8 @@ class Publisher:
         self.topic = TOPICS[topic]
         self.sequence = 0
         self._publisher = session.declare_publisher(
-            key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False)
+            key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False
+        )
 
     def put(self, message: Message) -> None:
         """Publish `message`. Raises ValueError where it is not what the topic declares."""
@@ -132,8 +140,7 @@ class Everything:
         self.malformed = 0
         self.complaint = ""
         names = [name for name, topic in TOPICS.items() if topic.kind != "query"]
-        self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth))
-                             for name in names]
+        self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth)) for name in names]
 
     def take(self) -> list[tuple[str, Message, bytes]]:
         """(topic, message, payload) of all that came since the last call, topic by topic."""
@@ -161,8 +168,9 @@ class RequestServer:
     def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
         self._prefix, self._give = f"{key(rig, 'request')}/", answer
         self.failures = 0
-        self._queryable = session.declare_queryable(request_key(rig, "*"), zenoh.handlers.RingChannel(_REQUESTS_WAITING),
-                                                    complete=True)
+        self._queryable = session.declare_queryable(
+            request_key(rig, "*"), zenoh.handlers.RingChannel(_REQUESTS_WAITING), complete=True
+        )
         self._thread = threading.Thread(target=self._serve, name="requests", daemon=True)
         self._thread.start()
 
@@ -217,8 +225,9 @@ class Session:
         key(rig, "state")
         self.rig = rig
         self._servers: list[RequestServer] = []
-        self.zenoh = _open(configuration(listen, connect, network),
-                           listen + list(network.listen if network is not None else ()))
+        self.zenoh = _open(
+            configuration(listen, connect, network), listen + list(network.listen if network is not None else ())
+        )
 
     @classmethod
     def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
@@ -253,8 +262,12 @@ class Session:
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
         """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
         try:
-            replies = self.zenoh.get(request_key(self.rig, command.commander), payload=encode(command), timeout=timeout_s,
-                                     congestion_control=zenoh.CongestionControl.DROP)
+            replies = self.zenoh.get(
+                request_key(self.rig, command.commander),
+                payload=encode(command),
+                timeout=timeout_s,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
         except zenoh.ZError:
             return None
         for reply in replies:

@@ -10,9 +10,10 @@ import threading
 from pathlib import Path
 from types import FrameType
 
-from realtime.process import RealtimeProcess
-from realtime.rig_file import RigFileError, load_rig
-from realtime.service_notify import ServiceNotifier, log_handler
+from protocol.errors import InputError
+from protocol.rig_file import load_rig
+from realtime.core.process import RealtimeProcess
+from realtime.loop.service_notify import ServiceNotifier, log_handler
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,9 +35,13 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, on_signal)
     try:
         process = RealtimeProcess(
-            load_rig(options.rig), board_port=options.board_port, tracker_port=options.tracker_port,
-            force_port=options.force_port, force_source=options.force_source)
-    except RigFileError as error:
+            load_rig(options.rig),
+            board_port=options.board_port,
+            tracker_port=options.tracker_port,
+            force_port=options.force_port,
+            force_source=options.force_source,
+        )
+    except InputError as error:
         print(f"seldinger: {error}", file=sys.stderr)
         return 2
     except (OSError, ValueError) as error:

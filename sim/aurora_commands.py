@@ -5,16 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from realtime.drivers.ndi_protocol import crc16
 
-if TYPE_CHECKING:
-    from sim.aurora_emulator import AuroraEmulatorConfig, Frame, Tracked
-
 FIRMWARE = "AURORA Control Firmware (emulated)\nNDI S/N: P6-00000\nCharacterization Date: 01/01/26\nFreeze Tag: none\n"
-SPEEDS = {"0": 9600, "1": 14400, "2": 19200, "3": 38400, "4": 57600, "5": 115200, "6": 921600, "7": 1228739,
-          "A": 230400}
+SPEEDS = {"0": 9600, "1": 14400, "2": 19200, "3": 38400, "4": 57600, "5": 115200, "6": 921600, "7": 1228739, "A": 230400}
 # Errors as the device numbers them.
 UNKNOWN, BAD_CRC, PARAMETERS, NO_HANDLE, BAD_PRIORITY = "01", "04", "07", "08", "09"
 WRONG_MODE, NO_TOOL, NOT_INITIALISED, SYSTEM_NOT_INITIALISED, OUT_OF_RANGE = "0C", "0D", "0E", "10", "23"
@@ -23,10 +18,72 @@ NOT_ALLOCATED = "2B"
 # Modes in which a command is allowed; before INIT nearly nothing is.
 _ANY, _SETUP, _TRACKING = ("power_up", "setup", "tracking"), ("setup",), ("tracking",)
 _MODES = {
-    "INIT": ("power_up", "setup"), "RESET": _ANY, "COMM": _ANY, "VER": _ANY, "APIREV": _ANY, "ECHO": _ANY,
-    "BEEP": ("setup", "tracking"), "PHSR": _SETUP, "PHINF": _SETUP, "PHF": _SETUP, "PINIT": _SETUP,
-    "PENA": _SETUP, "PDIS": _SETUP, "TSTART": _SETUP, "TSTOP": _TRACKING, "TX": _TRACKING, "BX": _TRACKING,
+    "INIT": ("power_up", "setup"),
+    "RESET": _ANY,
+    "COMM": _ANY,
+    "VER": _ANY,
+    "APIREV": _ANY,
+    "ECHO": _ANY,
+    "BEEP": ("setup", "tracking"),
+    "PHSR": _SETUP,
+    "PHINF": _SETUP,
+    "PHF": _SETUP,
+    "PINIT": _SETUP,
+    "PENA": _SETUP,
+    "PDIS": _SETUP,
+    "TSTART": _SETUP,
+    "TSTOP": _TRACKING,
+    "TX": _TRACKING,
+    "BX": _TRACKING,
 }
+
+
+@dataclass(frozen=True)
+class AuroraEmulatorConfig:
+    """position_noise_m, orientation_noise_rad: standard deviation per axis; noise_correlation_s: 0 is white;
+    frame_jitter_s: mean of an exponential delay on top of latency_s; clock_error: rate error of the device's clock
+    (ratio, positive: fast); start_ns: time of frame 0; dropout, wild: chance per tool and frame."""
+
+    handles: tuple[str, ...] = ("0A", "0B")
+    rate_hz: float = 40.0
+    latency_s: float = 0.025
+    frame_jitter_s: float = 0.0005
+    processing_s: float = 0.0002
+    processing_jitter_s: float = 0.0002
+    position_noise_m: float = 0.00029
+    orientation_noise_rad: float = 0.0034907
+    noise_correlation_s: float = 0.0
+    clock_error: float = 0.0
+    start_ns: int = 0
+    dropout: float = 0.0
+    wild: float = 0.0
+    wild_m: float = 0.05
+    init_s: float = 0.3
+    reset_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.rate_hz > 0 or not self.latency_s >= 0 or not abs(self.clock_error) < 0.01:
+            raise ValueError(
+                "aurora emulator: found rate_hz, latency_s or clock_error out of range, "
+                "wanted > 0, >= 0 and below 0.01 in size"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """What the device knows of one tool in one frame: flags by name, pose None when missing. Pose in mm."""
+
+    flags: frozenset[str]
+    pose: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One measurement frame and the time from which replies can carry it."""
+
+    number: int
+    available_ns: int
+    tools: dict[str, Tracked]
 
 
 class Refused(Exception):
@@ -138,9 +195,11 @@ class Console:
 
     def _phsr(self, parameters: str) -> str:
         chosen: dict[str, Callable[[Port], bool]] = {
-            "00": lambda port: True, "01": lambda port: port.stale,
+            "00": lambda port: True,
+            "01": lambda port: port.stale,
             "02": lambda port: port.occupied and not port.initialised,
-            "03": lambda port: port.initialised and not port.enabled, "04": lambda port: port.enabled,
+            "03": lambda port: port.initialised and not port.enabled,
+            "04": lambda port: port.enabled,
         }
         if parameters not in chosen:
             raise Refused(OUT_OF_RANGE)
@@ -232,8 +291,8 @@ def _split(line: bytes) -> tuple[str, str]:
     if colon >= 0 and (space < 0 or colon < space):
         if len(text) < colon + 5 or text[-4:] != f"{crc16(text[:-4].encode('ascii')):04X}":
             raise Refused(BAD_CRC)
-        return text[:colon], text[colon + 1:-4]
-    return (text, "") if space < 0 else (text[:space], text[space + 1:])
+        return text[:colon], text[colon + 1 : -4]
+    return (text, "") if space < 0 else (text[:space], text[space + 1 :])
 
 
 def _number(text: str, digits: int) -> int:

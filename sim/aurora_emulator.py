@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from realtime.drivers.ndi_protocol import crc16
-from sim.aurora_commands import Console, Port
+from sim.aurora_commands import AuroraEmulatorConfig, Console, Frame, Port, Tracked
 from sim.rotation import quaternion_of_vector, quaternion_product
 from sim.sensor_faults import Fault, active, checked, strongest
 from sim.sensor_noise import MarkovNoise, generators
@@ -27,64 +26,16 @@ _MAX_COMMAND = 4096
 FAULT_KINDS = ("missing", "out_of_volume", "partly", "wild", "frozen", "broken", "silent", "bit_errors", "late", "stuck")
 
 
-@dataclass(frozen=True)
-class AuroraEmulatorConfig:
-    """position_noise_m, orientation_noise_rad: standard deviation per axis; noise_correlation_s: 0 is white;
-    frame_jitter_s: mean of an exponential delay on top of latency_s; clock_error: rate error of the device's clock
-    (ratio, positive: fast); start_ns: time of frame 0; dropout, wild: chance per tool and frame."""
-
-    handles: tuple[str, ...] = ("0A", "0B")
-    rate_hz: float = 40.0
-    latency_s: float = 0.025
-    frame_jitter_s: float = 0.0005
-    processing_s: float = 0.0002
-    processing_jitter_s: float = 0.0002
-    position_noise_m: float = 0.00029
-    orientation_noise_rad: float = 0.0034907
-    noise_correlation_s: float = 0.0
-    clock_error: float = 0.0
-    start_ns: int = 0
-    dropout: float = 0.0
-    wild: float = 0.0
-    wild_m: float = 0.05
-    init_s: float = 0.3
-    reset_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.rate_hz > 0 or not self.latency_s >= 0 or not abs(self.clock_error) < 0.01:
-            raise ValueError("aurora emulator: found rate_hz, latency_s or clock_error out of range, "
-                             "wanted > 0, >= 0 and below 0.01 in size")
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """What the device knows of one tool in one frame: flags by name, pose None when missing. Pose in mm."""
-
-    flags: frozenset[str]
-    pose: tuple[float, ...] | None
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """One measurement frame and the time from which replies can carry it."""
-
-    number: int
-    available_ns: int
-    tools: dict[str, Tracked]
-
-
 class AuroraEmulator:
     """The device. `sample` is due at each `next_frame_ns`; `feed` what the host sent; `read` what has left by now.
 
     Times only go forward from call to call. The same seed and calls give the same bytes.
     """
 
-    def __init__(self, config: AuroraEmulatorConfig | None = None, seed: int = 0,
-                 faults: Sequence[Fault] = ()) -> None:
+    def __init__(self, config: AuroraEmulatorConfig | None = None, seed: int = 0, faults: Sequence[Fault] = ()) -> None:
         self.config = config or AuroraEmulatorConfig()
         self.faults = checked(faults, FAULT_KINDS)
-        self.ports = {handle: Port(handle, serial=f"{0x34801000 + i:08X}")
-                      for i, handle in enumerate(self.config.handles)}
+        self.ports = {handle: Port(handle, serial=f"{0x34801000 + i:08X}") for i, handle in enumerate(self.config.handles)}
         self.frame_number = 0
         noise_rng, self._delay_rng, self._fault_rng, self._bit_rng = generators(seed, 4)
         size = 3 * len(self.config.handles)
@@ -181,8 +132,9 @@ class AuroraEmulator:
         self._frames.append(Frame(self.frame_number, available_ns, tools))
         self._last = tools
 
-    def _spoilt(self, handle: str, pose: tuple[float, ...] | None, time_ns: int, draws: np.ndarray,
-                jump: np.ndarray) -> Tracked:
+    def _spoilt(
+        self, handle: str, pose: tuple[float, ...] | None, time_ns: int, draws: np.ndarray, jump: np.ndarray
+    ) -> Tracked:
         now = {fault.kind: fault for fault in active(self.faults, time_ns) if fault.handle in (None, handle)}
         if "frozen" in now and handle in self._last:
             return self._last[handle]
@@ -267,8 +219,12 @@ class AuroraEmulator:
         return bytes(np.bitwise_xor(np.frombuffer(data, np.uint8), flips))
 
 
-def _measured(pose: Pose | None, shift_m: np.ndarray, turn_rad: np.ndarray, quality_mm: float,
-              ) -> tuple[float, ...] | None:
+def _measured(
+    pose: Pose | None,
+    shift_m: np.ndarray,
+    turn_rad: np.ndarray,
+    quality_mm: float,
+) -> tuple[float, ...] | None:
     """Quaternion, position in mm and indicator value in mm, with the noise; None stays None."""
     if pose is None:
         return None

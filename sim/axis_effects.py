@@ -16,8 +16,9 @@ _TWO_PI = 2.0 * math.pi
 
 
 @njit(cache=True)
-def apply(effects: Array, port: int, x: float, load: float, stage: Array, curvature: float, time_s: float,
-          dt_s: float) -> float:
+def apply(
+    effects: Array, port: int, x: float, load: float, stage: Array, curvature: float, time_s: float, dt_s: float
+) -> float:
     """The motion x of `port` (m, rad, rad, 1/m) after all effects planted there, in their order.
 
     load: what the port carries (N, Nm, N wire tension, N at the tip); stage: all three stage positions;
@@ -56,8 +57,10 @@ def _with_memory(e, x: float, load: float, curvature: float, time_s: float, dt_s
 @njit(cache=True)
 def _elastic(e, x: float, load: float, stage: Array, time_s: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
     """Elastic and static effects, disturbances, resonance."""
-    if e.port == code.SHAPE and (e.code in (code.NONLINEAR_STIFFNESS, code.CREEP_RELAXATION, code.PLASTIC_SET,
-                                            code.SOFTENING, code.ASYMMETRY) or e.code >= code.GRAVITY_LOAD):
+    if e.port == code.SHAPE and (
+        e.code in (code.NONLINEAR_STIFFNESS, code.CREEP_RELAXATION, code.PLASTIC_SET, code.SOFTENING, code.ASYMMETRY)
+        or e.code >= code.GRAVITY_LOAD
+    ):
         return x
     if e.code == code.COMPLIANCE or e.code == code.NONLINEAR_STIFFNESS:
         return _yielding(e, x, load, dt_s)

@@ -79,7 +79,7 @@ def _missing_tools(kind: str) -> list[str]:
 
 
 def resolve_kind(kind: str) -> str:
-    """"avr" or "native". "auto" is avr where its tools are there, else native with one line on standard error.
+    """ "avr" or "native". "auto" is avr where its tools are there, else native with one line on standard error.
 
     Raises ValueError for another kind.
     """
@@ -136,14 +136,20 @@ class Board:
             program += [mcu, str(BUILD_DIR / f"seldinger-{mcu}.elf")]
         self.time_us = 0
         self._child: subprocess.Popen[bytes] = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
-            start_new_session=True)  # Ctrl-C is for the parent, which then ends its child in order
+            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
+        )  # Ctrl-C is for the parent, which then ends its child in order
         assert self._child.stdin is not None and self._child.stdout is not None
         self._to_child = self._child.stdin.fileno()
         self._from_child = self._child.stdout.fileno()
 
-    def exchange(self, until_us: int, uart_in: bytes = b"", limit_bits: int = 0, estop: bool = False,
-                 encoder_counts: Sequence[int] | np.ndarray = (0, 0, 0)) -> BoardSlice:
+    def exchange(
+        self,
+        until_us: int,
+        uart_in: bytes = b"",
+        limit_bits: int = 0,
+        estop: bool = False,
+        encoder_counts: Sequence[int] | np.ndarray = (0, 0, 0),
+    ) -> BoardSlice:
         """Runs the board until `until_us` with these inputs and returns what left it.
 
         until_us: board time, not before the last. uart_in: bytes that start on the line at the beginning of the
@@ -206,8 +212,9 @@ class Board:
         cycles = edges["cycle"].astype(np.int64)
         mean = isr_cycles / isr_count if isr_count else 0.0
         cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
-        return BoardSlice(body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(),
-                          cycles, cpu, uart_cycle)
+        return BoardSlice(
+            body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(), cycles, cpu, uart_cycle
+        )
 
     def _read(self, n: int) -> bytes:
         parts = []

@@ -74,7 +74,7 @@ class BoardPty:
     def _give(self, data: bytes) -> None:
         while data:
             try:
-                data = data[os.write(self._master, data):]
+                data = data[os.write(self._master, data) :]
             except OSError as error:
                 if error.errno != errno.EAGAIN:
                     raise
@@ -82,8 +82,9 @@ class BoardPty:
                 return
 
 
-def run_paced(pty: BoardPty, world: Callable[[BoardSlice | None], BoardInputs], stop: threading.Event,
-              slice_us: int = SLICE_US) -> PacingReport:
+def run_paced(
+    pty: BoardPty, world: Callable[[BoardSlice | None], BoardInputs], stop: threading.Event, slice_us: int = SLICE_US
+) -> PacingReport:
     """Runs the board at the rate of CLOCK_MONOTONIC until `stop` is set.
 
     world: called before each slice with the last one (None at first); returns the inputs for the next.

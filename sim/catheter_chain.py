@@ -17,8 +17,8 @@ from numba import njit
 from sim.rotation import exponential, multiply
 
 Array = np.ndarray
-CELLS = 128           # at most
-SHORTEST_M = 0.004    # the sheath holds the last millimetres of tip electrode
+CELLS = 128  # at most
+SHORTEST_M = 0.004  # the sheath holds the last millimetres of tip electrode
 
 
 @dataclass(frozen=True)
@@ -32,30 +32,61 @@ class CatheterConfig:
     diameter_m: float = 0.00233
     retardation_s: float = 0.004
     distal_cells: int = 55
-    wire_offset_m: float = 0.0008    # pull wire to centre line: curvature * EI1 / offset is its tension
+    wire_offset_m: float = 0.0008  # pull wire to centre line: curvature * EI1 / offset is its tension
 
 
 _STEEROCATH = ((0.1902e-3, 0.4168e-3, 0.2692e-3), (0.6163e-3, 0.8052e-3, 0.5384e-3))
 CATHETERS = {  # thesis table 3.2; the rigidity of blazer_prime_xp is not published: assumed like steerocath_t
-    "livewire": CatheterConfig("livewire", 0.070, (0.0239e-3, 0.1961e-3, 0.0846e-3), (0.0195e-3, 0.7044e-3, 0.2784e-3),
-                               distal_cells=35),
+    "livewire": CatheterConfig(
+        "livewire", 0.070, (0.0239e-3, 0.1961e-3, 0.0846e-3), (0.0195e-3, 0.7044e-3, 0.2784e-3), distal_cells=35
+    ),
     "steerocath_t": CatheterConfig("steerocath_t", 0.070, *_STEEROCATH, distal_cells=35),
     "blazer_prime_xp": CatheterConfig("blazer_prime_xp", 0.110, *_STEEROCATH),
 }
 
-CHAIN_PARAMETERS = np.dtype([("rigidity", "f8", (2, 3)), ("cell_m", "f8"), ("distal_cells", "i8"), ("distal_m", "f8"),
-                             ("retardation_s", "f8"), ("diameter_m", "f8"), ("wire_offset_m", "f8")], align=True)
-CHAIN_STATE = np.dtype([
-    ("cells", "i8"), ("exposed_m", "f8"), ("strain", "f8", (CELLS, 3)), ("length", "f8", (CELLS,)),
-    ("joint", "f8", (CELLS, 3)), ("before", "f8", (CELLS, 3, 3)), ("middle", "f8", (CELLS, 3, 3)),
-    ("exit", "f8", (3,)), ("root", "f8", (3, 3)), ("tip", "f8", (3,)), ("tip_frame", "f8", (3, 3)),
-    # what planted effects write before each step: rest strain beside the wires', moments inside, forces on the joints
-    ("rest", "f8", (CELLS, 3)), ("moment", "f8", (CELLS, 3)), ("force", "f8", (CELLS, 3)), ("stiffness", "f8"),
-    ("retardation", "f8"), ("tip_load", "f8", (3,)),
-    # results of the step
-    ("free", "f8", (CELLS, 3)), ("compliance", "f8", (3, 3)), ("shift", "f8", (3,)),
-    ("base_force", "f8", (3,)), ("base_moment", "f8", (3,)), ("residual", "f8"),
-    ("turn", "f8", (3, 3))], align=True)
+CHAIN_PARAMETERS = np.dtype(
+    [
+        ("rigidity", "f8", (2, 3)),
+        ("cell_m", "f8"),
+        ("distal_cells", "i8"),
+        ("distal_m", "f8"),
+        ("retardation_s", "f8"),
+        ("diameter_m", "f8"),
+        ("wire_offset_m", "f8"),
+    ],
+    align=True,
+)
+CHAIN_STATE = np.dtype(
+    [
+        ("cells", "i8"),
+        ("exposed_m", "f8"),
+        ("strain", "f8", (CELLS, 3)),
+        ("length", "f8", (CELLS,)),
+        ("joint", "f8", (CELLS, 3)),
+        ("before", "f8", (CELLS, 3, 3)),
+        ("middle", "f8", (CELLS, 3, 3)),
+        ("exit", "f8", (3,)),
+        ("root", "f8", (3, 3)),
+        ("tip", "f8", (3,)),
+        ("tip_frame", "f8", (3, 3)),
+        # what planted effects write before each step: rest strain beside the wires', moments inside, forces on the joints
+        ("rest", "f8", (CELLS, 3)),
+        ("moment", "f8", (CELLS, 3)),
+        ("force", "f8", (CELLS, 3)),
+        ("stiffness", "f8"),
+        ("retardation", "f8"),
+        ("tip_load", "f8", (3,)),
+        # results of the step
+        ("free", "f8", (CELLS, 3)),
+        ("compliance", "f8", (3, 3)),
+        ("shift", "f8", (3,)),
+        ("base_force", "f8", (3,)),
+        ("base_moment", "f8", (3,)),
+        ("residual", "f8"),
+        ("turn", "f8", (3, 3)),
+    ],
+    align=True,
+)
 
 
 def parameters(config: CatheterConfig) -> np.record:

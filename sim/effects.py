@@ -17,8 +17,12 @@ from sim.effect_codes import EFFECT, IDS, PARAMETERS, PORTS
 
 _UNIT = {"insertion": "m", "roll": "rad", "knob": "rad", "shape": "per_m"}
 _LOAD = {"insertion": "force_N", "roll": "torque_Nm", "knob": "force_N", "shape": "force_N"}
-_STIFFNESS = {"insertion": ("N_per_m", 2000.0), "roll": ("Nm_per_rad", 1.25e-3), "knob": ("N_per_rad", 8.0),
-              "shape": ("N_m", 0.25)}
+_STIFFNESS = {
+    "insertion": ("N_per_m", 2000.0),
+    "roll": ("Nm_per_rad", 1.25e-3),
+    "knob": ("N_per_rad", 8.0),
+    "shape": ("N_m", 0.25),
+}
 _SIZE = {"insertion": 1e-3, "roll": 0.1, "knob": 0.07, "shape": 1.5}  # a middling effect in the port's unit
 _BIG = 1e9
 
@@ -64,29 +68,44 @@ def _axis_parameters(port: str) -> dict[str, tuple[Parameter, ...]]:
         "dead_zone": (length("centre", 0.0, -_BIG), length("half_width", 0.7)),
         "coulomb_friction": (force, stiffness),
         "presliding_friction": (force, length("distance", 1.0, 1e-9), stiffness),
-        "load_dependent_friction": (Parameter("coefficient", 0.03, 0.0, 2.0),) if port == "knob" else (
-            Parameter("coefficient", 0.5, 0.0, 5.0), stiffness),
-        "stribeck_friction": (Parameter(f"static_{load}", k * size, 0.0, _BIG),
-                              Parameter(f"kinetic_{load}", 0.5 * k * size, 0.0, _BIG),
-                              Parameter(f"speed_{unit}_per_s", 3.0 * size, 1e-9, _BIG), stiffness),
+        "load_dependent_friction": (Parameter("coefficient", 0.03, 0.0, 2.0),)
+        if port == "knob"
+        else (Parameter("coefficient", 0.5, 0.0, 5.0), stiffness),
+        "stribeck_friction": (
+            Parameter(f"static_{load}", k * size, 0.0, _BIG),
+            Parameter(f"kinetic_{load}", 0.5 * k * size, 0.0, _BIG),
+            Parameter(f"speed_{unit}_per_s", 3.0 * size, 1e-9, _BIG),
+            stiffness,
+        ),
         "viscous_friction": (Parameter(f"{load}_s_per_{unit}", 0.05 * k, 0.0, _BIG), stiffness),
         "rate_lag": (time_constant,),
         "latency": (Parameter("delay_s", 0.03, 0.0, 1.0),),
         "clock_drift": (Parameter("rate", 0.001, 0.0, 0.1),),
-        "compliance": (Parameter(f"compliance_{unit}_per_{load.rpartition('_')[2]}",
-                                 size / {"insertion": 0.2, "roll": 1e-3, "knob": 5.0, "shape": 0.2}[port], 0.0, _BIG),),
+        "compliance": (
+            Parameter(
+                f"compliance_{unit}_per_{load.rpartition('_')[2]}",
+                size / {"insertion": 0.2, "roll": 1e-3, "knob": 5.0, "shape": 0.2}[port],
+                0.0,
+                _BIG,
+            ),
+        ),
         "nonlinear_stiffness": (stiffness, Parameter("cubic_per_square", 1.0 / size**2, 0.0, _BIG)),
         "creep_relaxation": (Parameter("share", 0.1, 0.0, 0.95), Parameter("time_constant_s", 1.0, 1e-3, 1e4)),
         "plastic_set": (length("yield", 4.0), Parameter("share", 0.2, 0.0, 1.0)),
         "softening": (Parameter("rate_per_s", 0.003, 0.0, 1.0),),
-        "asymmetry": (Parameter("ratio", 0.85, 0.0, 5.0),
-                      length("centre", {"insertion": 6.0, "knob": 8.0}.get(port, 0.0), -_BIG)),
+        "asymmetry": (
+            Parameter("ratio", 0.85, 0.0, 5.0),
+            length("centre", {"insertion": 6.0, "knob": 8.0}.get(port, 0.0), -_BIG),
+        ),
         "static_nonlinearity": (length("scale", 8.0, 1e-9), Parameter("share", 0.15, -0.5, 0.5)),
         "saturation": (length("limit", 9.0, 1e-9),),
         "coupling": (Parameter("gain", gain, -_BIG, _BIG), Parameter("source", source, 0.0, 2.0)),
-        "periodic_disturbance": (length("amplitude", 0.3), Parameter("frequency_Hz", 1.3, 0.0, 200.0),
-                                 Parameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG),
-                                 Parameter("phase_rad", 0.0, -_BIG, _BIG)),
+        "periodic_disturbance": (
+            length("amplitude", 0.3),
+            Parameter("frequency_Hz", 1.3, 0.0, 200.0),
+            Parameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG),
+            Parameter("phase_rad", 0.0, -_BIG, _BIG),
+        ),
         "resonance": (Parameter("frequency_Hz", 6.0, 0.1, 200.0), Parameter("damping_ratio", 0.15, 0.001, 2.0)),
     }
 
@@ -102,25 +121,38 @@ _ON_SHAPE = {
     "softening": (Parameter("rate_per_s", 0.005, 0.0, 1.0), Parameter("floor", 0.5, 0.05, 1.0)),
     "asymmetry": (Parameter("ratio", 0.8, 0.1, 10.0),),
     "gravity_load": (Parameter("weight_N_per_m", 0.05, 0.0, 100.0), Parameter("tip_weight_N", 0.01, 0.0, 10.0), *_DIRECTION),
-    "flow_drag": (Parameter("speed_m_per_s", 0.4, 0.0, 5.0), Parameter("pulsatility", 0.6, 0.0, 2.0),
-                  Parameter("frequency_Hz", 1.2, 0.0, 20.0), *_DIRECTION),
-    "second_contact": (Parameter("place_m", 0.012, 0.0, 0.3), Parameter("clearance_m", 0.0008, -_BIG, _BIG),
-                       Parameter("stiffness_N_per_m", 100.0, 0.0, 1e5), *_DIRECTION),
+    "flow_drag": (
+        Parameter("speed_m_per_s", 0.4, 0.0, 5.0),
+        Parameter("pulsatility", 0.6, 0.0, 2.0),
+        Parameter("frequency_Hz", 1.2, 0.0, 20.0),
+        *_DIRECTION,
+    ),
+    "second_contact": (
+        Parameter("place_m", 0.012, 0.0, 0.3),
+        Parameter("clearance_m", 0.0008, -_BIG, _BIG),
+        Parameter("stiffness_N_per_m", 100.0, 0.0, 1e5),
+        *_DIRECTION,
+    ),
 }
 _ON_CONTACT = {
     "contact_nonlinear": (Parameter("exponent", 1.5, 1.0, 4.0), Parameter("exponential_depth_m", 0.0, 0.0, 1.0)),
-    "contact_viscous": (Parameter("hunt_crossley_s_per_m", 20.0, 0.0, 1e4), Parameter("relaxing_N_per_m", 300.0, 0.0, 1e5),
-                        Parameter("relaxation_s", 0.3, 1e-3, 100.0)),
+    "contact_viscous": (
+        Parameter("hunt_crossley_s_per_m", 20.0, 0.0, 1e4),
+        Parameter("relaxing_N_per_m", 300.0, 0.0, 1e5),
+        Parameter("relaxation_s", 0.3, 1e-3, 100.0),
+    ),
     "contact_friction": (Parameter("coefficient", 0.2, 0.0, 3.0), Parameter("bristle_N_per_m", 2000.0, 1.0, 1e6)),
     "softening": (Parameter("rate_per_s", 0.01, 0.0, 1.0), Parameter("floor", 0.3, 0.05, 1.0)),
-    "periodic_disturbance": (Parameter("amplitude_m", 0.0003, 0.0, 0.01), Parameter("frequency_Hz", 5.0, 0.0, 100.0),
-                             Parameter("phase_rad", 0.0, -_BIG, _BIG)),
+    "periodic_disturbance": (
+        Parameter("amplitude_m", 0.0003, 0.0, 0.01),
+        Parameter("frequency_Hz", 5.0, 0.0, 100.0),
+        Parameter("phase_rad", 0.0, -_BIG, _BIG),
+    ),
 }
 
 
 def _vector(unit: str, x: float, y: float, z: float) -> tuple[Parameter, ...]:
-    return tuple(Parameter(f"{axis}_{unit}", value, -_BIG, _BIG)
-                 for axis, value in zip("xyz", (x, y, z), strict=True))
+    return tuple(Parameter(f"{axis}_{unit}", value, -_BIG, _BIG) for axis, value in zip("xyz", (x, y, z), strict=True))
 
 
 def _sensor_parameters(unit: str, size: float) -> dict[str, tuple[Parameter, ...]]:
@@ -132,8 +164,11 @@ def _sensor_parameters(unit: str, size: float) -> dict[str, tuple[Parameter, ...
         "clock_drift": (Parameter("rate", 0.002, 0.0, 0.1),),
         "creep_relaxation": (Parameter("share", 0.1, 0.0, 0.95), Parameter("time_constant_s", 3.0, 1e-3, 1e4)),
         "sensor_drift": (*_vector(f"{unit}_per_s", 0.02 * size, 0.0, 0.0), Parameter("time_constant_s", 120.0, 0.1, 1e6)),
-        "periodic_disturbance": (Parameter(f"amplitude_{unit}", 0.5 * size, 0.0, _BIG),
-                                 Parameter("frequency_Hz", 3.1, 0.0, 500.0), axis),
+        "periodic_disturbance": (
+            Parameter(f"amplitude_{unit}", 0.5 * size, 0.0, _BIG),
+            Parameter("frequency_Hz", 3.1, 0.0, 500.0),
+            axis,
+        ),
         "sensor_scale": (Parameter("gain", 1.05, -10.0, 10.0),),
         "sensor_bias": _vector(unit, size, 0.0, 0.0),
         "sensor_misalignment": _vector("rad", 0.0, 0.05, 0.0),
@@ -146,20 +181,39 @@ def _sensor_parameters(unit: str, size: float) -> dict[str, tuple[Parameter, ...
 
 
 _ON_POSE = _sensor_parameters("m", 1e-3) | {
-    "field_distortion": (Parameter("amplitude_m", 0.002, 0.0, 0.1), *_vector("m", 0.03, 0.0, 0.03),
-                         Parameter("reach_m", 0.03, 1e-4, 1.0))}
-_ON_BASE = {"base_motion": (*_vector("m", 0.0, 0.001, 0.0), *_vector("rad", 0.02, 0.0, 0.0),
-                            Parameter("frequency_Hz", 0.0, 0.0, 20.0), Parameter("rise_s", 2.0, 1e-3, 1e4))}
+    "field_distortion": (
+        Parameter("amplitude_m", 0.002, 0.0, 0.1),
+        *_vector("m", 0.03, 0.0, 0.03),
+        Parameter("reach_m", 0.03, 1e-4, 1.0),
+    )
+}
+_ON_BASE = {
+    "base_motion": (
+        *_vector("m", 0.0, 0.001, 0.0),
+        *_vector("rad", 0.02, 0.0, 0.0),
+        Parameter("frequency_Hz", 0.0, 0.0, 20.0),
+        Parameter("rise_s", 2.0, 1e-3, 1e4),
+    )
+}
 _MISSED = {"missed_steps": (Parameter("steps", 200.0, -1e6, 1e6), Parameter("every_s", 0.0, 0.0, 1e6))}
 
 CATALOGUE: dict[str, dict[str, tuple[Parameter, ...]]] = {
     "insertion": _axis_parameters("insertion") | _MISSED,
-    "roll": _axis_parameters("roll") | _MISSED | {
-        "whip": (Parameter("amplitude_rad", 0.35, 0.0, 3.0), Parameter("phase_rad", 0.0, -_BIG, _BIG))},
+    "roll": _axis_parameters("roll")
+    | _MISSED
+    | {"whip": (Parameter("amplitude_rad", 0.35, 0.0, 3.0), Parameter("phase_rad", 0.0, -_BIG, _BIG))},
     "knob": _axis_parameters("knob") | _MISSED,
-    "shape": {name: parameters for name, parameters in _axis_parameters("shape").items()
-              if name not in ("load_dependent_friction", "stribeck_friction")} | _ON_SHAPE,
-    "contact": _ON_CONTACT, "pose_sensor": _ON_POSE, "force_sensor": _sensor_parameters("N", 0.02), "base": _ON_BASE}
+    "shape": {
+        name: parameters
+        for name, parameters in _axis_parameters("shape").items()
+        if name not in ("load_dependent_friction", "stribeck_friction")
+    }
+    | _ON_SHAPE,
+    "contact": _ON_CONTACT,
+    "pose_sensor": _ON_POSE,
+    "force_sensor": _sensor_parameters("N", 0.02),
+    "base": _ON_BASE,
+}
 
 
 def describe(effect_id: str, port: str) -> tuple[Parameter, ...]:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Log, Message
-from realtime import safety
-from realtime.lockstep import Arriving, Leaving, Publish
-from realtime.records import PHASE_DISARMED, PHASE_NAMES, PHASE_STOPPED
-from realtime.rig_file import Rig
+from realtime.control import safety
+from realtime.control.records import PHASE_DISARMED, PHASE_NAMES, PHASE_STOPPED
+from realtime.core.lockstep import Arriving, Leaving, Publish
 from sim.line_noise import LineNoise
 from sim.scenario import Estimator, Scenario
 from sim.world import World
@@ -22,10 +22,28 @@ MS = 1_000_000
 BOARD_FAULT = 4
 # The computer has been up for so long when the rig is switched on, so that its clock can be set back.
 CLOCK_START_NS = 20_000_000_000
-_BAD_STATUS = ("crc_errors", "sequence_errors", "underruns", "rejected", "expired", "overflows", "rx_overruns",
-               "encoder_errors")
-_BAD_TRACKER = ("poll_timeouts", "damaged", "unexpected", "frames_missed", "frames_strange", "missing", "not_a_pose",
-                "frozen", "warnings", "errors")
+_BAD_STATUS = (
+    "crc_errors",
+    "sequence_errors",
+    "underruns",
+    "rejected",
+    "expired",
+    "overflows",
+    "rx_overruns",
+    "encoder_errors",
+)
+_BAD_TRACKER = (
+    "poll_timeouts",
+    "damaged",
+    "unexpected",
+    "frames_missed",
+    "frames_strange",
+    "missing",
+    "not_a_pose",
+    "frozen",
+    "warnings",
+    "errors",
+)
 _BAD_FORCE = ("malformed", "duplicates", "old", "strays", "lost", "status_errors", "wild", "frozen", "silences")
 
 
@@ -108,8 +126,9 @@ class Watcher:
     own (`sim.fault_table.FaultKind`).
     """
 
-    def __init__(self, run: FaultyScenario, large: Callable[[FaultyScenario], bool] | None = None,
-                 within_s: float = 0.0) -> None:
+    def __init__(
+        self, run: FaultyScenario, large: Callable[[FaultyScenario], bool] | None = None, within_s: float = 0.0
+    ) -> None:
         self.run, self.outcome = run, FaultOutcome()
         self._large, self._within_s = large, within_s
         self._large_since_s: float | None = None
@@ -191,8 +210,11 @@ class Watcher:
         outcome.final_phase = PHASE_NAMES[run.phase]
         expected = int(self.now_s * run.loop.rig.tracker.rate_hz)
         outcome.poses_lost = max(expected - self._poses - 1, 0)
-        outcome.counts = {name: count - self._counts.get(name, 0) for name, count in _bad_counts(run).items()
-                          if count > self._counts.get(name, 0)}
+        outcome.counts = {
+            name: count - self._counts.get(name, 0)
+            for name, count in _bad_counts(run).items()
+            if count > self._counts.get(name, 0)
+        }
         return outcome
 
 
@@ -201,8 +223,12 @@ def _bad_counts(run: FaultyScenario) -> dict[str, int]:
     loop = run.loop
     counts: dict[str, Any] = {f"board.{name}": getattr(loop.link.status, name, 0) for name in _BAD_STATUS}
     line = loop.link.decoder.counters
-    counts |= {"line.crc_errors": line.crc_errors, "line.lost": line.lost, "line.repeated": line.repeated,
-               "loop.missed_ticks": loop.missed_ticks}
+    counts |= {
+        "line.crc_errors": line.crc_errors,
+        "line.lost": line.lost,
+        "line.repeated": line.repeated,
+        "loop.missed_ticks": loop.missed_ticks,
+    }
     counts |= {f"tracker.{name}": value for name, value in vars(loop.tracker.counters).items() if name in _BAD_TRACKER}
     counts |= {f"force.{name}": value for name, value in vars(loop.force_sensor.counters).items() if name in _BAD_FORCE}
     return counts

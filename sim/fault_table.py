@@ -74,12 +74,14 @@ def _on_line(kind: str) -> Inject:
 def _on_tracker(kind: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
         run.world.tracker.faults.append(Fault(kind, *_span(run, seconds), value=size))
+
     return inject
 
 
 def _on_force(kind: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
         run.world.force_box.faults.append(Fault(kind, *_span(run, seconds), value=size))
+
     return inject
 
 
@@ -113,6 +115,7 @@ def _steps_apart(run: FaultyScenario) -> bool:
 def _host(state: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
         run.host = state
+
     return inject
 
 
@@ -145,55 +148,178 @@ _CHANCE = "chance per frame"
 
 FAULTS: tuple[FaultKind, ...] = (
     FaultKind("none", "nothing is wrong: whatever is detected is a false alarm", _none, must_detect=_never),
-    FaultKind("serial_bit_errors", "bits flipped on the board's line, both ways", _on_line("bit_errors"), (1e-6, 1e-2), _BIT,
-              within_s=0.1, must_detect=lambda size, seconds: size * seconds * 3e5 > 20),
-    FaultKind("frames_dropped", "frames lost on the board's line, both ways", _on_line("drop"), (0.02, 1.0), _CHANCE,
-              must_detect=lambda size, seconds: size > 0.05),
-    FaultKind("frames_duplicated", "frames that come twice", _on_line("duplicate"), (0.02, 1.0), _CHANCE,
-              must_detect=lambda size, seconds: size > 0.05),
-    FaultKind("frames_reordered", "frames overtaken by the next", _on_line("reorder"), (0.02, 1.0), _CHANCE,
-              must_detect=lambda size, seconds: size > 0.05),
-    FaultKind("link_cut", "the board's cable pulled, for good", _on_line("cut"), seconds=(1.0, 1.0), tail_s=0.0,
-              rest_s=LINK_REST_S, stops=True, within_s=0.1),
-    FaultKind("link_interrupted", "the board's cable out for a moment", _on_line("cut"), seconds=(0.005, 0.5),
-              must_detect=_long(0.012)),
+    FaultKind(
+        "serial_bit_errors",
+        "bits flipped on the board's line, both ways",
+        _on_line("bit_errors"),
+        (1e-6, 1e-2),
+        _BIT,
+        within_s=0.1,
+        must_detect=lambda size, seconds: size * seconds * 3e5 > 20,
+    ),
+    FaultKind(
+        "frames_dropped",
+        "frames lost on the board's line, both ways",
+        _on_line("drop"),
+        (0.02, 1.0),
+        _CHANCE,
+        must_detect=lambda size, seconds: size > 0.05,
+    ),
+    FaultKind(
+        "frames_duplicated",
+        "frames that come twice",
+        _on_line("duplicate"),
+        (0.02, 1.0),
+        _CHANCE,
+        must_detect=lambda size, seconds: size > 0.05,
+    ),
+    FaultKind(
+        "frames_reordered",
+        "frames overtaken by the next",
+        _on_line("reorder"),
+        (0.02, 1.0),
+        _CHANCE,
+        must_detect=lambda size, seconds: size > 0.05,
+    ),
+    FaultKind(
+        "link_cut",
+        "the board's cable pulled, for good",
+        _on_line("cut"),
+        seconds=(1.0, 1.0),
+        tail_s=0.0,
+        rest_s=LINK_REST_S,
+        stops=True,
+        within_s=0.1,
+    ),
+    FaultKind(
+        "link_interrupted",
+        "the board's cable out for a moment",
+        _on_line("cut"),
+        seconds=(0.005, 0.5),
+        must_detect=_long(0.012),
+    ),
     FaultKind("mcu_reset", "the board's reset pin pulled", _on_board("reset"), stops=True, rest_s=LINK_REST_S),
-    FaultKind("power_cycle", "the board's supply lost in mid move", _on_board("power_cycle"), stops=True,
-              rest_s=LINK_REST_S),
-    FaultKind("mcu_hang", "the board's processor hangs until its watchdog acts", _on_board("freeze"), stops=True,
-              rest_s=LINK_REST_S),
-    FaultKind("encoder_loss", "one encoder's plug out: its count stands", lambda run, size, seconds:
-              run.world.stages.unplug_encoder(_axis(size)), (1.0, 3.99), "axis", must_detect=_never, seconds=(1.0, 1.0)),
-    FaultKind("missed_steps", "a jam: one rotor stands, and what is commanded meanwhile is lost", _jam, (20.0, 2000.0),
-              "steps at most", seconds=(0.05, 1.0), within_s=0.1, large=_steps_apart),
-    FaultKind("slipped_steps", "motor too weak or its supply sags: the load turns one rotor, at half its full speed",
-              _slip, (-2000.0, 2000.0), "steps at most", seconds=(0.05, 1.0), within_s=0.1, large=_steps_apart),
-    FaultKind("tracker_dropout", "tools missing for some time", _on_tracker("missing"), seconds=(0.01, 5.0),
-              must_detect=_long(0.03), within_s=0.12),
+    FaultKind(
+        "power_cycle", "the board's supply lost in mid move", _on_board("power_cycle"), stops=True, rest_s=LINK_REST_S
+    ),
+    FaultKind(
+        "mcu_hang",
+        "the board's processor hangs until its watchdog acts",
+        _on_board("freeze"),
+        stops=True,
+        rest_s=LINK_REST_S,
+    ),
+    FaultKind(
+        "encoder_loss",
+        "one encoder's plug out: its count stands",
+        lambda run, size, seconds: run.world.stages.unplug_encoder(_axis(size)),
+        (1.0, 3.99),
+        "axis",
+        must_detect=_never,
+        seconds=(1.0, 1.0),
+    ),
+    FaultKind(
+        "missed_steps",
+        "a jam: one rotor stands, and what is commanded meanwhile is lost",
+        _jam,
+        (20.0, 2000.0),
+        "steps at most",
+        seconds=(0.05, 1.0),
+        within_s=0.1,
+        large=_steps_apart,
+    ),
+    FaultKind(
+        "slipped_steps",
+        "motor too weak or its supply sags: the load turns one rotor, at half its full speed",
+        _slip,
+        (-2000.0, 2000.0),
+        "steps at most",
+        seconds=(0.05, 1.0),
+        within_s=0.1,
+        large=_steps_apart,
+    ),
+    FaultKind(
+        "tracker_dropout",
+        "tools missing for some time",
+        _on_tracker("missing"),
+        seconds=(0.01, 5.0),
+        must_detect=_long(0.03),
+        within_s=0.12,
+    ),
     FaultKind("tracker_silent", "tracker unplugged", _on_tracker("silent"), seconds=(0.1, 2.0)),
-    FaultKind("tracker_bit_errors", "bits flipped on the tracker's line", _on_tracker("bit_errors"), (1e-6, 1e-2), _BIT,
-              must_detect=lambda size, seconds: size * seconds * 2e5 > 20),
-    FaultKind("wild_poses", "poses scattered about the true one", _on_tracker("wild"), (0.005, 0.2), "m",
-              must_detect=lambda size, seconds: size > 0.03 and seconds > 0.1, within_s=0.15),
-    FaultKind("frozen_poses", "the same pose under fresh frame numbers", _on_tracker("frozen"), seconds=(0.3, 1.5),
-              within_s=0.35, must_detect=_long(0.3)),
-    FaultKind("tracker_stuck", "frame counter and pose stand still", _on_tracker("stuck"), seconds=(0.2, 1.5),
-              within_s=0.35),
-    FaultKind("force_drift", "the force sensor's zero drifts, either way", _on_force("drift"), (-0.3, 0.3), "N/s",
-              tail_s=0.1, seconds=(2.0, 5.0), must_detect=lambda size, seconds: abs(size) * seconds > 0.5, within_s=5.0),
+    FaultKind(
+        "tracker_bit_errors",
+        "bits flipped on the tracker's line",
+        _on_tracker("bit_errors"),
+        (1e-6, 1e-2),
+        _BIT,
+        must_detect=lambda size, seconds: size * seconds * 2e5 > 20,
+    ),
+    FaultKind(
+        "wild_poses",
+        "poses scattered about the true one",
+        _on_tracker("wild"),
+        (0.005, 0.2),
+        "m",
+        must_detect=lambda size, seconds: size > 0.03 and seconds > 0.1,
+        within_s=0.15,
+    ),
+    FaultKind(
+        "frozen_poses",
+        "the same pose under fresh frame numbers",
+        _on_tracker("frozen"),
+        seconds=(0.3, 1.5),
+        within_s=0.35,
+        must_detect=_long(0.3),
+    ),
+    FaultKind(
+        "tracker_stuck", "frame counter and pose stand still", _on_tracker("stuck"), seconds=(0.2, 1.5), within_s=0.35
+    ),
+    FaultKind(
+        "force_drift",
+        "the force sensor's zero drifts, either way",
+        _on_force("drift"),
+        (-0.3, 0.3),
+        "N/s",
+        tail_s=0.1,
+        seconds=(2.0, 5.0),
+        must_detect=lambda size, seconds: abs(size) * seconds > 0.5,
+        within_s=5.0,
+    ),
     FaultKind("force_saturated", "the gauges at their limit", _on_force("saturated")),
     FaultKind("force_unplugged", "no record of the force sensor", _on_force("silent")),
     FaultKind("force_frozen", "the same reading under fresh numbers", _on_force("frozen")),
     FaultKind("host_killed", "the model process is gone", _host("dead"), seconds=(0.5, 0.5), within_s=0.35),
-    FaultKind("host_slow", "the model process answers late", _host_late, (0.02, 0.6), "s", seconds=(0.8, 0.8), within_s=0.8,
-              must_detect=lambda size, seconds: size > 0.25),
-    FaultKind("computer_paused", "the realtime process stands still; the world does not", _pause, (0.005, 0.5), "s",
-              must_detect=lambda size, seconds: size > 0.004, within_s=0.51),
+    FaultKind(
+        "host_slow",
+        "the model process answers late",
+        _host_late,
+        (0.02, 0.6),
+        "s",
+        seconds=(0.8, 0.8),
+        within_s=0.8,
+        must_detect=lambda size, seconds: size > 0.25,
+    ),
+    FaultKind(
+        "computer_paused",
+        "the realtime process stands still; the world does not",
+        _pause,
+        (0.005, 0.5),
+        "s",
+        must_detect=lambda size, seconds: size > 0.004,
+        within_s=0.51,
+    ),
     FaultKind("disk_full", "no room for the recording", _none, seconds=(1.5, 1.5), within_s=1.5),
     FaultKind("clock_step_forward", "the computer's clock jumps ahead", _clock, (0.01, 10.0), "s"),
     FaultKind("clock_step_back", "the computer's clock jumps back", _clock, (-10.0, -0.01), "s"),
     FaultKind("flood_in", "board and force sensor send everything ten times", _on_line("flood_in"), (10.0, 10.0), "times"),
-    FaultKind("flood_out", "every frame to the board sent ten times: more than its line carries", _on_line("flood_out"),
-              (10.0, 10.0), "times", seconds=(0.1, 0.6)),
+    FaultKind(
+        "flood_out",
+        "every frame to the board sent ten times: more than its line carries",
+        _on_line("flood_out"),
+        (10.0, 10.0),
+        "times",
+        seconds=(0.1, 0.6),
+    ),
 )
 BY_NAME = {fault.name: fault for fault in FAULTS}

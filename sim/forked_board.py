@@ -25,7 +25,7 @@ from sim.board import (
 )
 
 BOARD_SRC = Path(__file__).parent / "board_src"
-_BATCH = 100   # requests in flight: a few kB, which a pipe always holds
+_BATCH = 100  # requests in flight: a few kB, which a pipe always holds
 
 
 class LibraryBoard(Board):
@@ -50,12 +50,19 @@ class LibraryBoard(Board):
         data = ctypes.string_at(answer.value, length)
         head = _REPLY.unpack_from(data)
         cycle, _, _, idle_cycles, isr_max, starts, rx_lost, stack_free, n_uart, n_edges = head
-        body = data[_REPLY.size:]
+        body = data[_REPLY.size :]
         edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
         cycles = edges["cycle"].astype(np.int64)
         cpu = CpuStats(isr_max, 0.0, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
-        return BoardSlice(body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(), cycles, cpu,
-                          np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64))
+        return BoardSlice(
+            body[:n_uart],
+            cycles // CYCLES_PER_US,
+            edges["axis"].copy(),
+            edges["sign"].copy(),
+            cycles,
+            cpu,
+            np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64),
+        )
 
     def after_fork(self) -> None:
         """Nothing to do: the copy has the state."""
@@ -90,7 +97,7 @@ class ReplayedBoard(Board):
         assert self._child.stdin is not None and self._child.stdout is not None
         self._to_child, self._from_child = self._child.stdin.fileno(), self._child.stdout.fileno()
         for start in range(0, len(self._asked), _BATCH):
-            batch = self._asked[start:start + _BATCH]
+            batch = self._asked[start : start + _BATCH]
             os.write(self._to_child, b"".join(batch))
             for _ in batch:
                 head = _REPLY.unpack(self._read(_REPLY.size))
@@ -118,8 +125,21 @@ def _built_library() -> Path:
         raise BoardUnavailable("board native: found no gcc; install it (Debian: gcc libc6-dev)")
     BUILD_DIR.mkdir(parents=True, exist_ok=True)
     part = library.with_suffix(f".{os.getpid()}.part")
-    command = ["gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", "-fPIC", "-shared", "-fno-common", "-Wl,-Bsymbolic",
-               f"-I{FIRMWARE_DIR / 'src'}", f"-I{BOARD_SRC}", *map(str, sources), "-o", str(part)]
+    command = [
+        "gcc",
+        "-std=c99",
+        "-D_POSIX_C_SOURCE=200809L",
+        "-O2",
+        "-fPIC",
+        "-shared",
+        "-fno-common",
+        "-Wl,-Bsymbolic",
+        f"-I{FIRMWARE_DIR / 'src'}",
+        f"-I{BOARD_SRC}",
+        *map(str, sources),
+        "-o",
+        str(part),
+    ]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         said = [line for line in result.stderr.splitlines() if "error" in line] or ["gcc failed"]

@@ -11,7 +11,7 @@ from sim import effect_codes as code
 
 Array = np.ndarray
 _SLIP_TIME_S = 0.008
-_BENT_M = 0.1   # shaft that the wire runs along
+_BENT_M = 0.1  # shaft that the wire runs along
 
 
 @njit(cache=True)

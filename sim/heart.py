@@ -26,11 +26,35 @@ class HeartConfig:
     start_s: float = 0.0
 
 
-HEART_PARAMETERS = np.dtype([(name, "f8") for name in (
-    "beat_m", "beat_Hz", "second_harmonic", "respiration_m", "respiration_Hz", "irregularity", "premature_share",
-    "start_s")], align=True)
-HEART_STATE = np.dtype([("beat_phase", "f8"), ("respiration_phase", "f8"), ("length", "f8"), ("strength", "f8"),
-                        ("pause", "f8"), ("beats", "i8"), ("random", "i8", (1,)), ("displacement_m", "f8")], align=True)
+HEART_PARAMETERS = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "beat_m",
+            "beat_Hz",
+            "second_harmonic",
+            "respiration_m",
+            "respiration_Hz",
+            "irregularity",
+            "premature_share",
+            "start_s",
+        )
+    ],
+    align=True,
+)
+HEART_STATE = np.dtype(
+    [
+        ("beat_phase", "f8"),
+        ("respiration_phase", "f8"),
+        ("length", "f8"),
+        ("strength", "f8"),
+        ("pause", "f8"),
+        ("beats", "i8"),
+        ("random", "i8", (1,)),
+        ("displacement_m", "f8"),
+    ],
+    align=True,
+)
 
 
 def parameters(config: HeartConfig) -> np.record:

@@ -14,10 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from realtime.configure import tick_parameters
-from realtime.records import COMMAND_CONTACT, COMMAND_HOLD, COMMAND_POSITION, INPUTS, OUTPUTS, PHASE_CONTACT, STATE, new
-from realtime.rig_file import Rig
-from realtime.tick import tick
+from protocol.rig_file import Rig
+from realtime.control.configure import tick_parameters
+from realtime.control.records import (
+    COMMAND_CONTACT,
+    COMMAND_HOLD,
+    COMMAND_POSITION,
+    INPUTS,
+    OUTPUTS,
+    PHASE_CONTACT,
+    STATE,
+    new,
+)
+from realtime.control.tick import tick
 from sim.plant import Plant, PlantConfig
 
 Array = NDArray[np.float64]
@@ -46,15 +55,28 @@ class Trace(NamedTuple):
 
     def rows(self, which: Any) -> Trace:
         """Some of the rows: a mask, an index or a slice."""
-        return Trace(self.time_s[which], self.force_N[which], self.tip_m[which], self.wall_m[which], self.stage[which],
-                     self.phase[which])
+        return Trace(
+            self.time_s[which],
+            self.force_N[which],
+            self.tip_m[which],
+            self.wall_m[which],
+            self.stage[which],
+            self.phase[which],
+        )
 
 
 class IdealRig:
     """`rig`'s tick on a `config` plant, started where the plant starts, listening for a moment, then armed."""
 
-    def __init__(self, rig: Rig, config: PlantConfig, seed: int = 0, force_source: str = "sensor",
-                 extra_delay_s: float = 0.0, with_force: bool = True) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        config: PlantConfig,
+        seed: int = 0,
+        force_source: str = "sensor",
+        extra_delay_s: float = 0.0,
+        with_force: bool = True,
+    ) -> None:
         """`extra_delay_s`: poses and forces arrive so much later (stamps tell the truth), to find a loop's margin."""
         self.rig, self.plant = rig, Plant(replace(config, tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), seed)
         self.params, self.state = tick_parameters(rig, force_source), new(STATE)
@@ -117,8 +139,16 @@ class IdealRig:
             u.board.encoder_counts[:] = y.position_steps
         truth, normal = self.plant, np.asarray(self.plant.config.tissue.normal)
         tip = truth.sensor_pose(0.0)[0]
-        self._rows.append(((self._now_ns - _START_NS) * 1e-9, -float(truth.contact_force_N @ normal), *tip,
-                           float(truth._parts.heart_state.displacement_m), *self._pending[0], float(y.phase)))
+        self._rows.append(
+            (
+                (self._now_ns - _START_NS) * 1e-9,
+                -float(truth.contact_force_N @ normal),
+                *tip,
+                float(truth._parts.heart_state.displacement_m),
+                *self._pending[0],
+                float(y.phase),
+            )
+        )
 
     def _measure(self) -> None:
         tracker, sensor = self.rig.tracker, self.rig.force_sensor

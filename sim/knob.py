@@ -27,8 +27,9 @@ class KnobConfig:
     centre_rad: float = 0.0
 
 
-KNOB_PARAMETERS = np.dtype([("slack", "f8"), ("stop", "f8"), ("gain", "f8"), ("changeover", "f8"),
-                            ("centre", "f8")], align=True)
+KNOB_PARAMETERS = np.dtype(
+    [("slack", "f8"), ("stop", "f8"), ("gain", "f8"), ("changeover", "f8"), ("centre", "f8")], align=True
+)
 KNOB_STATE = np.dtype([("seated", "f8"), ("curvature", "f8")], align=True)
 
 

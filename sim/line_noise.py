@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realtime.lockstep import Arriving, Leaving
+from realtime.core.lockstep import Arriving, Leaving
 from sim.sensor_faults import Fault, active, checked, strongest
 
 # bit_errors: `value` is the rate per bit of the board's line, both ways; drop, duplicate, reorder: `value` is the chance

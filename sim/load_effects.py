@@ -14,9 +14,9 @@ from sim.rotation import exponential
 
 Array = np.ndarray
 _TWO_PI = 2.0 * math.pi
-_BLOOD_DRAG = 0.5 * 1060.0 * 1.1   # half density (kg/m^3) times a cylinder's drag coefficient
-_HALF = 256                        # second half of an effect's state: two numbers per cell, 128 cells
-_COULOMB_PER_M = 0.5               # curvature over which Coulomb's friction turns round
+_BLOOD_DRAG = 0.5 * 1060.0 * 1.1  # half density (kg/m^3) times a cylinder's drag coefficient
+_HALF = 256  # second half of an effect's state: two numbers per cell, 128 cells
+_COULOMB_PER_M = 0.5  # curvature over which Coulomb's friction turns round
 
 
 @njit(cache=True)
@@ -218,8 +218,11 @@ def _shift_of_joint(e, p, chain, joint: int, dt_s: float) -> tuple[float, float]
     ratio = p.retardation_s * chain.retardation / dt_s
     shift = soft = 0.0
     for j in range(joint + 1, chain.cells):
-        a, b, c = (chain.joint[joint, 0] - chain.joint[j, 0], chain.joint[joint, 1] - chain.joint[j, 1],
-                   chain.joint[joint, 2] - chain.joint[j, 2])
+        a, b, c = (
+            chain.joint[joint, 0] - chain.joint[j, 0],
+            chain.joint[joint, 1] - chain.joint[j, 1],
+            chain.joint[joint, 2] - chain.joint[j, 2],
+        )
         t0, t1, t2 = b * d2 - c * d1, c * d0 - a * d2, a * d1 - b * d0
         for k in range(3):
             turn = chain.middle[j, 0, k] * t0 + chain.middle[j, 1, k] * t1 + chain.middle[j, 2, k] * t2

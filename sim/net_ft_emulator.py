@@ -129,7 +129,7 @@ class NetFtEmulator:
         status = self._status(time_ns)
         if not active(self.faults, time_ns, "frozen"):
             shown = np.clip(self._load, -self._limit, self._limit) - self._bias
-            self._counts = np.clip(np.rint(shown * self._scale), -2**31, 2**31 - 1).astype(np.int64).tolist()
+            self._counts = np.clip(np.rint(shown * self._scale), -(2**31), 2**31 - 1).astype(np.int64).tolist()
         if not self.streaming:
             return
         self._rdt_sequence = (self._rdt_sequence + 1) & 0xFFFFFFFF
@@ -180,18 +180,26 @@ class NetFtEmulator:
         newtons, newton_metres = _UNITS[c.force_unit], _UNITS[c.torque_unit]
         ratings = [value / newtons for value in c.range_N] + [value / newton_metres for value in c.range_Nm]
         fields = {
-            "runstat": "0x00000000", "runrate": str(INTERNAL_RATE_HZ), "cfgnam": "emulated", "cfgcalsel": "0",
-            "cfgcalsn": c.serial, "scfgfu": c.force_unit, "scfgtu": c.torque_unit,
-            "cfgcpf": f"{c.counts_per_N * newtons:.10g}", "cfgcpt": f"{c.counts_per_Nm * newton_metres:.10g}",
-            "cfgmr": ";".join(f"{value:.6g}" for value in ratings), "setcfgsel": "0", "comrdte": "Enabled",
-            "comrdtrate": f"{c.rate_hz:.10g}", "comrdtbsiz": "1",
+            "runstat": "0x00000000",
+            "runrate": str(INTERNAL_RATE_HZ),
+            "cfgnam": "emulated",
+            "cfgcalsel": "0",
+            "cfgcalsn": c.serial,
+            "scfgfu": c.force_unit,
+            "scfgtu": c.torque_unit,
+            "cfgcpf": f"{c.counts_per_N * newtons:.10g}",
+            "cfgcpt": f"{c.counts_per_Nm * newton_metres:.10g}",
+            "cfgmr": ";".join(f"{value:.6g}" for value in ratings),
+            "setcfgsel": "0",
+            "comrdte": "Enabled",
+            "comrdtrate": f"{c.rate_hz:.10g}",
+            "comrdtbsiz": "1",
         }
         lines = "\n".join(f"<{key}>{value}</{key}>" for key, value in fields.items())
         return f'<?xml version="1.0" encoding="ISO-8859-1"?>\n<netft>\n{lines}\n</netft>\n'.encode("ascii")
 
 
-_UNITS = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605,
-          "Nm": 1.0, "N-m": 1.0, "N-mm": 1e-3, "lbf-in": 0.1129848290276167}
+_UNITS = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605, "Nm": 1.0, "N-m": 1.0, "N-mm": 1e-3, "lbf-in": 0.1129848290276167}
 
 
 def exchange(client: NetFtClient, emulator: NetFtEmulator, now_ns: int) -> list[ForceSample]:

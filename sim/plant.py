@@ -18,7 +18,7 @@ from sim.tissue import TissueConfig
 from sim.vessel import VesselConfig
 
 Array = np.ndarray
-TRAVEL = np.array([0.3, 60.0, 10.0])   # end stops of the stages: m, rad, rad either way
+TRAVEL = np.array([0.3, 60.0, 10.0])  # end stops of the stages: m, rad, rad either way
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,22 @@ class Plant:
         self.config = config or PlantConfig()
         self.seed = int(seed)
         c = self.config
-        self._arrays, self._parts = plant_step.hold(plant_step.Parts(
-            catheter_chain.parameters(c.catheter), catheter_chain.start(),
-            vessel.parameters(c.vessel), vessel.start(c.vessel, c.start_stage[0], c.start_stage[1]),
-            knob.parameters(c.knob), knob.start(), tissue.parameters(c.tissue), tissue.start(),
-            heart.parameters(c.heart), heart.start(self.seed), plant_step.start(c.start_stage, c.tool_offsets_m, self.seed),
-            effects.pack(c.effects)))
+        self._arrays, self._parts = plant_step.hold(
+            plant_step.Parts(
+                catheter_chain.parameters(c.catheter),
+                catheter_chain.start(),
+                vessel.parameters(c.vessel),
+                vessel.start(c.vessel, c.start_stage[0], c.start_stage[1]),
+                knob.parameters(c.knob),
+                knob.start(),
+                tissue.parameters(c.tissue),
+                tissue.start(),
+                heart.parameters(c.heart),
+                heart.start(self.seed),
+                plant_step.start(c.start_stage, c.tool_offsets_m, self.seed),
+                effects.pack(c.effects),
+            )
+        )
         self._stage = np.array(c.start_stage, float)
         self._position, self._frame, self._quaternion = np.zeros(3), np.eye(3), np.zeros(4)
         self._wrench = np.zeros(6)
@@ -124,13 +134,23 @@ class Plant:
         chain, wall, body = parts.chain_state, parts.tissue_state, parts.vessel_state
         tip, quaternion = self.sensor_pose(0.0)
         return {
-            "time_s": self.time_s, "insertion_m": float(body.body_m), "roll_rad": float(body.roll_rad),
-            "curvature_per_m": float(parts.rig.curvature), "wire_tension_N": float(parts.rig.load[2]),
-            "exposed_m": float(chain.exposed_m), "tip_m": tip, "tip_quaternion_wxyz": quaternion,
-            "contact_force_N": self.contact_force_N, "depth_m": float(wall.depth_m),
-            "heart_m": float(parts.heart_state.displacement_m), "slack_force_N": float(body.link_force_N),
-            "base_force_N": chain.base_force.copy(), "base_moment_Nm": chain.base_moment.copy(),
-            "strain_rate_per_m_s": float(chain.residual), "effects": [effect.says() for effect in self.config.effects]}
+            "time_s": self.time_s,
+            "insertion_m": float(body.body_m),
+            "roll_rad": float(body.roll_rad),
+            "curvature_per_m": float(parts.rig.curvature),
+            "wire_tension_N": float(parts.rig.load[2]),
+            "exposed_m": float(chain.exposed_m),
+            "tip_m": tip,
+            "tip_quaternion_wxyz": quaternion,
+            "contact_force_N": self.contact_force_N,
+            "depth_m": float(wall.depth_m),
+            "heart_m": float(parts.heart_state.displacement_m),
+            "slack_force_N": float(body.link_force_N),
+            "base_force_N": chain.base_force.copy(),
+            "base_moment_Nm": chain.base_moment.copy(),
+            "strain_rate_per_m_s": float(chain.residual),
+            "effects": [effect.says() for effect in self.config.effects],
+        }
 
     def shape(self, points: int = 60) -> Array:
         """Centre line (points, 3) from the sheath's exit to the tip (m)."""

@@ -12,18 +12,37 @@ from sim import axis_effects, catheter_chain, heart, knob, load_effects, rotatio
 from sim.random_stream import seeded
 
 Array = np.ndarray
-HISTORY = 1024           # steps that delayed sensors can look back
+HISTORY = 1024  # steps that delayed sensors can look back
 TOOLS = 4
 SUBSTEP_S = 0.0005
 _LOAD_PER_SUBSTEP = 12.0  # F L^2 / EI that half a millisecond follows without ringing
 
-RIG_STATE = np.dtype([
-    ("time_s", "f8"), ("step", "i8"), ("handle", "f8", (3,)), ("last_handle", "f8", (3,)), ("stage", "f8", (3,)),
-    ("load", "f8", (4,)), ("curvature", "f8"), ("last_curvature", "f8"), ("exit", "f8", (3,)), ("exit_frame", "f8", (3, 3)),
-    ("offset", "f8", (TOOLS,)), ("tools", "i8"), ("random", "i8", (1,)), ("history_s", "f8", (HISTORY,)),
-    ("history", "f8", (HISTORY, TOOLS, 7)), ("wrench", "f8", (HISTORY, 6)),
-    ("frame", "f8", (3, 3)), ("free_tip", "f8", (3,)), ("lever", "f8", (3,)),
-    ("last_pose", "f8", (TOOLS, 7)), ("last_wrench", "f8", (6,))], align=True)
+RIG_STATE = np.dtype(
+    [
+        ("time_s", "f8"),
+        ("step", "i8"),
+        ("handle", "f8", (3,)),
+        ("last_handle", "f8", (3,)),
+        ("stage", "f8", (3,)),
+        ("load", "f8", (4,)),
+        ("curvature", "f8"),
+        ("last_curvature", "f8"),
+        ("exit", "f8", (3,)),
+        ("exit_frame", "f8", (3, 3)),
+        ("offset", "f8", (TOOLS,)),
+        ("tools", "i8"),
+        ("random", "i8", (1,)),
+        ("history_s", "f8", (HISTORY,)),
+        ("history", "f8", (HISTORY, TOOLS, 7)),
+        ("wrench", "f8", (HISTORY, 6)),
+        ("frame", "f8", (3, 3)),
+        ("free_tip", "f8", (3,)),
+        ("lever", "f8", (3,)),
+        ("last_pose", "f8", (TOOLS, 7)),
+        ("last_wrench", "f8", (6,)),
+    ],
+    align=True,
+)
 
 
 class Parts(NamedTuple):
@@ -71,8 +90,9 @@ def advance(parts: Parts, stage: Array, dt_s: float) -> None:
     rig.step += 1
     for axis in range(3):
         rig.last_handle[axis] = rig.handle[axis]
-        rig.handle[axis] = axis_effects.apply(parts.effects, axis, stage[axis], rig.load[axis], stage, rig.curvature,
-                                              rig.time_s, dt_s)
+        rig.handle[axis] = axis_effects.apply(
+            parts.effects, axis, stage[axis], rig.load[axis], stage, rig.curvature, rig.time_s, dt_s
+        )
         rig.stage[axis] = stage[axis]
     rig.last_curvature = rig.curvature
     wanted = knob.pull(parts.knob[0], parts.knob_state[0], rig.handle[2])

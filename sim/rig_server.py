@@ -14,8 +14,8 @@ import tty
 from pathlib import Path
 from types import FrameType
 
-from realtime.rig_file import load_rig
-from realtime.service_notify import ServiceNotifier
+from protocol.rig_file import load_rig
+from realtime.loop.service_notify import ServiceNotifier
 from sim.board import Board
 from sim.effects import parse
 from sim.plant import Plant, PlantConfig
@@ -44,8 +44,12 @@ class RigServer:
     @property
     def ports(self) -> dict[str, str | int]:
         """Where the devices are to be found."""
-        return {"board": os.ttyname(self._board_end), "tracker": self.tracker.path, "force_port": self.force_box.rdt_port,
-                "page_port": self.force_box.web_port}
+        return {
+            "board": os.ttyname(self._board_end),
+            "tracker": self.tracker.path,
+            "force_port": self.force_box.rdt_port,
+            "page_port": self.force_box.web_port,
+        }
 
     def stop(self) -> None:
         """Ends `serve` after the present slice."""
@@ -88,10 +92,17 @@ class RigServer:
     def summary(self) -> dict[str, object]:
         """What the rig itself counted, for a test or a report."""
         world = self.world
-        return {"virtual_s": world.now_ns * 1e-9, "steps_on_pins": world.steps.tolist(), "edges": world.edges.tolist(),
-                "longest_stall_ms": self.longest_stall_ns * 1e-6, "longest_stall_at_s": self.longest_stall_at_ns * 1e-9,
-                "last_byte_s": self.last_byte_ns * 1e-9, "last_edge_s": self.last_edge_ns * 1e-9,
-                "peak_force_N": world.peak_force_N, "board": world.board.kind}
+        return {
+            "virtual_s": world.now_ns * 1e-9,
+            "steps_on_pins": world.steps.tolist(),
+            "edges": world.edges.tolist(),
+            "longest_stall_ms": self.longest_stall_ns * 1e-6,
+            "longest_stall_at_s": self.longest_stall_at_ns * 1e-9,
+            "last_byte_s": self.last_byte_ns * 1e-9,
+            "last_edge_s": self.last_edge_ns * 1e-9,
+            "peak_force_N": world.peak_force_N,
+            "board": world.board.kind,
+        }
 
     def close(self) -> None:
         """Gives the lines back."""
@@ -110,8 +121,13 @@ def _ask_for_priority() -> None:
 def _write_ports(path: Path, ports: dict[str, str | int]) -> None:
     """The ports as NAME=value lines, whole or not at all."""
     part = path.with_suffix(".part")
-    part.write_text("".join(f"{name}={ports[key]}\n" for name, key in (
-        ("BOARD_PORT", "board"), ("TRACKER_PORT", "tracker"), ("FORCE_PORT", "force_port"))), encoding="ascii")
+    part.write_text(
+        "".join(
+            f"{name}={ports[key]}\n"
+            for name, key in (("BOARD_PORT", "board"), ("TRACKER_PORT", "tracker"), ("FORCE_PORT", "force_port"))
+        ),
+        encoding="ascii",
+    )
     part.replace(path)
 
 

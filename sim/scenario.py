@@ -10,12 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from protocol.commander import Acknowledgement, Commander
+from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Message, Reply, SimulatedTruth, encode
+from realtime.control.records import PHASE_CONTACT, PHASE_STOPPED
+from realtime.core.lockstep import Arriving, LockstepLoop, Publish
 from realtime.drivers.stepper_board import LinkPhase
-from realtime.lockstep import Arriving, LockstepLoop, Publish
-from realtime.records import PHASE_CONTACT, PHASE_STOPPED
-from realtime.rig_file import Rig
 from sim.world import World
+
+# Where the simulated wall stands and how the catheter is bent in front of it.
+TARGET_M = (0.0, -0.0107, 0.025)
 
 Estimator = Callable[[Message, Message | None, Message], ForceEstimate | None]
 
@@ -56,8 +59,17 @@ class Scenario:
     pace: 1.0 is real time, 0 is as fast as it goes.
     """
 
-    def __init__(self, rig: Rig, world: World, publish: Publish, *, estimator: Estimator | None = None,
-                 estimator_delay_s: float = 0.005, force_source: str = "sensor", pace: float = 0.0) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        world: World,
+        publish: Publish,
+        *,
+        estimator: Estimator | None = None,
+        estimator_delay_s: float = 0.005,
+        force_source: str = "sensor",
+        pace: float = 0.0,
+    ) -> None:
         self.world, self.pace = world, pace
         self._estimator, self._delay_ns = estimator, round(estimator_delay_s * 1e9)
         self._publish = publish
@@ -126,7 +138,7 @@ class Scenario:
 
     @property
     def phase(self) -> int:
-        """The loop's phase (`realtime.records`)."""
+        """The loop's phase (`realtime.control.records`)."""
         return int(self.loop.outputs[0].phase)
 
     def ready(self) -> bool:
@@ -213,8 +225,11 @@ def _truth(world: World) -> SimulatedTruth:
     tissue = world.plant.config.tissue
     wall_m = np.array(tissue.point_m) + truth["heart_m"] * np.array(tissue.normal)
     return SimulatedTruth(
-        stamp_ns=world.now_ns, tip_m=tuple(map(float, truth["tip_m"])), wall_m=tuple(map(float, wall_m)),
+        stamp_ns=world.now_ns,
+        tip_m=tuple(map(float, truth["tip_m"])),
+        wall_m=tuple(map(float, wall_m)),
         contact_force_N=tuple(map(float, truth["contact_force_N"])),
-        distal_insertion_m=float(truth["insertion_m"]), distal_roll_rad=float(truth["roll_rad"]),
-        distal_curvature_per_m=float(truth["curvature_per_m"]))
-
+        distal_insertion_m=float(truth["insertion_m"]),
+        distal_roll_rad=float(truth["roll_rad"]),
+        distal_curvature_per_m=float(truth["curvature_per_m"]),
+    )

@@ -13,7 +13,7 @@ from sim.rotation import quaternion_of_vector, quaternion_product
 
 Array = np.ndarray
 _TWO_PI = 2.0 * math.pi
-_PER_TOOL = 32    # numbers an effect remembers per tool
+_PER_TOOL = 32  # numbers an effect remembers per tool
 
 
 @njit(cache=True)

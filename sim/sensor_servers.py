@@ -146,8 +146,13 @@ def _page_handler(emulator: NetFtEmulator) -> type[BaseHTTPRequestHandler]:
 class SensorServers(threading.Thread):
     """Both devices on CLOCK_MONOTONIC in one daemon thread; `poses_at` and `load_at` give the truth at a time in ns."""
 
-    def __init__(self, aurora: AuroraPty | None, poses_at: PosesAt | None, net_ft: NetFtUdp | None = None,
-                 load_at: LoadAt | None = None) -> None:
+    def __init__(
+        self,
+        aurora: AuroraPty | None,
+        poses_at: PosesAt | None,
+        net_ft: NetFtUdp | None = None,
+        load_at: LoadAt | None = None,
+    ) -> None:
         super().__init__(name="sensor servers", daemon=True)
         self._aurora, self._poses_at, self._net_ft, self._load_at = aurora, poses_at, net_ft, load_at
         self._halt = threading.Event()

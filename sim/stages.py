@@ -62,8 +62,8 @@ class Stages:
         """At step zero, at rest. Of `effects` only missed_steps is used here; the plant takes the others."""
         self.config = config or StagesConfig()
         self._per_unit = np.array(self.config.steps_per_unit)
-        self._counts = np.zeros(3, np.int64)     # edges seen
-        self._lost = np.zeros(3)                 # steps that the rotor did not follow
+        self._counts = np.zeros(3, np.int64)  # edges seen
+        self._lost = np.zeros(3)  # steps that the rotor did not follow
         self._rotor, self._speed = np.zeros(3), np.zeros(3)
         self._time_s = 0.0
         self._encoder_stands: dict[int, int] = {}

@@ -24,23 +24,47 @@ class TissueConfig:
     point_m: tuple[float, float, float] = (0.0, 0.0, 0.025)
     normal: tuple[float, float, float] = (0.0, 0.0, -1.0)
     stiffness_N_per_m: float = 1000.0
-    exponent: float = 1.0                      # of depth; 1.5 is Hertz'
-    exponential_depth_m: float = 0.0           # above 0: stiffness * depth0 * (exp(depth/depth0) - 1)
-    hunt_crossley_s_per_m: float = 0.0         # force * (1 + this * depth rate)
+    exponent: float = 1.0  # of depth; 1.5 is Hertz'
+    exponential_depth_m: float = 0.0  # above 0: stiffness * depth0 * (exp(depth/depth0) - 1)
+    hunt_crossley_s_per_m: float = 0.0  # force * (1 + this * depth rate)
     viscosity_N_s_per_m: float = 0.0
-    relaxing_N_per_m: float = 0.0              # a Maxwell branch beside the spring
+    relaxing_N_per_m: float = 0.0  # a Maxwell branch beside the spring
     relaxation_s: float = 0.1
     friction: float = 0.0
-    bristle_N_per_m: float = 2000.0            # tangential stiffness while it sticks
+    bristle_N_per_m: float = 2000.0  # tangential stiffness while it sticks
 
 
-TISSUE_PARAMETERS = np.dtype([
-    ("point", "f8", (3,)), ("normal", "f8", (3,)), ("along", "f8", (2, 3)), ("law", "i8"), ("stiffness", "f8"),
-    ("exponent", "f8"), ("depth0", "f8"), ("hunt_crossley", "f8"), ("viscosity", "f8"), ("relaxing", "f8"),
-    ("relaxation_s", "f8"), ("friction", "f8"), ("bristle", "f8")], align=True)
-TISSUE_STATE = np.dtype([
-    ("depth_m", "f8"), ("relaxing_N", "f8"), ("stretch", "f8", (2,)), ("last_tip", "f8", (3,)), ("began", "i8"),
-    ("normal_force", "f8"), ("solved", "f8", (3,)), ("force", "f8", (3,))], align=True)
+TISSUE_PARAMETERS = np.dtype(
+    [
+        ("point", "f8", (3,)),
+        ("normal", "f8", (3,)),
+        ("along", "f8", (2, 3)),
+        ("law", "i8"),
+        ("stiffness", "f8"),
+        ("exponent", "f8"),
+        ("depth0", "f8"),
+        ("hunt_crossley", "f8"),
+        ("viscosity", "f8"),
+        ("relaxing", "f8"),
+        ("relaxation_s", "f8"),
+        ("friction", "f8"),
+        ("bristle", "f8"),
+    ],
+    align=True,
+)
+TISSUE_STATE = np.dtype(
+    [
+        ("depth_m", "f8"),
+        ("relaxing_N", "f8"),
+        ("stretch", "f8", (2,)),
+        ("last_tip", "f8", (3,)),
+        ("began", "i8"),
+        ("normal_force", "f8"),
+        ("solved", "f8", (3,)),
+        ("force", "f8", (3,)),
+    ],
+    align=True,
+)
 
 
 def parameters(config: TissueConfig) -> np.record:

@@ -19,23 +19,35 @@ from numba import njit
 class VesselConfig:
     """The way from the handle to the sheath's exit (thesis 6.2.1, 6.2.2)."""
 
-    home_insertion_m: float = -0.0890        # body insertion d when the insertion stage reads 0
+    home_insertion_m: float = -0.0890  # body insertion d when the insertion stage reads 0
     play_width_m: float = 0.0031
     insertion_slope: float = 1.0
     link_stiffness_N_per_m: float = 20000.0  # shaft stretched, or bowed against its guide
-    slack_stiffness_N_per_m: float = 20.0    # shaft bowing freely
-    friction_N: float = 1.0                  # the vessel's hold on the body
+    slack_stiffness_N_per_m: float = 20.0  # shaft bowing freely
+    friction_N: float = 1.0  # the vessel's hold on the body
     damping_N_s_per_m: float = 2.0
     roll_slope: float = 0.48
     windup_stiffness_Nm_per_rad: float = 6.0e-4  # GJ of the body over 0.9 m of vessel
     roll_lag_s: float = 0.003
-    start_in_play: float = 0.0               # -1..1: body at the pulled flank, centred, at the pushed flank
+    start_in_play: float = 0.0  # -1..1: body at the pulled flank, centred, at the pushed flank
 
 
-VESSEL_PARAMETERS = np.dtype([
-    ("home_m", "f8"), ("gap_m", "f8"), ("slope", "f8"), ("link_stiffness", "f8"), ("slack_stiffness", "f8"),
-    ("friction_N", "f8"), ("damping", "f8"), ("rigid", "i8"), ("windup", "f8"), ("bed", "f8"),
-    ("roll_damping", "f8")], align=True)
+VESSEL_PARAMETERS = np.dtype(
+    [
+        ("home_m", "f8"),
+        ("gap_m", "f8"),
+        ("slope", "f8"),
+        ("link_stiffness", "f8"),
+        ("slack_stiffness", "f8"),
+        ("friction_N", "f8"),
+        ("damping", "f8"),
+        ("rigid", "i8"),
+        ("windup", "f8"),
+        ("bed", "f8"),
+        ("roll_damping", "f8"),
+    ],
+    align=True,
+)
 VESSEL_STATE = np.dtype([("body_m", "f8"), ("roll_rad", "f8"), ("link_force_N", "f8")], align=True)
 
 

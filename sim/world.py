@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 
-from realtime.intake import quaternion_product, rotation
-from realtime.lockstep import Arriving, Leaving
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
+from realtime.core.intake import quaternion_product, rotation
+from realtime.core.lockstep import Arriving, Leaving
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
 from sim.board import CPU_HZ, STEP_TIMER_CYCLES, Board, BoardSlice
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
-from sim.plant import Plant
+from sim.plant import Plant, PlantConfig
 from sim.stages import Stages, StagesConfig
 
 # Tools of the plant, in the order of its tool_offsets_m.
 TIP, SHAFT = 0, 1
+
+
+def simulated_plant(rig: Rig, seed: int, **changes: Any) -> Plant:
+    """The plant that stands for `rig`: its sensors where the rig file has them, at home."""
+    return Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m), **changes), seed)
 
 
 class World:
@@ -29,25 +35,40 @@ class World:
         self.rig, self.plant, self.board = rig, plant, board
         self.now_ns = 0
         self.edges = np.zeros(3, np.int64)
-        self.edge_phases = np.zeros(STEP_TIMER_CYCLES, np.int64)   # edges by processor cycle within the step timer's period
+        self.edge_phases = np.zeros(STEP_TIMER_CYCLES, np.int64)  # edges by processor cycle within the step timer's period
         self.slice: BoardSlice | None = None
         self.peak_force_N = 0.0
         self.limit_bits, self.estop = 0, False
         tracker, sensor = rig.tracker, rig.force_sensor
-        self.tracker = AuroraEmulator(AuroraEmulatorConfig(
-            handles=(tracker.tip_handle, tracker.shaft_handle), rate_hz=tracker.rate_hz, latency_s=tracker.latency_s,
-            position_noise_m=tracker.position_noise_m, orientation_noise_rad=tracker.orientation_noise_rad,
-        ), seed=2 * seed + 1)
-        self.force_box = NetFtEmulator(NetFtEmulatorConfig(
-            rate_hz=sensor.rate_hz, counts_per_N=sensor.counts_per_newton,
-            counts_per_Nm=sensor.counts_per_newton_metre, force_noise_N=sensor.noise_N,
-        ), seed=2 * seed + 2)
+        self.tracker = AuroraEmulator(
+            AuroraEmulatorConfig(
+                handles=(tracker.tip_handle, tracker.shaft_handle),
+                rate_hz=tracker.rate_hz,
+                latency_s=tracker.latency_s,
+                position_noise_m=tracker.position_noise_m,
+                orientation_noise_rad=tracker.orientation_noise_rad,
+            ),
+            seed=2 * seed + 1,
+        )
+        self.force_box = NetFtEmulator(
+            NetFtEmulatorConfig(
+                rate_hz=sensor.rate_hz,
+                counts_per_N=sensor.counts_per_newton,
+                counts_per_Nm=sensor.counts_per_newton_metre,
+                force_noise_N=sensor.noise_N,
+            ),
+            seed=2 * seed + 2,
+        )
         self._digest = hashlib.sha256()
-        self.stages = Stages(StagesConfig(
-            steps_per_unit=tuple(rig.stage(axis).steps_per_unit for axis in range(3)),  # type: ignore[arg-type]
-            encoder_counts_per_step=tuple(  # type: ignore[arg-type]
-                rig.stage(axis).encoder_counts_per_step for axis in range(3)),
-        ), plant.config.effects)
+        self.stages = Stages(
+            StagesConfig(
+                steps_per_unit=tuple(rig.stage(axis).steps_per_unit for axis in range(3)),  # type: ignore[arg-type]
+                encoder_counts_per_step=tuple(  # type: ignore[arg-type]
+                    rig.stage(axis).encoder_counts_per_step for axis in range(3)
+                ),
+            ),
+            plant.config.effects,
+        )
         turn = np.array(tracker.base_from_tracker_wxyz)
         self._tracker_from_base = rotation(turn).T
         self._tracker_turn = turn * (1.0, -1.0, -1.0, -1.0)
@@ -109,8 +130,9 @@ class World:
         """Let the sensors measure what falls due. Their sampling is placed at the end of the 1 ms slice it is in."""
         while self.force_box.next_sample_ns <= until_ns:
             force_N, torque_Nm = self.plant.measured_wrench()
-            self.force_box.sample(self.force_box.next_sample_ns, self._sensor_from_base @ force_N,
-                                  self._sensor_from_base @ torque_Nm)
+            self.force_box.sample(
+                self.force_box.next_sample_ns, self._sensor_from_base @ force_N, self._sensor_from_base @ torque_Nm
+            )
         while self.tracker.next_frame_ns <= until_ns:
             poses = [self._in_tracker_frame(tool) for tool in (TIP, SHAFT)]
             self.tracker.sample(self.tracker.next_frame_ns, poses)
@@ -119,5 +141,7 @@ class World:
         measured = self.plant.measured_pose(tool)
         if measured.missing:
             return None
-        return (self._tracker_from_base @ (measured.position_m - self._tracker_shift_m),
-                quaternion_product(self._tracker_turn, measured.quaternion_wxyz))
+        return (
+            self._tracker_from_base @ (measured.position_m - self._tracker_shift_m),
+            quaternion_product(self._tracker_turn, measured.quaternion_wxyz),
+        )

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from host import bench as benchmarks
-from host.cli.contract_io import BadInput, write_json
+from host.cli.contract_io import write_json
+from host.studies.benchmarks import runner as benchmarks
+from protocol.errors import InputError
 
 ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"))
 
@@ -20,7 +21,7 @@ def bench(
 ) -> None:
     """Time the kernels and their peers on equal inputs, one core. Progress on standard error."""
     if seed < 0:
-        raise BadInput("seed", seed, "0 or more")
+        raise InputError("seed", seed, "0 or more")
     rows, missing = benchmarks.run(only or [], seed, lambda line: print(f"seldinger: {line}", file=sys.stderr))
     if json:
         write_json({"results": rows, "missing": missing})
@@ -34,19 +35,25 @@ def _table(rows: list[dict[str, Any]]) -> str:
     lines = [f"{'benchmark':<34} {'median us':>10} {'p95 us':>9} {'peer us':>10} {'times':>8}  accuracy (peer), peer"]
     for row in rows:
         name = f"{row['name']} {row['variant']}".strip()
-        lines.append(f"{name:<34} {row['median']:>10.2f} {row['p95']:>9.2f} {row['peer_median']:>10.1f} "
-                     f"{row['speedup']:>8.1f}  {_accuracy(row)} {row['peer']}")
+        lines.append(
+            f"{name:<34} {row['median']:>10.2f} {row['p95']:>9.2f} {row['peer_median']:>10.1f} "
+            f"{row['speedup']:>8.1f}  {_accuracy(row)} {row['peer']}"
+        )
     return "\n".join(lines)
 
 
 def _accuracy(row: dict[str, Any]) -> str:
-    parts = [f"{row[key]:.1e} ({row['peer_' + key]:.1e}) {unit}" for key, unit in ACCURACY_KEYS
-             if row.get(key) is not None and row.get("peer_" + key) is not None]
+    parts = [
+        f"{row[key]:.1e} ({row['peer_' + key]:.1e}) {unit}"
+        for key, unit in ACCURACY_KEYS
+        if row.get(key) is not None and row.get("peer_" + key) is not None
+    ]
     if "right" in row:
         parts.append(f"right {row['right']} ({row['peer_right']}) of {row['cases']}")
     if "noise_over_bound" in row:
-        parts.append(f"noise {row['noise_over_bound']:.3f} of the bound "
-                     f"({row['peer_noise_over_bound']:.3f}, {row['noise_peer']})")
+        parts.append(
+            f"noise {row['noise_over_bound']:.3f} of the bound ({row['peer_noise_over_bound']:.3f}, {row['noise_peer']})"
+        )
     if "poses_per_s" in row:
         parts.append(f"{row['poses_per_s']:,.0f} poses/s on {row['workers']} cores")
     return ", ".join(parts) + ";"

@@ -12,25 +12,25 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from host.characterization import (
+from host.cli.contract_io import write_json
+from host.commissioning.characterization import (
     Characterization,
     calibrated_rig_text,
     record_simulated,
     standard_sweeps,
     transmission_toml,
 )
-from host.characterization import (
+from host.commissioning.characterization import (
     characterize as identify,
 )
-from host.characterization_report import lines_of, write_characterization
-from host.cli.contract_io import BadInput, write_json
-from host.demo import SIMULATED_RIG, new_recording_path
-from host.recording import Recording
-from host.rig_sweeps import PortNames, in_words, record_on_rig
-from host.sweep_fits import Estimate
+from host.commissioning.characterization_report import lines_of, write_characterization
+from host.commissioning.rig_sweeps import PortNames, in_words, record_on_rig
+from host.commissioning.sweep_fits import Estimate
+from host.recordings.recording import Recording, new_recording_path
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
+from realtime.core.sweep import Sweep
 from realtime.drivers.net_ft import RDT_PORT
-from realtime.rig_file import Rig, RigFileError, load_rig, parse_rig
-from realtime.sweep import Sweep
 from sim.board import KINDS, BoardUnavailable
 
 
@@ -50,13 +50,13 @@ def characterize(
 ) -> None:
     """Characterize a rig in free space: backlash, slopes, dead zones, curves; write its calibration."""
     if board not in KINDS:
-        raise BadInput("--board", board, " or ".join(KINDS))
+        raise InputError("--board", board, " or ".join(KINDS))
     if not 1 <= repeats <= 20:
-        raise BadInput("--repeats", repeats, "1 to 20")
+        raise InputError("--repeats", repeats, "1 to 20")
     if real and recording is not None:
-        raise BadInput("--real", "with --recording", "one of them: a recording moves nothing")
+        raise InputError("--real", "with --recording", "one of them: a recording moves nothing")
     if not 1 <= force_port <= 65535:
-        raise BadInput("--force-port", force_port, "1 to 65535")
+        raise InputError("--force-port", force_port, "1 to 65535")
     ports, loaded = PortNames(board_port, tracker_port, force_port), load_rig(rig)
     try:
         if real:
@@ -64,20 +64,22 @@ def characterize(
         else:
             source = recording or _record(loaded, repeats, seed, board, directory)
         found = identify(Recording(source), loaded)
-    except RigFileError:
+    except InputError:
         raise
     except ValueError as error:
         key, _, rest = str(error).partition(": found ")
         what, _, wanted = rest.partition(", wanted ")
-        raise BadInput(key, what, wanted) from None
+        raise InputError(key, what, wanted) from None
     except (BoardUnavailable, RuntimeError, OSError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     result = _write(found, loaded, rig, source, directory)
     for line in lines_of(found):
         print(f"{line.name:<22} {line.value:>12}  {line.beside}", file=sys.stderr)
-    print(f"calibration: {result['calibration']}\nrig file:    {result['rig_file']}\npage:        {result['report']}",
-          file=sys.stderr)
+    print(
+        f"calibration: {result['calibration']}\nrig file:    {result['rig_file']}\npage:        {result['report']}",
+        file=sys.stderr,
+    )
     if json:
         write_json(result)
 
@@ -94,7 +96,7 @@ def _record_on_rig(rig: Rig, sweeps: Sequence[Sweep], ports: PortNames, yes: boo
     """Asks first: sweeps swing the tip through free space, and the command cannot see what stands there."""
     print(f"seldinger: {in_words(sweeps)}", file=sys.stderr)
     if not yes and not sys.stdin.isatty():
-        raise BadInput("--yes", "missing", "it, or somebody at the terminal who says that the tip hangs free")
+        raise InputError("--yes", "missing", "it, or somebody at the terminal who says that the tip hangs free")
     if not (yes or typer.confirm("Does the catheter's tip hang free, nothing within its reach?", err=True)):
         print("seldinger: nothing was moved", file=sys.stderr)
         raise typer.Exit(1)
@@ -120,10 +122,19 @@ def _write(found: Characterization, rig: Rig, rig_file: Path, source: Path, dire
         return {"value": value.value * scale, "ci95": [value.low * scale, value.high * scale]}
 
     names = ("knob_lower_stop_rad", "knob_slack_from_rad", "knob_slack_to_rad", "knob_upper_stop_rad")
-    return {"catheter": found.catheter, "insertion_backlash_m": told(found.insertion.width),
-            "insertion_slope": told(found.insertion.slope), "insertion_at_home_m": told(found.insertion_at_home_m),
-            "roll_slope": told(found.roll.slope), "roll_backlash_rad": told(found.roll_backlash_rad),
-            **{name: told(edge) for name, edge in zip(names, found.knob.edges_rad, strict=True)},
-            "knob_gain_per_m_rad": [told(gain) for gain in found.knob.gains_per_m_rad],
-            "tracker_noise_m": found.insertion.noise, "roll_noise_deg": math.degrees(found.roll.noise),
-            "calibration": str(calibration), "rig_file": str(whole), "report": str(page), "recording": str(source)}
+    return {
+        "catheter": found.catheter,
+        "insertion_backlash_m": told(found.insertion.width),
+        "insertion_slope": told(found.insertion.slope),
+        "insertion_at_home_m": told(found.insertion_at_home_m),
+        "roll_slope": told(found.roll.slope),
+        "roll_backlash_rad": told(found.roll_backlash_rad),
+        **{name: told(edge) for name, edge in zip(names, found.knob.edges_rad, strict=True)},
+        "knob_gain_per_m_rad": [told(gain) for gain in found.knob.gains_per_m_rad],
+        "tracker_noise_m": found.insertion.noise,
+        "roll_noise_deg": math.degrees(found.roll.noise),
+        "calibration": str(calibration),
+        "rig_file": str(whole),
+        "report": str(page),
+        "recording": str(source),
+    }

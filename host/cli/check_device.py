@@ -11,16 +11,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from host.cli.contract_io import BadInput, write_json
-from host.demo import SIMULATED_RIG
+from host.cli.contract_io import write_json
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.serial_frames import Fault
-from realtime.board_intake import axis_limits
+from realtime.core.board_intake import axis_limits
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
 from realtime.drivers.net_ft import RDT_PORT
 from realtime.drivers.stepper_board import FAULT_ADVICE, BoardStatus, EventKind, LinkPhase, StepperBoardLink
 from realtime.drivers.transport import Transport, open_serial
-from realtime.rig_file import Rig, load_rig
 
 DEVICES = ("tracker", "force", "board")
 STATUS_HZ, BRING_UP_S = 200.0, 5.0
@@ -37,9 +37,9 @@ def check_device(
 ) -> None:
     """Read a device for some seconds; nothing moves. Exit status 1 when it is not fit."""
     if device not in DEVICES:
-        raise BadInput("device", device, " or ".join(DEVICES))
+        raise InputError("device", device, " or ".join(DEVICES))
     if not 0.1 <= seconds <= 3600.0:
-        raise BadInput("--seconds", seconds, "0.1 to 3600 (s)")
+        raise InputError("--seconds", seconds, "0.1 to 3600 (s)")
     settings = load_rig(rig)
     if device == "tracker":
         report = _tracker(settings, port, seconds)
@@ -108,14 +108,22 @@ def _judge_board(link: StepperBoardLink, report: DeviceReport, rate_hz: float, f
         return
     if link.phase is not LinkPhase.READY:
         report.problems.append(f"bring-up ended in phase {link.phase.value}, wanted ready")
-    report.figures |= {"firmware": f"{identity.firmware_version >> 8}.{identity.firmware_version & 0xFF}",
-                       "boot_count": identity.boot_count, "timer_hz": identity.timer_hz, "status_hz": round(rate_hz, 1)}
+    report.figures |= {
+        "firmware": f"{identity.firmware_version >> 8}.{identity.firmware_version & 0xFF}",
+        "boot_count": identity.boot_count,
+        "timer_hz": identity.timer_hz,
+        "status_hz": round(rate_hz, 1),
+    }
     if status is None or first is None:
         return
     damaged = link.decoder.counters.crc_errors + status.crc_errors - first.crc_errors
-    report.figures |= {"damaged_frames": damaged, "clock_drift": link.clock.drift,
-                       "fault": FAULT_ADVICE[Fault(status.fault)],
-                       "encoder_errors": status.encoder_errors, "inputs": f"{status.inputs:07b}"}
+    report.figures |= {
+        "damaged_frames": damaged,
+        "clock_drift": link.clock.drift,
+        "fault": FAULT_ADVICE[Fault(status.fault)],
+        "encoder_errors": status.encoder_errors,
+        "inputs": f"{status.inputs:07b}",
+    }
     if rate_hz < 0.98 * STATUS_HZ:
         report.problems.append(f"{rate_hz:.0f} status frames a second, wanted {STATUS_HZ:g}")
     if damaged:

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput, write_json
-from host.control_study import SECTIONS, StudySettings, in_words, study
-from host.demo import SIMULATED_RIG
+from host.cli.contract_io import write_json
+from host.studies.control.study import SECTIONS, StudySettings, in_words, study
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG
 
 
 def control_study(
@@ -24,9 +25,9 @@ def control_study(
     """Run the study in virtual time; with the defaults it takes some twenty minutes of one core."""
     settings = StudySettings(_seeds(seeds), seconds, goals, rig, _sections(only))
     if not 10.0 <= seconds <= 600.0:
-        raise BadInput("--seconds", seconds, "10 to 600")
+        raise InputError("--seconds", seconds, "10 to 600")
     if not 1 <= goals <= 1000:
-        raise BadInput("--goals", goals, "1 to 1000")
+        raise InputError("--goals", goals, "1 to 1000")
     result = study(settings, lambda text: print(f"seldinger: {text}", file=sys.stderr, flush=True))
     print("\n".join(in_words(result)), file=sys.stderr)
     if json:
@@ -37,9 +38,9 @@ def _seeds(text: str) -> tuple[int, ...]:
     try:
         seeds = tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise BadInput("--seeds", text, "whole numbers with commas between") from None
+        raise InputError("--seeds", text, "whole numbers with commas between") from None
     if not all(0 <= seed < 2**31 for seed in seeds):
-        raise BadInput("--seeds", text, "numbers from 0 to 2147483647")
+        raise InputError("--seeds", text, "numbers from 0 to 2147483647")
     return seeds
 
 
@@ -47,5 +48,5 @@ def _sections(text: str) -> tuple[str, ...]:
     names = tuple(part.strip() for part in text.split(",") if part.strip()) or SECTIONS
     for name in names:
         if name not in SECTIONS:
-            raise BadInput("--only", name, "one of " + ", ".join(SECTIONS))
+            raise InputError("--only", name, "one of " + ", ".join(SECTIONS))
     return names

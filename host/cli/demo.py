@@ -10,12 +10,13 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from host.cli.contract_io import BadInput, write_json
-from host.demo import SIMULATED_RIG, DemoRun, DemoSettings, exit_status, run_lockstep
-from host.demo_summary import demo_result, print_summary
-from host.recording import Recording
-from host.report import write_report
-from realtime.rig_file import RigFileError, load_rig
+from host.cli.contract_io import write_json
+from host.recordings.recording import Recording
+from host.report.demo_summary import demo_result, print_summary
+from host.report.run_report import write_report
+from host.run.demo import DemoRun, DemoSettings, exit_status, run_lockstep
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from sim.board import KINDS, BoardUnavailable
 from sim.effects import parse
 
@@ -45,11 +46,9 @@ def demo(
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     except ValueError as error:
-        if isinstance(error, RigFileError):
+        if isinstance(error, InputError):
             raise
-        key, _, rest = str(error).partition(": found ")
-        found, _, wanted = rest.partition(", wanted ")
-        raise BadInput(key, found, wanted) from None
+        raise InputError.from_sentence(str(error)) from None
     recording = Recording(run.recording)
     try:
         report = write_report(recording, run.recording.with_suffix(".html"))
@@ -63,41 +62,64 @@ def demo(
     raise typer.Exit(exit_status(run, result["contact_seconds"] > 0))
 
 
-def _settings(board: str, seed: int, force: float, hold: float, fast: bool, force_source: str, rig: Path,
-              directory: Path, effects: tuple[str, ...]) -> DemoSettings:
+def _settings(
+    board: str,
+    seed: int,
+    force: float,
+    hold: float,
+    fast: bool,
+    force_source: str,
+    rig: Path,
+    directory: Path,
+    effects: tuple[str, ...],
+) -> DemoSettings:
     if board not in KINDS:
-        raise BadInput("--board", board, " or ".join(KINDS))
+        raise InputError("--board", board, " or ".join(KINDS))
     if force_source not in ("sensor", "estimate"):
-        raise BadInput("--force-source", force_source, "sensor or estimate")
+        raise InputError("--force-source", force_source, "sensor or estimate")
     for text in effects:
         try:
             parse(text)
         except ValueError as error:
             found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
-            raise BadInput(f"--effect {text}", found, wanted) from None
+            raise InputError(f"--effect {text}", found, wanted) from None
     limit = load_rig(rig).safety.over_force_N
     if not 0.02 <= force < limit:
-        raise BadInput("--force", force, f"at least 0.02 and below safety.over_force_N {limit} (N)")
+        raise InputError("--force", force, f"at least 0.02 and below safety.over_force_N {limit} (N)")
     if not 1.0 <= hold <= 3600.0:
-        raise BadInput("--hold", hold, "1 to 3600 (s)")
-    return DemoSettings(board=board, seed=seed, force_N=force, hold_s=hold, pace=0.0 if fast else 1.0,
-                        force_source=force_source, rig_file=rig, directory=directory, effects=effects)
+        raise InputError("--hold", hold, "1 to 3600 (s)")
+    return DemoSettings(
+        board=board,
+        seed=seed,
+        force_N=force,
+        hold_s=hold,
+        pace=0.0 if fast else 1.0,
+        force_source=force_source,
+        rig_file=rig,
+        directory=directory,
+        effects=effects,
+    )
 
 
 def _with_progress(settings: DemoSettings, wall_clock: bool) -> DemoRun:
     """Run with a line on standard error that says what goes on."""
-    columns = (TextColumn("{task.description:<9}"), BarColumn(bar_width=30), TextColumn("{task.fields[force]}"),
-               TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:<9}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.fields[force]}"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("start", total=1.0, force="")
 
         def progress(phase: str, share: float, force_N: float) -> None:
             first, last = _SHARES.get(phase, (0.0, 0.0))
-            bar.update(task, description=phase, completed=first + min(share, 1.0) * (last - first),
-                       force=f"{force_N:+.3f} N")
+            bar.update(
+                task, description=phase, completed=first + min(share, 1.0) * (last - first), force=f"{force_N:+.3f} N"
+            )
 
         if wall_clock:
-            from host.wall_clock import run_wall_clock
+            from host.run.wall_clock import run_wall_clock
 
             return run_wall_clock(settings, progress)
         return run_lockstep(settings, progress)

@@ -67,20 +67,20 @@ def diagnose(
 
         watch_rig(rig, json)
         return
-    from host.cli.contract_io import BadInput
-    from host.diagnosis.dataset import find_files
-    from host.diagnosis.effect import library
-    from host.diagnosis.nominal import effect_of, read_nominal
+    from host.diagnosis.model.dataset import find_files
+    from host.diagnosis.model.effect import library
+    from host.diagnosis.model.nominal import effect_of, read_nominal
     from host.diagnosis.pipeline import diagnose as run
-    from host.diagnosis.verdict import as_json
+    from host.diagnosis.report.verdict import as_json
+    from protocol.errors import InputError
 
     began = time.monotonic()
     known = {effect.id for effect in library()}
     for effect_id in without or []:
         if effect_id not in known:
-            raise BadInput("--without", effect_id, "one of " + ", ".join(sorted(known)))
+            raise InputError("--without", effect_id, "one of " + ", ".join(sorted(known)))
     if not nominal:
-        raise BadInput("--nominal", "nothing", "a TOML file")
+        raise InputError("--nominal", "nothing", "a TOML file")
     spec = read_nominal(nominal_path(nominal))
     spec.effect += [effect_of(text) for text in effect or []]
     files = find_files(spec, recordings or [], data or os.environ.get("SELDINGER_DATA"))
@@ -89,7 +89,7 @@ def diagnose(
     progress.close()
     verdict = as_json(result, time.monotonic() - began)
     if out is not None:
-        from host.diagnosis.scripts import write_scripts
+        from host.diagnosis.design.scripts import write_scripts
 
         out.mkdir(parents=True, exist_ok=True)
         verdict["scripts"] = [str(path) for path in write_scripts(result, out)]
@@ -98,7 +98,7 @@ def diagnose(
         for path in verdict["scripts"]:
             print(f"script: {path}", file=sys.stderr)
     if report:
-        from host.diagnosis.report import write_report
+        from host.diagnosis.report.page import write_report
 
         write_report(result, verdict, Path(report))
     if json or not report:
@@ -108,5 +108,5 @@ def diagnose(
 def nominal_path(name: str) -> Path:
     """The file `name`, or the shipped nominal of that name."""
     path = Path(name)
-    shipped = Path(__file__).parent.parent / "diagnosis" / "nominals" / f"{name}.toml"
+    shipped = Path(__file__).parents[1] / "diagnosis" / "nominals" / f"{name}.toml"
     return shipped if not path.exists() and shipped.exists() else path

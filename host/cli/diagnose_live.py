@@ -11,10 +11,9 @@ import threading
 from pathlib import Path
 from types import FrameType
 
-from host.demo import SIMULATED_RIG
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm
 from protocol.zenoh_session import Session
-from realtime.rig_file import load_rig
 
 SAYS = {"waiting": "waiting for an armed rig", "learning": "learning how rig and twin agree", "watching": "watching"}
 
@@ -22,9 +21,9 @@ SAYS = {"waiting": "waiting for an armed rig", "learning": "learning how rig and
 def watch_rig(rig_file: str | None, json: str | None) -> None:
     """Watch the rig of `rig_file` until SIGINT or SIGTERM. With json `-`, one JSON object a line for each alarm.
 
-    Raises BadInput (RigFileError) for a bad rig file.
+    Raises InputError for a bad rig file.
     """
-    from host.diagnosis.live import warm_up, watch
+    from host.diagnosis.live.watch import warm_up, watch
 
     os.nice(10)  # behind the rig's own processes
     rig = load_rig(Path(rig_file) if rig_file else SIMULATED_RIG)

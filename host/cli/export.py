@@ -8,22 +8,26 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput, write_json
-from host.export import FORMATS
-from host.export import export as export_tables
-from host.recording import Recording
+from host.cli.contract_io import write_json
+from host.recordings.export import FORMATS
+from host.recordings.export import export as export_tables
+from host.recordings.recording import Recording
+from protocol.errors import InputError
 
 
 def open_recording(path: Path) -> Recording:
-    """The recording at `path`, with a line on standard error where it is incomplete. Raises BadInput."""
+    """The recording at `path`, with a line on standard error where it is incomplete. Raises InputError."""
     try:
         recording = Recording(path)
     except ValueError as error:
         found, _, wanted = str(error).removeprefix(f"{path}: found ").partition(", wanted ")
-        raise BadInput(str(path), found, wanted) from None
+        raise InputError(str(path), found, wanted) from None
     if recording.truncated or recording.damaged_chunks:
-        print(f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "
-              f"({recording.damaged_chunks} damaged chunks): using the messages that are intact", file=sys.stderr)
+        print(
+            f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "
+            f"({recording.damaged_chunks} damaged chunks): using the messages that are intact",
+            file=sys.stderr,
+        )
     return recording
 
 
@@ -35,15 +39,20 @@ def export(
 ) -> None:
     """Write one table for each topic: `seldinger export REC.mcap --to parquet DIR`."""
     if to not in FORMATS:
-        raise BadInput("to", to, f"one of {', '.join(FORMATS)}")
+        raise InputError("to", to, f"one of {', '.join(FORMATS)}")
     opened = open_recording(recording)
     try:
         written = export_tables(opened, to, folder)
     except OSError as error:
-        raise BadInput(str(folder), error.strerror or str(error), "a folder that can be written to") from None
+        raise InputError(str(folder), error.strerror or str(error), "a folder that can be written to") from None
     if json:
-        write_json({"tables": {topic: rows for topic, rows in sorted(opened.topics.items())},
-                    "files": [str(path) for path in written], "truncated": opened.truncated})
+        write_json(
+            {
+                "tables": {topic: rows for topic, rows in sorted(opened.topics.items())},
+                "files": [str(path) for path in written],
+                "truncated": opened.truncated,
+            }
+        )
         return
     for topic, rows in sorted(opened.topics.items()):
         print(f"{rows:9d} rows  {topic}")

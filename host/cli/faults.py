@@ -12,10 +12,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from host.cli.contract_io import BadInput, write_json
-from host.fault_campaign import RunResult, by_fault, run_campaign, summary_of
-from host.fault_report import page_section
-from host.reliability_page import write_section
+from host.cli.contract_io import write_json
+from host.studies.faults.campaign import RunResult, by_fault, run_campaign, summary_of
+from host.studies.faults.report import page_section
+from host.studies.reliability_page import write_section
+from protocol.errors import InputError
 from sim.board import KINDS, BoardUnavailable
 from sim.fault_table import FAULTS
 
@@ -31,16 +32,16 @@ def faults(
 ) -> None:
     """Inject faults into the job, in approach, contact and hold. Exit status 1 when a run broke a rule."""
     if not 1 <= runs <= 100_000:
-        raise BadInput("--runs", runs, "1 to 100000")
+        raise InputError("--runs", runs, "1 to 100000")
     if not 1 <= jobs <= 64:
-        raise BadInput("--jobs", jobs, "1 to 64")
+        raise InputError("--jobs", jobs, "1 to 64")
     if seed < 0:
-        raise BadInput("--seed", seed, "0 or more")
+        raise InputError("--seed", seed, "0 or more")
     if board not in KINDS:
-        raise BadInput("--board", board, " or ".join(KINDS))
+        raise InputError("--board", board, " or ".join(KINDS))
     for name in fault or ():
         if name not in {row.name for row in FAULTS}:
-            raise BadInput("--fault", name, "one of " + ", ".join(row.name for row in FAULTS))
+            raise InputError("--fault", name, "one of " + ", ".join(row.name for row in FAULTS))
     try:
         results = _with_progress(runs, seed, jobs, board, tuple(fault or ()))
     except (BoardUnavailable, RuntimeError) as error:
@@ -51,15 +52,28 @@ def faults(
     if docs is not None:
         write_section(docs, "faults", page_section(results, seed, board))
     if json:
-        write_json({"runs": len(results), "seed": seed, "board": board, "by_fault": by_fault(results),
-                    "violations": [_broken(result) for result in bad]})
+        write_json(
+            {
+                "runs": len(results),
+                "seed": seed,
+                "board": board,
+                "by_fault": by_fault(results),
+                "violations": [_broken(result) for result in bad],
+            }
+        )
     raise typer.Exit(1 if bad else 0)
 
 
 def _broken(result: RunResult) -> dict[str, object]:
     plan = result.plan
-    return {"run": plan.index, "fault": plan.fault, "phase": plan.phase, "size": plan.size, "seconds": plan.seconds,
-            "says": list(result.violations)}
+    return {
+        "run": plan.index,
+        "fault": plan.fault,
+        "phase": plan.phase,
+        "size": plan.size,
+        "seconds": plan.seconds,
+        "says": list(result.violations),
+    }
 
 
 def _with_progress(runs: int, seed: int, jobs: int, board: str, names: tuple[str, ...]) -> list[RunResult]:
@@ -81,10 +95,21 @@ def _tell(results: list[RunResult], bad: list[RunResult]) -> None:
             continue
         s = summary_of(mine)
         times = "" if s["detection_ms_p50"] is None else f"{s['detection_ms_p50']:.0f} (99 %: {s['detection_ms_p99']:.0f})"
-        table.add_row(row.name, str(s["runs"]), str(s["must_detect"]), str(s["missed"]), times, f"{s['peak_force_N']:.3f}",
-                      ", ".join(f"{name} {count}" for name, count in s["actions"].items()), str(s["violations"] or ""))
+        table.add_row(
+            row.name,
+            str(s["runs"]),
+            str(s["must_detect"]),
+            str(s["missed"]),
+            times,
+            f"{s['peak_force_N']:.3f}",
+            ", ".join(f"{name} {count}" for name, count in s["actions"].items()),
+            str(s["violations"] or ""),
+        )
     console.print(table)
     for result in bad:
-        console.print(f"run {result.plan.index}, {result.plan.fault} in {result.plan.phase} ({result.plan.size:.3g}, "
-                      f"{result.plan.seconds:.2f} s): {'; '.join(result.violations)}", markup=False)
+        console.print(
+            f"run {result.plan.index}, {result.plan.fault} in {result.plan.phase} ({result.plan.size:.3g}, "
+            f"{result.plan.seconds:.2f} s): {'; '.join(result.violations)}",
+            markup=False,
+        )
     console.print(f"{len(results)} runs, {len(bad)} broke a rule")

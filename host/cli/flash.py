@@ -10,10 +10,9 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from host.cli.contract_io import BadInput
-from host.demo import SIMULATED_RIG
-from realtime.board_pins import definitions
-from realtime.rig_file import Pins, load_rig
+from protocol.board_pins import definitions
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Pins, load_rig
 from sim.board import FIRMWARE_DIR
 
 
@@ -39,17 +38,19 @@ def flash(
 ) -> None:
     """Build the firmware and write it to the board. The stages must be free to stand still: the board resets."""
     if mcu and mcu not in PROGRAMMERS:
-        raise BadInput("--mcu", mcu, " or ".join(PROGRAMMERS))
+        raise InputError("--mcu", mcu, " or ".join(PROGRAMMERS))
     pins = load_rig(rig).board.pins
     if mcu and mcu != pins.mcu:
         pins = Pins.model_validate({"mcu": mcu})
     if shutil.which("avrdude") is None:
-        raise BadInput("avrdude", "no such program", "avrdude on the PATH (Debian: apt install avrdude)")
+        raise InputError("avrdude", "no such program", "avrdude on the PATH (Debian: apt install avrdude)")
     if not Path(port).exists() and not dry_run:
-        raise BadInput("--port", port, f"a serial port that is there; found {', '.join(ports()) or 'none on this machine'}")
+        raise InputError(
+            "--port", port, f"a serial port that is there; found {', '.join(ports()) or 'none on this machine'}"
+        )
     elf = image or built(pins)
     if not elf.is_file():
-        raise BadInput("--image", str(elf), "an ELF file of the firmware")
+        raise InputError("--image", str(elf), "an ELF file of the firmware")
     command = avrdude_command(pins.mcu, port, elf, baud)
     print("seldinger: " + " ".join(command), file=sys.stderr)
     if dry_run:
@@ -60,8 +61,11 @@ def flash(
         print(f"seldinger: avrdude did not end within {TIMEOUT_S} s; is another program holding {port}?", file=sys.stderr)
         raise typer.Exit(1) from None
     if status:
-        print(f"seldinger: avrdude ended with status {status}: nothing else may hold {port}, and the board must have an "
-              f"{pins.mcu}", file=sys.stderr)
+        print(
+            f"seldinger: avrdude ended with status {status}: nothing else may hold {port}, and the board must have an "
+            f"{pins.mcu}",
+            file=sys.stderr,
+        )
         raise typer.Exit(1)
     print("seldinger: written and verified; now `seldinger check-device board`", file=sys.stderr)
 
@@ -75,15 +79,27 @@ def ports() -> list[str]:
 def avrdude_command(mcu: str, port: str, elf: Path, baud: int = 0) -> list[str]:
     """The call of avrdude that writes and verifies the flash memory of `mcu`; -D: boot loaders erase page by page."""
     programmer = PROGRAMMERS[mcu]
-    return ["avrdude", "-p", programmer.part, "-c", programmer.protocol, "-P", port, "-b", str(baud or programmer.baud),
-            "-D", "-U", f"flash:w:{elf}:e"]
+    return [
+        "avrdude",
+        "-p",
+        programmer.part,
+        "-c",
+        programmer.protocol,
+        "-P",
+        port,
+        "-b",
+        str(baud or programmer.baud),
+        "-D",
+        "-U",
+        f"flash:w:{elf}:e",
+    ]
 
 
 def built(pins: Pins) -> Path:
-    """The firmware's ELF for these pins, built if stale. Raises BadInput where that cannot be."""
+    """The firmware's ELF for these pins, built if stale. Raises InputError where that cannot be."""
     for tool in ("make", "avr-gcc"):
         if shutil.which(tool) is None:
-            raise BadInput(tool, "no such program", "the AVR tool chain (Debian: gcc-avr avr-libc make), or --image FILE")
+            raise InputError(tool, "no such program", "the AVR tool chain (Debian: gcc-avr avr-libc make), or --image FILE")
     folder, options = "build", list[str]()
     if pins != Pins.model_validate({"mcu": pins.mcu}):
         folder = f"build/pins-{pins.outputs}{pins.output_shift}{pins.encoders}{pins.switches}"
@@ -93,5 +109,5 @@ def built(pins: Pins) -> Path:
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         said = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]
-        raise BadInput("firmware", said[0], f"sources that build (`make -C firmware {target}`)")
+        raise InputError("firmware", said[0], f"sources that build (`make -C firmware {target}`)")
     return FIRMWARE_DIR / target

@@ -11,10 +11,9 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput
-from host.demo import SIMULATED_RIG
-from host.services.units import UnitSettings, install, undo, unit_texts
-from realtime.rig_file import load_rig
+from host.run.service_units import UnitSettings, install, undo, unit_texts
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
 
 _MANAGER = Path("/run/systemd/system")
 
@@ -29,21 +28,21 @@ def install_services(
     """Write unit files and the service user, tell systemd. Nothing is started or enabled: the command for that is shown."""
     system = root == Path("/")
     if system and os.geteuid() != 0:
-        raise BadInput("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
+        raise InputError("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
     if take_away:
         _undo(root, system)
         return
     count = os.cpu_count() or 1
     if not -1 <= cpu < count:
-        raise BadInput("--cpu", cpu, f"-1 to {count - 1}")
+        raise InputError("--cpu", cpu, f"-1 to {count - 1}")
     settings = UnitSettings(rig.resolve(), count - 1 if cpu < 0 else cpu, simulated)
     try:
         written = install(root, unit_texts(settings, load_rig(rig)))
     except ValueError as error:
         key, _, rest = str(error).partition(": found ")
-        raise BadInput(key, *rest.split(", wanted ", 1)) from None
+        raise InputError(key, *rest.split(", wanted ", 1)) from None
     except FileExistsError as error:
-        raise BadInput("--root", str(error), "a place without files of that name") from None
+        raise InputError("--root", str(error), "a place without files of that name") from None
     for path in written:
         print(f"seldinger: wrote {path}", file=sys.stderr)
     if system and _MANAGER.is_dir():
@@ -61,8 +60,12 @@ def _undo(root: Path, system: bool) -> None:
         print(f"seldinger: removed {path}", file=sys.stderr)
     if managed:
         _call("systemctl", "daemon-reload")
-    print("seldinger: recordings in /var/lib/seldinger and the user stay; `userdel seldinger` removes the user"
-          if removed else "seldinger: nothing was installed here", file=sys.stderr)
+    print(
+        "seldinger: recordings in /var/lib/seldinger and the user stay; `userdel seldinger` removes the user"
+        if removed
+        else "seldinger: nothing was installed here",
+        file=sys.stderr,
+    )
 
 
 def _call(*command: str) -> None:

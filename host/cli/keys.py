@@ -25,14 +25,18 @@ def _group() -> None:
 
 
 @keys.command()
-def init(directory: Directory = KEYS,
-         laboratory: Annotated[str, typer.Option(help="Its name, in the authority's certificate.")] = "laboratory") -> None:
+def init(
+    directory: Directory = KEYS,
+    laboratory: Annotated[str, typer.Option(help="Its name, in the authority's certificate.")] = "laboratory",
+) -> None:
     """Make the laboratory's authority. Refuses where there is one: its certificates would all be worthless."""
-    from host.keys import make_authority
+    from host.security.keys import make_authority
 
     folder = make_authority(directory, laboratory)
-    print(f"authority in {folder}; whoever has its key.pem can command every rig: keep it off the rigs, and back it up",
-          file=sys.stderr)
+    print(
+        f"authority in {folder}; whoever has its key.pem can command every rig: keep it off the rigs, and back it up",
+        file=sys.stderr,
+    )
 
 
 @keys.command()
@@ -45,8 +49,8 @@ def issue(
     days: Annotated[int, typer.Option(help="How long it is valid.")] = 365,
 ) -> None:
     """A key and a certificate in a folder of its own, to be copied to that machine; and what the rig file needs."""
-    from host.keys import CLIENT_FILE, network_lines
-    from host.keys import issue as issue_certificate
+    from host.security.keys import CLIENT_FILE, network_lines
+    from host.security.keys import issue as issue_certificate
 
     addresses = address or []
     one = issue_certificate(directory, name, role, addresses=addresses, days=days, connect=connect)
@@ -59,10 +63,11 @@ def issue(
 
 
 @keys.command()
-def show(directory: Directory = KEYS,
-         json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False) -> None:
+def show(
+    directory: Directory = KEYS, json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False
+) -> None:
     """All certificates: whose, for what, until when. Exit status 1 when one has expired."""
-    from host.keys import issued
+    from host.security.keys import issued
 
     now = datetime.datetime.now(datetime.UTC)
     found = issued(directory)

@@ -8,37 +8,44 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput, write_json
-from realtime.configure import tick_parameters
-from realtime.latency import LatencyResult, as_contract, check_latency, text_histogram
-from realtime.native_loop import GAP_PLACES
-from realtime.rig_file import load_rig
-from realtime.scheduling import RealtimeSettings
-from realtime.tick import tick
+from host.cli.contract_io import write_json
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
+from realtime.control.configure import tick_parameters
+from realtime.control.tick import tick
+from realtime.loop.latency import LatencyResult, as_contract, check_latency, text_histogram
+from realtime.loop.native_loop import GAP_PLACES
+from realtime.loop.scheduling import RealtimeSettings
 
 RATES_HZ = (100, 4000)
 MAX_SECONDS = 86_400
-_RIG = Path(__file__).parents[1] / "rigs" / "simulated.toml"
+_RIG = SIMULATED_RIG
 
 
 def latency_check(
     seconds: Annotated[float, typer.Option(help="how long in all; cyclictest, where installed, takes half")] = 20.0,
     hz: Annotated[int, typer.Option(help="ticks per second, 100 to 4000")] = 1000,
     json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-    beside: Annotated[str, typer.Option("--with", help="subscribers beside which to measure, by commas: frozen, flooding, "
-                                        "leaving, view, or all; runs the simulated rig")] = "",
+    beside: Annotated[
+        str,
+        typer.Option(
+            "--with",
+            help="subscribers beside which to measure, by commas: frozen, flooding, "
+            "leaving, view, or all; runs the simulated rig",
+        ),
+    ] = "",
     docs: Annotated[Path | None, typer.Option(help="with --with: page whose section on subscribers is written anew")] = None,
 ) -> None:
     """Run the wall-clock loop with the real tick and say how late it woke and how long it worked."""
     if not RATES_HZ[0] <= hz <= RATES_HZ[1]:
-        raise BadInput("hz", hz, f"{RATES_HZ[0]} to {RATES_HZ[1]}")
+        raise InputError("hz", hz, f"{RATES_HZ[0]} to {RATES_HZ[1]}")
     if not 0 < seconds <= MAX_SECONDS:
-        raise BadInput("seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
+        raise InputError("seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
     if beside:
         _beside(beside, seconds, json, docs)
         return
     if docs is not None:
-        raise BadInput("docs", docs, "--with beside it")
+        raise InputError("docs", docs, "--with beside it")
     params = tick_parameters(load_rig(_RIG))
     params[0].period_s = 1.0 / hz
     result = check_latency(tick, params, hz, seconds, RealtimeSettings())
@@ -53,14 +60,14 @@ def latency_check(
 
 
 def _beside(names: str, seconds: float, json: bool, docs: Path | None) -> None:
-    from host.bad_subscriber import KINDS
-    from host.reliability_page import write_section
-    from host.subscriber_study import page_section, study
+    from host.studies.bad_subscriber import KINDS
+    from host.studies.reliability_page import write_section
+    from host.studies.subscriber_study import page_section, study
 
     kinds = list(KINDS) if names == "all" else names.split(",")
     for kind in kinds:
         if kind not in KINDS:
-            raise BadInput("with", kind, f"all, or some of {', '.join(KINDS)}")
+            raise InputError("with", kind, f"all, or some of {', '.join(KINDS)}")
     try:
         found = study(kinds, seconds)
     except OSError as error:
@@ -81,14 +88,20 @@ def _table(result: LatencyResult) -> str:
     if result.cyclictest is not None:
         columns["cyclictest"] = result.cyclictest
     lines = [f"{'us':>24} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}"]
-    for label, key in (("loop woken late by", "lateness_us"), ("cyclictest late by", "cyclictest_us"),
-                       ("one pass of the loop", "tick_us")):
+    for label, key in (
+        ("loop woken late by", "lateness_us"),
+        ("cyclictest late by", "cyclictest_us"),
+        ("one pass of the loop", "tick_us"),
+    ):
         row = figures[key]
         if isinstance(row, dict):
             lines.append(f"{label:>24} " + " ".join(f"{row[name]:9.1f}" for name in ("p50", "p99", "p999", "max")))
         else:
             lines.append(f"{label:>24} not measured (cyclictest of rt-tests is not installed, or failed)")
     gap = f"{result.longest_gap_ns * 1e-6:.3f} ms ({GAP_PLACES[result.longest_gap_place]})"
-    lines += [f"{result.ticks} ticks at {result.hz} Hz, {result.missed} missed, longest gap {gap}", "",
-              text_histogram(columns)]
+    lines += [
+        f"{result.ticks} ticks at {result.hz} Hz, {result.missed} missed, longest gap {gap}",
+        "",
+        text_histogram(columns),
+    ]
     return "\n".join(lines)

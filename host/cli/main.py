@@ -9,8 +9,7 @@ from types import FrameType
 
 import typer
 
-from host.cli.contract_io import BadInput
-from realtime.rig_file import RigFileError
+from protocol.errors import InputError
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -45,8 +44,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 def build(argv: list[str]) -> typer.Typer:
     """The application with the called command in it, or with all their lines when none is named (help)."""
     app = typer.Typer(
-        name="seldinger", help="Control stack for robotic steerable catheters. Not a medical device.",
-        no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
+        name="seldinger",
+        help="Control stack for robotic steerable catheters. Not a medical device.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
     )
     app.callback()(lambda: None)
     called = next((word for word in argv if not word.startswith("-")), None)
@@ -80,7 +83,7 @@ def main() -> None:
         signal.signal(signal.SIGTERM, _interrupt)
     try:
         build(sys.argv[1:])()
-    except (BadInput, RigFileError) as error:
+    except InputError as error:
         print(f"seldinger: {error}", file=sys.stderr)
         sys.exit(2)
     finally:

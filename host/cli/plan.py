@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from host.characterization import load_calibrated_rig
-from host.cli.contract_io import read_json, validate, write_json
-from host.demo import SIMULATED_RIG
+from host.cli.contract_io import write_json
+from host.commissioning.characterization import load_calibrated_rig
+from protocol.requests import read_json, validate
+from protocol.rig_file import SIMULATED_RIG
 
 
 def plan(
@@ -27,13 +28,18 @@ def plan(
     checked = validate(PlanRequest, _with_tuples(read_json(request)))
     answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:
-        print(f"seldinger: no way found in {checked.samples} samples; more samples or less clearance_m may find one",
-              file=sys.stderr)
+        print(
+            f"seldinger: no way found in {checked.samples} samples; more samples or less clearance_m may find one",
+            file=sys.stderr,
+        )
         if json:
             write_json({"found": False})
         raise typer.Exit(1)
-    print(f"{answer.time_s[-1]:.2f} s, {answer.waypoints} way points, least clearance {answer.clearance_m * 1e3:.2f} mm, "
-          f"{answer.checks} collision checks", file=sys.stderr)
+    print(
+        f"{answer.time_s[-1]:.2f} s, {answer.waypoints} way points, least clearance {answer.clearance_m * 1e3:.2f} mm, "
+        f"{answer.checks} collision checks",
+        file=sys.stderr,
+    )
     if json:
         write_json(answer.as_json())
 

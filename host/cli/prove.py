@@ -10,7 +10,8 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput, write_json
+from host.cli.contract_io import write_json
+from protocol.errors import InputError
 
 _WIDTH = 28
 
@@ -54,16 +55,16 @@ def prove(
     baselines: Annotated[bool, typer.Option(help="also run the baselines")] = True,
 ) -> None:
     """Put the mismatch finder to the proof on concealed cases."""
-    from host.proof import workers
-    from host.proof.runner import Settings
-    from host.proof.runner import prove as run
-    from host.proof.table import markdown
+    from host.studies.proof import workers
+    from host.studies.proof.runner import Settings
+    from host.studies.proof.runner import prove as run
+    from host.studies.proof.table import markdown
 
     for key, value, least in (("--cases", cases, 1), ("--seed", seed, 0), ("--jobs", jobs, 1), ("--limit-s", limit_s, 1.0)):
         if not value >= least:
-            raise BadInput(key, value, f"at least {least}")
+            raise InputError(key, value, f"at least {least}")
     if resume is not None and not (resume / "suite.json").exists():
-        raise BadInput("--resume", str(resume), "a folder that an earlier run made")
+        raise InputError("--resume", str(resume), "a folder that an earlier run made")
     folder = resume or dir or Path("runs") / f"prove_{seed}_{cases}"
     command = tuple(shlex.split(finder)) if finder else workers.FINDER
     result = run(

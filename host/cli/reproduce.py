@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput, write_json
-from host.reproduction.report import WORDS, as_json
+from host.cli.contract_io import write_json
+from host.report.figure_page import WORDS, as_json
+from protocol.errors import InputError
 
 # part -> module with run(directory, quick, progress) -> (sections, path of the report); imported only when asked for
-PARTS = {"mechanics": "host.reproduction.mechanics", "control": "host.reproduction.control"}
+PARTS = {"mechanics": "host.studies.reproduction.mechanics", "control": "host.studies.reproduction.control"}
 
 
 def reproduce(
@@ -24,7 +25,7 @@ def reproduce(
 ) -> None:
     """Reproduce the thesis' figures; one section a figure, each with its verdict."""
     if part not in PARTS:
-        raise BadInput("part", part, " or ".join(PARTS))
+        raise InputError("part", part, " or ".join(PARTS))
 
     def progress(text: str) -> None:
         print(f"reproduce {part}: {text}", file=sys.stderr)

@@ -10,10 +10,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from host.cli.contract_io import BadInput, write_json
-from host.keys_check import keys_problems
-from host.mechanics.catheter import load_catheter
-from realtime.rig_file import Rig, parse_rig, problems_of, read_rig_data
+from host.cli.contract_io import write_json
+from host.security.keys_check import keys_problems
+from protocol.catheter import load_catheter
+from protocol.errors import InputError
+from protocol.rig_file import Rig, parse_rig, problems_of, read_rig_data
 
 rig = typer.Typer(help="The rig file: check it, show what it comes to.", no_args_is_help=True)
 DISTAL_AGREES_M = 0.005
@@ -53,12 +54,14 @@ def catheter_problems(good: Rig) -> list[str]:
     """Where the named catheter is not known, or is not the one that the rest of the file speaks of."""
     try:
         catheter: Any = load_catheter(good.catheter.name)
-    except (BadInput, ValueError, OSError) as error:
+    except (InputError, ValueError, OSError) as error:
         return [f"catheter.name: found {good.catheter.name!r}, wanted a catheter that ships or its file ({error})"]
     length_m = getattr(catheter, "distal_length_m", None)
     if length_m is not None and abs(length_m - good.catheter.distal_length_m) > DISTAL_AGREES_M:
-        return [f"catheter.distal_length_m: found {good.catheter.distal_length_m}, wanted about {length_m}, which "
-                f"{good.catheter.name} has"]
+        return [
+            f"catheter.distal_length_m: found {good.catheter.distal_length_m}, wanted about {length_m}, which "
+            f"{good.catheter.name} has"
+        ]
     return []
 
 

@@ -7,33 +7,35 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
-ARROW_m_PER_N = 0.2     # the scale of the thesis' Fig. 4.6: 200 mm to 1 N
+ARROW_m_PER_N = 0.2  # the scale of the thesis' Fig. 4.6: 200 mm to 1 N
 VIEWS = {2: [(0, 1)], 3: [(2, 1), (2, 0)]}
 LABELS = {2: ("x", "y"), 3: ("e1", "e2", "e3")}
 
 
 def check_plot_path(path: str | None) -> None:
-    """Refuses a plot that could not be written, before anything is computed. Raises BadInput."""
+    """Refuses a plot that could not be written, before anything is computed. Raises InputError."""
     if path is None:
         return
     if Path(path).suffix.lower() != ".png":
-        raise BadInput("plot", path, "a file name that ends in .png")
+        raise InputError("plot", path, "a file name that ends in .png")
     if not Path(path).resolve().parent.is_dir():
-        raise BadInput("plot", path, "a file in a folder that exists")
+        raise InputError("plot", path, "a file in a folder that exists")
 
 
 def plot_shape(path: str, title: str, loaded: Array, unloaded: Array, force_N: Array, measured: Array) -> None:
     """Writes the picture.
 
     Arguments: `loaded`, `unloaded` (points, 2 or 3) in m, sheath to tip; `force_N` on the tip, base frame;
-    `measured` (k, 2 or 3), tracked positions, k may be 0. Raises: BadInput where the file cannot be written.
+    `measured` (k, 2 or 3), tracked positions, k may be 0. Raises: InputError where the file cannot be written.
     """
     import matplotlib
+
     matplotlib.use("Agg")
     from matplotlib import pyplot
+
     views = VIEWS[loaded.shape[1]]
     figure, axes = pyplot.subplots(1, len(views), figsize=(6.0 * len(views), 5.6), squeeze=False)
     for axis, (across, up) in zip(axes[0], views, strict=True):
@@ -44,7 +46,7 @@ def plot_shape(path: str, title: str, loaded: Array, unloaded: Array, force_N: A
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:
-        raise BadInput("plot", path, error.strerror or "a file that can be written") from None
+        raise InputError("plot", path, error.strerror or "a file that can be written") from None
     finally:
         pyplot.close(figure)
 
@@ -55,11 +57,20 @@ def _draw_view(axis, loaded: Array, unloaded: Array, force_N: Array, measured: A
     axis.plot(mm * unloaded[:, across], mm * unloaded[:, up], "--", color="0.6", label="unloaded")
     axis.plot(mm * loaded[:, across], mm * loaded[:, up], "-", color="tab:blue", lw=2.5, label="loaded")
     axis.plot(0.0, 0.0, "s", color="black", ms=7, label="sheath's exit")
-    axis.plot([], [], "-", color="tab:red", label=f"force on the tip, {np.linalg.norm(force_N) * 1e3:.1f} mN "
-              f"({ARROW_m_PER_N * 1e3:.0f} mm : 1 N)")
+    axis.plot(
+        [],
+        [],
+        "-",
+        color="tab:red",
+        label=f"force on the tip, {np.linalg.norm(force_N) * 1e3:.1f} mN ({ARROW_m_PER_N * 1e3:.0f} mm : 1 N)",
+    )
     if np.hypot(head[across] - tip[across], head[up] - tip[up]) > 0.1:
-        axis.annotate("", xy=(head[across], head[up]), xytext=(tip[across], tip[up]),
-                      arrowprops={"arrowstyle": "-|>", "color": "tab:red", "lw": 2})
+        axis.annotate(
+            "",
+            xy=(head[across], head[up]),
+            xytext=(tip[across], tip[up]),
+            arrowprops={"arrowstyle": "-|>", "color": "tab:red", "lw": 2},
+        )
     if len(measured):
         axis.plot(mm * measured[:, across], mm * measured[:, up], "o", mfc="none", color="tab:green", label="measured")
     drawn = np.vstack([mm * loaded, mm * unloaded, head[None, :], mm * measured.reshape(-1, head.size), np.zeros(head.size)])
@@ -67,6 +78,11 @@ def _draw_view(axis, loaded: Array, unloaded: Array, force_N: Array, measured: A
     half = 0.55 * float(np.ptp(drawn, axis=0).max())
     middle = 0.5 * (drawn.min(axis=0) + drawn.max(axis=0))
     names = LABELS[loaded.shape[1]]
-    axis.set(xlabel=f"{names[across]} (mm)", ylabel=f"{names[up]} (mm)", aspect="equal",
-             xlim=(middle[across] - half, middle[across] + half), ylim=(middle[up] - half, middle[up] + half))
+    axis.set(
+        xlabel=f"{names[across]} (mm)",
+        ylabel=f"{names[up]} (mm)",
+        aspect="equal",
+        xlim=(middle[across] - half, middle[across] + half),
+        ylim=(middle[up] - half, middle[up] + half),
+    )
     axis.grid(alpha=0.3)

@@ -10,10 +10,11 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from host.cli.contract_io import BadInput, write_json
-from host.reliability_page import write_section
-from host.soak import page_section
-from host.soak import soak as run_soak
+from host.cli.contract_io import write_json
+from host.studies.reliability_page import write_section
+from host.studies.soak import page_section
+from host.studies.soak import soak as run_soak
+from protocol.errors import InputError
 from sim.board import KINDS, BoardUnavailable
 
 
@@ -27,11 +28,12 @@ def soak(
 ) -> None:
     """Hold a force for MINUTES of virtual time. Exit status 1 when something did not stay as it must."""
     if not 0.1 <= minutes <= 10_000:
-        raise BadInput("--minutes", minutes, "0.1 to 10000")
+        raise InputError("--minutes", minutes, "0.1 to 10000")
     if board not in KINDS:
-        raise BadInput("--board", board, " or ".join(KINDS))
-    with Progress(TextColumn("soak"), BarColumn(bar_width=30), TimeElapsedColumn(), console=Console(stderr=True),
-                  transient=True) as bar:
+        raise InputError("--board", board, " or ".join(KINDS))
+    with Progress(
+        TextColumn("soak"), BarColumn(bar_width=30), TimeElapsedColumn(), console=Console(stderr=True), transient=True
+    ) as bar:
         task = bar.add_task("soak", total=1.0)
         try:
             result = run_soak(minutes, seed, board, lambda share: bar.update(task, completed=share), record)

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
-from host.cli.contract_io import BadInput, Request, read_json, validate
-from host.mechanics.catheter import Catheter, load_catheter
+from protocol.catheter import Catheter, load_catheter
+from protocol.errors import InputError
+from protocol.requests import Request, read_json, validate
 
 # Far beyond any catheter: what lies outside is a slip of unit, and must not reach a kernel.
 Insertion = Annotated[float, Field(ge=-0.5, le=0.5)]
@@ -98,26 +99,27 @@ class CosseratEstimate(Actuated):
 
 
 def read_request(source: str, planar: type[Model], spatial: type[Model]) -> Model:
-    """The request in file `source` ('-': standard input), checked. Raises BadInput naming the key."""
+    """The request in file `source` ('-': standard input), checked. Raises InputError naming the key."""
     data = read_json(source)
     model: Any = data.get("model") if isinstance(data, dict) else None
     if isinstance(data, dict) and model not in ("pcar", "cosserat"):
-        raise BadInput("model", "nothing" if model is None else model, "pcar or cosserat")
+        raise InputError("model", "nothing" if model is None else model, "pcar or cosserat")
     wanted = planar if model == "pcar" else spatial
     unknown = [key for key in data if key not in wanted.model_fields] if isinstance(data, dict) else []
-    if unknown:   # before missing keys: a misspelt key is both
-        raise BadInput(unknown[0], data[unknown[0]], "no such key; known keys: " + ", ".join(wanted.model_fields))
+    if unknown:  # before missing keys: a misspelt key is both
+        raise InputError(unknown[0], data[unknown[0]], "no such key; known keys: " + ", ".join(wanted.model_fields))
     return validate(wanted, data)
 
 
 def catheter_for(request: Actuated, group: str) -> Catheter:
-    """The request's catheter, which must have parameter group `group` (pcar or cosserat). Raises BadInput."""
+    """The request's catheter, which must have parameter group `group` (pcar or cosserat). Raises InputError."""
     catheter = load_catheter(request.catheter)
     if getattr(catheter, group) is None:
-        raise BadInput("catheter", request.catheter, f"a catheter with [{group}] parameters, which nobody has "
-                       "identified for this one")
+        raise InputError(
+            "catheter", request.catheter, f"a catheter with [{group}] parameters, which nobody has identified for this one"
+        )
     if not request.insertion_m > -catheter.distal_length_m:
-        raise BadInput("insertion_m", request.insertion_m,
-                       f"more than -{catheter.distal_length_m}, the length of the distal shaft")
+        raise InputError(
+            "insertion_m", request.insertion_m, f"more than -{catheter.distal_length_m}, the length of the distal shaft"
+        )
     return catheter
-

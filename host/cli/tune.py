@@ -9,12 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from host.characterization import load_calibrated_rig
-from host.cli.contract_io import BadInput, write_json
-from host.demo import SIMULATED_RIG
-from host.tuning import GAINS, Margin, Tuned, best_of, criterion, half_way, stability_margin
-from host.tuning import tune as search
-from realtime.rig_file import RigFileError
+from host.cli.contract_io import write_json
+from host.commissioning.characterization import load_calibrated_rig
+from host.commissioning.tuning import GAINS, Margin, Tuned, best_of, criterion, half_way, stability_margin
+from host.commissioning.tuning import tune as search
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG
 
 # Least gain factor and phase margin of a proposal; below, the force gains are halved once.
 LEAST_FACTOR, LEAST_PHASE_DEG = 2.0, 30.0
@@ -32,34 +32,43 @@ def tune(
 ) -> None:
     """Tune the gains of the thesis' law on the simulated rig, over desired forces of 0.1, 0.2 and 0.3 N."""
     if not 8 <= evaluations <= 5000:
-        raise BadInput("--evaluations", evaluations, "8 to 5000")
+        raise InputError("--evaluations", evaluations, "8 to 5000")
     if not 1 <= processes <= 64:
-        raise BadInput("--processes", processes, "1 to 64")
+        raise InputError("--processes", processes, "1 to 64")
     try:
         loaded = load_calibrated_rig(rig, calibration)
         names = [name.strip() for name in gains.split(",") if name.strip()]
         present = {name: float(getattr(loaded.control, name)) for name in GAINS}
         if check:
-            result: dict[str, Any] = {"present": _told(Tuned("present", present, criterion(loaded, present), 1),
-                                                       stability_margin(loaded, present))}
+            result: dict[str, Any] = {
+                "present": _told(Tuned("present", present, criterion(loaded, present), 1), stability_margin(loaded, present))
+            }
         else:
             found = search(loaded, names, evaluations, processes, seed, progress=lambda text: print(text, file=sys.stderr))
             result = _proposal(loaded, present, found)
-    except (RigFileError, ValueError) as error:
+    except ValueError as error:
         key, _, rest = str(error).partition(": found ")
         what, _, wanted = rest.partition(", wanted ")
-        raise BadInput(key, what, wanted) from None
+        raise InputError(key, what, wanted) from None
     _print(result)
     if json:
         write_json(result)
 
 
 def _told(tuned: Tuned, margin: Margin | None) -> dict[str, Any]:
-    told: dict[str, Any] = {"method": tuned.method, "gains": tuned.gains, "cost_N": tuned.cost_N,
-                            "evaluations": tuned.evaluations}
+    told: dict[str, Any] = {
+        "method": tuned.method,
+        "gains": tuned.gains,
+        "cost_N": tuned.cost_N,
+        "evaluations": tuned.evaluations,
+    }
     if margin is not None:
-        told["margin"] = {"gain_factor": margin.gain_factor, "delay_s": margin.delay_s, "crossover_Hz": margin.crossover_Hz,
-                          "phase_deg": margin.phase_deg}
+        told["margin"] = {
+            "gain_factor": margin.gain_factor,
+            "delay_s": margin.delay_s,
+            "crossover_Hz": margin.crossover_Hz,
+            "phase_deg": margin.phase_deg,
+        }
     return told
 
 
@@ -75,9 +84,13 @@ def _proposal(rig: Any, present: dict[str, float], found: list[Tuned]) -> dict[s
         best = half_way(rig, best)
         margin = stability_margin(rig, {**present, **best.gains})
     before = criterion(rig, present)
-    return {"present": _told(Tuned("present", present, before, 1), None), "methods": [_told(item, None) for item in found],
-            "proposal": {**_told(best, margin), "force_gains_halved_for_margin": halved}, "loop_hz": rig.control.loop_hz,
-            "simulated_on": "tick and plant with obedient stages, tracker and force sensor with noise and delays"}
+    return {
+        "present": _told(Tuned("present", present, before, 1), None),
+        "methods": [_told(item, None) for item in found],
+        "proposal": {**_told(best, margin), "force_gains_halved_for_margin": halved},
+        "loop_hz": rig.control.loop_hz,
+        "simulated_on": "tick and plant with obedient stages, tracker and force sensor with noise and delays",
+    }
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -88,6 +101,12 @@ def _print(result: dict[str, Any]) -> None:
         if "margin" in item:
             margin = item["margin"]
             phase = f"phase {margin['phase_deg']:.0f} deg at {margin['crossover_Hz']:.2f} Hz"
-            print(f"{'':<24} rings at {margin['gain_factor']:.1f} times the gain; "
-                  + (f"with {margin['delay_s'] * 1e3:.0f} ms more delay, {phase}" if math.isfinite(margin["phase_deg"])
-                     else f"not with {margin['delay_s'] * 1e3:.0f} ms more delay"), file=sys.stderr)
+            print(
+                f"{'':<24} rings at {margin['gain_factor']:.1f} times the gain; "
+                + (
+                    f"with {margin['delay_s'] * 1e3:.0f} ms more delay, {phase}"
+                    if math.isfinite(margin["phase_deg"])
+                    else f"not with {margin['delay_s'] * 1e3:.0f} ms more delay"
+                ),
+                file=sys.stderr,
+            )

@@ -10,31 +10,30 @@ from typing import Annotated
 
 import typer
 
-from host.cli.contract_io import BadInput
 from host.view.live import LiveRig
 from host.view.server import ADDRESS, ViewServer
 from host.view.source import Source
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.zenoh_session import Session
-from realtime.rig_file import load_rig
-
-SIMULATED_RIG = Path(__file__).parent.parent / "rigs" / "simulated.toml"
 
 
 def serve(source: Source, port: int, what: str) -> None:
-    """Serve `source` until SIGINT. Raises BadInput for a port that is taken."""
+    """Serve `source` until SIGINT. Raises InputError for a port that is taken."""
     server = ViewServer(source, port)
     print(f"{what}: http://{ADDRESS}:{port}/  (Ctrl-C ends it)", file=sys.stderr)
     try:
         server.serve()
     except SystemExit:
-        raise BadInput("--port", port, "a port that is free") from None
+        raise InputError("--port", port, "a port that is free") from None
 
 
 @contextlib.contextmanager
 def _simulated(rig: Path, directory: Path) -> Iterator[Path]:
     """The simulated rig, running; its rig file, with an endpoint of its own."""
-    from host.demo import DemoSettings, new_recording_path
-    from host.wall_clock import Fleet
+    from host.recordings.recording import new_recording_path
+    from host.run.demo import DemoSettings
+    from host.run.wall_clock import Fleet
 
     print("starting the simulated rig (the first time it is compiled: a minute or two)", file=sys.stderr)
     recording = new_recording_path(directory, "view")

@@ -10,23 +10,23 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis import noise as noise_module
-from host.diagnosis.chains import build, channels_of
-from host.diagnosis.dataset import Recording, load, thin
-from host.diagnosis.dictionary import lay_out
-from host.diagnosis.effect import candidates
-from host.diagnosis.equivalence import Standing, beside_unlisted, standings
-from host.diagnosis.evidence import whiteness
-from host.diagnosis.experiment import Design, design
-from host.diagnosis.fit import Fit, Problem
-from host.diagnosis.known import Known
-from host.diagnosis.locate import Condition, condition, inside, joined, mismatch_of, windows
-from host.diagnosis.model import Model, Piece
-from host.diagnosis.noise import Noise
-from host.diagnosis.nominal import NominalSpec
-from host.diagnosis.search import Found, search
-from host.diagnosis.uncertainty import intervals
-from host.diagnosis.unlisted import Rest, explain_rest
+from host.diagnosis.design.experiment import Design, design
+from host.diagnosis.estimation import noise as noise_module
+from host.diagnosis.estimation.evidence import whiteness
+from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.estimation.known import Known
+from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.estimation.uncertainty import intervals
+from host.diagnosis.model.dataset import Recording, load, thin
+from host.diagnosis.model.effect import candidates
+from host.diagnosis.model.model import Model, Piece
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.models import build, channels_of
+from host.diagnosis.selection.dictionary import lay_out
+from host.diagnosis.selection.equivalence import Standing, beside_unlisted, standings
+from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
+from host.diagnosis.selection.search import Found, search
+from host.diagnosis.symbolic.unlisted import Rest, explain_rest
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from host.estimation.planar import tip_covariance
-from host.mechanics.catheter import Catheter, CosseratParameters, PcarParameters
 from host.mechanics.pcar import arcs_of, kinematic_jacobian, point_at
+from protocol.catheter import Catheter, CosseratParameters, PcarParameters
 
 Array = NDArray[np.float64]
 
@@ -28,19 +28,19 @@ FIT_STEPS = 8
 class AdaptationConfig:
     """What is assumed of drift, actuation and contact."""
 
-    drift_per_sqrt_s: float = 0.004         # random walk of log stiffness: 10 % in ten minutes
-    first_std: float = 0.05                 # of log stiffness before anything was seen
-    actuation_std: float = 0.01             # relative, of the curvature that the actuation should give
-    curvature_exponent: float = 1.0         # curvature ~ stiffness^-exponent: 1 for a given tension, less for a given wire
-    least_curvature_per_m: float = 5.0      # a straighter shaft tells nothing
-    free_chi_square: float = 13.8           # of two degrees of freedom: one free pose in a thousand is taken for contact
-    memory_samples: float = 20.0            # of the mean residual that finds a light, lasting contact
-    settle_samples: int = 10                # free poses in a row before they are believed
-    confirm_samples: int = 5                # a free pose counts only when so many after it are free as well
-    largest_innovation: float = 3.0         # in standard deviations: what is further out counts as this
-    change_drift: float = 0.5               # of the two-sided cumulative sum, in standard deviations
+    drift_per_sqrt_s: float = 0.004  # random walk of log stiffness: 10 % in ten minutes
+    first_std: float = 0.05  # of log stiffness before anything was seen
+    actuation_std: float = 0.01  # relative, of the curvature that the actuation should give
+    curvature_exponent: float = 1.0  # curvature ~ stiffness^-exponent: 1 for a given tension, less for a given wire
+    least_curvature_per_m: float = 5.0  # a straighter shaft tells nothing
+    free_chi_square: float = 13.8  # of two degrees of freedom: one free pose in a thousand is taken for contact
+    memory_samples: float = 20.0  # of the mean residual that finds a light, lasting contact
+    settle_samples: int = 10  # free poses in a row before they are believed
+    confirm_samples: int = 5  # a free pose counts only when so many after it are free as well
+    largest_innovation: float = 3.0  # in standard deviations: what is further out counts as this
+    change_drift: float = 0.5  # of the two-sided cumulative sum, in standard deviations
     change_level: float = 12.0
-    change_std: float = 0.1                 # uncertainty of log stiffness after a detected change
+    change_std: float = 0.1  # uncertainty of log stiffness after a detected change
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,18 @@ class StiffnessState:
     """What is known after a sample. `scale` multiplies the catheter's nominal stiffness."""
 
     scale: float
-    std: float              # of log scale
-    free: bool              # this pose was out of contact and was used
-    changed: bool           # a sudden change was detected at this sample
-    samples: int            # free poses used so far
+    std: float  # of log scale
+    free: bool  # this pose was out of contact and was used
+    changed: bool  # a sudden change was detected at this sample
+    samples: int  # free poses used so far
 
 
 class StiffnessTracker:
     """Random-walk Kalman filter on the log of the stiffness scale, fed by free poses only."""
 
-    def __init__(self, catheter: Catheter, covariance: ArrayLike | None = None,
-                 config: AdaptationConfig | None = None) -> None:
+    def __init__(
+        self, catheter: Catheter, covariance: ArrayLike | None = None, config: AdaptationConfig | None = None
+    ) -> None:
         self._catheter = catheter
         self._covariance = tip_covariance() if covariance is None else np.asarray(covariance, dtype=float)
         self._root = np.linalg.inv(np.linalg.cholesky(self._covariance))
@@ -170,5 +171,6 @@ def scaled(catheter: Catheter, scale: float) -> Catheter:
         raise ValueError(f"scale: found {scale}, wanted a positive number")
     pcar = catheter.pcar and PcarParameters(tuple(scale * EI for EI in catheter.pcar.EI_N_m2), catheter.pcar.distal_arcs_m)
     cosserat = catheter.cosserat and CosseratParameters(
-        **{key: scale * value for key, value in vars(catheter.cosserat).items()})
+        **{key: scale * value for key, value in vars(catheter.cosserat).items()}
+    )
     return replace(catheter, pcar=pcar, cosserat=cosserat)

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
 from host.estimation.sensor_noise import (
     ORIENTATION_STD_rad,
     PoseSensor,
@@ -19,9 +18,10 @@ from host.estimation.sensor_noise import (
 from host.estimation.spatial import GATE, LARGEST_FORCE_N, ODD_DEVIATIONS, WEAK_STD_N, ForceEstimate
 from host.estimation.spatial_residuals import section_tangents
 from host.mechanics import sections
-from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
 from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix, skew, vector_of_quaternion
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -32,18 +32,24 @@ MOST_ITERATIONS = 40
 Model = Callable[[Array], tuple[Array, Array]]
 
 
-def estimate_contact(catheter: Catheter, insertion_m: float, curvature_per_m: float, sensors: Sequence[PoseSensor], *,
-                     largest_force_N: float = LARGEST_FORCE_N) -> ForceEstimate:
+def estimate_contact(
+    catheter: Catheter,
+    insertion_m: float,
+    curvature_per_m: float,
+    sensors: Sequence[PoseSensor],
+    *,
+    largest_force_N: float = LARGEST_FORCE_N,
+) -> ForceEstimate:
     """One force anywhere on the exposed catheter, from the absolute poses of two or more sensors (three to be sure).
 
     Arguments: insertion_m, curvature_per_m as in `solve_cosserat`; sensors, poses in the base frame of zero roll.
     Result: force in the tip frame (the tip beyond the contact is not bent by it), `contact_offset_m` back from the tip
     with its standard deviation; four unknowns. Beyond the contact the catheter keeps its unloaded shape.
-    Raises: BadInput naming the key.
+    Raises: InputError naming the key.
     """
     rod = rod_record(catheter, insertion_m, curvature_per_m)
     if len(sensors) < 2:
-        raise BadInput("sensors", len(sensors), "at least 2, to find a place as well as a force")
+        raise InputError("sensors", len(sensors), "at least 2, to find a place as well as a force")
     offsets, positions, quaternions, weights = _measured(sensors)
     total = float(rod[6] + rod[7])
     shortest = 0.15 * total
@@ -70,13 +76,16 @@ def _measured(sensors: Sequence[PoseSensor]) -> tuple[Array, Array, Array, Array
         offsets[i] = finite(f"{key}.offset_m", sensor.offset_m, (), "an arc length in m")
         positions[i] = finite(f"{key}.position_m", sensor.position_m, (3,), "three finite numbers in m")
         quaternions[i] = checked_quaternion(f"{key}.quaternion_wxyz", sensor.quaternion_wxyz)
-        blocks = (checked_covariance(f"{key}.position_covariance_m2", sensor.position_covariance_m2, POSITION_STD_m),
-                  checked_covariance(f"{key}.orientation_covariance_rad2", sensor.orientation_covariance_rad2,
-                                     ORIENTATION_STD_rad))
+        blocks = (
+            checked_covariance(f"{key}.position_covariance_m2", sensor.position_covariance_m2, POSITION_STD_m),
+            checked_covariance(
+                f"{key}.orientation_covariance_rad2", sensor.orientation_covariance_rad2, ORIENTATION_STD_rad
+            ),
+        )
         for j, block in enumerate(blocks):
             weights[i, 3 * j : 3 * j + 3, 3 * j : 3 * j + 3] = np.linalg.inv(np.linalg.cholesky(block))
     if np.any(offsets < 0.0) or np.any(np.diff(offsets) <= 0.0):
-        raise BadInput("sensors.offset_m", offsets.tolist(), "0 or more and growing from the tip backwards")
+        raise InputError("sensors.offset_m", offsets.tolist(), "0 or more and growing from the tip backwards")
     return offsets, positions, quaternions, weights
 
 
@@ -160,8 +169,9 @@ def _descend(model: Model, start: Array, free: int, longest: float, largest: flo
     return x, cost
 
 
-def _report(model: Model, x: Array, cost: float, rod: Array, length: float, offsets: Array, positions: Array,
-            quaternions: Array) -> ForceEstimate:
+def _report(
+    model: Model, x: Array, cost: float, rod: Array, length: float, offsets: Array, positions: Array, quaternions: Array
+) -> ForceEstimate:
     _, A = model(x)
     information = A.T @ A + np.diag([1e-2, 1e-2, 1e-2, 1.0 / (rod[6] + rod[7]) ** 2])
     joint = np.linalg.inv(information)
@@ -183,5 +193,19 @@ def _report(model: Model, x: Array, cost: float, rod: Array, length: float, offs
     if weakest > WEAK_STD_N:
         notes.append(f"weakly observed: one component of the force is only known to +-{weakest:.2g} N")
     force = T @ x[:3]
-    return ForceEstimate(force, "tip", covariance, converged, residual, MOST_ITERATIONS, cost, freedom, tuple(notes),
-                         directions[:, -1], weakest, force[None, :].copy(), float(x[3]), place_std)
+    return ForceEstimate(
+        force,
+        "tip",
+        covariance,
+        converged,
+        residual,
+        MOST_ITERATIONS,
+        cost,
+        freedom,
+        tuple(notes),
+        directions[:, -1],
+        weakest,
+        force[None, :].copy(),
+        float(x[3]),
+        place_std,
+    )

@@ -10,26 +10,22 @@ import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from host.estimation import planar_kernels as kernels
-from host.mechanics.catheter import Catheter
 from host.mechanics.pcar import NO_DRAG, Arcs, arcs_of
 from host.mechanics.pcar_kernels import ROWS
-
-if TYPE_CHECKING:
-    from host.estimation.interface import Estimator
-    from realtime.rig_file import Rig
+from protocol.catheter import Catheter
 
 Array = NDArray[np.float64]
 
-POSITION_STD_m, ANGLE_STD_rad = 0.29e-3, math.radians(0.2)   # Aurora's precision, per axis
-CONVERGED_CHI_SQUARE = 36.0     # six standard deviations of the one direction that no force explains
-WEAK_STD_N = 0.02               # beyond this a direction of the force is called weakly observed
-UNSEEN_STD_N = 10.0             # stands for "not observed at all" in a covariance
+POSITION_STD_m, ANGLE_STD_rad = 0.29e-3, math.radians(0.2)  # Aurora's precision, per axis
+CONVERGED_CHI_SQUARE = 36.0  # six standard deviations of the one direction that no force explains
+WEAK_STD_N = 0.02  # beyond this a direction of the force is called weakly observed
+UNSEEN_STD_N = 10.0  # stands for "not observed at all" in a covariance
 
 
 def tip_covariance(position_std_m: float = POSITION_STD_m, angle_std_rad: float = ANGLE_STD_rad) -> Array:
@@ -56,14 +52,14 @@ class SurfacePrior:
 class PlanarEstimate:
     """Force on the tip, how sure, and whether to believe it."""
 
-    force_N: Array                  # (2,) base frame
-    covariance_N2: Array            # (2, 2)
-    converged: bool                 # the iteration ended, and a force explains the pose
-    residual: float                 # dimensionless: sqrt((position error / length outside)^2 + angle error^2)
-    chi_square: float               # weighted squared residual; about 1 where model and covariance are right
+    force_N: Array  # (2,) base frame
+    covariance_N2: Array  # (2, 2)
+    converged: bool  # the iteration ended, and a force explains the pose
+    residual: float  # dimensionless: sqrt((position error / length outside)^2 + angle error^2)
+    chi_square: float  # weighted squared residual; about 1 where model and covariance are right
     iterations: int
-    curvature_per_m: Array          # (n,) shape of the answer
-    weakest_direction: Array        # (2,) unit vector
+    curvature_per_m: Array  # (n,) shape of the answer
+    weakest_direction: Array  # (2,) unit vector
     weakest_std_N: float
     warnings: tuple[str, ...]
 
@@ -104,8 +100,14 @@ def _covariance_of(row: Array) -> tuple[Array, Array, float]:
     return 0.5 * (covariance + covariance.T), vectors[:, 0], float(math.sqrt(variances[0]))
 
 
-def estimate(arcs: Arcs, pose: ArrayLike, covariance: ArrayLike | None = None, prior: SurfacePrior | None = None,
-             previous: PlanarEstimate | None = None, thorough: bool = False) -> PlanarEstimate:
+def estimate(
+    arcs: Arcs,
+    pose: ArrayLike,
+    covariance: ArrayLike | None = None,
+    prior: SurfacePrior | None = None,
+    previous: PlanarEstimate | None = None,
+    thorough: bool = False,
+) -> PlanarEstimate:
     """The force that best explains one tip pose.
 
     Arguments: `arcs` outside the sheath; `pose` (3,) x (m), y (m), angle (rad); `covariance` (3, 3) of the pose, by
@@ -122,8 +124,9 @@ def estimate(arcs: Arcs, pose: ArrayLike, covariance: ArrayLike | None = None, p
     model = (arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m, NO_DRAG)
     if previous is not None and previous.curvature_per_m.size == arcs.length_m.size:
         kappa = previous.curvature_per_m.copy()
-        kernels.likelihood(*model, measured, weight, prior_vector, kappa, previous.force_N[0], previous.force_N[1],
-                           work, row)
+        kernels.likelihood(
+            *model, measured, weight, prior_vector, kappa, previous.force_N[0], previous.force_N[1], work, row
+        )
         if row[kernels.ENDED] == 1.0 and row[kernels.CHI_SQUARE] < CONVERGED_CHI_SQUARE:
             return _result(arcs, kappa, row)
     kappa = np.empty(arcs.length_m.size)
@@ -140,21 +143,37 @@ def _result(arcs: Arcs, kappa: Array, row: Array) -> PlanarEstimate:
     ended = bool(row[kernels.ENDED] == 1.0)
     warnings = []
     if weakest_std > WEAK_STD_N:
-        warnings.append(f"force weakly observed along ({weakest[0]:+.2f}, {weakest[1]:+.2f}): "
-                        f"standard deviation {weakest_std:.3g} N")
+        warnings.append(
+            f"force weakly observed along ({weakest[0]:+.2f}, {weakest[1]:+.2f}): standard deviation {weakest_std:.3g} N"
+        )
     if not ended:
         warnings.append(f"no force up to {kernels.FORCE_LIMIT_N:g} N explains the pose")
     elif not chi_square <= CONVERGED_CHI_SQUARE:
         warnings.append(f"no force explains the pose: chi square {chi_square:.3g}, wanted at most {CONVERGED_CHI_SQUARE}")
-    return PlanarEstimate(row[:2].copy(), covariance, ended and chi_square <= CONVERGED_CHI_SQUARE, residual, chi_square,
-                          int(row[kernels.EVALUATIONS]), kappa, weakest, weakest_std, tuple(warnings))
+    return PlanarEstimate(
+        row[:2].copy(),
+        covariance,
+        ended and chi_square <= CONVERGED_CHI_SQUARE,
+        residual,
+        chi_square,
+        int(row[kernels.EVALUATIONS]),
+        kappa,
+        weakest,
+        weakest_std,
+        tuple(warnings),
+    )
 
 
 class PlanarTracker:
     """Tracking mode: each estimate starts from the one before, and starts anew where that one did not converge."""
 
-    def __init__(self, catheter: Catheter, covariance: ArrayLike | None = None, prior: SurfacePrior | None = None,
-                 longest_arc_m: float = math.inf) -> None:
+    def __init__(
+        self,
+        catheter: Catheter,
+        covariance: ArrayLike | None = None,
+        prior: SurfacePrior | None = None,
+        longest_arc_m: float = math.inf,
+    ) -> None:
         self._catheter, self._covariance, self._prior = catheter, covariance, prior
         self._longest_arc_m = longest_arc_m
         self._previous: PlanarEstimate | None = None
@@ -170,14 +189,20 @@ class PlanarTracker:
 class RecordingEstimate(NamedTuple):
     """Forces of N samples, arrays by sample."""
 
-    force_N: Array                     # (N, 2)
-    covariance_N2: Array               # (N, 2, 2)
-    converged: NDArray[np.bool_]       # (N,)
-    residual: Array                    # (N,)
+    force_N: Array  # (N, 2)
+    covariance_N2: Array  # (N, 2, 2)
+    converged: NDArray[np.bool_]  # (N,)
+    residual: Array  # (N,)
 
 
-def estimate_recording(catheter: Catheter, insertion_m: ArrayLike, curvature_per_m: ArrayLike, pose: ArrayLike,
-                       covariance: ArrayLike | None = None, threads: int = 2) -> RecordingEstimate:
+def estimate_recording(
+    catheter: Catheter,
+    insertion_m: ArrayLike,
+    curvature_per_m: ArrayLike,
+    pose: ArrayLike,
+    covariance: ArrayLike | None = None,
+    threads: int = 2,
+) -> RecordingEstimate:
     """Independent-batch mode: every sample from its own unloaded shape, in parallel.
 
     Arguments: `insertion_m`, `curvature_per_m` (N,) or scalar; `pose` (N, 3) x, y, angle; `covariance` (3, 3) of each
@@ -198,8 +223,19 @@ def estimate_recording(catheter: Catheter, insertion_m: ArrayLike, curvature_per
     kappa, rows = np.empty_like(length), np.empty((count, kernels.COLUMNS))
 
     def run(part: slice) -> None:
-        kernels.estimate_many(length[part], template.EI_N_m2, template.cubic_stiffening_m2, unloaded[part], NO_DRAG,
-                              measured[part], matrix, weight, np.zeros((1, 5)), kappa[part], rows[part])
+        kernels.estimate_many(
+            length[part],
+            template.EI_N_m2,
+            template.cubic_stiffening_m2,
+            unloaded[part],
+            NO_DRAG,
+            measured[part],
+            matrix,
+            weight,
+            np.zeros((1, 5)),
+            kappa[part],
+            rows[part],
+        )
 
     edges = np.linspace(0, count, 8 * max(1, threads) + 1).astype(int)
     parts = [slice(a, b) for a, b in itertools.pairwise(edges) if b > a]
@@ -240,12 +276,13 @@ def two_stage(arcs: Arcs, pose: ArrayLike) -> tuple[Array, bool]:
     """
     work, kappa = np.empty((ROWS, arcs.length_m.size)), np.empty(arcs.length_m.size)
     converged, fx, fy = kernels.two_stage(
-        arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m,
-        np.ascontiguousarray(pose, dtype=float), tip_covariance(), kappa, work)
+        arcs.length_m,
+        arcs.EI_N_m2,
+        arcs.cubic_stiffening_m2,
+        arcs.unloaded_curvature_per_m,
+        np.ascontiguousarray(pose, dtype=float),
+        tip_covariance(),
+        kappa,
+        work,
+    )
     return np.array([fx, fy]), bool(converged)
-
-
-def make_estimator(rig: Rig) -> Estimator:
-    """The estimator of the running rig: both tracked poses, projected into the bending plane. See `planar_rig`."""
-    from host.estimation.planar_rig import PlanarRigEstimator
-    return PlanarRigEstimator.from_rig(rig)

@@ -17,18 +17,18 @@ FORCE_X, FORCE_Y, INFO_XX, INFO_XY, INFO_YY, CHI_SQUARE, ERROR_X, ERROR_Y, ERROR
 COLUMNS = 11
 
 STEP_LIMIT_rad = 0.8
-CURVATURE_TOLERANCE_rad = 1e-3    # the maximum-likelihood stage takes over from here
+CURVATURE_TOLERANCE_rad = 1e-3  # the maximum-likelihood stage takes over from here
 EXACT_TOLERANCE_rad = 1e-10
-END_rad = 1e-10                   # turning of the last step
-END_N = 1e-9                      # force of the last step
-FORCE_LIMIT_N = 10.0              # a pose that asks for more is one that no force explains
+END_rad = 1e-10  # turning of the last step
+END_N = 1e-9  # force of the last step
+FORCE_LIMIT_N = 10.0  # a pose that asks for more is one that no force explains
 CURVATURE_STEPS, LIKELIHOOD_STEPS = 50, 40
 # Keeps fewer than three arcs solvable: the pose is met up to this share of its covariance, 1e-4 m/N at 0.3 mm
 SOFTNESS_per_N_m = 1e-4
 # The first steps may miss the pose as freely as they bend: without that, three arcs fall into other solutions of
 # (2.12)-(2.14) in one case of ten
 FIRST_SOFTNESS_per_N_m, SOFTENING = 1e8, 0.15
-SECOND_START_CHI_SQUARE = 6.0     # of one degree of freedom
+SECOND_START_CHI_SQUARE = 6.0  # of one degree of freedom
 SCAN_DIRECTIONS, SCAN_FORCES_N, SCAN_BEST = 12, (0.08, 0.25), 3
 
 
@@ -50,8 +50,9 @@ def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, flo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array, covariance: Array,
-                            tolerance: float, kappa: Array, work: Array) -> tuple[bool, int]:
+def least_energy_curvatures(
+    length: Array, EI: Array, kappa0: Array, pose: Array, covariance: Array, tolerance: float, kappa: Array, work: Array
+) -> tuple[bool, int]:
     """Curvatures that reach the tip pose with the least bending energy, from the unloaded shape. Writes `kappa`.
 
     Arguments: `pose` (3,) x, y, angle; `covariance` (3, 3) of the pose, which decides how it is missed where fewer
@@ -102,8 +103,9 @@ def least_energy_curvatures(length: Array, EI: Array, kappa0: Array, pose: Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def force_by_statics(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array,
-                     work: Array) -> tuple[float, float]:
+def force_by_statics(
+    length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array
+) -> tuple[float, float]:
     """Force that best explains `kappa`, each arc's moment weighted by its compliance (least energy of the misfit).
 
     Result: Fx, Fy (N). Source: (4.4), linear least squares of (2.8).
@@ -130,8 +132,9 @@ def force_by_statics(length: Array, EI: Array, cubic: Array, kappa0: Array, kapp
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def two_stage(length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array, covariance: Array, kappa: Array,
-              work: Array) -> tuple[bool, float, float]:
+def two_stage(
+    length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array, covariance: Array, kappa: Array, work: Array
+) -> tuple[bool, float, float]:
     """The thesis' estimate: curvatures from the pose (4.3), then force from the curvatures (4.4).
 
     Result: converged, Fx, Fy (N); writes `kappa`.
@@ -142,8 +145,19 @@ def two_stage(length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sensitivities(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, fx: float, fy: float,
-                  drag: Array, pose: Array, work: Array, out: Array) -> None:
+def sensitivities(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    kappa: Array,
+    fx: float,
+    fy: float,
+    drag: Array,
+    pose: Array,
+    work: Array,
+    out: Array,
+) -> None:
     """Linearization at (`kappa`, force), in equilibrium or not: `out` gets 6 of d(pose)/d(force) row by row, then the
     pose's error after the shape has been corrected to equilibrium (3). Leaves the steps in work[STEP, ARM_X, ARM_Y].
     """
@@ -174,8 +188,7 @@ def sensitivities(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: float,
-                     row: Array) -> tuple[float, float]:
+def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: float, row: Array) -> tuple[float, float]:
     """Information of the force into `row`, chi square too. Result: gradient. `prior`: force (2), information (3)."""
     gx = gy = xx = xy = yy = chi = 0.0
     for k in range(3):
@@ -197,8 +210,21 @@ def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: flo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array, weight: Array,
-               prior: Array, kappa: Array, fx: float, fy: float, work: Array, row: Array) -> None:
+def likelihood(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    drag: Array,
+    pose: Array,
+    weight: Array,
+    prior: Array,
+    kappa: Array,
+    fx: float,
+    fy: float,
+    work: Array,
+    row: Array,
+) -> None:
     """Maximum-likelihood force from start (`kappa`, fx, fy): Gauss-Newton on shape and force together.
 
     Arguments: `weight` (3, 3), inverse covariance of the pose; `prior` (5,): force, then its information xx, xy, yy.
@@ -241,9 +267,21 @@ def likelihood(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Arra
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def estimate_cold(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
-                  covariance: Array, weight: Array, prior: Array, enough: float, kappa: Array, work: Array,
-                  row: Array) -> None:
+def estimate_cold(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    drag: Array,
+    pose: Array,
+    covariance: Array,
+    weight: Array,
+    prior: Array,
+    enough: float,
+    kappa: Array,
+    work: Array,
+    row: Array,
+) -> None:
     """Maximum likelihood from the unloaded shape; other starts where that does not end or does not explain the pose.
 
     Arguments as in `likelihood`, `covariance` (3, 3) of the pose, and `enough`, the chi square below which no other
@@ -272,8 +310,21 @@ def keep_better(other: Array, second: Array, kappa: Array, row: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scan(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array, weight: Array,
-         prior: Array, other: Array, work: Array, second: Array, kappa: Array, row: Array) -> None:
+def scan(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    drag: Array,
+    pose: Array,
+    weight: Array,
+    prior: Array,
+    other: Array,
+    work: Array,
+    second: Array,
+    kappa: Array,
+    row: Array,
+) -> None:
     """The last resort: solves the statics for forces all around, and starts from those nearest to the pose."""
     count = SCAN_DIRECTIONS * len(SCAN_FORCES_N)
     miss, shapes = np.full(count, np.inf), np.empty((count, kappa.size))
@@ -282,8 +333,7 @@ def scan(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pos
         angle = 2.0 * math.pi * (k % SCAN_DIRECTIONS) / SCAN_DIRECTIONS
         size = SCAN_FORCES_N[k // SCAN_DIRECTIONS]
         forces[k, 0], forces[k, 1] = size * math.cos(angle), size * math.sin(angle)
-        status, _, _ = kernels.load_path(length, EI, cubic, kappa0, forces[k, 0], forces[k, 1], drag, shapes[k],
-                                         work)
+        status, _, _ = kernels.load_path(length, EI, cubic, kappa0, forces[k, 0], forces[k, 1], drag, shapes[k], work)
         if status == kernels.CONVERGED:
             x, y, turn = kernels.evaluate(length, shapes[k], 0.0, 0.0, drag, 0.0, work)
             error = pose - np.array([x, y, turn])
@@ -294,14 +344,24 @@ def scan(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pos
     order = np.argsort(miss)
     for k in order[:SCAN_BEST]:
         other[:] = shapes[k]
-        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, forces[k, 0], forces[k, 1], work,
-                   second)
+        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, forces[k, 0], forces[k, 1], work, second)
         keep_better(other, second, kappa, row)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def estimate_many(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: Array, pose: Array,
-                  covariance: Array, weight: Array, prior: Array, kappa: Array, rows: Array) -> None:
+def estimate_many(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    drag: Array,
+    pose: Array,
+    covariance: Array,
+    weight: Array,
+    prior: Array,
+    kappa: Array,
+    rows: Array,
+) -> None:
     """`estimate_cold` for N independent samples: `length`, `kappa0`, `kappa` (N, n), `pose` (N, 3), `prior` (N, 5) or
     (1, 5) for all, `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording."""
     work = np.empty((kernels.ROWS, length.shape[1]))
@@ -309,5 +369,18 @@ def estimate_many(length: Array, EI: Array, cubic: Array, kappa0: Array, drag: A
         if not math.isfinite(pose[i, 0] + pose[i, 1] + pose[i, 2]):
             rows[i] = math.nan
             continue
-        estimate_cold(length[i], EI, cubic, kappa0[i], drag, pose[i], covariance, weight,
-                      prior[i % prior.shape[0]], SECOND_START_CHI_SQUARE, kappa[i], work, rows[i])
+        estimate_cold(
+            length[i],
+            EI,
+            cubic,
+            kappa0[i],
+            drag,
+            pose[i],
+            covariance,
+            weight,
+            prior[i % prior.shape[0]],
+            SECOND_START_CHI_SQUARE,
+            kappa[i],
+            work,
+            rows[i],
+        )

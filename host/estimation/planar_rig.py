@@ -12,20 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.interface import Actuation, ForceEstimate, PoseReading
+from host.estimation.interface import Actuation, Estimator, ForceEstimate, PoseReading
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
-from host.mechanics.catheter import Catheter, load_catheter
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
-from realtime.rig_file import Rig
+from protocol.catheter import Catheter, load_catheter
+from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 
 STEPS = 12
-LONGEST_ARC_m = 0.0056          # the 11 mm arcs of the catheter file, halved: 0.1 % of the force
+LONGEST_ARC_m = 0.0056  # the 11 mm arcs of the catheter file, halved: 0.1 % of the force
 END_N = 1e-6
 LARGEST_FORCE_STEP_N = 0.1
 FORCE_LIMIT_N = 2.0
-CHI_SQUARE_PER_FREEDOM = 12.0   # about 3.5 standard deviations throughout: beyond it no force explains the poses
+CHI_SQUARE_PER_FREEDOM = 12.0  # about 3.5 standard deviations throughout: beyond it no force explains the poses
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,15 @@ class Knowledge:
     insertion_m: float = 0.4e-3
     curvature_per_m: float = 1.0
     roll_rad: float = 0.08
-    axial_force_N: float = 1.0          # weak: keeps an unseen direction finite
-    lateral_force_N: float = 1.0        # in the bending plane; less where the wall is known to face the sheath
+    axial_force_N: float = 1.0  # weak: keeps an unseen direction finite
+    lateral_force_N: float = 1.0  # in the bending plane; less where the wall is known to face the sheath
     out_of_plane_force_N: float = 0.05  # planar poses do not show it
 
 
 @dataclass(frozen=True)
 class _Fit:
-    parameters: Array    # force x, y (N), insertion error (m), curvature error (1/m)
-    covariance: Array    # (4, 4)
+    parameters: Array  # force x, y (N), insertion error (m), curvature error (1/m)
+    covariance: Array  # (4, 4)
     chi_square: float
     residual: float
     ended: bool
@@ -64,8 +64,14 @@ def tangent_of(quaternion_wxyz: Array) -> Array:
 class PlanarRigEstimator:
     """Implements `host.estimation.interface.Estimator` with the planar model. Keeps only the branch it is on."""
 
-    def __init__(self, catheter: Catheter, shaft_offset_m: float, position_std_m: float, angle_std_rad: float,
-                 knowledge: Knowledge | None = None) -> None:
+    def __init__(
+        self,
+        catheter: Catheter,
+        shaft_offset_m: float,
+        position_std_m: float,
+        angle_std_rad: float,
+        knowledge: Knowledge | None = None,
+    ) -> None:
         self._catheter = catheter
         self._shaft_offset_m = shaft_offset_m
         self._position_std_m = position_std_m
@@ -75,18 +81,23 @@ class PlanarRigEstimator:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
-        """For the catheter and the tracker of a rig file. Raises BadInput where the catheter is not known."""
+        """For the catheter and the tracker of a rig file. Raises InputError where the catheter is not known."""
         tracker = rig.tracker
         # the rig's wall faces the sheath: its force is along e3 but for friction and for the wall's tilt
-        return cls(load_catheter(rig.catheter.name), tracker.shaft_sensor_offset_m, tracker.position_noise_m,
-                   tracker.orientation_noise_rad, Knowledge(lateral_force_N=0.05))
+        return cls(
+            load_catheter(rig.catheter.name),
+            tracker.shaft_sensor_offset_m,
+            tracker.position_noise_m,
+            tracker.orientation_noise_rad,
+            Knowledge(lateral_force_N=0.05),
+        )
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
         values = [*pose_tip.position_m, *pose_tip.quaternion_wxyz, *actuation[:3]]
         if not np.isfinite(values).all():
             raise ValueError("pose_tip, actuation: found NaN or infinity, wanted finite numbers")
-        arcs_of(self._catheter, actuation.insertion_m, actuation.curvature_per_m)   # refuses what is out of range
+        arcs_of(self._catheter, actuation.insertion_m, actuation.curvature_per_m)  # refuses what is out of range
         y_axis, normal = bending_plane(self._roll(pose_tip, actuation))
         poses = {0.0: self._planar(pose_tip, y_axis, actuation)}
         seen = pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all()
@@ -102,8 +113,9 @@ class PlanarRigEstimator:
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
         covariance = axes @ fit.covariance[:2, :2] @ axes.T
         covariance += self._known.out_of_plane_force_N**2 * np.outer(normal, normal)
-        return ForceEstimate(-axes @ fit.parameters[:2], 0.5 * (covariance + covariance.T), converged, fit.residual,
-                             pose_tip.stamp_ns)
+        return ForceEstimate(
+            -axes @ fit.parameters[:2], 0.5 * (covariance + covariance.T), converged, fit.residual, pose_tip.stamp_ns
+        )
 
     def _roll(self, tip: PoseReading, actuation: Actuation) -> float:
         """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
@@ -126,8 +138,9 @@ class PlanarRigEstimator:
     def _fit(self, poses: dict[float, Array], actuation: Actuation, start: Array) -> _Fit:
         """Gauss-Newton on force, insertion error and curvature error, held by what is known of them."""
         known = self._known
-        held = np.diag([known.axial_force_N**-2, known.lateral_force_N**-2, known.insertion_m**-2,
-                        known.curvature_per_m**-2])
+        held = np.diag(
+            [known.axial_force_N**-2, known.lateral_force_N**-2, known.insertion_m**-2, known.curvature_per_m**-2]
+        )
         parameters, ended, chi_square, residual = start.copy(), False, math.inf, math.inf
         information = held
         for _ in range(STEPS):
@@ -152,8 +165,9 @@ class PlanarRigEstimator:
                 break
         return _Fit(parameters, _capped(information), chi_square, residual, ended)
 
-    def _linearize(self, poses: dict[float, Array], actuation: Actuation,
-                   parameters: Array) -> list[tuple[Array, Array]] | None:
+    def _linearize(
+        self, poses: dict[float, Array], actuation: Actuation, parameters: Array
+    ) -> list[tuple[Array, Array]] | None:
         """Error and Jacobian of each pose; None where the force has no equilibrium on the branch."""
         insertion = max(actuation.insertion_m + parameters[2], -self._catheter.distal_length_m + 1e-3)
         arcs = arcs_of(self._catheter, insertion, actuation.curvature_per_m + parameters[3], LONGEST_ARC_m)
@@ -177,3 +191,8 @@ def _capped(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(scale, scale)
     return np.asarray(inverse * min(1.0, UNSEEN_STD_N**2 / max(float(inverse[:2, :2].max()), 1e-300)))
+
+
+def make_estimator(rig: Rig) -> Estimator:
+    """The estimator of the running rig: both tracked poses, projected into the bending plane."""
+    return PlanarRigEstimator.from_rig(rig)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from host.cli.contract_io import BadInput
 from host.mechanics.rod import finite
 from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -32,21 +32,21 @@ class PoseSensor:
 
 
 def checked_covariance(key: str, value: ArrayLike | None, std: float) -> Array:
-    """Covariance (3, 3), the default where None. Raises BadInput where it is not symmetric and positive definite."""
+    """Covariance (3, 3), the default where None. Raises InputError where it is not symmetric and positive definite."""
     if value is None:
         return std * std * np.eye(3)
     matrix = finite(key, value, (3, 3), "a covariance: 3 x 3, symmetric, positive definite")
     if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0) or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-        raise BadInput(key, matrix.tolist(), "a covariance: 3 x 3, symmetric, positive definite")
+        raise InputError(key, matrix.tolist(), "a covariance: 3 x 3, symmetric, positive definite")
     return matrix
 
 
 def checked_quaternion(key: str, value: ArrayLike) -> Array:
-    """Unit quaternion (4,), brought to length one exactly. Raises BadInput where its length is off by more than 1e-3."""
+    """Unit quaternion (4,), brought to length one exactly. Raises InputError where its length is off by more than 1e-3."""
     q = finite(key, value, (4,), "four finite numbers (w, x, y, z)")
     norm = float(np.linalg.norm(q))
     if abs(norm - 1.0) > UNIT_TOLERANCE:
-        raise BadInput(key, q.tolist(), f"a quaternion of unit length, not {norm:.6g}")
+        raise InputError(key, q.tolist(), f"a quaternion of unit length, not {norm:.6g}")
     return q / norm
 
 

@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from host.cli.contract_io import BadInput
 from host.estimation.interface import Actuation, Estimator, PoseReading
+from protocol.errors import InputError
+from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Message, Pose, Stage
-from realtime.rig_file import Rig
 
-DEFAULT_ESTIMATOR = "host.estimation.planar:make_estimator"
+DEFAULT_ESTIMATOR = "host.estimation.planar_rig:make_estimator"
 HISTORY_NS = 500_000_000
 PAIRED_WITHIN_NS = 5_000_000
 
@@ -104,7 +104,7 @@ class EstimationService:
         begin_ns = self._timer_ns()
         try:
             answer = self._estimator.estimate(_reading(tip), shaft, actuation)
-        except (ValueError, ArithmeticError, BadInput) as error:
+        except (ValueError, ArithmeticError, InputError) as error:
             self.last_failure = f"{type(error).__name__}: {error}"
             answer = None
         compute_us = (self._timer_ns() - begin_ns) * 1e-3
@@ -112,11 +112,24 @@ class EstimationService:
         self.answered += good
         self.unanswered += not good
         if answer is None or not good:
-            return ForceEstimate(stamp_ns=tip.stamp_ns, frame="base", converged=False, published_ns=now_ns,
-                                 residual=None if answer is None else answer.residual, compute_us=compute_us)
-        return ForceEstimate(stamp_ns=tip.stamp_ns, frame="base", converged=True, published_ns=now_ns,
-                             force_N=np.asarray(answer.force_N), covariance_N2=np.asarray(answer.covariance_N2),
-                             residual=answer.residual, compute_us=compute_us)
+            return ForceEstimate(
+                stamp_ns=tip.stamp_ns,
+                frame="base",
+                converged=False,
+                published_ns=now_ns,
+                residual=None if answer is None else answer.residual,
+                compute_us=compute_us,
+            )
+        return ForceEstimate(
+            stamp_ns=tip.stamp_ns,
+            frame="base",
+            converged=True,
+            published_ns=now_ns,
+            force_N=np.asarray(answer.force_N),
+            covariance_N2=np.asarray(answer.covariance_N2),
+            residual=answer.residual,
+            compute_us=compute_us,
+        )
 
 
 def _believable(force_N: np.ndarray, covariance_N2: np.ndarray) -> bool:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from host.cli.contract_io import BadInput
 from host.estimation.sensor_noise import (
     ORIENTATION_STD_rad,
     PoseSensor,
@@ -22,10 +21,11 @@ from host.estimation.sensor_noise import (
 )
 from host.estimation.spatial_kernels import CAREFUL, Problem, Scratch, best_of, estimate, new_scratch, search, unweighted
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
-from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
 from host.mechanics.rotations import conjugate, quaternion_of_vector, quaternion_product, rotation_matrix
 from host.mechanics.tip_shooting import load_number
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 __all__ = ["ForceEstimate", "PoseSensor", "SurfacePrior", "estimate_cosserat"]
 
@@ -110,12 +110,12 @@ def estimate_cosserat(
     better force wherever the first one leaves any residual, not only more than noise would (some milliseconds more).
     Result: `converged` False where no force explains the poses; several `solutions_N` where cases 1, 3, 5 leave the
     choice open (then force_N is the smallest of them, unless previous_force_N is given).
-    Raises: BadInput naming the key. Source: (5.3) to (5.11) with (5.5) put right, weighted by the sensors' noise.
+    Raises: InputError naming the key. Source: (5.3) to (5.11) with (5.5) put right, weighted by the sensors' noise.
     """
     problem, length = sample(catheter, insertion_m, curvature_per_m, case, sensors, prior, roll_rad)
     largest = float(finite("largest_force_N", largest_force_N, (), "a force in N above 0"))
     if largest <= 0.0:
-        raise BadInput("largest_force_N", largest, "a force in N above 0")
+        raise InputError("largest_force_N", largest, "a force in N above 0")
     scratch = new_scratch(len(problem.stations))
     x, notes = np.zeros(3), []
     rows = int(ROWS_OF_CASE[case]) + len(problem.prior)
@@ -143,20 +143,28 @@ def estimate_cosserat(
     return _report(problem, scratch, x, cost, freedom, converged, sweeps, length, notes, solutions)
 
 
-def sample(catheter: Catheter, insertion_m: float, curvature_per_m: float, case: int, sensors: Sequence[PoseSensor],
-           prior: SurfacePrior | None, roll_rad: float) -> tuple[Problem, float]:
+def sample(
+    catheter: Catheter,
+    insertion_m: float,
+    curvature_per_m: float,
+    case: int,
+    sensors: Sequence[PoseSensor],
+    prior: SurfacePrior | None,
+    roll_rad: float,
+) -> tuple[Problem, float]:
     """The checked `Problem` of one sample, with the handle's roll taken out, and the shaft's length in m."""
     rod = rod_record(catheter, insertion_m, curvature_per_m)
     if isinstance(case, bool) or case not in range(1, 7):
-        raise BadInput("case", case, "1 to 6")
+        raise InputError("case", case, "1 to 6")
     count = int(SENSORS_OF_CASE[case])
     if len(sensors) < count:
-        raise BadInput("sensors", len(sensors), f"at least {count} for case {case}")
+        raise InputError("sensors", len(sensors), f"at least {count} for case {case}")
     used = list(sensors)[:count]
-    offsets = np.array([float(finite(f"sensors.{i}.offset_m", sensor.offset_m, (), "an arc length in m"))
-                        for i, sensor in enumerate(used)])
+    offsets = np.array(
+        [float(finite(f"sensors.{i}.offset_m", sensor.offset_m, (), "an arc length in m")) for i, sensor in enumerate(used)]
+    )
     if np.any(offsets < 0.0) or np.any(np.diff(offsets) <= 0.0):
-        raise BadInput("sensors.offset_m", offsets.tolist(), "0 or more and growing from the tip backwards")
+        raise InputError("sensors.offset_m", offsets.tolist(), "0 or more and growing from the tip backwards")
     roll = float(finite("roll_rad", roll_rad, (), "a finite angle in rad"))
     q_roll = quaternion_of_vector(np.array([0.0, 0.0, roll]))
     Z = rotation_matrix(q_roll)
@@ -164,26 +172,46 @@ def sample(catheter: Catheter, insertion_m: float, curvature_per_m: float, case:
     for i, sensor in enumerate(used):
         key = f"sensors.{i}"
         positions[i] = finite(f"{key}.position_m", sensor.position_m, (3,), "three finite numbers in m") @ Z
-        quaternions[i] = quaternion_product(conjugate(q_roll), checked_quaternion(f"{key}.quaternion_wxyz",
-                                                                                  sensor.quaternion_wxyz))
+        quaternions[i] = quaternion_product(
+            conjugate(q_roll), checked_quaternion(f"{key}.quaternion_wxyz", sensor.quaternion_wxyz)
+        )
         C = checked_covariance(f"{key}.position_covariance_m2", sensor.position_covariance_m2, POSITION_STD_m)
         position_cov.append(Z.T @ C @ Z)
-        turn_cov.append(checked_covariance(f"{key}.orientation_covariance_rad2", sensor.orientation_covariance_rad2,
-                                           ORIENTATION_STD_rad))
+        turn_cov.append(
+            checked_covariance(f"{key}.orientation_covariance_rad2", sensor.orientation_covariance_rad2, ORIENTATION_STD_rad)
+        )
     W = whitening(residual_covariance(case, quaternions, position_cov, turn_cov))
     return pose_problem(rod, offsets, case, positions, quaternions, W, _prior_rows(prior, Z)), catheter.distal_length_m
 
 
-def pose_problem(rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array,
-                 prior: Array, bend: float = CAREFUL) -> Problem:
+def pose_problem(
+    rod: Array,
+    offsets: Array,
+    case: int,
+    positions: Array,
+    quaternions: Array,
+    W: Array,
+    prior: Array,
+    bend: float = CAREFUL,
+) -> Problem:
     """`Problem` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
     whole, total = rod, rod[6] + rod[7]
     if case >= 5 and len(prior) == 0:
         rod = rod.copy()
         last = min(offsets[-1], total)
         rod[6], rod[7] = min(rod[6], last), max(0.0, last - rod[6])
-    return Problem(rod, whole, np.minimum(offsets, total), np.maximum(offsets - total, 0.0), case, positions, quaternions, W,
-                   bend, prior)
+    return Problem(
+        rod,
+        whole,
+        np.minimum(offsets, total),
+        np.maximum(offsets - total, 0.0),
+        case,
+        positions,
+        quaternions,
+        W,
+        bend,
+        prior,
+    )
 
 
 def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:
@@ -192,16 +220,17 @@ def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:
     normal = finite("prior.normal", prior.normal, (3,), "three finite numbers") @ Z
     std = float(finite("prior.tangential_std_N", prior.tangential_std_N, (), "a force in N above 0"))
     if std <= 0.0:
-        raise BadInput("prior.tangential_std_N", std, "a force in N above 0")
+        raise InputError("prior.tangential_std_N", std, "a force in N above 0")
     size = float(np.linalg.norm(normal))
     if size < 1e-9:
-        raise BadInput("prior.normal", normal.tolist(), "a direction, not zero")
+        raise InputError("prior.normal", normal.tolist(), "a direction, not zero")
     across = np.linalg.svd((normal / size)[None, :])[2][1:]
     return np.ascontiguousarray(across / std)
 
 
-def _all_solutions(problem: Problem, largest: float, believable: float, x: Array,
-                   scratch: Scratch) -> tuple[bool, float, int, Array]:
+def _all_solutions(
+    problem: Problem, largest: float, believable: float, x: Array, scratch: Scratch
+) -> tuple[bool, float, int, Array]:
     """Every force found, smallest first; x (3,) and the scratch are left at that one, or at the best try."""
     found = np.zeros((MOST_SOLUTIONS, 3))
     starts = np.vstack([np.zeros((1, 3)), start_grid(largest)])
@@ -215,8 +244,18 @@ def _all_solutions(problem: Problem, largest: float, believable: float, x: Array
     return settled, cost, sweeps + more, solutions
 
 
-def _report(problem: Problem, scratch: Scratch, x: Array, cost: float, freedom: int, converged: bool, sweeps: int,
-            length: float, notes: list[str], solutions: Array | None) -> ForceEstimate:
+def _report(
+    problem: Problem,
+    scratch: Scratch,
+    x: Array,
+    cost: float,
+    freedom: int,
+    converged: bool,
+    sweeps: int,
+    length: float,
+    notes: list[str],
+    solutions: Array | None,
+) -> ForceEstimate:
     information = scratch.information + np.eye(3) / LARGEST_STD_N**2
     covariance: Array = np.linalg.inv(information).astype(np.float64)
     values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
@@ -227,11 +266,25 @@ def _report(problem: Problem, scratch: Scratch, x: Array, cost: float, freedom: 
     if not converged:
         notes.append(f"no force explains these poses: residual {residual:.3g}, weighted cost {cost:.3g}")
     elif cost > chi_square_limit(freedom, ODD_DEVIATIONS):
-        notes.append(f"larger residual than noise leaves (chi square {cost:.3g} for {freedom} degrees of freedom): "
-                     "calibration, insertion or curvature is off, or the contact is not at the tip")
+        notes.append(
+            f"larger residual than noise leaves (chi square {cost:.3g} for {freedom} degrees of freedom): "
+            "calibration, insertion or curvature is off, or the contact is not at the tip"
+        )
     if weakest > WEAK_STD_N:
         arrow = ", ".join(f"{v:+.2f}" for v in direction)
         notes.append(f"weakly observed: along [{arrow}] of the tip frame the force is only known to +-{weakest:.2g} N")
     kept = solutions if solutions is not None else x[None, :].copy() if converged else np.zeros((0, 3))
-    return ForceEstimate(x.copy(), "tip", covariance, converged, residual, sweeps, float(cost), freedom, tuple(notes),
-                         direction, weakest, kept)
+    return ForceEstimate(
+        x.copy(),
+        "tip",
+        covariance,
+        converged,
+        residual,
+        sweeps,
+        float(cost),
+        freedom,
+        tuple(notes),
+        direction,
+        weakest,
+        kept,
+    )

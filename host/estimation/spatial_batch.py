@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from host.cli.contract_io import BadInput
 from host.estimation.sensor_noise import (
     UNIT_TOLERANCE,
     ORIENTATION_STD_rad,
@@ -22,9 +21,10 @@ from host.estimation.sensor_noise import (
 from host.estimation.spatial import FAIR_DEVIATIONS, GATE, LARGEST_FORCE_N, LARGEST_STD_N, start_grid
 from host.estimation.spatial_kernels import QUICK, Problem, Scratch, best_of, estimate, new_scratch, unweighted
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
-from host.mechanics.catheter import Catheter
 from host.mechanics.rod import finite, rod_record
 from host.mechanics.small_matrices import inverse3
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -44,8 +44,9 @@ class BatchEstimate:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def problem_of(rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array,
-               prior: Array) -> Problem:
+def problem_of(
+    rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, prior: Array
+) -> Problem:
     """`Problem` of one sample, compiled (see `spatial.pose_problem`)."""
     total = rod[6] + rod[7]
     stations, inside = np.minimum(offsets, total), np.maximum(offsets - total, 0.0)
@@ -59,8 +60,18 @@ def problem_of(rod: Array, offsets: Array, case: int, positions: Array, quaterni
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate_next(p: Problem, length_m: float, largest_N: float, starts: Array, fair: float, believable: float, known: bool,
-                  x: Array, covariance: Array, s: Scratch) -> tuple[bool, float, float]:
+def estimate_next(
+    p: Problem,
+    length_m: float,
+    largest_N: float,
+    starts: Array,
+    fair: float,
+    believable: float,
+    known: bool,
+    x: Array,
+    covariance: Array,
+    s: Scratch,
+) -> tuple[bool, float, float]:
     """One sample, from the last force x (3,) if that is `known`, else from none. Returns (converged, residual, cost).
 
     Written: x, covariance (3, 3). Where the last force leads nowhere fair, the sample is begun anew.
@@ -79,16 +90,33 @@ def estimate_next(p: Problem, length_m: float, largest_N: float, starts: Array, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate_rows(rods: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, length_m: float,
-                  largest_N: float, starts: Array, fair: float, believable: float, ordered: bool, force: Array,
-                  covariance: Array, converged: NDArray[np.bool_], residual: Array, cost: Array) -> None:
+def estimate_rows(
+    rods: Array,
+    offsets: Array,
+    case: int,
+    positions: Array,
+    quaternions: Array,
+    W: Array,
+    length_m: float,
+    largest_N: float,
+    starts: Array,
+    fair: float,
+    believable: float,
+    ordered: bool,
+    force: Array,
+    covariance: Array,
+    converged: NDArray[np.bool_],
+    residual: Array,
+    cost: Array,
+) -> None:
     """Samples one after the other: rods (n, 9), positions (n, k, 3), quaternions (n, k, 4); results written."""
     s, x = new_scratch(offsets.shape[0]), np.zeros(3)
     known = False
     for i in range(rods.shape[0]):
         p = problem_of(rods[i], offsets, case, positions[i], quaternions[i], W, NO_PRIOR)
-        converged[i], residual[i], cost[i] = estimate_next(p, length_m, largest_N, starts, fair, believable, known, x,
-                                                           covariance[i], s)
+        converged[i], residual[i], cost[i] = estimate_next(
+            p, length_m, largest_N, starts, fair, believable, known, x, covariance[i], s
+        )
         force[i] = x
         known = ordered and converged[i]
 
@@ -97,7 +125,7 @@ def _weights(case: int, position_std_m: float, orientation_std_rad: float) -> tu
     """Whitening for equal, isotropic sensors, and the costs that are fair and believable."""
     for key, value in (("position_std_m", position_std_m), ("orientation_std_rad", orientation_std_rad)):
         if not float(finite(key, value, (), "a number above 0")) > 0.0:
-            raise BadInput(key, value, "a number above 0")
+            raise InputError(key, value, "a number above 0")
     count, rows = int(SENSORS_OF_CASE[case]), int(ROWS_OF_CASE[case])
     unit = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
     stds = (position_std_m, orientation_std_rad)
@@ -107,11 +135,11 @@ def _weights(case: int, position_std_m: float, orientation_std_rad: float) -> tu
 
 def _checked_offsets(case: int, offsets_m: ArrayLike) -> Array:
     if isinstance(case, bool) or case not in range(1, 7):
-        raise BadInput("case", case, "1 to 6")
+        raise InputError("case", case, "1 to 6")
     count = int(SENSORS_OF_CASE[case])
     offsets = finite("offsets_m", offsets_m, (count,), f"{count} arc lengths in m for case {case}")
     if np.any(offsets < 0.0) or np.any(np.diff(offsets) <= 0.0):
-        raise BadInput("offsets_m", offsets.tolist(), "0 or more and growing from the tip backwards")
+        raise InputError("offsets_m", offsets.tolist(), "0 or more and growing from the tip backwards")
     return offsets
 
 
@@ -121,14 +149,23 @@ def _checked_poses(offsets: Array, positions_m: ArrayLike, quaternions_wxyz: Arr
     norms = np.linalg.norm(q, axis=2)
     if n and np.abs(norms - 1.0).max() > UNIT_TOLERANCE:
         worst = float(norms.flat[np.abs(norms - 1.0).argmax()])
-        raise BadInput("quaternions_wxyz", worst, "quaternions of unit length")
+        raise InputError("quaternions_wxyz", worst, "quaternions of unit length")
     return positions, q / norms[:, :, None]
 
 
 def estimate_batch(
-    catheter: Catheter, insertion_m: ArrayLike, curvature_per_m: ArrayLike, case: int, offsets_m: ArrayLike,
-    positions_m: ArrayLike, quaternions_wxyz: ArrayLike, *, position_std_m: float = POSITION_STD_m,
-    orientation_std_rad: float = ORIENTATION_STD_rad, ordered: bool = False, workers: int = 2,
+    catheter: Catheter,
+    insertion_m: ArrayLike,
+    curvature_per_m: ArrayLike,
+    case: int,
+    offsets_m: ArrayLike,
+    positions_m: ArrayLike,
+    quaternions_wxyz: ArrayLike,
+    *,
+    position_std_m: float = POSITION_STD_m,
+    orientation_std_rad: float = ORIENTATION_STD_rad,
+    ordered: bool = False,
+    workers: int = 2,
     largest_force_N: float = LARGEST_FORCE_N,
 ) -> BatchEstimate:
     """Tip forces of a recording, spread over threads.
@@ -136,7 +173,7 @@ def estimate_batch(
     Arguments: insertion_m, curvature_per_m (n,) or scalars; case 1 to 6; offsets_m (k,) of the sensors the case uses;
     positions_m (n, k, 3), quaternions_wxyz (n, k, 4) in the base frame of zero roll; isotropic noise per axis;
     ordered: neighbours are neighbours in time, so each starts from the one before (needed for cases 1, 3, 5);
-    workers: threads. Raises: BadInput naming the key.
+    workers: threads. Raises: InputError naming the key.
     """
     offsets = _checked_offsets(case, offsets_m)
     n = len(np.asarray(positions_m))
@@ -149,9 +186,25 @@ def estimate_batch(
     starts = start_grid(largest_force_N)[FEW_STARTS]
 
     def work(part: slice) -> None:
-        estimate_rows(rods[part], offsets, case, positions[part], quaternions[part], W, catheter.distal_length_m,
-                      largest_force_N, starts, fair, believable, ordered, out.force_N[part], out.covariance_N2[part],
-                      out.converged[part], out.residual[part], out.chi_square[part])
+        estimate_rows(
+            rods[part],
+            offsets,
+            case,
+            positions[part],
+            quaternions[part],
+            W,
+            catheter.distal_length_m,
+            largest_force_N,
+            starts,
+            fair,
+            believable,
+            ordered,
+            out.force_N[part],
+            out.covariance_N2[part],
+            out.converged[part],
+            out.residual[part],
+            out.chi_square[part],
+        )
 
     edges = np.linspace(0, n, max(1, workers) + 1).astype(int)
     with ThreadPoolExecutor(max(1, workers)) as pool:
@@ -162,9 +215,17 @@ def estimate_batch(
 class ForceTracker:
     """Sample after sample from one set of sensors, each begun from the force before. One thread only."""
 
-    def __init__(self, catheter: Catheter, case: int, offsets_m: ArrayLike, *, position_std_m: float = POSITION_STD_m,
-                 orientation_std_rad: float = ORIENTATION_STD_rad, largest_force_N: float = LARGEST_FORCE_N) -> None:
-        """Arguments as in `estimate_batch`. Raises: BadInput naming the key."""
+    def __init__(
+        self,
+        catheter: Catheter,
+        case: int,
+        offsets_m: ArrayLike,
+        *,
+        position_std_m: float = POSITION_STD_m,
+        orientation_std_rad: float = ORIENTATION_STD_rad,
+        largest_force_N: float = LARGEST_FORCE_N,
+    ) -> None:
+        """Arguments as in `estimate_batch`. Raises: InputError naming the key."""
         self.catheter, self.case, self.offsets_m = catheter, case, _checked_offsets(case, offsets_m)
         self._W, self._fair, self._believable = _weights(case, position_std_m, orientation_std_rad)
         self._largest, self._starts = largest_force_N, start_grid(largest_force_N)[FEW_STARTS]
@@ -174,16 +235,29 @@ class ForceTracker:
         """The next sample starts anew (after a gap, or a change of catheter)."""
         self._known = False
 
-    def update(self, insertion_m: float, curvature_per_m: float, positions_m: ArrayLike,
-               quaternions_wxyz: ArrayLike) -> BatchEstimate:
-        """One sample: positions_m (k, 3), quaternions_wxyz (k, 4). A batch of one. Raises: BadInput naming the key."""
+    def update(
+        self, insertion_m: float, curvature_per_m: float, positions_m: ArrayLike, quaternions_wxyz: ArrayLike
+    ) -> BatchEstimate:
+        """One sample: positions_m (k, 3), quaternions_wxyz (k, 4). A batch of one. Raises: InputError naming the key."""
         rod = rod_record(self.catheter, insertion_m, curvature_per_m)
-        positions, quaternions = _checked_poses(self.offsets_m, np.asarray(positions_m)[None],
-                                                np.asarray(quaternions_wxyz)[None], 1)
+        positions, quaternions = _checked_poses(
+            self.offsets_m, np.asarray(positions_m)[None], np.asarray(quaternions_wxyz)[None], 1
+        )
         p = problem_of(rod, self.offsets_m, self.case, positions[0], quaternions[0], self._W, NO_PRIOR)
         covariance = np.empty((3, 3))
-        converged, residual, cost = estimate_next(p, self.catheter.distal_length_m, self._largest, self._starts, self._fair,
-                                                  self._believable, self._known, self._force, covariance, self._scratch)
+        converged, residual, cost = estimate_next(
+            p,
+            self.catheter.distal_length_m,
+            self._largest,
+            self._starts,
+            self._fair,
+            self._believable,
+            self._known,
+            self._force,
+            covariance,
+            self._scratch,
+        )
         self._known = converged
-        return BatchEstimate(self._force[None].copy(), covariance[None], np.array([converged]), np.array([residual]),
-                             np.array([cost]))
+        return BatchEstimate(
+            self._force[None].copy(), covariance[None], np.array([converged]), np.array([residual]), np.array([cost])
+        )

@@ -77,9 +77,20 @@ class Scratch(NamedTuple):
 def new_scratch(sensors: int) -> Scratch:
     """Scratch for that many sensors."""
     m = MOST_ROWS
-    return Scratch(np.zeros(WORK), np.zeros(SCRATCH), np.zeros((sensors + 1, ROW)), np.zeros(m), np.zeros((m, 3)),
-                   np.zeros(m), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((m, 3)), np.zeros((3, 3)), np.zeros((3, 3)),
-                   np.zeros((4, 3)))
+    return Scratch(
+        np.zeros(WORK),
+        np.zeros(SCRATCH),
+        np.zeros((sensors + 1, ROW)),
+        np.zeros(m),
+        np.zeros((m, 3)),
+        np.zeros(m),
+        np.zeros((m, 3)),
+        np.zeros((m, 3)),
+        np.zeros((m, 3)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros((4, 3)),
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -164,8 +175,9 @@ def damped_step(damping: float, s: Scratch) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def descend(p: Problem, largest_N: float, bend: float, close: float, close_N: float, x: Array,
-            s: Scratch) -> tuple[bool, float, int]:
+def descend(
+    p: Problem, largest_N: float, bend: float, close: float, close_N: float, x: Array, s: Scratch
+) -> tuple[bool, float, int]:
     """x (3,), in place, until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
 
     A step that does not lower the cost is damped; forces above `largest_N` are not entered. x is the force in the tip

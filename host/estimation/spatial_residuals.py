@@ -22,8 +22,7 @@ def quaternion_error(q_measured: Array, q_model: Array, error: Array) -> float:
 
     In the model's own frame; for small angles the rotation vector. The sign is chosen so that the turn is the short one.
     """
-    w = (q_model[0] * q_measured[0] + q_model[1] * q_measured[1] + q_model[2] * q_measured[2]
-         + q_model[3] * q_measured[3])
+    w = q_model[0] * q_measured[0] + q_model[1] * q_measured[1] + q_model[2] * q_measured[2] + q_model[3] * q_measured[3]
     sign = -2.0 if w < 0.0 else 2.0
     a0, a1, a2, a3 = q_model[0], -q_model[1], -q_model[2], -q_model[3]
     b0, b1, b2, b3 = q_measured[0], q_measured[1], q_measured[2], q_measured[3]
@@ -53,7 +52,7 @@ def section_tangents(base: Array, row: Array, R: Array, turn: Array, move: Array
     """turn (3, 3), move (3, 3): the section's turn (its own frame) and motion (base frame) by the force's components."""
     for c in range(3):
         for i in range(3):
-            turn[i, c] = (row[36 + 4 * i + c] - R[0, i] * base[36 + c] - R[1, i] * base[40 + c] - R[2, i] * base[44 + c])
+            turn[i, c] = row[36 + 4 * i + c] - R[0, i] * base[36 + c] - R[1, i] * base[40 + c] - R[2, i] * base[44 + c]
         t0, t1, t2 = turn[0, c], turn[1, c], turn[2, c]
         v0 = row[12 + c] + t1 * row[2] - t2 * row[1]
         v1 = row[16 + c] + t2 * row[0] - t0 * row[2]
@@ -75,13 +74,29 @@ def error_sensitivity(w: float, error: Array, turn: Array, at: int, A: Array) ->
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _views(scratch: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    return (scratch[0:3], scratch[3:6], scratch[6:10], scratch[10:19].reshape((3, 3)), scratch[19:28].reshape((3, 3)),
-            scratch[28:37].reshape((3, 3)), scratch[37:41])
+    return (
+        scratch[0:3],
+        scratch[3:6],
+        scratch[6:10],
+        scratch[10:19].reshape((3, 3)),
+        scratch[19:28].reshape((3, 3)),
+        scratch[28:37].reshape((3, 3)),
+        scratch[37:41],
+    )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def residuals(case: int, rows: Array, inside: Array, positions: Array, quaternions: Array, tangents: bool, z: Array,
-              A: Array, scratch: Array) -> None:
+def residuals(
+    case: int,
+    rows: Array,
+    inside: Array,
+    positions: Array,
+    quaternions: Array,
+    tangents: bool,
+    z: Array,
+    A: Array,
+    scratch: Array,
+) -> None:
     """z (m,) = measured minus modelled, A (m, 3) = the model's sensitivity to the tip-frame force (if `tangents`).
 
     Arguments: rows (k + 1, 48) of a sweep, sensors then base; inside (k,) m into the sheath; positions (k, 3) and
@@ -118,8 +133,9 @@ def residuals(case: int, rows: Array, inside: Array, positions: Array, quaternio
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _relative_turn(row0: Array, row: Array, q0: Array, q: Array, at: int, tangents: bool, z: Array, A: Array,
-                   scratch: Array) -> None:
+def _relative_turn(
+    row0: Array, row: Array, q0: Array, q: Array, at: int, tangents: bool, z: Array, A: Array, scratch: Array
+) -> None:
     """z[at:at+3] = error of the orientation relative to sensor 0, in its frame; A its sensitivity."""
     _, error, conj, R, turn, _, model = _views(scratch)
     measured = scratch[41:45]
@@ -136,6 +152,5 @@ def _relative_turn(row0: Array, row: Array, q0: Array, q: Array, at: int, tangen
     if tangents:
         for c in range(3):
             for i in range(3):
-                turn[i, c] = (R[i, 0] * row[36 + c] + R[i, 1] * row[40 + c] + R[i, 2] * row[44 + c]
-                              - row0[36 + 4 * i + c])
+                turn[i, c] = R[i, 0] * row[36 + c] + R[i, 1] * row[40 + c] + R[i, 2] * row[44 + c] - row0[36 + 4 * i + c]
         error_sensitivity(w, error, turn, at, A)

@@ -12,9 +12,9 @@ from host.identification.robust_fit import Fit, Objective, ShapeModel, gauss_new
 
 Array = NDArray[np.float64]
 
-UNTOLD_STD = 0.5        # relative standard deviation beyond which the data are said not to tell a parameter
-NOTHING_KNOWN_STD = 10.0    # relative standard deviation that stands for "nothing is known"
-ROUNDS = 4              # of scale and fit in turns
+UNTOLD_STD = 0.5  # relative standard deviation beyond which the data are said not to tell a parameter
+NOTHING_KNOWN_STD = 10.0  # relative standard deviation that stands for "nothing is known"
+ROUNDS = 4  # of scale and fit in turns
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FittedParameter:
 class UntoldDirection:
     """A combination of parameters that the data do not tell: moving along it hardly moves a marker."""
 
-    combination: dict[str, float]   # unit vector in relative parameters
+    combination: dict[str, float]  # unit vector in relative parameters
     relative_std: float
 
 
@@ -53,18 +53,23 @@ class Calibration:
 
     x: Array
     parameters: list[FittedParameter]
-    fits: list[Fit]                     # on the same objective
-    noise_m: float                      # robust, per axis
+    fits: list[Fit]  # on the same objective
+    noise_m: float  # robust, per axis
     rms_m: float
     max_m: float
-    outliers: list[tuple[int, int]]     # (recording, marker) beyond four standard deviations
-    singular_values: Array              # of the scaled sensitivities, largest first
+    outliers: list[tuple[int, int]]  # (recording, marker) beyond four standard deviations
+    singular_values: Array  # of the scaled sensitivities, largest first
     untold: list[UntoldDirection]
     left_out: list[LeftOut]
 
 
-def calibrate_model(model: ShapeModel, names: list[tuple[str, str, bool]], loss: str = "huber", method: str = "gauss-newton",
-                    leave_one_out: bool = True) -> Calibration:
+def calibrate_model(
+    model: ShapeModel,
+    names: list[tuple[str, str, bool]],
+    loss: str = "huber",
+    method: str = "gauss-newton",
+    leave_one_out: bool = True,
+) -> Calibration:
     """Fits `model` to its recordings.
 
     Arguments: `names`, (name, unit, logarithmic) of each parameter; `loss`, a key of `LOSSES`; `method`, gauss-newton,
@@ -93,10 +98,12 @@ def calibrate_model(model: ShapeModel, names: list[tuple[str, str, bool]], loss:
     return Calibration(fit.x, parameters, fits, objective.noise_m, rms, largest, outliers, singular, untold, left_out)
 
 
-def _confidence(model: ShapeModel, objective: Objective, x: Array,
-                names: list[tuple[str, str, bool]]) -> tuple[list[FittedParameter], Array, list[UntoldDirection]]:
+def _confidence(
+    model: ShapeModel, objective: Objective, x: Array, names: list[tuple[str, str, bool]]
+) -> tuple[list[FittedParameter], Array, list[UntoldDirection]]:
     """Intervals from the sandwich over recordings (the markers of one shape err together), and what is not told."""
     from scipy.stats import t as student
+
     linear = objective.linearize(x)
     assert linear is not None
     _, _, matrix, parts = linear
@@ -114,9 +121,14 @@ def _confidence(model: ShapeModel, objective: Objective, x: Array,
     quantile = float(student.ppf(0.975, max(count - size, 1))) if count > 1 else 12.7
     relative = np.sqrt(np.diag(inverse)) / scale
     fitted = [_interval(names[i], x[i], math.sqrt(variance[i]) * quantile, relative[i] < UNTOLD_STD) for i in range(size)]
-    untold = [UntoldDirection({names[i][0]: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
-                              float(1.0 / math.sqrt(known[k])))
-              for k in range(size) if 1.0 / math.sqrt(known[k]) > UNTOLD_STD]
+    untold = [
+        UntoldDirection(
+            {names[i][0]: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
+            float(1.0 / math.sqrt(known[k])),
+        )
+        for k in range(size)
+        if 1.0 / math.sqrt(known[k]) > UNTOLD_STD
+    ]
     return fitted, np.sqrt(values[::-1]), untold
 
 
@@ -153,4 +165,3 @@ def _leave_one_out(model: ShapeModel, objective: Objective, x: Array) -> list[Le
         tip = int(np.argmin(recording.offset_m))
         found.append(LeftOut(index, float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(distance[tip])))
     return found
-

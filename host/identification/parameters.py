@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
 from host.identification.recorded_shapes import RecordedShape
-from host.mechanics.catheter import Catheter
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -32,11 +32,17 @@ class ParametricModel:
         for index, recording in enumerate(recordings):
             outside = catheter.distal_length_m + recording.insertion_m
             if not outside > 0.0:
-                raise BadInput(f"recordings.{index}.insertion_m", recording.insertion_m,
-                               f"more than -{catheter.distal_length_m}, the length of the distal shaft")
+                raise InputError(
+                    f"recordings.{index}.insertion_m",
+                    recording.insertion_m,
+                    f"more than -{catheter.distal_length_m}, the length of the distal shaft",
+                )
             if recording.offset_m.max() > outside + 1e-9:
-                raise BadInput(f"recordings.{index}.markers", float(recording.offset_m.max()),
-                               f"offset_m of at most {outside:.6g}, the length outside the sheath")
+                raise InputError(
+                    f"recordings.{index}.markers",
+                    float(recording.offset_m.max()),
+                    f"offset_m of at most {outside:.6g}, the length outside the sheath",
+                )
 
     def start(self) -> Array:
         """The search's start, in its own scale."""
@@ -49,8 +55,7 @@ class ParametricModel:
 
     def values(self, x: Array) -> dict[str, float]:
         """Parameters by name, SI, from the search's `x`."""
-        return {p.name: float(np.exp(v)) if p.logarithmic else float(v)
-                for p, v in zip(self.parameters, x, strict=True)}
+        return {p.name: float(np.exp(v)) if p.logarithmic else float(v) for p, v in zip(self.parameters, x, strict=True)}
 
     def curvature(self, values: dict[str, float], recording: RecordedShape) -> float:
         """Unloaded curvature (1/m) of a recording: the fitted one of its nominal curvature, else the nominal one."""

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
 from host.identification import planar_sensitivities as sensitivities
 from host.identification.parameters import Parameter, ParametricModel, curvature_name, curvature_parameters
 from host.identification.recorded_shapes import RecordedShape
 from host.mechanics import pcar_kernels as kernels
-from host.mechanics.catheter import Catheter, PcarParameters
 from host.mechanics.pcar import NO_DRAG, Arcs, arcs_of
+from protocol.catheter import Catheter, PcarParameters
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 GROUPS = ("stiffness", "lengths", "curvature")
@@ -25,7 +25,7 @@ class PlanarModel(ParametricModel):
 
     def __init__(self, catheter: Catheter, recordings: list[RecordedShape], fit: tuple[str, ...]) -> None:
         if catheter.pcar is None:
-            raise BadInput("catheter", catheter.name, "a start catheter with [pcar] parameters")
+            raise InputError("catheter", catheter.name, "a start catheter with [pcar] parameters")
         self.pcar = catheter.pcar
         self.arc_count = len(self.pcar.EI_N_m2)
         found = []
@@ -57,9 +57,17 @@ class PlanarModel(ParametricModel):
         arcs = arcs_of(catheter, recording.insertion_m, self.curvature(self.values(x), recording))
         n = arcs.length_m.size
         work, kappa = np.empty((kernels.ROWS, n)), np.empty(n)
-        status, _, _ = kernels.load_path(arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2,
-                                         arcs.unloaded_curvature_per_m, recording.force_N[0], recording.force_N[1],
-                                         NO_DRAG, kappa, work)
+        status, _, _ = kernels.load_path(
+            arcs.length_m,
+            arcs.EI_N_m2,
+            arcs.cubic_stiffening_m2,
+            arcs.unloaded_curvature_per_m,
+            recording.force_N[0],
+            recording.force_N[1],
+            NO_DRAG,
+            kappa,
+            work,
+        )
         if status != kernels.CONVERGED:
             return None
         node, turn = np.empty(n + 1, dtype=complex), np.empty(n + 1, dtype=complex)
@@ -70,15 +78,35 @@ class PlanarModel(ParametricModel):
         derivatives = self._derivatives(x, arcs, recording, kappa, node, turn, station, work) if jacobian else np.empty(0)
         return position, derivatives
 
-    def _derivatives(self, x: Array, arcs: Arcs, recording: RecordedShape, kappa: Array, node: NDArray[np.complex128],
-                     turn: NDArray[np.complex128], station: Array, work: Array) -> Array:
+    def _derivatives(
+        self,
+        x: Array,
+        arcs: Arcs,
+        recording: RecordedShape,
+        kappa: Array,
+        node: NDArray[np.complex128],
+        turn: NDArray[np.complex128],
+        station: Array,
+        work: Array,
+    ) -> Array:
         n = arcs.length_m.size
         length_by = self._length_by(arcs, recording)
         q = length_by.shape[1]
         response, every = np.empty((n, n + q + 1)), np.empty((station.size, 2, n + q + 1))
-        sensitivities.curvature_response(arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2,
-                                         arcs.unloaded_curvature_per_m, arcs.distal, recording.force_N, length_by,
-                                         kappa, node, turn, work, response)
+        sensitivities.curvature_response(
+            arcs.length_m,
+            arcs.EI_N_m2,
+            arcs.cubic_stiffening_m2,
+            arcs.unloaded_curvature_per_m,
+            arcs.distal,
+            recording.force_N,
+            length_by,
+            kappa,
+            node,
+            turn,
+            work,
+            response,
+        )
         sensitivities.marker_jacobian(arcs.length_m, kappa, station, length_by, response, node, turn, every)
         columns = []
         values = self.values(x)

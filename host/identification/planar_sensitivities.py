@@ -37,9 +37,20 @@ def station_of(length: Array, station: float) -> tuple[int, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def curvature_response(length: Array, EI: Array, cubic: Array, kappa0: Array, distal: NDArray[np.bool_], force: Array,
-                       length_by: Array, kappa: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128],
-                       work: Array, response: Array) -> None:
+def curvature_response(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    distal: NDArray[np.bool_],
+    force: Array,
+    length_by: Array,
+    kappa: Array,
+    node: NDArray[np.complex128],
+    turn: NDArray[np.complex128],
+    work: Array,
+    response: Array,
+) -> None:
     """d kappa / d parameters, (n, n + q + 1), at the equilibrium `kappa` under the tip `force`.
 
     Parameters: EI of each arc (n), the q length parameters whose columns are `length_by` (n, q), the unloaded
@@ -81,8 +92,9 @@ def curvature_response(length: Array, EI: Array, cubic: Array, kappa0: Array, di
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_positions(length: Array, kappa: Array, station: Array, node: NDArray[np.complex128],
-                     turn: NDArray[np.complex128], position: Array) -> None:
+def marker_positions(
+    length: Array, kappa: Array, station: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128], position: Array
+) -> None:
     """Positions (m, 2) of the points at arc lengths `station` (m,) from the base; `node`, `turn` from `nodes_of`."""
     for j in range(station.size):
         arc, part = station_of(length, station[j])
@@ -92,8 +104,16 @@ def marker_positions(length: Array, kappa: Array, station: Array, node: NDArray[
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_jacobian(length: Array, kappa: Array, station: Array, length_by: Array, response: Array,
-                    node: NDArray[np.complex128], turn: NDArray[np.complex128], jacobian: Array) -> None:
+def marker_jacobian(
+    length: Array,
+    kappa: Array,
+    station: Array,
+    length_by: Array,
+    response: Array,
+    node: NDArray[np.complex128],
+    turn: NDArray[np.complex128],
+    jacobian: Array,
+) -> None:
     """Derivatives (m, 2, n + q + 1) of the marker positions; arguments as above. The markers stay at their arc length."""
     n, q = length_by.shape
     for j in range(station.size):

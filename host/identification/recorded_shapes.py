@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from host.cli.contract_io import BadInput, Request, read_json, validate
+from protocol.errors import InputError
+from protocol.requests import Request, read_json, validate
 
 Array = NDArray[np.float64]
 Coordinate = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -35,9 +36,9 @@ class RecordedShape:
 
     insertion_m: float
     curvature_per_m: float
-    force_N: Array      # (2,) or (3,) base frame
-    offset_m: Array     # (m,) arc lengths back from the tip
-    position_m: Array   # (m, 2) or (m, 3)
+    force_N: Array  # (2,) or (3,) base frame
+    offset_m: Array  # (m,) arc lengths back from the tip
+    position_m: Array  # (m, 2) or (m, 3)
     weight: float = 1.0
 
 
@@ -61,19 +62,27 @@ class _File(Request):
 def read_recorded_shapes(source: str, dimensions: int) -> list[RecordedShape]:
     """The recordings in file `source` (.csv, else JSON; '-' is JSON on standard input).
 
-    Arguments: `dimensions`, 2 for the planar model, 3 for the spatial one. Raises: BadInput, naming key or line.
+    Arguments: `dimensions`, 2 for the planar model, 3 for the spatial one. Raises: InputError, naming key or line.
     """
     data = _table(source, dimensions) if source.lower().endswith(".csv") else read_json(source)
     checked = validate(_File, data)
     for i, recording in enumerate(checked.recordings):
         if len(recording.force_N) != dimensions:
-            raise BadInput(f"recordings.{i}.force_N", recording.force_N, f"{dimensions} components")
+            raise InputError(f"recordings.{i}.force_N", recording.force_N, f"{dimensions} components")
         for j, marker in enumerate(recording.markers):
             if len(marker.position_m) != dimensions:
-                raise BadInput(f"recordings.{i}.markers.{j}.position_m", marker.position_m, f"{dimensions} coordinates")
-    return [RecordedShape(r.insertion_m, r.curvature_per_m, np.array(r.force_N),
-                          np.array([m.offset_m for m in r.markers]), np.array([m.position_m for m in r.markers]), r.weight)
-            for r in checked.recordings]
+                raise InputError(f"recordings.{i}.markers.{j}.position_m", marker.position_m, f"{dimensions} coordinates")
+    return [
+        RecordedShape(
+            r.insertion_m,
+            r.curvature_per_m,
+            np.array(r.force_N),
+            np.array([m.offset_m for m in r.markers]),
+            np.array([m.position_m for m in r.markers]),
+            r.weight,
+        )
+        for r in checked.recordings
+    ]
 
 
 def _table(source: str, dimensions: int) -> dict[str, Any]:
@@ -81,22 +90,25 @@ def _table(source: str, dimensions: int) -> dict[str, Any]:
     try:
         text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(source, str(error), "a readable CSV file") from None
+        raise InputError(source, str(error), "a readable CSV file") from None
     wanted = PLANAR_COLUMNS if dimensions == 2 else SPATIAL_COLUMNS
     reader = csv.DictReader(io.StringIO(text))
     columns = tuple(reader.fieldnames or ())
     if set(columns) != set(wanted) or len(columns) != len(wanted):
-        raise BadInput(f"{source}: heading", ",".join(columns), ",".join(wanted))
+        raise InputError(f"{source}: heading", ",".join(columns), ",".join(wanted))
     groups: dict[str, dict[str, Any]] = {}
     axes = "xyz"[:dimensions]
     for row in reader:
         line = f"{source}: line {reader.line_num}"
         values = {key: _number(row[key], f"{line}: {key}") for key in wanted[1:]}
-        head = {"insertion_m": values["insertion_m"], "curvature_per_m": values["curvature_per_m"],
-                "force_N": [values[f"force_{axis}_N"] for axis in axes]}
+        head = {
+            "insertion_m": values["insertion_m"],
+            "curvature_per_m": values["curvature_per_m"],
+            "force_N": [values[f"force_{axis}_N"] for axis in axes],
+        }
         group = groups.setdefault(row["recording"], {**head, "markers": []})
         if any(group[key] != value for key, value in head.items()):
-            raise BadInput(line, head, f"the load and actuation of the other rows of recording {row['recording']}")
+            raise InputError(line, head, f"the load and actuation of the other rows of recording {row['recording']}")
         group["markers"].append({"offset_m": values["offset_m"], "position_m": [values[f"{a}_m"] for a in axes]})
     return {"recordings": list(groups.values())}
 
@@ -105,4 +117,4 @@ def _number(text: str | None, key: str) -> float:
     try:
         return float(text or "")
     except ValueError:
-        raise BadInput(key, text, "a number") from None
+        raise InputError(key, text, "a number") from None

@@ -16,9 +16,9 @@ from host.identification.recorded_shapes import RecordedShape
 Array = NDArray[np.float64]
 
 STEPS = 60
-END = 1e-7                  # scaled step
+END = 1e-7  # scaled step
 FIRST_DAMPING = 1e-3
-SMOOTHING = 1e-2            # of the loss "distance" near zero, in units of the noise scale
+SMOOTHING = 1e-2  # of the loss "distance" near zero, in units of the noise scale
 
 
 class ShapeModel(Protocol):
@@ -54,7 +54,7 @@ class Fit:
 
     x: Array
     objective: float
-    evaluations: int        # of the whole set of recordings
+    evaluations: int  # of the whole set of recordings
     seconds: float
     converged: bool
     method: str
@@ -139,12 +139,23 @@ def gauss_newton(objective: Objective, start: Array, steps: int = STEPS) -> Fit:
 def nelder_mead(objective: Objective, start: Array) -> Fit:
     """The thesis' search (2.3.1): the simplex of Nelder and Mead, without derivatives."""
     from scipy.optimize import minimize
+
     begin, before = time.perf_counter(), objective.evaluations
     scale = objective.model.scale()
-    found = minimize(lambda u: objective(u * scale), start / scale, method="Nelder-Mead",
-                     options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 4000, "maxfev": 4000, "adaptive": start.size > 4})
-    return Fit(found.x * scale, float(found.fun), objective.evaluations - before, time.perf_counter() - begin,
-               bool(found.success), "nelder-mead")
+    found = minimize(
+        lambda u: objective(u * scale),
+        start / scale,
+        method="Nelder-Mead",
+        options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 4000, "maxfev": 4000, "adaptive": start.size > 4},
+    )
+    return Fit(
+        found.x * scale,
+        float(found.fun),
+        objective.evaluations - before,
+        time.perf_counter() - begin,
+        bool(found.success),
+        "nelder-mead",
+    )
 
 
 def noise_scale(model: ShapeModel, x: Array) -> float:

@@ -11,17 +11,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
 from host.identification.parameters import Parameter, ParametricModel, curvature_parameters
 from host.identification.recorded_shapes import RecordedShape
-from host.mechanics.catheter import Catheter, CosseratParameters
 from host.mechanics.cosserat import CosseratSolution, solve_cosserat
+from protocol.catheter import Catheter, CosseratParameters
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 GROUPS = ("stiffness", "torsion", "curvature")
 
-TORSION_SHARE = 0.3846      # 1 / (2 (1 + 0.3))
-STEP = 2e-3                 # of a parameter's scale, for the differences
+TORSION_SHARE = 0.3846  # 1 / (2 (1 + 0.3))
+STEP = 2e-3  # of a parameter's scale, for the differences
 BENDING, TORSION = ("EI1", "EI2", "EbI1", "EbI2"), ("GJ", "GbJ")
 
 
@@ -30,7 +30,7 @@ class SpatialModel(ParametricModel):
 
     def __init__(self, catheter: Catheter, recordings: list[RecordedShape], fit: tuple[str, ...]) -> None:
         if catheter.cosserat is None:
-            raise BadInput("catheter", catheter.name, "a start catheter with [cosserat] parameters")
+            raise InputError("catheter", catheter.name, "a start catheter with [cosserat] parameters")
         self.rod = catheter.cosserat
         names = (BENDING if "stiffness" in fit else ()) + (TORSION if "torsion" in fit else ())
         found = [Parameter(name, "N m2", getattr(self.rod, name), True) for name in names]
@@ -71,6 +71,12 @@ class SpatialModel(ParametricModel):
         catheter, recording = self.catheter_at(x), self.recordings[index]
         if catheter is None:
             return None
-        found = solve_cosserat(catheter, recording.insertion_m, self.curvature(self.values(x), recording), recording.force_N,
-                               stations_m=recording.offset_m, start=start)
+        found = solve_cosserat(
+            catheter,
+            recording.insertion_m,
+            self.curvature(self.values(x), recording),
+            recording.force_N,
+            stations_m=recording.offset_m,
+            start=start,
+        )
         return found if found.converged else None

@@ -33,8 +33,9 @@ NO_FORCES = np.zeros((0, 3))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve_cold(rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array,
-               work: Array) -> tuple[int, float, int, int, int]:
+def solve_cold(
+    rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array, work: Array
+) -> tuple[int, float, int, int, int]:
     """Equilibrium on the branch from the unloaded shape. Returns (status, load reached, sweeps, load steps, unstable).
 
     Arguments: rod (9,); force (3,) N, base frame; stations (n,) m back from the tip, ascending, exposed; bend: FINE
@@ -60,8 +61,9 @@ def solve_cold(rod: Array, force: Array, stations: Array, bend: float, x: Array,
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve_warm(rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array,
-               work: Array) -> tuple[bool, int]:
+def solve_warm(
+    rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array, work: Array
+) -> tuple[bool, int]:
     """Equilibrium next to the guess x (3,), the force as the tip saw it before; refined in place. (converged, sweeps).
 
     Arguments as `solve_cold`. Not converged where the guess is too far off to be sure of the branch: solve cold then.
@@ -84,8 +86,9 @@ def solve_warm(rod: Array, force: Array, stations: Array, bend: float, x: Array,
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def robust_branch(rod: Array, force: Array, stations: Array, bend: float, x: Array,
-                  out: Array) -> tuple[int, float, int, int, int]:
+def robust_branch(
+    rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array
+) -> tuple[int, float, int, int, int]:
     """`solve_cold` by multiple shooting, for any load number: slower, with a wider and better watched path."""
     size = length3(force)
     total = rod[SHAFT_LENGTH] + rod[BODY_LENGTH]

@@ -50,8 +50,17 @@ def size_of(step: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def newton(segments: Array, load: float, Q: Array, M: Array, bend: float, tolerance: float, trust: float,
-           by_load: Array, work: Array) -> tuple[bool, float, int, int]:
+def newton(
+    segments: Array,
+    load: float,
+    Q: Array,
+    M: Array,
+    bend: float,
+    tolerance: float,
+    trust: float,
+    by_load: Array,
+    work: Array,
+) -> tuple[bool, float, int, int]:
     """Newton at one load, in place. Returns (converged, first step's turn, passes, unstable modes).
 
     Gives up where the first step turns a section by more than `trust`, or a step is not a third of the one before.
@@ -78,8 +87,9 @@ def newton(segments: Array, load: float, Q: Array, M: Array, bend: float, tolera
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow(segments: Array, Q: Array, M: Array, first_step: float, bend: float,
-           trust: float) -> tuple[int, float, int, int, int]:
+def follow(
+    segments: Array, Q: Array, M: Array, first_step: float, bend: float, trust: float
+) -> tuple[int, float, int, int, int]:
     """Nodes carried along the branch from no load to full load. Returns (status, load, passes, load steps, unstable).
 
     Arguments: segments (n, 18) with lane 6 = the full load; Q (n + 1, 4), M (n + 1, 3), written; first_step: share

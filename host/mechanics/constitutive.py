@@ -14,13 +14,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from host.mechanics.catheter import Catheter
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, solve
+from protocol.catheter import Catheter
 
 Array = NDArray[np.float64]
 
 ROUNDS = 60
-TOLERANCE = 1e-12       # relative change of the tensions between rounds
+TOLERANCE = 1e-12  # relative change of the tensions between rounds
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -43,14 +43,15 @@ class WireEquilibrium:
 
     equilibrium: Equilibrium
     arcs: Arcs
-    tension_N: Array    # (n,) one per arc; that of the body is the tension which enters the shaft
+    tension_N: Array  # (n,) one per arc; that of the body is the tension which enters the shaft
 
 
 class FrictionalWire:
     """A catheter whose pull-wire rubs in its sheath: call `step` along the history of tension and load."""
 
-    def __init__(self, catheter: Catheter, insertion_m: float, body_turning_rad: float = 0.0,
-                 longest_arc_m: float = math.inf) -> None:
+    def __init__(
+        self, catheter: Catheter, insertion_m: float, body_turning_rad: float = 0.0, longest_arc_m: float = math.inf
+    ) -> None:
         """`body_turning_rad`: total bend of the body on its way from the handle, which takes its share of tension.
 
         Raises: ValueError where the catheter has no [constitutive] or no [pcar] parameters.
@@ -99,8 +100,14 @@ class FrictionalWire:
         return np.where(arcs.distal, middle + before, own)
 
 
-def hysteresis_loop(catheter: Catheter, insertion_m: float, tension_N: ArrayLike, force_N: ArrayLike = (0.0, 0.0),
-                    body_turning_rad: float = 0.0, longest_arc_m: float = math.inf) -> tuple[Array, Array]:
+def hysteresis_loop(
+    catheter: Catheter,
+    insertion_m: float,
+    tension_N: ArrayLike,
+    force_N: ArrayLike = (0.0, 0.0),
+    body_turning_rad: float = 0.0,
+    longest_arc_m: float = math.inf,
+) -> tuple[Array, Array]:
     """Tip angle and tip tension along a history of handle tension.
 
     Arguments: `tension_N` (k,) handle tensions in order; `force_N` (2,) constant tip force. Result: tip angle (k,) rad,

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from host.cli.contract_io import BadInput
-from host.mechanics.catheter import Catheter
 from host.mechanics.helical_kernels import load_up, screw
 from host.mechanics.rod import checked_force, rod_record
 from host.mechanics.rotations import quaternion_of_matrix
 from host.mechanics.tip_shooting import UNIQUE_BELOW, load_number
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -36,17 +36,18 @@ class HelicalSolution:
     unstable_modes: int
 
 
-def solve_helical(catheter: Catheter, insertion_m: float, curvature_per_m: float, force_N: ArrayLike,
-                  segments: int = 4) -> HelicalSolution:
+def solve_helical(
+    catheter: Catheter, insertion_m: float, curvature_per_m: float, force_N: ArrayLike, segments: int = 4
+) -> HelicalSolution:
     """Shape under a tip force in the base frame, on the branch from the unloaded shape.
 
     Arguments: insertion_m, curvature_per_m as in `solve_cosserat`; force_N (3,); segments, in proportion to length, at
     least one each for body and shaft. Error of the tip falls with the square of their number.
-    Raises: BadInput naming the key. Source: 8.1.1; virtual work as (2.6) to (2.13), with torsion.
+    Raises: InputError naming the key. Source: 8.1.1; virtual work as (2.6) to (2.13), with torsion.
     """
     rod = rod_record(catheter, insertion_m, curvature_per_m)
     if isinstance(segments, bool) or not isinstance(segments, int) or not 1 <= segments <= MOST_SEGMENTS:
-        raise BadInput("segments", segments, f"a whole number from 1 to {MOST_SEGMENTS}")
+        raise InputError("segments", segments, f"a whole number from 1 to {MOST_SEGMENTS}")
     force = checked_force("force_N", force_N, rod)
     chain = chain_of(rod, segments)
     u = np.empty((len(chain), 3))

@@ -132,8 +132,9 @@ def back_substitute(H: Array, b: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def newton(segments: Array, force: Array, load: float, u: Array, trust: float, tolerance: float,
-           rate: Array) -> tuple[bool, float, int, int]:
+def newton(
+    segments: Array, force: Array, load: float, u: Array, trust: float, tolerance: float, rate: Array
+) -> tuple[bool, float, int, int]:
     """Newton on the curvatures u (n, 3), in place, at the force times `load`. (converged, first turn, passes, unstable).
 
     rate (n, 3), written: change of u with the load. A turn is the largest change of a segment's bend, in rad.

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar_kernels as kernels
-from host.mechanics.catheter import Catheter
+from protocol.catheter import Catheter
 
 Array = NDArray[np.float64]
 NO_DRAG: Array = np.zeros((0, 2))
@@ -25,7 +25,7 @@ class Status(Enum):
     """How the solution of the statics ended."""
 
     CONVERGED = kernels.CONVERGED
-    FOLD = kernels.FOLD                    # the branch folds back before full load: no answer
+    FOLD = kernels.FOLD  # the branch folds back before full load: no answer
     NOT_CONVERGED = kernels.NOT_CONVERGED  # the limit of evaluations was reached
 
 
@@ -37,8 +37,8 @@ class Arcs:
     EI_N_m2: Array
     unloaded_curvature_per_m: Array
     cubic_stiffening_m2: Array
-    distal: NDArray[np.bool_]       # arcs of the distal shaft, which the pull-wire bends
-    length_by_insertion: Array      # d length / d insertion: not zero only for the parts of the arc at the exit
+    distal: NDArray[np.bool_]  # arcs of the distal shaft, which the pull-wire bends
+    length_by_insertion: Array  # d length / d insertion: not zero only for the parts of the arc at the exit
 
     @property
     def total_length_m(self) -> float:
@@ -50,13 +50,13 @@ class Arcs:
 class Equilibrium:
     """A static shape. An arc without length bears the curvature with which it would leave the sheath."""
 
-    curvature_per_m: Array          # (n,)
-    tip_position_m: Array           # (2,)
+    curvature_per_m: Array  # (n,)
+    tip_position_m: Array  # (2,)
     tip_angle_rad: float
     status: Status
-    stable: bool                    # second variation of the energy positive
-    iterations: int                 # evaluations of the model
-    load_share: float               # share of the load that was reached on the branch; 1 where converged
+    stable: bool  # second variation of the energy positive
+    iterations: int  # evaluations of the model
+    load_share: float  # share of the load that was reached on the branch; 1 where converged
 
     @property
     def converged(self) -> bool:
@@ -64,8 +64,7 @@ class Equilibrium:
         return self.status is Status.CONVERGED
 
 
-def arcs_of(catheter: Catheter, insertion_m: float, curvature_per_m: float,
-            longest_arc_m: float = math.inf) -> Arcs:
+def arcs_of(catheter: Catheter, insertion_m: float, curvature_per_m: float, longest_arc_m: float = math.inf) -> Arcs:
     """The arcs of `catheter` outside the sheath.
 
     Arguments: `insertion_m`, length of body outside the sheath; negative: that much of the distal shaft is inside.
@@ -92,8 +91,14 @@ def arcs_of(catheter: Catheter, insertion_m: float, curvature_per_m: float,
     lengths, origins = np.array(length), np.array(origin)
     at_exit = origins == origins[int(np.argmax(lengths > 0.0))]
     cubic = catheter.constitutive.cubic_stiffening_m2 if catheter.constitutive else 0.0
-    return Arcs(lengths, np.array(catheter.pcar.EI_N_m2)[origins], np.where(origins > 0, curvature_per_m, 0.0),
-                np.full(lengths.size, cubic), origins > 0, at_exit / at_exit.sum())
+    return Arcs(
+        lengths,
+        np.array(catheter.pcar.EI_N_m2)[origins],
+        np.where(origins > 0, curvature_per_m, 0.0),
+        np.full(lengths.size, cubic),
+        origins > 0,
+        at_exit / at_exit.sum(),
+    )
 
 
 def _force(force_N: ArrayLike) -> Array:
@@ -123,17 +128,35 @@ def solve(arcs: Arcs, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None)
     work = np.empty((kernels.ROWS, arcs.length_m.size))
     kappa = np.empty(arcs.length_m.size)
     status, evaluations, share = kernels.load_path(
-        arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m, force[0], force[1],
-        drag, kappa, work)
+        arcs.length_m,
+        arcs.EI_N_m2,
+        arcs.cubic_stiffening_m2,
+        arcs.unloaded_curvature_per_m,
+        force[0],
+        force[1],
+        drag,
+        kappa,
+        work,
+    )
     x, y, angle = kernels.evaluate(arcs.length_m, kappa, force[0], force[1], drag, share, work)
-    negative = kernels.factorize(arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2,
-                                 arcs.unloaded_curvature_per_m, kappa, work)
+    negative = kernels.factorize(
+        arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m, kappa, work
+    )
     return Equilibrium(kappa, np.array([x, y]), angle, Status(status), negative == 0, evaluations, share)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_many(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array,
-               kappa: Array, pose: Array, status: Array) -> None:
+def solve_many(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force: Array,
+    drag: Array,
+    kappa: Array,
+    pose: Array,
+    status: Array,
+) -> None:
     """Array form of `solve`: N cases of n arcs, all arguments plain arrays, nothing is checked.
 
     Arguments: `length`, `kappa0` (N, n); `EI`, `cubic` (n,); `force` (N, 2); `drag` (n, 2) or (0, 2). Results, written
@@ -141,10 +164,12 @@ def solve_many(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Arr
     """
     work = np.empty((kernels.ROWS, length.shape[1]))
     for i in range(length.shape[0]):
-        status[i], _, share = kernels.load_path(length[i], EI, cubic, kappa0[i], force[i, 0], force[i, 1], drag,
-                                                kappa[i], work)
-        pose[i, 0], pose[i, 1], pose[i, 2] = kernels.evaluate(length[i], kappa[i], force[i, 0], force[i, 1], drag,
-                                                              share, work)
+        status[i], _, share = kernels.load_path(
+            length[i], EI, cubic, kappa0[i], force[i, 0], force[i, 1], drag, kappa[i], work
+        )
+        pose[i, 0], pose[i, 1], pose[i, 2] = kernels.evaluate(
+            length[i], kappa[i], force[i, 0], force[i, 1], drag, share, work
+        )
 
 
 def shortened(arcs: Arcs, station_m: float) -> Arcs:
@@ -197,8 +222,9 @@ def _second_variation_of_work(arcs: Arcs, curvature_per_m: ArrayLike, force: Arr
     return np.asarray(matrix * np.outer(arcs.length_m, arcs.length_m))
 
 
-def static_residual(arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike,
-                    drag_N_per_m: ArrayLike | None = None) -> Array:
+def static_residual(
+    arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None
+) -> Array:
     """External less elastic generalized moment of each arc, (n,), N m2: P_i of (2.9)-(2.11), zero in equilibrium."""
     kappa, work = _evaluated(arcs, curvature_per_m, _force(force_N), _drag(arcs, drag_N_per_m))
     delta = kappa - arcs.unloaded_curvature_per_m
@@ -211,8 +237,9 @@ def static_jacobian(arcs: Arcs, curvature_per_m: ArrayLike) -> Array:
     return kinematic_jacobian(arcs, curvature_per_m)[:2].T
 
 
-def tangent_stiffness(arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike,
-                      drag_N_per_m: ArrayLike | None = None) -> Array:
+def tangent_stiffness(
+    arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None
+) -> Array:
     """Second variation of the energy, -dP / d(curvatures), (n, n), N m3: positive definite in a stable equilibrium."""
     force, drag = _force(force_N), _drag(arcs, drag_N_per_m)
     delta = np.asarray(curvature_per_m, dtype=float) - arcs.unloaded_curvature_per_m
@@ -224,13 +251,12 @@ def tangent_stiffness(arcs: Arcs, curvature_per_m: ArrayLike, force_N: ArrayLike
 class PoseSensitivity:
     """Derivatives of the pose (x, y, angle) of a point of the catheter at an equilibrium."""
 
-    by_force: Array      # (3, 2): m/N, m/N, rad/N
+    by_force: Array  # (3, 2): m/N, m/N, rad/N
     by_curvature: Array  # (3,): per 1/m of unloaded curvature of the distal shaft
     by_insertion: Array  # (3,): per m of insertion; where the body just begins to come out, that on the way back
 
 
-def pose_sensitivity(arcs: Arcs, equilibrium: Equilibrium, force_N: ArrayLike,
-                     back_m: float = 0.0) -> PoseSensitivity:
+def pose_sensitivity(arcs: Arcs, equilibrium: Equilibrium, force_N: ArrayLike, back_m: float = 0.0) -> PoseSensitivity:
     """Exact derivatives of a loaded pose by force and by actuation, for control and for estimation.
 
     Arguments: `arcs` and `force_N` (2,) of the solved `equilibrium`; `back_m`, arc length back from the tip, where
@@ -248,8 +274,9 @@ def pose_sensitivity(arcs: Arcs, equilibrium: Equilibrium, force_N: ArrayLike,
         share = arcs.length_by_insertion[arc]
         moment_by_insertion += share * by_arc_length(arcs, kappa, force, int(arc))[1]
         pose_by_insertion += share * by_arc_length(part, kappa, force, int(arc))[0]
-    right = np.column_stack([kinematic_jacobian(arcs, kappa)[:2].T, np.where(arcs.distal, elastic, 0.0),
-                             moment_by_insertion])[out]
+    right = np.column_stack(
+        [kinematic_jacobian(arcs, kappa)[:2].T, np.where(arcs.distal, elastic, 0.0), moment_by_insertion]
+    )[out]
     response = kinematic_jacobian(part, kappa)[:, out] @ np.linalg.solve(stiffness, right)
     return PoseSensitivity(response[:, :2], response[:, 2], response[:, 3] + pose_by_insertion)
 

@@ -24,20 +24,21 @@ ROWS = 18
 
 CONVERGED, FOLD, NOT_CONVERGED = 0, 1, 2
 
-FINAL_TOLERANCE_rad = 1e-8      # the last quadratic step leaves its square
-PATH_TOLERANCE_rad = 2e-2       # between load steps the path only has to stay near the branch
-FIRST_STEP_rad = 0.6            # turning that one load step may predict
+FINAL_TOLERANCE_rad = 1e-8  # the last quadratic step leaves its square
+PATH_TOLERANCE_rad = 2e-2  # between load steps the path only has to stay near the branch
+FIRST_STEP_rad = 0.6  # turning that one load step may predict
 LARGEST_STEP_rad = 1.2
-CONTRACTION = 0.35              # a Newton step that shrinks less is taken as a warning of another branch
-SMALLEST_LOAD_STEP = 0.02       # below this the path is followed by arc length
+CONTRACTION = 0.35  # a Newton step that shrinks less is taken as a warning of another branch
+SMALLEST_LOAD_STEP = 0.02  # below this the path is followed by arc length
 SMALLEST_ARC_STEP = 1e-5
 EVALUATION_LIMIT = 400
-SYMMETRIC_rad = 1e-13           # no moment at all: a straight arc under axial load, stable or not
+SYMMETRIC_rad = 1e-13  # no moment at all: a straight arc under axial load, stable or not
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate(length: Array, kappa: Array, force_x: float, force_y: float, drag: Array, load: float,
-             work: Array) -> tuple[float, float, float]:
+def evaluate(
+    length: Array, kappa: Array, force_x: float, force_y: float, drag: Array, load: float, work: Array
+) -> tuple[float, float, float]:
     """Moments and their derivatives at curvatures `kappa` under `load` times the external load.
 
     Arguments: `length`, `kappa` (n,); tip force (N); `drag` (n, 2) force per length (N/m), or (0, 2) for none.
@@ -71,8 +72,10 @@ def evaluate(length: Array, kappa: Array, force_x: float, force_y: float, drag: 
         X_x = T_x + P_x * work[LEVER1_X, i] - P_y * work[LEVER1_Y, i]
         X_y = T_y + P_x * work[LEVER1_Y, i] + P_y * work[LEVER1_X, i]
         S_x = T_x + P_x * work[LEVER2_X, i] - P_y * work[LEVER2_Y, i]
-        T_x, T_y = (T_x + P_x * work[CHORD_X, i] - P_y * work[CHORD_Y, i],
-                    T_y + P_x * work[CHORD_Y, i] + P_y * work[CHORD_X, i])
+        T_x, T_y = (
+            T_x + P_x * work[CHORD_X, i] - P_y * work[CHORD_Y, i],
+            T_y + P_x * work[CHORD_Y, i] + P_y * work[CHORD_X, i],
+        )
         if loaded_along:
             q_x, q_y = load * drag[i, 0] * length[i], -load * drag[i, 1] * length[i]
             d_x, d_y = work[LEVER1_X, i] - work[LEVER2_X, i], work[LEVER1_Y, i] - work[LEVER2_Y, i]
@@ -143,8 +146,7 @@ def back_substitute(length: Array, work: Array, row: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array,
-                work: Array) -> tuple[int, float]:
+def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array) -> tuple[int, float]:
     """Newton's step into work[STEP] after `evaluate`. Result: pivots that are not positive, turning of the step."""
     negative = factorize(length, EI, cubic, kappa0, kappa, work)
     for i in range(length.size):
@@ -158,9 +160,20 @@ def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Ar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def correct(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
-            load: float, tolerance: float, first: float, kappa: Array,
-            work: Array) -> tuple[bool, int, float, float]:
+def correct(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force_x: float,
+    force_y: float,
+    drag: Array,
+    load: float,
+    tolerance: float,
+    first: float,
+    kappa: Array,
+    work: Array,
+) -> tuple[bool, int, float, float]:
     """Newton at fixed `load` from `kappa` (changed in place), refusing whatever smells of another branch.
 
     Result: accepted, evaluations, the turning of the first step, the worst contraction.
@@ -188,8 +201,18 @@ def correct(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def tangent(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
-            load: float, kappa: Array, work: Array) -> tuple[int, float, float, float]:
+def tangent(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force_x: float,
+    force_y: float,
+    drag: Array,
+    load: float,
+    kappa: Array,
+    work: Array,
+) -> tuple[int, float, float, float]:
     """d kappa / d load into work[TANGENT], residual step into work[STEP]. Result: pivots not positive, squared turning
     of the tangent, its product with the residual step, turning of the residual step."""
     evaluate(length, kappa, force_x, force_y, drag, load, work)
@@ -206,8 +229,18 @@ def tangent(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def arc_length_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
-                    evaluations: int, kappa: Array, work: Array) -> tuple[int, int, float]:
+def arc_length_path(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force_x: float,
+    force_y: float,
+    drag: Array,
+    evaluations: int,
+    kappa: Array,
+    work: Array,
+) -> tuple[int, int, float]:
     """Follows the branch anew by arc length in (turning of the arcs, load), so that a sharp turn is passed and a fold is
     told from it: on the branch the second variation stays positive up to the fold. Arguments and result: `load_path`.
     """
@@ -221,7 +254,7 @@ def arc_length_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force
         if negative > 0:
             if before < 0.0 or turned_back(length, work):
                 return FOLD, evaluations, load
-            load = restore(before, kappa, work)   # landed beside the branch
+            load = restore(before, kappa, work)  # landed beside the branch
             before, step = -1.0, step * 0.4
             continue
         advance = step / math.sqrt(square + 1.0)
@@ -232,13 +265,15 @@ def arc_length_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force
             kappa[i] += advance * work[TANGENT, i]
         before = load
         if load + advance >= 1.0:
-            accepted, count, _, worst = correct(length, EI, cubic, kappa0, force_x, force_y, drag, 1.0,
-                                                FINAL_TOLERANCE_rad, step, kappa, work)
+            accepted, count, _, worst = correct(
+                length, EI, cubic, kappa0, force_x, force_y, drag, 1.0, FINAL_TOLERANCE_rad, step, kappa, work
+            )
             if accepted:
                 return CONVERGED, evaluations + count, 1.0
         else:
             accepted, count, load, worst = correct_on_arc(
-                length, EI, cubic, kappa0, force_x, force_y, drag, load + advance, step, kappa, work)
+                length, EI, cubic, kappa0, force_x, force_y, drag, load + advance, step, kappa, work
+            )
         evaluations += count
         if accepted:
             step *= 1.5 if worst < 0.1 else 1.0
@@ -266,8 +301,19 @@ def turned_back(length: Array, work: Array) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def correct_on_arc(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
-                   load: float, step: float, kappa: Array, work: Array) -> tuple[bool, int, float, float]:
+def correct_on_arc(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force_x: float,
+    force_y: float,
+    drag: Array,
+    load: float,
+    step: float,
+    kappa: Array,
+    work: Array,
+) -> tuple[bool, int, float, float]:
     """Newton back to the branch, at right angles to the tangent kept in work[ARM_X] (borrowed).
 
     Result: accepted, evaluations, load, worst contraction.
@@ -301,8 +347,17 @@ def correct_on_arc(length: Array, EI: Array, cubic: Array, kappa0: Array, force_
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def load_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: float, force_y: float, drag: Array,
-              kappa: Array, work: Array) -> tuple[int, int, float]:
+def load_path(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force_x: float,
+    force_y: float,
+    drag: Array,
+    kappa: Array,
+    work: Array,
+) -> tuple[int, int, float]:
     """Curvatures at full load on the branch that starts at the unloaded shape. Writes `kappa`.
 
     Result: status (CONVERGED, FOLD, NOT_CONVERGED), evaluations, share of the load that was reached.
@@ -321,8 +376,9 @@ def load_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force_x: fl
         for i in range(n):
             work[TRIAL, i] = kappa[i]
         tolerance = FINAL_TOLERANCE_rad if target == 1.0 else PATH_TOLERANCE_rad
-        accepted, count, _, worst = correct(length, EI, cubic, kappa0, force_x, force_y, drag, target, tolerance,
-                                            LARGEST_STEP_rad, kappa, work)
+        accepted, count, _, worst = correct(
+            length, EI, cubic, kappa0, force_x, force_y, drag, target, tolerance, LARGEST_STEP_rad, kappa, work
+        )
         evaluations += count
         if accepted:
             if target == 1.0:

@@ -28,8 +28,9 @@ class PuncturedEquilibrium:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_reaction(length: Array, arc: int, part: float, reaction: Array, kappa: Array, work: Array,
-                 short: Array, short_work: Array) -> tuple[float, float]:
+def add_reaction(
+    length: Array, arc: int, part: float, reaction: Array, kappa: Array, work: Array, short: Array, short_work: Array
+) -> tuple[float, float]:
     """Adds the reaction's moments to `work` after `evaluate`; leaves the held point's levers in `short_work`.
 
     Arguments: the point lies `part` (m) into arc `arc`; `short` is room for the lengths up to it. The rows of the
@@ -40,8 +41,7 @@ def add_reaction(length: Array, arc: int, part: float, reaction: Array, kappa: A
         short[i] = length[i]
     short[arc] = part
     count = arc + 1
-    x, y, _ = kernels.evaluate(short[:count], kappa[:count], reaction[0], reaction[1], np.zeros((0, 2)), 1.0,
-                               short_work)
+    x, y, _ = kernels.evaluate(short[:count], kappa[:count], reaction[0], reaction[1], np.zeros((0, 2)), 1.0, short_work)
     kernels.arms(short_work)
     share = part / length[arc]
     for i in range(count):
@@ -55,9 +55,24 @@ def add_reaction(length: Array, arc: int, part: float, reaction: Array, kappa: A
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def constrained_step(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array, load: float,
-                     arc: int, part: float, point: Array, compliance: float, kappa: Array, reaction: Array,
-                     work: Array, short: Array, short_work: Array) -> tuple[int, float, float, float]:
+def constrained_step(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force: Array,
+    drag: Array,
+    load: float,
+    arc: int,
+    part: float,
+    point: Array,
+    compliance: float,
+    kappa: Array,
+    reaction: Array,
+    work: Array,
+    short: Array,
+    short_work: Array,
+) -> tuple[int, float, float, float]:
     """One Newton step of shape and reaction together; the step of `kappa` is left in work[STEP].
 
     The held point is off `point` by `compliance` (m/N) times the reaction. Result: negative directions of the second
@@ -98,9 +113,20 @@ def constrained_step(length: Array, EI: Array, cubic: Array, kappa0: Array, forc
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def constrained_path(length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array, arc: int,
-                     part: float, point: Array, kappa: Array, reaction: Array,
-                     work: Array) -> tuple[int, int, float, int]:
+def constrained_path(
+    length: Array,
+    EI: Array,
+    cubic: Array,
+    kappa0: Array,
+    force: Array,
+    drag: Array,
+    arc: int,
+    part: float,
+    point: Array,
+    kappa: Array,
+    reaction: Array,
+    work: Array,
+) -> tuple[int, int, float, int]:
     """From the loaded free shape to the held one: the hole is a spring that stiffens without bound.
 
     Where the free shape has no equilibrium at full load, the load grows together with the spring. Writes `kappa`
@@ -116,7 +142,7 @@ def constrained_path(length: Array, EI: Array, cubic: Array, kappa0: Array, forc
     bending = 0.0
     for i in range(arc + 1):
         bending += length[i] / EI[i]
-    scale = bending * (length[:arc].sum() + part) ** 2   # compliance of the held point, roughly
+    scale = bending * (length[:arc].sum() + part) ** 2  # compliance of the held point, roughly
     limit = evaluations + STEP_LIMIT
     share, step, negative = 0.0, 0.25, 0
     while evaluations < limit and step > SMALLEST_STEP:
@@ -125,8 +151,23 @@ def constrained_path(length: Array, EI: Array, cubic: Array, kappa0: Array, forc
         previous, accepted = 0.0, False
         for count in range(12):
             negative, turning, d_x, d_y = constrained_step(
-                length, EI, cubic, kappa0, force, drag, load, arc, part, point, scale * (1.0 - goal) / goal, kappa,
-                reaction, work, short, short_work)
+                length,
+                EI,
+                cubic,
+                kappa0,
+                force,
+                drag,
+                load,
+                arc,
+                part,
+                point,
+                scale * (1.0 - goal) / goal,
+                kappa,
+                reaction,
+                work,
+                short,
+                short_work,
+            )
             evaluations += 1
             too_far = not turning <= kernels.LARGEST_STEP_rad
             slow = count > 0 and previous > 1e-7 and turning > kernels.CONTRACTION * previous
@@ -150,8 +191,9 @@ def constrained_path(length: Array, EI: Array, cubic: Array, kappa0: Array, forc
     return kernels.NOT_CONVERGED, evaluations, share, negative
 
 
-def solve_through_puncture(arcs: Arcs, force_N: ArrayLike, station_m: float, point_m: ArrayLike,
-                           drag_N_per_m: ArrayLike | None = None) -> PuncturedEquilibrium:
+def solve_through_puncture(
+    arcs: Arcs, force_N: ArrayLike, station_m: float, point_m: ArrayLike, drag_N_per_m: ArrayLike | None = None
+) -> PuncturedEquilibrium:
     """Static shape with the point at arc length `station_m` held at `point_m`, and the reaction there.
 
     Arguments: `force_N` (2,) at the tip; `station_m` from the sheath's exit, with at least two arcs from the exit up
@@ -168,15 +210,21 @@ def solve_through_puncture(arcs: Arcs, force_N: ArrayLike, station_m: float, poi
         raise ValueError(f"station_m: found {station_m}, wanted more than 0, up to {float(ends[-1])}")
     arc = int(np.searchsorted(ends, station_m))
     if arc == 0:
-        raise ValueError(f"station_m: found {station_m} in the first arc, which cannot give way to a puncture in both "
-                         f"directions; wanted more than {float(ends[0])}, or more arcs")
-    drag = NO_DRAG if drag_N_per_m is None else np.ascontiguousarray(
-        np.broadcast_to(np.asarray(drag_N_per_m, dtype=float), (out.size, 2))[out])
+        raise ValueError(
+            f"station_m: found {station_m} in the first arc, which cannot give way to a puncture in both "
+            f"directions; wanted more than {float(ends[0])}, or more arcs"
+        )
+    drag = (
+        NO_DRAG
+        if drag_N_per_m is None
+        else np.ascontiguousarray(np.broadcast_to(np.asarray(drag_N_per_m, dtype=float), (out.size, 2))[out])
+    )
     part = min(station_m - (ends[arc] - length[arc]), length[arc])
     kappa, reaction, work = np.empty(length.size), np.empty(2), np.empty((kernels.ROWS, length.size))
     parameters = (length, arcs.EI_N_m2[out], arcs.cubic_stiffening_m2[out], arcs.unloaded_curvature_per_m[out])
     status, evaluations, share, negative = constrained_path(
-        *parameters, force, drag, arc, part, point, kappa, reaction, work)
+        *parameters, force, drag, arc, part, point, kappa, reaction, work
+    )
     x, y, angle = kernels.evaluate(length, kappa, force[0], force[1], drag, share, work)
     every = arcs.unloaded_curvature_per_m.copy()
     every[out] = kappa

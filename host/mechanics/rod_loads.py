@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from host.cli.contract_io import BadInput
 from host.mechanics import multiple_shooting as ms
 from host.mechanics.base_force import lay_out
 from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, follow, newton
@@ -20,6 +19,7 @@ from host.mechanics.rotations import rotation_matrix
 from host.mechanics.sections import rigid_motion
 from host.mechanics.segments import cut, lay_loads, turn_loads
 from host.mechanics.tip_shooting import UNIQUE_BELOW, load_number
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -100,21 +100,22 @@ def jacobians(segments: Array, Q: Array, M: Array, curvature: Array, bend: float
 
 
 def checked_loads(rod: Array, point_loads: Sequence[PointLoad], distributed: ArrayLike) -> tuple[Array, Array, Array]:
-    """Arc lengths from the base (k,), forces (k, 3) and distributed load (3,). Raises BadInput."""
+    """Arc lengths from the base (k,), forces (k, 3) and distributed load (3,). Raises InputError."""
     total = float(rod[SHAFT_LENGTH] + rod[BODY_LENGTH])
     places, forces = np.zeros(len(point_loads)), np.zeros((len(point_loads), 3))
     for i, load in enumerate(point_loads):
         offset = float(finite(f"point_loads.{i}.offset_m", load.offset_m, (), "an arc length back from the tip in m"))
         if not 0.0 <= offset < total:
-            raise BadInput(f"point_loads.{i}.offset_m", offset, f"0 or more, less than the exposed length {total:.6g}")
+            raise InputError(f"point_loads.{i}.offset_m", offset, f"0 or more, less than the exposed length {total:.6g}")
         places[i], forces[i] = total - offset, checked_force(f"point_loads.{i}.force_N", load.force_N, rod)
     weight = finite("distributed_N_per_m", distributed, (3,), "three finite numbers in N/m")
     checked_force("distributed_N_per_m", weight * total, rod)
     return places, forces, weight
 
 
-def solve_loads(rod: Array, tip_force: Array, places: Array, forces: Array, distributed: Array,
-                arc_lengths: Array) -> LoadedRod:
+def solve_loads(
+    rod: Array, tip_force: Array, places: Array, forces: Array, distributed: Array, arc_lengths: Array
+) -> LoadedRod:
     """The rod under several loads held in the base frame, on the branch along which all of them grow together.
 
     Arguments: rod (9,); tip_force (3,) N; places (k,) arc lengths from the base of the point forces (k, 3) N;
@@ -143,13 +144,37 @@ def solve_loads(rod: Array, tip_force: Array, places: Array, forces: Array, dist
     carried = segments[0, ms.N_START : ms.N_START + 3].copy()
     by_force, by_actuation = jacobians(segments, Q, M, curvature, EXACT)
     by_actuation[:, :2] += rigid_motion(positions[-1], curvature)
-    return LoadedRod(status, 1.0, passes, steps, unstable, positions[nodes], Q[nodes], carried, M[0].copy(), curvature,
-                     by_force, by_actuation)
+    return LoadedRod(
+        status,
+        1.0,
+        passes,
+        steps,
+        unstable,
+        positions[nodes],
+        Q[nodes],
+        carried,
+        M[0].copy(),
+        curvature,
+        by_force,
+        by_actuation,
+    )
 
 
 def _unknown(status: int, reached: float, passes: int, steps: int, unstable: int, stations: int) -> LoadedRod:
     def nan(*shape: int) -> Array:
         return np.full(shape, np.nan)
 
-    return LoadedRod(status, reached, passes, steps, unstable, nan(stations + 1, 3), nan(stations + 1, 4), nan(3), nan(3),
-                     nan(3), nan(6, 3), nan(6, 3))
+    return LoadedRod(
+        status,
+        reached,
+        passes,
+        steps,
+        unstable,
+        nan(stations + 1, 3),
+        nan(stations + 1, 4),
+        nan(3),
+        nan(3),
+        nan(3),
+        nan(6, 3),
+        nan(6, 3),
+    )

@@ -70,8 +70,9 @@ def base_curvature(rod: Array, row: Array) -> tuple[Array, Array]:
 def rigid_motion(position: Array, curvature: Array) -> Array:
     """Tip's motion (6, 2) by insertion and roll when the rod moves as a body; curvature (3,) that of the base."""
     e3 = np.array([0.0, 0.0, 1.0])
-    return np.column_stack([np.concatenate([e3 + np.cross(curvature, position), curvature]),
-                            np.concatenate([np.cross(e3, position), e3])])
+    return np.column_stack(
+        [np.concatenate([e3 + np.cross(curvature, position), curvature]), np.concatenate([np.cross(e3, position), e3])]
+    )
 
 
 def jacobians_tip_frame(rod: Array, row: Array) -> tuple[Array, Array]:

@@ -46,8 +46,9 @@ def apply3(A: Array, b: Array, out: Array) -> None:
 def negative_eigenvalues3(A: Array) -> int:
     """How many of the (real) eigenvalues of A (3, 3) are negative: Descartes' rule on its characteristic polynomial."""
     trace = A[0, 0] + A[1, 1] + A[2, 2]
-    minors = (A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0] + A[0, 0] * A[2, 2] - A[0, 2] * A[2, 0]
-              + A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
+    minors = (
+        A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0] + A[0, 0] * A[2, 2] - A[0, 2] * A[2, 0] + A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
+    )
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     c10 = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
     c20 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]

@@ -115,8 +115,9 @@ def quaternion_error(q_star: Array, q_bar: Array) -> Array:
     return quaternion_product(conjugate(q_star), q_bar)[1:]
 
 
-def estimate(rod: Array, length_m: float, case: int, offsets: Array, positions: Array, quaternions: Array,
-             elements: int = ELEMENTS) -> tuple[Array, int]:
+def estimate(
+    rod: Array, length_m: float, case: int, offsets: Array, positions: Array, quaternions: Array, elements: int = ELEMENTS
+) -> tuple[Array, int]:
     """Force (3,) in the tip frame as the thesis finds it: unweighted, from zero, finite differences. And model sweeps."""
     total = rod[6] + rod[7]
     nodes = np.rint((total - offsets) / total * elements).astype(int)

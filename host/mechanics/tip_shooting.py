@@ -86,8 +86,9 @@ def miss_of(row: Array, force: Array, miss: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def correct_once(rod: Array, force: Array, bend: float, x: Array, Gi: Array, scratch: Array, out: Array,
-                 work: Array) -> tuple[float, float]:
+def correct_once(
+    rod: Array, force: Array, bend: float, x: Array, Gi: Array, scratch: Array, out: Array, work: Array
+) -> tuple[float, float]:
     """One Newton step of the tip-frame force x (3,), in place. Returns (miss before it, determinant of G).
 
     Arguments: force (3,) base frame; Gi (3, 3), written: inverse of G; scratch (2 or more, 3), out (1, 48), work.
@@ -105,8 +106,19 @@ def correct_once(rod: Array, force: Array, bend: float, x: Array, Gi: Array, scr
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def polish(rod: Array, force: Array, stations: Array, bend: float, x: Array, Gi: Array, limit: float, goal: float,
-           scratch: Array, out: Array, work: Array) -> tuple[float, int]:
+def polish(
+    rod: Array,
+    force: Array,
+    stations: Array,
+    bend: float,
+    x: Array,
+    Gi: Array,
+    limit: float,
+    goal: float,
+    scratch: Array,
+    out: Array,
+    work: Array,
+) -> tuple[float, int]:
     """x (3,) refined at full accuracy by Broyden steps from the inverse Gi (3, 3). Returns (last miss, sweeps).
 
     Arguments: limit: largest first miss that is believed to be the same branch; goal: miss to reach; scratch (4, 3).
@@ -160,8 +172,9 @@ def hermite(s: float, span: float, x0: Array, d0: Array, x1: Array, d1: Array, o
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def land(rod: Array, goal: Array, bend: float, trust: float, x: Array, Gi: Array, scratch: Array, out: Array,
-         work: Array) -> tuple[bool, float, float, int]:
+def land(
+    rod: Array, goal: Array, bend: float, trust: float, x: Array, Gi: Array, scratch: Array, out: Array, work: Array
+) -> tuple[bool, float, float, int]:
     """Newton from the prediction x (3,), in place. Returns (landed, first miss, determinant, sweeps)."""
     first, before, determinant = 0.0, 1e300, 0.0
     for sweeps in range(1, 7):

@@ -55,8 +55,9 @@ def load_mesh(path: Path, scale: float, chamber: bool) -> Mesh:
     except (OSError, ValueError, AttributeError, KeyError, IndexError) as error:
         raise ValueError(f"obstacles.file: found {path}: {error}, wanted a triangle mesh (STL, OBJ, PLY, OFF)") from None
     if len(mesh.faces) == 0 or not closed or not np.all(np.isfinite(mesh.vertices)):
-        raise ValueError(f"obstacles.file: found {path} with {len(mesh.faces)} triangles, closed: {closed}; wanted a "
-                         "closed mesh")
+        raise ValueError(
+            f"obstacles.file: found {path} with {len(mesh.faces)} triangles, closed: {closed}; wanted a closed mesh"
+        )
     return Mesh(np.array(mesh.vertices, np.float64) * scale, np.array(mesh.faces, np.int64), chamber)
 
 
@@ -66,8 +67,9 @@ def winding_number(mesh: Mesh, point_m: Array) -> float:
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] - point_m for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     above = np.einsum("ij,ij->i", a, np.cross(b, c))
-    below = la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la + np.einsum(
-        "ij,ij->i", c, a) * lb
+    below = (
+        la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la + np.einsum("ij,ij->i", c, a) * lb
+    )
     return float(np.sum(2.0 * np.arctan2(above, below)) / (4.0 * np.pi))
 
 

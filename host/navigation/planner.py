@@ -41,12 +41,13 @@ class _Tree:
 def free_between(start: Array, end: Array, free: Free, check_m: float = CHECK_M) -> bool:
     """Whether the straight way between two scaled joints is free, both ends taken as free; far points first."""
     count = int(np.ceil(np.linalg.norm(end - start) / check_m))
-    order = sorted(range(1, count), key=lambda k: (k & -k), reverse=True)
+    order = sorted(range(1, count), key=lambda k: k & -k, reverse=True)
     return all(free(start + (end - start) * k / count) for k in order)
 
 
-def connect(starts: list[Array], goals: list[Array], low: Array, high: Array, free: Free, seed: int,
-            most: int) -> list[Array] | None:
+def connect(
+    starts: list[Array], goals: list[Array], low: Array, high: Array, free: Free, seed: int, most: int
+) -> list[Array] | None:
     """Scaled joints from one of `starts` to one of `goals`, straight ways between them free; None after `most` samples."""
     random = np.random.default_rng(seed)
     trees, swapped = (_Tree(starts), _Tree(goals)), False
@@ -110,4 +111,4 @@ def _halfway(path: list[Array], random: np.random.Generator) -> list[Array]:
     legs = [float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(path)]
     k = int(np.argmax(legs))
     share = float(random.uniform(0.3, 0.7))
-    return path[: k + 1] + [path[k] + share * (path[k + 1] - path[k])] + path[k + 1:]
+    return path[: k + 1] + [path[k] + share * (path[k + 1] - path[k])] + path[k + 1 :]

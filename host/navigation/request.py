@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from host.cli.contract_io import BadInput, Request
-from host.mechanics.catheter import load_catheter
 from host.navigation import planner, shape, timing
 from host.navigation.obstacles import Capsule, Mesh, Obstacle, Sphere, Surroundings, load_mesh, to_line_m
-from realtime import inverse_kinematics as ik
-from realtime.configure import tick_parameters
-from realtime.rig_file import Rig
+from protocol.catheter import load_catheter
+from protocol.errors import InputError
+from protocol.requests import Request
+from protocol.rig_file import Rig
+from realtime.control import inverse_kinematics as ik
+from realtime.control.configure import tick_parameters
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -95,11 +96,17 @@ class Answer(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Columns by name, SI."""
-        return {"found": True, "duration_s": float(self.time_s[-1]), "clearance_m": self.clearance_m,
-                "waypoints": self.waypoints, "collision_checks": self.checks, "time_s": self.time_s,
-                "stage": {"insertion_m": self.stage[:, 0], "roll_rad": self.stage[:, 1], "knob_rad": self.stage[:, 2]},
-                "joint": {"insertion_m": self.joint[:, 0], "roll_rad": self.joint[:, 1],
-                          "curvature_per_m": self.joint[:, 2]}, "tip_m": self.tip_m}
+        return {
+            "found": True,
+            "duration_s": float(self.time_s[-1]),
+            "clearance_m": self.clearance_m,
+            "waypoints": self.waypoints,
+            "collision_checks": self.checks,
+            "time_s": self.time_s,
+            "stage": {"insertion_m": self.stage[:, 0], "roll_rad": self.stage[:, 1], "knob_rad": self.stage[:, 2]},
+            "joint": {"insertion_m": self.joint[:, 0], "roll_rad": self.joint[:, 1], "curvature_per_m": self.joint[:, 2]},
+            "tip_m": self.tip_m,
+        }
 
 
 class _World:
@@ -142,22 +149,29 @@ def _obstacle(item: Any, folder: Path) -> Obstacle:
 def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> Answer | None:
     """The fastest found way of the tip to the goal; None where `request.samples` found none. Mesh files are in `folder`.
 
-    Raises BadInput: goal inside an obstacle, out of reach, reachable only in touch; start not free; a mesh not usable.
+    Raises InputError: goal inside an obstacle, out of reach, reachable only in touch; start not free; a mesh not usable.
     """
     try:
         world = _World(request, rig, folder)
     except ValueError as error:
         key, _, rest = str(error).partition(": found ")
         found, _, wanted = rest.rpartition(", wanted ")
-        raise BadInput(key, found or rest, wanted) from None
+        raise InputError(key, found or rest, wanted) from None
     start = np.array([request.start.insertion_m, request.start.roll_rad, request.start.curvature_per_m])
     why = world.refused(start)
     if why:
-        raise BadInput("start", start.tolist(), f"a free start; found {why}")
+        raise InputError("start", start.tolist(), f"a free start; found {why}")
     goals = _goals(request, rig, world)
     scale = world.reach.scale_m
-    path = planner.connect([start * scale], [goal * scale for goal in goals], world.reach.low * scale,
-                           world.reach.high * scale, world.free, request.seed, request.samples)
+    path = planner.connect(
+        [start * scale],
+        [goal * scale for goal in goals],
+        world.reach.low * scale,
+        world.reach.high * scale,
+        world.free,
+        request.seed,
+        request.samples,
+    )
     if path is None:
         return None
     path = planner.shorten(path, world.free, request.seed)
@@ -168,14 +182,14 @@ def _goals(request: PlanRequest, rig: Rig, world: _World) -> list[Array]:
     goal = np.array(request.goal_m)
     inside = world.surroundings.holds(goal)
     if inside:
-        raise BadInput("goal_m", request.goal_m, f"a goal in free space; it is {inside}")
+        raise InputError("goal_m", request.goal_m, f"a goal in free space; it is {inside}")
     reachable = shape.joints_of(world.reach, rig, goal)
     if not reachable:
-        raise BadInput("goal_m", request.goal_m, "a goal that the unloaded tip can reach within the stages' travel")
+        raise InputError("goal_m", request.goal_m, "a goal that the unloaded tip can reach within the stages' travel")
     reasons = [world.refused(joint) for joint in reachable]
     free = [joint for joint, why in zip(reachable, reasons, strict=True) if not why]
     if not free:
-        raise BadInput("goal_m", request.goal_m, f"a goal that is reached free; there is {reasons[0]}")
+        raise InputError("goal_m", request.goal_m, f"a goal that is reached free; there is {reasons[0]}")
     return free
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realtime import inverse_kinematics as ik
-from realtime.configure import tick_parameters
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
+from realtime.control import inverse_kinematics as ik
+from realtime.control.configure import tick_parameters
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import toppra
 from numpy.typing import NDArray
 from toppra import algorithm, constraint
 
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 logging.getLogger("toppra").setLevel(logging.ERROR)
@@ -41,8 +41,10 @@ def fastest(waypoints: Array, rig: Rig, period_s: float) -> Timed:
     path = toppra.SplineInterpolator(distance / distance[-1], waypoints, bc_type="natural")
     speed = np.array([rig.stage(axis).max_speed_unit_per_s for axis in range(3)]) * SPEED_SHARE
     push = np.array([rig.stage(axis).max_accel_unit_per_s2 for axis in range(3)]) * ACCELERATION_SHARE
-    limits = [constraint.JointVelocityConstraint(np.column_stack([-speed, speed])),
-              constraint.JointAccelerationConstraint(np.column_stack([-push, push]))]
+    limits = [
+        constraint.JointVelocityConstraint(np.column_stack([-speed, speed])),
+        constraint.JointAccelerationConstraint(np.column_stack([-push, push])),
+    ]
     grid = np.linspace(0.0, 1.0, max(100, 6 * len(waypoints)))
     trajectory = algorithm.TOPPRA(limits, path, gridpoints=grid, solver_wrapper="seidel").compute_trajectory(0.0, 0.0)
     if trajectory is None:

@@ -11,18 +11,27 @@ import msgpack
 import zenoh
 from pydantic import Field, ValidationError
 
-from host.cli.contract_io import Request
-from host.commander import Acknowledgement, Commander
-from host.mechanics.catheter import load_catheter
-from host.view.picture import Picture
+from host.recordings.rig_picture import Picture
+from host.run.commander import Acknowledgement, Commander
 from host.view.source import refusal
+from protocol.catheter import load_catheter
+from protocol.requests import Request
+from protocol.rig_file import Rig
 from protocol.topics import TOPICS, decode, key
 from protocol.zenoh_session import Session
-from realtime.rig_file import Rig
 
 # Messages kept between two frames: all of the traces' topics, the newest of the others.
-DEPTHS = {"stage": 1, "pose/tip": 1, "pose/shaft": 1, "force/sensor": 1, "board": 1, "loop": 1, "state": 64,
-          "force/estimate": 64, "log": 32}
+DEPTHS = {
+    "stage": 1,
+    "pose/tip": 1,
+    "pose/shaft": 1,
+    "force/sensor": 1,
+    "board": 1,
+    "loop": 1,
+    "state": 64,
+    "force/estimate": 64,
+    "log": 32,
+}
 
 
 class Press(Request):
@@ -41,15 +50,21 @@ class LiveRig:
         self._picture = Picture(rig.effective(), dataclasses.asdict(load_catheter(rig.catheter.name)))
         self._subscribers = {
             topic: session.zenoh.declare_subscriber(key(rig.name, topic), zenoh.handlers.RingChannel(depth))
-            for topic, depth in DEPTHS.items()}
+            for topic, depth in DEPTHS.items()
+        }
         self._heard_s: float | None = None
         self.malformed = 0
 
     def hello(self) -> dict[str, Any]:
         """Rig, limits and kind; see `Source`."""
-        return {"kind": "live", "rig": self._rig.name, "catheter": self._rig.catheter.name,
-                "over_force_N": self._rig.safety.over_force_N, "radius_m": _radius_m(self._rig.catheter.name),
-                "past": self._picture.past()}
+        return {
+            "kind": "live",
+            "rig": self._rig.name,
+            "catheter": self._rig.catheter.name,
+            "over_force_N": self._rig.safety.over_force_N,
+            "radius_m": _radius_m(self._rig.catheter.name),
+            "past": self._picture.past(),
+        }
 
     def frame(self) -> dict[str, Any]:
         """The picture, and how long the rig has been silent (nil before it was heard of)."""

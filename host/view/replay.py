@@ -11,10 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError
 
-from host.cli.contract_io import BadInput, Request, read_json
-from host.recording import Recording
-from host.view.picture import WAITING, Picture
+from host.recordings.recording import Recording
+from host.recordings.rig_picture import WAITING, Picture
 from host.view.source import refusal
+from protocol.errors import InputError
+from protocol.requests import Request, read_json
 
 # Topics whose every message is shown, and those of which only the newest counts.
 EVERY, NEWEST = ("state", "force/estimate", "log"), ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "loop")
@@ -50,15 +51,21 @@ class Findings(Request):
 
 
 def read_findings(source: str) -> Findings:
-    """The findings in the JSON that `seldinger diagnose` writes. Raises BadInput where it is none."""
+    """The findings in the JSON that `seldinger diagnose` writes. Raises InputError where it is none."""
     data = read_json(source)
     try:
-        windows = [Window(subsystem=place["subsystem"], condition=str(place.get("condition") or ""),
-                          span_s=(float(span[0]), float(span[1])))
-                   for place in data["located"] for span in place["windows_s"]]
+        windows = [
+            Window(
+                subsystem=place["subsystem"],
+                condition=str(place.get("condition") or ""),
+                span_s=(float(span[0]), float(span[1])),
+            )
+            for place in data["located"]
+            for span in place["windows_s"]
+        ]
         return Findings(verdict=data["verdict"], says=[effect["says"] for effect in data["effects"]], windows=windows)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise BadInput(source, f"{type(error).__name__}: {error}", "the JSON that `seldinger diagnose` writes") from None
+        raise InputError(source, f"{type(error).__name__}: {error}", "the JSON that `seldinger diagnose` writes") from None
 
 
 def origin_ns(recording: Recording) -> int:
@@ -70,15 +77,20 @@ def origin_ns(recording: Recording) -> int:
 class Replay:
     """A `Source`. Time goes on between frames while it plays, times `speed`; it stops at the end.
 
-    Raises BadInput for a recording without messages, or a speed out of its bounds.
+    Raises InputError for a recording without messages, or a speed out of its bounds.
     """
 
-    def __init__(self, recording: Recording, speed: float = 1.0, findings: Findings | None = None,
-                 clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        speed: float = 1.0,
+        findings: Findings | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         if not any(topic in recording.topics for topic in (*EVERY, *NEWEST)):
-            raise BadInput(str(recording.path), "no message of the rig's", "a recording that has some")
+            raise InputError(str(recording.path), "no message of the rig's", "a recording that has some")
         if not MIN_SPEED <= speed <= MAX_SPEED:
-            raise BadInput("--speed", speed, f"{MIN_SPEED:g} to {MAX_SPEED:g}")
+            raise InputError("--speed", speed, f"{MIN_SPEED:g} to {MAX_SPEED:g}")
         self._recording, self._findings, self._clock_s = recording, findings, clock_s
         self._picture = Picture(recording.configuration, recording.catheter)
         self._times = {topic: recording.times_ns(topic) for topic in (*EVERY, *NEWEST)}
@@ -97,15 +109,34 @@ class Replay:
                 self._looked_s = self._clock_s()
         configuration, found = self._recording.configuration, self._findings
         origin_s = origin_ns(self._recording) * 1e-9
-        windows = [] if found is None else [
-            {"from": origin_s + window.span_s[0], "to": origin_s + window.span_s[1], "subsystem": window.subsystem,
-             "condition": window.condition} for window in found.windows]
-        return {"kind": "play", "rig": self._recording.run.get("rig", ""), "file": Path(self._recording.path).name,
-                "catheter": self._recording.catheter.get("name", ""), "begin": self._begin_ns * 1e-9,
-                "end": self._end_ns * 1e-9, "truncated": self._recording.truncated, "windows": windows,
-                "verdict": found.verdict if found else "", "says": found.says if found else [],
-                "over_force_N": configuration.get("safety", {}).get("over_force_N"),
-                "radius_m": 0.5 * self._recording.catheter.get("diameter_m", 0.0023), "past": self._picture.past()}
+        windows = (
+            []
+            if found is None
+            else [
+                {
+                    "from": origin_s + window.span_s[0],
+                    "to": origin_s + window.span_s[1],
+                    "subsystem": window.subsystem,
+                    "condition": window.condition,
+                }
+                for window in found.windows
+            ]
+        )
+        return {
+            "kind": "play",
+            "rig": self._recording.run.get("rig", ""),
+            "file": Path(self._recording.path).name,
+            "catheter": self._recording.catheter.get("name", ""),
+            "begin": self._begin_ns * 1e-9,
+            "end": self._end_ns * 1e-9,
+            "truncated": self._recording.truncated,
+            "windows": windows,
+            "verdict": found.verdict if found else "",
+            "says": found.says if found else [],
+            "over_force_N": configuration.get("safety", {}).get("over_force_N"),
+            "radius_m": 0.5 * self._recording.catheter.get("diameter_m", 0.0023),
+            "past": self._picture.past(),
+        }
 
     def frame(self) -> dict[str, Any]:
         """The picture at the player's time, and where the player is; `jumps` counts the jumps so far."""
@@ -116,8 +147,13 @@ class Replay:
                 self._playing = self._at_ns < self._end_ns
             self._looked_s = now_s
             self._catch_up()
-            return {**self._picture.frame(), "jumps": self._jumps, "malformed": 0, "silent_s": 0.0,
-                    "play": {"at": round(self._at_ns * 1e-9, 4), "playing": self._playing, "speed": self._speed}}
+            return {
+                **self._picture.frame(),
+                "jumps": self._jumps,
+                "malformed": 0,
+                "silent_s": 0.0,
+                "play": {"at": round(self._at_ns * 1e-9, 4), "playing": self._playing, "speed": self._speed},
+            }
 
     def _catch_up(self) -> None:
         """Tell the picture all that was recorded up to now; of a long stretch an even choice."""

@@ -30,8 +30,10 @@ MAX_PAGES, MAX_ASKED_AT_ONCE, MAX_MESSAGE_BYTES = 8, 4, 1024
 # A page that takes nothing for so long is gone: its connection is given up.
 STUCK_S = 10.0
 STATIC = Path(__file__).parent / "static"
-_POLICY = ("default-src 'self'; style-src 'self'; script-src 'self'; img-src 'self' data:; connect-src 'self'; "
-           "frame-ancestors 'none'; base-uri 'none'; form-action 'none'")
+_POLICY = (
+    "default-src 'self'; style-src 'self'; script-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
 
 
 def three_js() -> Path:
@@ -83,9 +85,13 @@ class Guard:
 def _with_policy(send: Send) -> Send:
     async def answer(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message["headers"] = [*message["headers"], (b"content-security-policy", _POLICY.encode()),
-                                  (b"x-content-type-options", b"nosniff"), (b"referrer-policy", b"no-referrer"),
-                                  (b"cache-control", b"no-cache")]
+            message["headers"] = [
+                *message["headers"],
+                (b"content-security-policy", _POLICY.encode()),
+                (b"x-content-type-options", b"nosniff"),
+                (b"referrer-policy", b"no-referrer"),
+                (b"cache-control", b"no-cache"),
+            ]
         await send(message)
 
     return answer
@@ -129,13 +135,19 @@ class ViewServer:
         self._source, self.port = source, port
         self.pages: set[Page] = set()
         three = three_js()
-        self.app = Guard(Starlette(lifespan=self._lifespan, routes=[
-            Route("/", lambda request: FileResponse(STATIC / "index.html")),
-            Route("/lib/three.js", lambda request: FileResponse(three, media_type="text/javascript")),
-            Route("/favicon.ico", _nothing),
-            WebSocketRoute("/rig", self._rig),
-            Mount("/static", StaticFiles(directory=STATIC)),
-        ]), port)
+        self.app = Guard(
+            Starlette(
+                lifespan=self._lifespan,
+                routes=[
+                    Route("/", lambda request: FileResponse(STATIC / "index.html")),
+                    Route("/lib/three.js", lambda request: FileResponse(three, media_type="text/javascript")),
+                    Route("/favicon.ico", _nothing),
+                    WebSocketRoute("/rig", self._rig),
+                    Mount("/static", StaticFiles(directory=STATIC)),
+                ],
+            ),
+            port,
+        )
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
@@ -206,8 +218,17 @@ class ViewServer:
 
     def configuration(self) -> uvicorn.Config:
         """How `app` is served: on loopback, with small messages in."""
-        return uvicorn.Config(self.app, host=ADDRESS, port=self.port, log_level="warning", ws_max_size=4 * MAX_MESSAGE_BYTES,
-                              ws_max_queue=8, ws="websockets-sansio", server_header=False, timeout_graceful_shutdown=1)
+        return uvicorn.Config(
+            self.app,
+            host=ADDRESS,
+            port=self.port,
+            log_level="warning",
+            ws_max_size=4 * MAX_MESSAGE_BYTES,
+            ws_max_queue=8,
+            ws="websockets-sansio",
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
 
     def serve(self) -> None:
         """Serve until SIGINT or SIGTERM. Raises SystemExit where the port is taken."""

@@ -13,7 +13,7 @@ class Source(Protocol):
         ...
 
     def frame(self) -> dict[str, Any]:
-        """What has changed: `host.view.picture.Picture.frame` and more. Called thirty times a second."""
+        """What has changed: `host.recordings.rig_picture.Picture.frame` and more. Called thirty times a second."""
         ...
 
     def act(self, text: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from realtime.drivers import ndi_protocol as ndi
-from realtime.drivers.aurora_session import LineAction, SessionFailed, Step, enumerate_and_start, set_up
+from realtime.drivers.aurora_session import AuroraConfig, LineAction, SessionFailed, Step, enumerate_and_start, set_up
 from realtime.drivers.device_events import DeviceEvent, EventKind
 from realtime.drivers.frame_clock import FrameClock
 from realtime.drivers.pose_sample import NO_FLAGS, PoseFlag, PoseSample, flag_words, flags_of
@@ -27,41 +27,6 @@ FRAME_MODULUS = 1 << 32
 # A frame counter that goes back, or runs ahead of time by more than these frames, is believed only when it insists.
 _JUMP_FRAMES, _STRANGE_IN_ROW = 10, 3
 _UNIT_TOLERANCE = 0.02  # of |q|; TX rounds to 1e-4, damage that passes two CRCs does not stop here by chance
-
-
-@dataclass(frozen=True)
-class AuroraConfig:
-    """tools: wanted port handles, () for all; latency_s: from sampling to the first byte of a reply at no waiting;
-    baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: rest of the line between a reply
-    that brought nothing new and the next poll; settle_frames: frames from which times are learnt before poses are told
-    (the first frame seen may be nearly a period old); frozen_after: frames with one and the same pose, bit for bit,
-    after which it is no measurement any more (real ones have noise), 0: never."""
-
-    tools: tuple[str, ...] = ("0A", "0B")
-    rate_hz: float = 40.0
-    latency_s: float = 0.025
-    baud: int = 921600
-    reply: str = "BX"
-    beeps: int = 2
-    poll_gap_s: float = 0.0005
-    poll_timeout_s: float = 0.05
-    reply_timeout_s: float = 3.0
-    reset_timeout_s: float = 8.0
-    retry_s: float = 0.5
-    max_distance_m: float = 3.0
-    settle_frames: int = 20
-    frozen_after: int = 8
-
-    def __post_init__(self) -> None:
-        wanted = {
-            "rate_hz": (self.rate_hz > 0, "more than 0"), "latency_s": (0 <= self.latency_s < 1, "0 to 1"),
-            "baud": (self.baud in ndi.BAUD_CODES, f"one of {sorted(ndi.BAUD_CODES)}"),
-            "reply": (self.reply in ("BX", "TX"), "BX or TX"), "beeps": (0 <= self.beeps <= 9, "0 to 9"),
-            "poll_timeout_s": (self.poll_timeout_s > 0, "more than 0"),
-        }
-        for key, (good, text) in wanted.items():
-            if not good:
-                raise ValueError(f"{key}: found {getattr(self, key)!r}, wanted {text}")
 
 
 @dataclass

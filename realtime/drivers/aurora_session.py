@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from realtime.drivers import ndi_protocol as ndi
 from realtime.drivers.device_events import EventKind
-
-if TYPE_CHECKING:
-    from realtime.drivers.aurora import AuroraClient
 
 POWER_UP_BAUD = 9600
 BREAK_S = 0.25
@@ -38,6 +35,56 @@ class Step:
     pause: bool = False
 
 
+@dataclass(frozen=True)
+class AuroraConfig:
+    """tools: wanted port handles, () for all; latency_s: from sampling to the first byte of a reply at no waiting;
+    baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: rest of the line between a reply
+    that brought nothing new and the next poll; settle_frames: frames from which times are learnt before poses are told
+    (the first frame seen may be nearly a period old); frozen_after: frames with one and the same pose, bit for bit,
+    after which it is no measurement any more (real ones have noise), 0: never."""
+
+    tools: tuple[str, ...] = ("0A", "0B")
+    rate_hz: float = 40.0
+    latency_s: float = 0.025
+    baud: int = 921600
+    reply: str = "BX"
+    beeps: int = 2
+    poll_gap_s: float = 0.0005
+    poll_timeout_s: float = 0.05
+    reply_timeout_s: float = 3.0
+    reset_timeout_s: float = 8.0
+    retry_s: float = 0.5
+    max_distance_m: float = 3.0
+    settle_frames: int = 20
+    frozen_after: int = 8
+
+    def __post_init__(self) -> None:
+        wanted = {
+            "rate_hz": (self.rate_hz > 0, "more than 0"),
+            "latency_s": (0 <= self.latency_s < 1, "0 to 1"),
+            "baud": (self.baud in ndi.BAUD_CODES, f"one of {sorted(ndi.BAUD_CODES)}"),
+            "reply": (self.reply in ("BX", "TX"), "BX or TX"),
+            "beeps": (0 <= self.beeps <= 9, "0 to 9"),
+            "poll_timeout_s": (self.poll_timeout_s > 0, "more than 0"),
+        }
+        for key, (good, text) in wanted.items():
+            if not good:
+                raise ValueError(f"{key}: found {getattr(self, key)!r}, wanted {text}")
+
+
+class SessionClient(Protocol):
+    """What the session's script needs of the client that runs it (`aurora.AuroraClient`)."""
+
+    config: AuroraConfig
+    firmware: str
+
+    def line(self, action: LineAction) -> None:
+        """Queue a change of the line for the transport."""
+
+    def event(self, kind: EventKind, text: str, now_ns: int | None = None) -> None:
+        """Report an event of the device."""
+
+
 class SessionFailed(Exception):
     """Bringing up went wrong; the text says at which command and why."""
 
@@ -46,7 +93,7 @@ Script = Generator[Step, str | None, dict[str, ndi.ToolInfo]]
 _Part = Generator[Step, str | None, str]
 
 
-def set_up(client: AuroraClient) -> Script:
+def set_up(client: SessionClient) -> Script:
     """From an unknown state to tracking. Returns the enabled tools by handle. Raises SessionFailed."""
     yield from _reset(client)
     yield from _command(client, "initialising", "INIT")
@@ -60,7 +107,7 @@ def set_up(client: AuroraClient) -> Script:
     return (yield from enumerate_and_start(client, stop_first=False))
 
 
-def enumerate_and_start(client: AuroraClient, stop_first: bool) -> Script:
+def enumerate_and_start(client: SessionClient, stop_first: bool) -> Script:
     """Free what was pulled, initialise what is new, enable what is wanted, start tracking. Raises SessionFailed."""
     if stop_first:
         yield from _command(client, "reading ports", "TSTOP")
@@ -87,7 +134,7 @@ def enumerate_and_start(client: AuroraClient, stop_first: bool) -> Script:
     return tools
 
 
-def _reset(client: AuroraClient) -> Generator[Step, str | None, None]:
+def _reset(client: SessionClient) -> Generator[Step, str | None, None]:
     """A serial break resets the device whatever its speed and mode; where the adapter swallows breaks, ask in words."""
     client.line(LineAction(POWER_UP_BAUD, BREAK_S))
     if (yield Step("resetting", b"", client.config.reset_timeout_s)) == "RESET":
@@ -101,12 +148,15 @@ def _reset(client: AuroraClient) -> Generator[Step, str | None, None]:
     raise SessionFailed("no answer to a reset: is the Aurora switched on, and is this its port?")
 
 
-def _initialise_tools(client: AuroraClient) -> Generator[Step, str | None, None]:
+def _initialise_tools(client: SessionClient) -> Generator[Step, str | None, None]:
     """PINIT until no handle waits: initialising a tool with two sensors brings up a second handle."""
     refused: set[str] = set()
     while True:
-        waiting = [handle for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "02")))
-                   if handle not in refused]
+        waiting = [
+            handle
+            for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "02")))
+            if handle not in refused
+        ]
         if not waiting:
             return
         for handle in waiting:
@@ -117,7 +167,7 @@ def _initialise_tools(client: AuroraClient) -> Generator[Step, str | None, None]
                 client.event(EventKind.ERROR, str(failed))
 
 
-def _command(client: AuroraClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
+def _command(client: SessionClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
     """One command and its reply. Silence (a damaged command or reply) is answered by asking again."""
     for _ in range(attempts):
         reply = yield Step(phase, ndi.command(name, parameters), client.config.reply_timeout_s)

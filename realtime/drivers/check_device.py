@@ -37,8 +37,11 @@ class DeviceReport:
         return not self.problems
 
 
-def check_aurora(open_transport: Callable[[], Transport], config: AuroraConfig | None = None, seconds: float = 5.0,
-                 ) -> DeviceReport:
+def check_aurora(
+    open_transport: Callable[[], Transport],
+    config: AuroraConfig | None = None,
+    seconds: float = 5.0,
+) -> DeviceReport:
     """Bring an Aurora up and read it for `seconds`; the tools should lie still in the volume."""
     config = config or AuroraConfig()
     report, samples = DeviceReport("aurora"), list[PoseSample]()
@@ -46,8 +49,13 @@ def check_aurora(open_transport: Callable[[], Transport], config: AuroraConfig |
     if not _run(thread, samples, seconds, report):
         return report
     counters, client = thread.client.counters, thread.client
-    report.figures |= {"firmware": client.firmware, "clock_drift": client.clock.drift, "polls": counters.polls,
-                       "damaged": counters.damaged, "poll_timeouts": counters.poll_timeouts}
+    report.figures |= {
+        "firmware": client.firmware,
+        "clock_drift": client.clock.drift,
+        "polls": counters.polls,
+        "damaged": counters.damaged,
+        "poll_timeouts": counters.poll_timeouts,
+    }
     if counters.damaged > MAX_DAMAGED * counters.replies:
         report.problems.append(f"{counters.damaged} of {counters.replies} replies damaged: cable, speed, interference")
     ages_s = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9
@@ -84,16 +92,23 @@ def check_net_ft(host: str, seconds: float = 5.0, port: int = RDT_PORT, web_port
     except (OSError, ValueError) as bad:
         report.problems.append(str(bad))
         return report
-    report.figures |= {"serial": calibration.serial, "counts_per_N": calibration.counts_per_N,
-                       "counts_per_Nm": calibration.counts_per_Nm}
+    report.figures |= {
+        "serial": calibration.serial,
+        "counts_per_N": calibration.counts_per_N,
+        "counts_per_Nm": calibration.counts_per_Nm,
+    }
     thread = NetFtThread(host, samples.append, NetFtConfig(calibration), report.events.append, port)
     if not _run(thread, samples, seconds, report):
         return report
     counters = thread.client.counters
     force_N = np.array([sample.force_N for sample in samples])
     rate = (len(samples) - 1) / max((samples[-1].stamp_ns - samples[0].stamp_ns) * 1e-9, 1e-9)
-    report.figures |= {"rate_hz": rate, "lost": counters.lost, "status_errors": counters.status_errors,
-                       "clock_drift": thread.client.clock.drift}
+    report.figures |= {
+        "rate_hz": rate,
+        "lost": counters.lost,
+        "status_errors": counters.status_errors,
+        "clock_drift": thread.client.clock.drift,
+    }
     for axis, name in enumerate("xyz"):
         report.figures[f"mean_{name}_N"] = float(np.mean(force_N[:, axis]))
         report.figures[f"noise_{name}_N"] = float(np.std(force_N[:, axis]))

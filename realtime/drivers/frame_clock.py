@@ -19,8 +19,17 @@ class FrameClock:
     An arrival far before or after the line is not learnt from; a run of such begins the learning again.
     """
 
-    def __init__(self, period_s: float, *, window_s: float = 30.0, block_s: float = 0.5, max_drift: float = 500e-6,
-                 early_s: float = 0.005, late_s: float = 1.0, strange_in_row: int = 10) -> None:
+    def __init__(
+        self,
+        period_s: float,
+        *,
+        window_s: float = 30.0,
+        block_s: float = 0.5,
+        max_drift: float = 500e-6,
+        early_s: float = 0.005,
+        late_s: float = 1.0,
+        strange_in_row: int = 10,
+    ) -> None:
         """Args: period_s: nominal time between frames; max_drift: largest clock error believed (ratio);
         early_s, late_s: distance from the line beyond which an arrival is strange."""
         if not period_s > 0:

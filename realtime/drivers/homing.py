@@ -38,8 +38,10 @@ class Home:
 def homing_limits(limits: tuple[AxisLimits, ...], home: Home) -> tuple[AxisLimits, ...]:
     """`limits` with the soft limits of the axis out of the way: until it is homed they mean nothing."""
     far = 4 * home.travel_steps
-    return tuple(one._replace(soft_min_steps=-far, soft_max_steps=far) if axis == home.axis else one
-                 for axis, one in enumerate(limits))
+    return tuple(
+        one._replace(soft_min_steps=-far, soft_max_steps=far) if axis == home.axis else one
+        for axis, one in enumerate(limits)
+    )
 
 
 class Homing:
@@ -94,8 +96,9 @@ class Homing:
         yield self._link.clear_fault(fault)
         yield from self._until(lambda: self._state() is State.DISARMED, _ANSWER_S, "the fault cleared")
         if not touched:
-            raise HomingFailed(f"{self._name}: found another switch than the {self._end()} one, wanted that: wiring or "
-                               "direction?")
+            raise HomingFailed(
+                f"{self._name}: found another switch than the {self._end()} one, wanted that: wiring or direction?"
+            )
 
     def _leave(self, speed: float) -> Iterator[bytes]:
         """Off the switch and some steps beyond, then disarmed and at rest."""
@@ -123,8 +126,10 @@ class Homing:
             gone = speed * (0.5 * gone_s**2 / RAMP_S if gone_s < RAMP_S else gone_s - 0.5 * RAMP_S)
             if abs(gone) > FARTHEST * self._home.travel_steps:
                 yield self._link.disarm()
-                raise HomingFailed(f"{self._name}: found no change of the {self._end()} switch after {abs(gone):.0f} steps, "
-                                   "wanted one: wiring, motor or direction?")
+                raise HomingFailed(
+                    f"{self._name}: found no change of the {self._end()} switch after {abs(gone):.0f} steps, "
+                    "wanted one: wiring, motor or direction?"
+                )
             if self._now_ns - sent_ns >= _EVERY_NS:
                 sent_ns = self._now_ns
                 self._number += 1
@@ -134,8 +139,9 @@ class Homing:
             else:
                 yield b""
 
-    def _until(self, condition: Callable[[], bool], seconds: float, what: str,
-               sending: Callable[[], bytes] = lambda: b"") -> Iterator[bytes]:
+    def _until(
+        self, condition: Callable[[], bool], seconds: float, what: str, sending: Callable[[], bytes] = lambda: b""
+    ) -> Iterator[bytes]:
         begin_ns = self._now_ns
         while not condition():
             if self._now_ns - begin_ns > seconds * 1e9:

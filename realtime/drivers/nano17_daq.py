@@ -97,8 +97,13 @@ def parse_calibration_file(text: bytes) -> Nano17Calibration:
             raise ValueError(f"UserAxis {name}: found {len(values)} values, wanted {GAUGES}")
         rows.append([unit * value / _number(axis.get("scale") or "1", f"{name} scale") for value in values])
         ranges.append(unit * _number(axis.get("max") or "nan", f"{name} max"))
-    return Nano17Calibration(np.array(rows), np.zeros(GAUGES), (ranges[0], ranges[1], ranges[2]),
-                             (ranges[3], ranges[4], ranges[5]), serial=root.get("Serial", ""))
+    return Nano17Calibration(
+        np.array(rows),
+        np.zeros(GAUGES),
+        (ranges[0], ranges[1], ranges[2]),
+        (ranges[3], ranges[4], ranges[5]),
+        serial=root.get("Serial", ""),
+    )
 
 
 def _unit(name: str | None, known: dict[str, float], key: str) -> float:
@@ -198,8 +203,9 @@ class NidaqmxReader:
         try:
             self._task: Any = nidaqmx.Task()
             self._task.ai_channels.add_ai_voltage_chan(f"{device}/ai0:6", min_val=-10.0, max_val=10.0)
-            self._task.timing.cfg_samp_clk_timing(rate_hz, sample_mode=AcquisitionType.CONTINUOUS,
-                                                  samps_per_chan=int(rate_hz))
+            self._task.timing.cfg_samp_clk_timing(
+                rate_hz, sample_mode=AcquisitionType.CONTINUOUS, samps_per_chan=int(rate_hz)
+            )
             self._task.start()
         except Exception as error:  # the driver has its own tree of exceptions
             raise OSError(f"nano17: {device} does not start ({error})") from error
@@ -220,9 +226,14 @@ class NidaqmxReader:
 class Nano17Thread(threading.Thread):
     """Reads the card every 2 ms and hands samples on; opens it again when it is gone, and tells so."""
 
-    def __init__(self, open_reader: Callable[[], GaugeReader], callback: Callable[[ForceSample], None],
-                 calibration: Nano17Calibration, on_event: Callable[[DeviceEvent], None] = lambda event: None,
-                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        open_reader: Callable[[], GaugeReader],
+        callback: Callable[[ForceSample], None],
+        calibration: Nano17Calibration,
+        on_event: Callable[[DeviceEvent], None] = lambda event: None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         super().__init__(name="nano17", daemon=True)
         self.client = Nano17Client(calibration)
         self._open, self._callback, self._on_event, self._now_ns = open_reader, callback, on_event, now_ns

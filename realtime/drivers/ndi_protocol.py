@@ -18,33 +18,66 @@ TRANSFORMS = 0x0001  # reply option of BX and TX: transforms and port status
 PHINF_BASIC, PHINF_PART_NUMBER, PHINF_LOCATION = 0x0001, 0x0004, 0x0020
 
 ERROR_WORDS = {
-    0x01: "command not known", 0x02: "command too long", 0x03: "command too short",
-    0x04: "command damaged on the way (CRC)", 0x05: "command not carried out in time",
-    0x06: "serial settings refused", 0x07: "wrong number of parameters", 0x08: "no such port handle",
-    0x09: "tracking priority is none of S, D, B", 0x0A: "no such LED", 0x0B: "no such LED state",
-    0x0C: "command not allowed in the present mode", 0x0D: "no tool behind this port handle",
-    0x0E: "port handle not initialised", 0x0F: "port handle not enabled", 0x10: "system not initialised",
-    0x11: "tracking could not be stopped", 0x12: "tracking could not be started",
-    0x13: "tool could not be initialised", 0x14: "field generator's characterisation not valid",
-    0x15: "measurement system could not be initialised", 0x16: "diagnostic mode could not be started",
-    0x17: "diagnostic mode could not be stopped", 0x19: "firmware version could not be read",
-    0x1A: "internal error of the measurement system", 0x1D: "no SROM found in the tool",
-    0x1E: "SROM of the tool could not be read", 0x1F: "SROM of the tool could not be written",
-    0x20: "SROM could not be selected", 0x21: "tool current test failed", 0x23: "parameter out of range",
-    0x24: "no parameters for this volume", 0x25: "list of features could not be read",
-    0x28: "too many tools enabled, or type of tool not supported", 0x29: "main firmware corrupt",
-    0x2A: "out of memory", 0x2B: "port handle not allocated", 0x2C: "port handle has become unoccupied",
-    0x2D: "no port handle left", 0x2E: "firmware versions do not fit each other", 0x2F: "port description not valid",
-    0x30: "port already has a handle", 0x32: "not possible for the device behind this handle",
-    0x33: "feature not available", 0x40: "tool definition damaged", 0x41: "tool's characteristics not supported",
-    0x42: "device not present", 0xF4: "flash could not be erased", 0xF5: "flash could not be written",
+    0x01: "command not known",
+    0x02: "command too long",
+    0x03: "command too short",
+    0x04: "command damaged on the way (CRC)",
+    0x05: "command not carried out in time",
+    0x06: "serial settings refused",
+    0x07: "wrong number of parameters",
+    0x08: "no such port handle",
+    0x09: "tracking priority is none of S, D, B",
+    0x0A: "no such LED",
+    0x0B: "no such LED state",
+    0x0C: "command not allowed in the present mode",
+    0x0D: "no tool behind this port handle",
+    0x0E: "port handle not initialised",
+    0x0F: "port handle not enabled",
+    0x10: "system not initialised",
+    0x11: "tracking could not be stopped",
+    0x12: "tracking could not be started",
+    0x13: "tool could not be initialised",
+    0x14: "field generator's characterisation not valid",
+    0x15: "measurement system could not be initialised",
+    0x16: "diagnostic mode could not be started",
+    0x17: "diagnostic mode could not be stopped",
+    0x19: "firmware version could not be read",
+    0x1A: "internal error of the measurement system",
+    0x1D: "no SROM found in the tool",
+    0x1E: "SROM of the tool could not be read",
+    0x1F: "SROM of the tool could not be written",
+    0x20: "SROM could not be selected",
+    0x21: "tool current test failed",
+    0x23: "parameter out of range",
+    0x24: "no parameters for this volume",
+    0x25: "list of features could not be read",
+    0x28: "too many tools enabled, or type of tool not supported",
+    0x29: "main firmware corrupt",
+    0x2A: "out of memory",
+    0x2B: "port handle not allocated",
+    0x2C: "port handle has become unoccupied",
+    0x2D: "no port handle left",
+    0x2E: "firmware versions do not fit each other",
+    0x2F: "port description not valid",
+    0x30: "port already has a handle",
+    0x32: "not possible for the device behind this handle",
+    0x33: "feature not available",
+    0x40: "tool definition damaged",
+    0x41: "tool's characteristics not supported",
+    0x42: "device not present",
+    0xF4: "flash could not be erased",
+    0xF5: "flash could not be written",
     0xF6: "flash could not be read",
 }
 WARNING_WORDS = {0x01: "possible hardware fault"}
 SYSTEM_STATUS_WORDS = {
-    0x0001: "communication between units out of step", 0x0004: "communication between units damaged (CRC)",
-    0x0008: "recoverable processing exception", 0x0010: "hardware failure", 0x0020: "hardware changed",
-    0x0040: "a port has become occupied", 0x0080: "a port has become unoccupied",
+    0x0001: "communication between units out of step",
+    0x0004: "communication between units damaged (CRC)",
+    0x0008: "recoverable processing exception",
+    0x0010: "hardware failure",
+    0x0020: "hardware changed",
+    0x0040: "a port has become occupied",
+    0x0080: "a port has become unoccupied",
     0x0100: "diagnostic data waiting",
 }
 PORT_OCCUPIED, PORT_UNOCCUPIED = 0x0040, 0x0080
@@ -155,8 +188,8 @@ class ReplyReader:
             return (end, None) if end > MAX_TEXT_BYTES else (0, None)
         if buffer[end] != 0x0D:
             return _until_start(buffer, max(end, 1)), None
-        body = bytes(buffer[:max(end - 4, 0)])
-        good = end >= 4 and bytes(buffer[end - 4:end]) == b"%04X" % crc16(body)
+        body = bytes(buffer[: max(end - 4, 0)])
+        good = end >= 4 and bytes(buffer[end - 4 : end]) == b"%04X" % crc16(body)
         return end + 1, Reply(body.decode("ascii"), None, end + 1) if good else None
 
     def _next_binary(self) -> tuple[int, Reply | None]:
@@ -168,8 +201,8 @@ class ReplyReader:
             return _until_start(buffer, 1), None
         if len(buffer) < 8 + length:
             return 0, None
-        body = bytes(buffer[6:6 + length])
-        if int.from_bytes(buffer[6 + length:8 + length], "little") != crc16(body):
+        body = bytes(buffer[6 : 6 + length])
+        if int.from_bytes(buffer[6 + length : 8 + length], "little") != crc16(body):
             return _until_start(buffer, 1), None
         return 8 + length, Reply(None, body, 8 + length)
 
@@ -184,8 +217,9 @@ def _until_start(buffer: bytearray, at_least: int) -> int:
 
 def words(reply: str) -> str:
     """An ERROR or WARNING reply in words, e.g. "error 0C: command not allowed in the present mode"."""
-    kind, code, table = ("error", reply[5:7], ERROR_WORDS) if reply.startswith("ERROR") else (
-        "warning", reply[7:9], WARNING_WORDS)
+    kind, code, table = (
+        ("error", reply[5:7], ERROR_WORDS) if reply.startswith("ERROR") else ("warning", reply[7:9], WARNING_WORDS)
+    )
     try:
         return f"{kind} {code}: {table.get(int(code, 16), 'not in the list of codes')}"
     except ValueError:
@@ -216,7 +250,7 @@ def parse_phsr(text: str) -> list[tuple[str, PortStatus]]:
     count = _hex(text[:2])
     if len(text) != 2 + 5 * count:
         raise ProtocolError(f"PHSR: found {len(text)} characters, wanted {2 + 5 * count} for {count} handles")
-    parts = [text[2 + 5 * i:7 + 5 * i] for i in range(count)]
+    parts = [text[2 + 5 * i : 7 + 5 * i] for i in range(count)]
     return [(f"{_hex(part[:2]):02X}", PortStatus(_hex(part[2:]))) for part in parts]
 
 
@@ -224,8 +258,16 @@ def parse_phinf(text: str) -> ToolInfo:
     """What PHINF says of a tool with option 0x0025 (33 + 20 + 14 characters). Raises ProtocolError."""
     if len(text) != 67:
         raise ProtocolError(f"PHINF: found {text[:16]!r} of {len(text)} characters, wanted 67")
-    return ToolInfo(text[:8].strip(), text[8:20].strip(), text[20:23].strip(), text[23:31].strip(),
-                    PortStatus(_hex(text[31:33])), text[33:53].strip(), text[63:65], text[65:67])
+    return ToolInfo(
+        text[:8].strip(),
+        text[8:20].strip(),
+        text[20:23].strip(),
+        text[23:31].strip(),
+        PortStatus(_hex(text[31:33])),
+        text[33:53].strip(),
+        text[63:65],
+        text[65:67],
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,15 +343,15 @@ def _tx_line(line: str) -> ToolReply:
     start = 7 if missing else sum(_TX_WIDTHS)
     if len(rest) != start + 16:
         raise ProtocolError(f"TX: found {line!r}, wanted {start + 18} characters")
-    status, frame = _hex(rest[start:start + 8]), _hex(rest[start + 8:])
+    status, frame = _hex(rest[start : start + 8]), _hex(rest[start + 8 :])
     if missing:
         return _tool(handle, HandleState.MISSING, None, status, frame)
     numbers, at = [], 0
     for width, scale in zip(_TX_WIDTHS, _TX_SCALES, strict=True):
-        digits = rest[at + 1:at + width]
+        digits = rest[at + 1 : at + width]
         if rest[at] not in "+-" or not (digits.isascii() and digits.isdigit()):
-            raise ProtocolError(f"TX: found {rest[at:at + width]!r}, wanted a sign and {width - 1} digits")
-        numbers.append(int(rest[at:at + width]) * scale)
+            raise ProtocolError(f"TX: found {rest[at : at + width]!r}, wanted a sign and {width - 1} digits")
+        numbers.append(int(rest[at : at + width]) * scale)
         at += width
     return _tool(handle, HandleState.VALID, tuple(numbers), status, frame)
 
@@ -318,8 +360,7 @@ def _tool(handle: str, state: HandleState, numbers: tuple[float, ...] | None, st
     if numbers is None:
         return ToolReply(handle, state, status=PortStatus(status), frame=frame)
     w, x, y, z, tx, ty, tz, error = numbers
-    return ToolReply(handle, state, (w, x, y, z), (tx * 1e-3, ty * 1e-3, tz * 1e-3), error * 1e-3,
-                     PortStatus(status), frame)
+    return ToolReply(handle, state, (w, x, y, z), (tx * 1e-3, ty * 1e-3, tz * 1e-3), error * 1e-3, PortStatus(status), frame)
 
 
 _HEX_DIGITS = frozenset("0123456789ABCDEF")

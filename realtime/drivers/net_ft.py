@@ -20,18 +20,35 @@ _MODULUS = 1 << 32
 # Error bits of a record's status; a latched monitor condition (bit 16) with the summary bit alone is no fault.
 ERROR_SUMMARY, MONITOR_CONDITION = 0x80000000, 0x00010000
 STATUS_WORDS = {
-    0x40000000: "CPU or RAM error", 0x20000000: "digital board error", 0x10000000: "analog board error",
-    0x08000000: "serial link communication error", 0x04000000: "program memory error",
-    0x02000000: "halted by configuration errors", 0x01000000: "settings not valid",
-    0x00800000: "configuration does not fit the calibration", 0x00400000: "network failure",
-    0x00200000: "CAN failure", 0x00100000: "RDT failure", 0x00080000: "EtherNet/IP failure",
-    0x00040000: "DeviceNet failure", 0x00020000: "transducer saturated or A/D error",
-    0x00010000: "monitor condition latched", 0x00004000: "watchdog timeout", 0x00002000: "stack error",
-    0x00001000: "EEPROM failure", 0x00000800: "flash failure", 0x00000400: "analog board watchdog timeout",
-    0x00000200: "excitation current too high", 0x00000100: "excitation current too low",
-    0x00000080: "analog ground out of range", 0x00000040: "analog supply too high",
-    0x00000020: "analog supply too low", 0x00000010: "no data on the serial link",
-    0x00000008: "reference voltage error", 0x00000004: "temperature error", 0x00000002: "HTTP failure",
+    0x40000000: "CPU or RAM error",
+    0x20000000: "digital board error",
+    0x10000000: "analog board error",
+    0x08000000: "serial link communication error",
+    0x04000000: "program memory error",
+    0x02000000: "halted by configuration errors",
+    0x01000000: "settings not valid",
+    0x00800000: "configuration does not fit the calibration",
+    0x00400000: "network failure",
+    0x00200000: "CAN failure",
+    0x00100000: "RDT failure",
+    0x00080000: "EtherNet/IP failure",
+    0x00040000: "DeviceNet failure",
+    0x00020000: "transducer saturated or A/D error",
+    0x00010000: "monitor condition latched",
+    0x00004000: "watchdog timeout",
+    0x00002000: "stack error",
+    0x00001000: "EEPROM failure",
+    0x00000800: "flash failure",
+    0x00000400: "analog board watchdog timeout",
+    0x00000200: "excitation current too high",
+    0x00000100: "excitation current too low",
+    0x00000080: "analog ground out of range",
+    0x00000040: "analog supply too high",
+    0x00000020: "analog supply too low",
+    0x00000010: "no data on the serial link",
+    0x00000008: "reference voltage error",
+    0x00000004: "temperature error",
+    0x00000002: "HTTP failure",
 }
 
 
@@ -77,8 +94,10 @@ class NetFtConfig:
 
     def __post_init__(self) -> None:
         if not (self.ft_rate_hz > 0 and self.latency_s >= 0 and self.max_gap > 0 and self.resync_after > 0):
-            raise ValueError("net_ft: found ft_rate_hz, latency_s, max_gap or resync_after out of range, "
-                             "wanted more than 0 (latency_s: 0 or more)")
+            raise ValueError(
+                "net_ft: found ft_rate_hz, latency_s, max_gap or resync_after out of range, "
+                "wanted more than 0 (latency_s: 0 or more)"
+            )
 
 
 @dataclass
@@ -108,7 +127,8 @@ def request(command: Command, count: int = 0) -> bytes:
 def status_words(status: int) -> str:
     """A status word in words; "good" when no bit of it is set."""
     return ", ".join(text for bit, text in STATUS_WORDS.items() if status & bit) or (
-        "error" if status & ERROR_SUMMARY else "good")
+        "error" if status & ERROR_SUMMARY else "good"
+    )
 
 
 def is_fault(status: int) -> bool:
@@ -124,8 +144,9 @@ class NetFtClient:
 
     def __init__(self, config: NetFtConfig) -> None:
         self.config = config
-        self.clock = FrameClock(1.0 / config.ft_rate_hz, window_s=20.0, block_s=0.5, early_s=0.002, late_s=0.5,
-                                strange_in_row=200)
+        self.clock = FrameClock(
+            1.0 / config.ft_rate_hz, window_s=20.0, block_s=0.5, early_s=0.002, late_s=0.5, strange_in_row=200
+        )
         c = config.calibration
         self._newton = np.array([1.0 / c.counts_per_N] * 3)
         self._newton_metre = np.array([1.0 / c.counts_per_Nm] * 3)

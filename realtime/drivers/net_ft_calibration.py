@@ -10,8 +10,16 @@ from dataclasses import dataclass
 MAX_PAGE_BYTES = 65536
 NEWTONS_PER = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605, "klbf": 4448.2216152605, "kgf": 9.80665, "gf": 9.80665e-3}
 NEWTON_METRES_PER = {
-    "Nm": 1.0, "N-m": 1.0, "Nmm": 1e-3, "N-mm": 1e-3, "kNm": 1e3, "kN-m": 1e3, "lbf-in": 0.1129848290276167,
-    "lbf-ft": 1.3558179483314, "kgf-cm": 0.0980665, "kgf-m": 9.80665,
+    "Nm": 1.0,
+    "N-m": 1.0,
+    "Nmm": 1e-3,
+    "N-mm": 1e-3,
+    "kNm": 1e3,
+    "kN-m": 1e3,
+    "lbf-in": 0.1129848290276167,
+    "lbf-ft": 1.3558179483314,
+    "kgf-cm": 0.0980665,
+    "kgf-m": 9.80665,
 }
 
 
@@ -39,8 +47,9 @@ def parse_calibration(page: bytes) -> NetFtCalibration:
     Raises ValueError with the element's name when one is missing or not what it should be, or when RDT is disabled.
     """
     if len(page) > MAX_PAGE_BYTES or b"<!" in page:
-        raise ValueError(f"netftapi2.xml: found {len(page)} bytes or a DOCTYPE, wanted a plain page up to "
-                         f"{MAX_PAGE_BYTES} bytes")
+        raise ValueError(
+            f"netftapi2.xml: found {len(page)} bytes or a DOCTYPE, wanted a plain page up to {MAX_PAGE_BYTES} bytes"
+        )
     try:
         root = ElementTree.fromstring(page)
     except ElementTree.ParseError as bad:
@@ -54,9 +63,13 @@ def parse_calibration(page: bytes) -> NetFtCalibration:
         raise ValueError(f"cfgmr: found {len(ratings)} ratings, wanted 6")
     fx, fy, fz, tx, ty, tz = ratings
     return NetFtCalibration(
-        _number(_text(texts, "cfgcpf"), "cfgcpf") / newtons, _number(_text(texts, "cfgcpt"), "cfgcpt") / newton_metres,
-        (fx * newtons, fy * newtons, fz * newtons), (tx * newton_metres, ty * newton_metres, tz * newton_metres),
-        _number(_text(texts, "comrdtrate"), "comrdtrate"), texts.get("cfgcalsn", ""))
+        _number(_text(texts, "cfgcpf"), "cfgcpf") / newtons,
+        _number(_text(texts, "cfgcpt"), "cfgcpt") / newton_metres,
+        (fx * newtons, fy * newtons, fz * newtons),
+        (tx * newton_metres, ty * newton_metres, tz * newton_metres),
+        _number(_text(texts, "comrdtrate"), "comrdtrate"),
+        texts.get("cfgcalsn", ""),
+    )
 
 
 def fetch_calibration(host: str, port: int = 80, timeout_s: float = 2.0) -> NetFtCalibration:

@@ -48,8 +48,10 @@ class PoseSample:
 
 
 _STATE_FLAGS = {
-    ndi.HandleState.VALID: NO_FLAGS, ndi.HandleState.MISSING: PoseFlag.MISSING,
-    ndi.HandleState.DISABLED: PoseFlag.DISABLED, ndi.HandleState.UNOCCUPIED: PoseFlag.UNOCCUPIED,
+    ndi.HandleState.VALID: NO_FLAGS,
+    ndi.HandleState.MISSING: PoseFlag.MISSING,
+    ndi.HandleState.DISABLED: PoseFlag.DISABLED,
+    ndi.HandleState.UNOCCUPIED: PoseFlag.UNOCCUPIED,
 }
 _PORT_FLAGS = {
     ndi.PortStatus.OUT_OF_VOLUME: PoseFlag.OUT_OF_VOLUME,

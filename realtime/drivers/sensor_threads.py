@@ -76,9 +76,14 @@ class SensorThread(threading.Thread):
 class AuroraThread(SensorThread):
     """Reads an Aurora. `open_transport()` opens the port at 9600 baud (OSError when it is not there)."""
 
-    def __init__(self, open_transport: Callable[[], Transport], callback: Callable[[PoseSample], None],
-                 config: AuroraConfig | None = None, on_event: OnEvent | None = None,
-                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        open_transport: Callable[[], Transport],
+        callback: Callable[[PoseSample], None],
+        config: AuroraConfig | None = None,
+        on_event: OnEvent | None = None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         super().__init__("aurora", on_event, now_ns)
         self.client = AuroraClient(config)
         self._open, self._callback = open_transport, callback
@@ -117,9 +122,15 @@ class AuroraThread(SensorThread):
 class NetFtThread(SensorThread):
     """Reads a Net F/T box by UDP. `request_bias()` may be called from any thread."""
 
-    def __init__(self, host: str, callback: Callable[[ForceSample], None], config: NetFtConfig,
-                 on_event: OnEvent | None = None, port: int = RDT_PORT,
-                 now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        host: str,
+        callback: Callable[[ForceSample], None],
+        config: NetFtConfig,
+        on_event: OnEvent | None = None,
+        port: int = RDT_PORT,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         super().__init__("net_ft", on_event, now_ns)
         self.client = NetFtClient(config)
         self._address, self._callback = (host, port), callback

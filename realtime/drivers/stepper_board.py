@@ -218,8 +218,14 @@ class StepperBoardLink:
     def setpoint(self, number: int, execute_us: int, expiry_us: int, position_steps: Sequence[int]) -> bytes:
         """SETPOINT for callers that do not use protocol.setpoint_encoder; number and times are wrapped to the wire."""
         self._setpoint_sequence = self._setpoint_sequence + 1 & 0xFF
-        return encode("SETPOINT", self._setpoint_sequence, number=number & 0xFFFF, execute_us=execute_us & 0xFFFFFFFF,
-                      expiry_us=expiry_us, position_steps=[int(s) for s in position_steps])
+        return encode(
+            "SETPOINT",
+            self._setpoint_sequence,
+            number=number & 0xFFFF,
+            execute_us=execute_us & 0xFFFFFFFF,
+            expiry_us=expiry_us,
+            position_steps=[int(s) for s in position_steps],
+        )
 
     def _command(self, name: str, **fields: int) -> bytes:
         self._sequence = self._sequence + 1 & 0xFF
@@ -254,17 +260,31 @@ class StepperBoardLink:
         major, minor = divmod(identity.firmware_version, 256)
         if identity.protocol_hash != PROTOCOL_HASH or major != FIRMWARE_VERSION[0]:
             self.phase = LinkPhase.MISMATCH
-            return [LinkEvent(EventKind.MISMATCH, now_ns, (
-                f"board: found protocol {identity.protocol_hash:#010x}, firmware {major}.{minor}; wanted "
-                f"{PROTOCOL_HASH:#010x}, {FIRMWARE_VERSION[0]}.x: build and flash this version's firmware"))]
+            return [
+                LinkEvent(
+                    EventKind.MISMATCH,
+                    now_ns,
+                    (
+                        f"board: found protocol {identity.protocol_hash:#010x}, firmware {major}.{minor}; wanted "
+                        f"{PROTOCOL_HASH:#010x}, {FIRMWARE_VERSION[0]}.x: build and flash this version's firmware"
+                    ),
+                )
+            ]
         events = self._check_boot(identity.boot_count, now_ns)
         if self.phase is LinkPhase.HELLO:
             self.identity = identity
             self.phase = LinkPhase.CONFIGURE
             self._sent_ns = None
-            events.append(LinkEvent(EventKind.IDENTIFIED, now_ns, (
-                f"board: {Mcu(identity.mcu).name.lower()}, firmware {major}.{minor}, "
-                f"start {identity.boot_count} by {ResetCause(identity.reset_cause).name.lower()}")))
+            events.append(
+                LinkEvent(
+                    EventKind.IDENTIFIED,
+                    now_ns,
+                    (
+                        f"board: {Mcu(identity.mcu).name.lower()}, firmware {major}.{minor}, "
+                        f"start {identity.boot_count} by {ResetCause(identity.reset_cause).name.lower()}"
+                    ),
+                )
+            )
         return events
 
     def _on_status(self, message: Message, now_ns: int) -> list[LinkEvent]:
@@ -287,8 +307,13 @@ class StepperBoardLink:
         known = self.identity.boot_count
         self.phase = LinkPhase.RESET
         self.clock.restart()
-        return [LinkEvent(EventKind.RESET, now_ns, (
-            f"board was reset: found start {boot_count}, wanted {known}; its positions are lost, home the axes again"))]
+        return [
+            LinkEvent(
+                EventKind.RESET,
+                now_ns,
+                (f"board was reset: found start {boot_count}, wanted {known}; its positions are lost, home the axes again"),
+            )
+        ]
 
     def _on_ack(self, message: Message, now_ns: int) -> list[LinkEvent]:
         result = Result(message.fields["result"])

@@ -19,8 +19,7 @@ def programs() -> Path:
     BUILD_DIR.mkdir(parents=True, exist_ok=True)
     with open(BUILD_DIR / ".lock", "w", encoding="ascii") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        result = subprocess.run(["make", "--silent", "-C", str(FIRMWARE_DIR), "host-tests"],
-                                capture_output=True, text=True)
+        result = subprocess.run(["make", "--silent", "-C", str(FIRMWARE_DIR), "host-tests"], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     return BUILD_DIR
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from host.estimation.interface import Actuation, ForceEstimate, PoseReading
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
 
 
 class NoForce:

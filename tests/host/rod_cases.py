@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.mechanics.catheter import Catheter, CosseratParameters, load_catheter
 from host.mechanics.rod import rod_record
+from protocol.catheter import Catheter, CosseratParameters, load_catheter
 
 Array = NDArray[np.float64]
 

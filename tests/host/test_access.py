@@ -16,13 +16,13 @@ import pytest
 import zenoh
 from cryptography import x509
 
-from host import keys
-from host.commander import Commander
-from host.wall_clock import with_endpoint
+from host.run.commander import Commander
+from host.run.wall_clock import with_endpoint
+from host.security import keys
 from protocol.topics import Command, ForceSensor, Message, Reply, encode, key, request_key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE, Network, client_settings
 from protocol.zenoh_session import Session
-from realtime.command_gate import CommandGate
+from realtime.core.command_gate import CommandGate
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import free_port, until
 
@@ -39,8 +39,13 @@ class Laboratory:
         self.endpoint = f"tls/127.0.0.1:{free_port()}"
         keys.make_authority(folder)
         keys.issue(folder, "rig1", "rig", addresses=["127.0.0.1"])
-        for name, role in (("analysis", "reader"), ("console", "commander"), ("second", "commander"),
-                           ("dismissed", "commander"), ("promoted", "reader")):
+        for name, role in (
+            ("analysis", "reader"),
+            ("console", "commander"),
+            ("second", "commander"),
+            ("dismissed", "commander"),
+            ("promoted", "reader"),
+        ):
             keys.issue(folder, name, role, connect=self.endpoint)
         # `dismissed` has a good certificate and is in no list; `promoted` is listed above what its certificate says.
         network = Network("simulated", (self.endpoint,), folder / "rig1", ("analysis",), ("console", "second", "promoted"))
@@ -110,10 +115,14 @@ def test_the_wrong_role_commands_nothing(laboratory: Laboratory, name: str) -> N
 
 @pytest.mark.parametrize("name", ["dismissed", "promoted"])
 def test_who_is_in_no_list_reads_nothing(laboratory: Laboratory, name: str) -> None:
-    with Session.remote("simulated", laboratory.endpoint, laboratory.folder / name) as stranger, \
-            Session.remote("simulated", laboratory.endpoint, laboratory.folder / "analysis") as reader:
-        wanted, all_keys = stranger.latest("force/sensor"), stranger.zenoh.declare_subscriber(
-            "**", zenoh.handlers.RingChannel(10))
+    with (
+        Session.remote("simulated", laboratory.endpoint, laboratory.folder / name) as stranger,
+        Session.remote("simulated", laboratory.endpoint, laboratory.folder / "analysis") as reader,
+    ):
+        wanted, all_keys = (
+            stranger.latest("force/sensor"),
+            stranger.zenoh.declare_subscriber("**", zenoh.handlers.RingChannel(10)),
+        )
         latest = reader.latest("force/sensor")
         assert until(lambda: laboratory.publisher.put(reading()) is None and latest.take() is not None)
         time.sleep(0.3)
@@ -123,8 +132,11 @@ def test_who_is_in_no_list_reads_nothing(laboratory: Laboratory, name: str) -> N
 @pytest.mark.parametrize("mode", ["client", "peer", "router"])
 @pytest.mark.parametrize("name", ["analysis", "console"])
 def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory, name: str, mode: str) -> None:
-    config = zenoh.Config.from_json5(json.dumps(
-        client_settings(laboratory.endpoint, laboratory.folder / name) | {"mode": mode, "listen": {"endpoints": []}}))
+    config = zenoh.Config.from_json5(
+        json.dumps(
+            client_settings(laboratory.endpoint, laboratory.folder / name) | {"mode": mode, "listen": {"endpoints": []}}
+        )
+    )
     inside = [session.everything() for session in (laboratory.host, laboratory.realtime)]
     with zenoh.open(config) as session:
         hijacked: list[Any] = []
@@ -158,13 +170,25 @@ def test_the_model_process_opens_the_way_in_that_the_rig_file_describes(laborato
     local, outside = (f"{kind}/127.0.0.1:{free_port()}" for kind in ("tcp", "tls"))
     text = with_endpoint(RIG_FILE.read_text(encoding="utf-8"), local)
     section = keys.network_lines(laboratory.folder, outside)
-    (tmp_path / "rig.toml").write_text(text[:text.index("[network]")] + section, encoding="utf-8")
-    child = subprocess.Popen([sys.executable, "-m", "host.estimator_process", str(tmp_path / "rig.toml"), "--estimator",
-                              "tests.host.no_estimator:make"], stdout=subprocess.PIPE, text=True)
+    (tmp_path / "rig.toml").write_text(text[: text.index("[network]")] + section, encoding="utf-8")
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "host.run.model_process",
+            str(tmp_path / "rig.toml"),
+            "--estimator",
+            "tests.host.no_estimator:make",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert child.stdout is not None and "ready" in child.stdout.readline()
-        with Session("simulated", [], [local]) as realtime, \
-                Session.remote("simulated", outside, laboratory.folder / "analysis") as reader:
+        with (
+            Session("simulated", [], [local]) as realtime,
+            Session.remote("simulated", outside, laboratory.folder / "analysis") as reader,
+        ):
             publisher, latest = realtime.publisher("force/sensor"), reader.latest("force/sensor")
             assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
     finally:
@@ -203,8 +227,7 @@ def test_no_certificate_gets_no_session(laboratory: Laboratory) -> None:
 
 def test_plain_tcp_at_the_tls_port_gets_no_session(laboratory: Laboratory) -> None:
     endpoint = laboratory.endpoint.replace("tls/", "tcp/")
-    assert refused({"mode": "client", "connect": {"endpoints": [endpoint]},
-                    "scouting": {"multicast": {"enabled": False}}})
+    assert refused({"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}})
 
 
 def test_a_certificate_of_another_authority_gets_no_session(laboratory: Laboratory, tmp_path: Path) -> None:
@@ -213,8 +236,9 @@ def test_a_certificate_of_another_authority_gets_no_session(laboratory: Laborato
     assert refused(client_settings(laboratory.endpoint, tmp_path / "console"))
     trusting = client_settings(laboratory.endpoint, tmp_path / "console")
     right = client_settings(laboratory.endpoint, laboratory.folder / "console")
-    trusting["transport"]["link"]["tls"]["root_ca_certificate_base64"] = \
-        right["transport"]["link"]["tls"]["root_ca_certificate_base64"]
+    trusting["transport"]["link"]["tls"]["root_ca_certificate_base64"] = right["transport"]["link"]["tls"][
+        "root_ca_certificate_base64"
+    ]
     assert refused(trusting), "it trusts the rig, but the rig must not trust it"
 
 
@@ -222,8 +246,9 @@ def test_a_rig_of_another_authority_is_not_believed(laboratory: Laboratory, tmp_
     keys.make_authority(tmp_path)
     settings = client_settings(laboratory.endpoint, laboratory.folder / "console")
     other = client_settings(laboratory.endpoint, keys.issue(tmp_path, "console", "commander").folder)
-    settings["transport"]["link"]["tls"]["root_ca_certificate_base64"] = \
-        other["transport"]["link"]["tls"]["root_ca_certificate_base64"]
+    settings["transport"]["link"]["tls"]["root_ca_certificate_base64"] = other["transport"]["link"]["tls"][
+        "root_ca_certificate_base64"
+    ]
     assert refused(settings)
 
 

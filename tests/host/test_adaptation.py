@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from host.estimation import planar
 from host.estimation.adaptation import AdaptationConfig, StiffnessState, StiffnessTracker, scaled
 from host.mechanics import pcar
-from host.mechanics.catheter import load_catheter
+from protocol.catheter import load_catheter
 
 THERMOCOOL = load_catheter("thermocool_sf")
 RATE_HZ, INSERTION_m = 40, 0.04
 STD = np.sqrt(np.diag(planar.tip_covariance()))
 
 
-def run(drift: Callable[[float], float], seconds: float = 90.0, force: tuple[float, float] = (-0.1, -0.15),
-        always: bool = False) -> tuple[NDArray, NDArray, list[StiffnessState]]:
+def run(
+    drift: Callable[[float], float], seconds: float = 90.0, force: tuple[float, float] = (-0.1, -0.15), always: bool = False
+) -> tuple[NDArray, NDArray, list[StiffnessState]]:
     """A run of 2 s in free space and 4 s on the beating heart in turns, with tracker noise and a true stiffness
     `drift(t)`; force errors in contact without and with adaptation, (k, 2), and the states."""
     rng = np.random.default_rng(0)
@@ -49,8 +50,8 @@ def test_ten_percent_drift_costs_the_force_little_with_adaptation() -> None:
     without, with_it, states = run(lambda t: 1.0 - 0.1 * min(1.0, t / 40.0))
     undisturbed, _, _ = run(lambda t: 1.0)
     assert states[-1].scale == pytest.approx(0.9, abs=0.01)
-    assert median(without) > 0.05                                # tens of millinewtons of bias
-    assert median(with_it) < 1.1 * median(undisturbed) < 0.012   # as good as if nothing had drifted
+    assert median(without) > 0.05  # tens of millinewtons of bias
+    assert median(with_it) < 1.1 * median(undisturbed) < 0.012  # as good as if nothing had drifted
     assert np.abs(np.median(with_it, axis=0)).max() < 0.002
 
 
@@ -63,7 +64,7 @@ def test_without_drift_the_force_estimate_is_not_disturbed() -> None:
 def test_a_sudden_change_is_detected_once_and_followed() -> None:
     _, with_it, states = run(lambda t: 0.9 if t > 40.0 else 1.0)
     detected = [i / RATE_HZ for i, state in enumerate(states) if state.changed]
-    assert len(detected) == 1 and 40.0 < detected[0] < 45.0     # within the next free moment
+    assert len(detected) == 1 and 40.0 < detected[0] < 45.0  # within the next free moment
     assert states[-1].scale == pytest.approx(0.9, abs=0.01)
     assert median(with_it) < 0.012
 

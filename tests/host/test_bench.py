@@ -8,13 +8,21 @@ import types
 
 import pytest
 
-from host import bench
-from host.bench import Timed, alternate, find, row_of, run
-from host.benchmarks import control
-from host.cli.contract_io import BadInput
+from host.studies.benchmarks import control
+from host.studies.benchmarks import runner as bench
+from host.studies.benchmarks.runner import Timed, alternate, find, row_of, run
+from protocol.errors import InputError
 
-CONTRACT_NAMES = ["pcar_direct", "pcar_inverse", "cosserat_tip", "cosserat_global",
-                  *(f"estimate_case_{i}" for i in range(1, 7)), "control_tick", "kalman_predict", "diagnose"]
+CONTRACT_NAMES = [
+    "pcar_direct",
+    "pcar_inverse",
+    "cosserat_tip",
+    "cosserat_global",
+    *(f"estimate_case_{i}" for i in range(1, 7)),
+    "control_tick",
+    "kalman_predict",
+    "diagnose",
+]
 CONTRACT_KEYS = ("name", "unit", "median", "p95", "seed", "peer", "peer_median", "speedup")
 
 
@@ -48,7 +56,7 @@ def test_a_row_has_the_contracts_keys() -> None:
 
 
 def test_an_unknown_name_is_bad_input() -> None:
-    with pytest.raises(BadInput, match="cosserat_tip"):
+    with pytest.raises(InputError, match="cosserat_tip"):
         run(["cosserat_tipp"], 1, quiet)
 
 
@@ -56,7 +64,9 @@ def test_a_benchmark_can_be_added_and_one_whose_module_is_missing_is_named(monke
     module = types.ModuleType("a_new_benchmark")
     module.added = lambda seed, report: [{"name": "added", "seed": seed}]  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "a_new_benchmark", module)
-    monkeypatch.setattr(bench, "BENCHMARKS", {"added": "a_new_benchmark:added", "absent": "host.benchmarks.absent:absent"})
+    monkeypatch.setattr(
+        bench, "BENCHMARKS", {"added": "a_new_benchmark:added", "absent": "host.studies.benchmarks.absent:absent"}
+    )
     rows, missing = run([], 3, quiet)
     assert rows == [{"name": "added", "seed": 3}] and missing == ["absent"]
 
@@ -71,7 +81,8 @@ def test_a_module_that_is_there_but_broken_is_an_error(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("name", ["cosserat_tip", "pcar_direct"])
 def test_a_real_benchmark_holds_its_accuracy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from host.benchmarks import planar, statics
+    from host.studies.benchmarks import planar, statics
+
     monkeypatch.setattr(statics, "CASES", 4)
     monkeypatch.setattr(planar, "CASES", 4)
     (row,), missing = run([name], 1, quiet)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.characterization import (
+from host.commissioning.characterization import (
     calibrated_rig_text,
     characterize,
     load_calibrated_rig,
@@ -15,13 +15,13 @@ from host.characterization import (
     standard_sweeps,
     transmission_toml,
 )
-from host.characterization_report import write_characterization
-from host.demo import SIMULATED_RIG
-from host.recording import Recording
-from host.sine_kinematics import fit_sines
-from host.sweep_fits import Run, dead_zone_curvature, fit_knob, fit_play, play
-from realtime.rig_file import Rig, RigFileError, load_rig, parse_rig
-from realtime.sweep import Sweep, SweepLoop, check_sweeps
+from host.commissioning.characterization_report import write_characterization
+from host.commissioning.sine_kinematics import fit_sines
+from host.commissioning.sweep_fits import Run, dead_zone_curvature, fit_knob, fit_play, play
+from host.recordings.recording import Recording
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
+from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
 from sim.knob import KnobConfig
 from sim.vessel import VesselConfig
 
@@ -83,11 +83,21 @@ def test_sums_of_sines_fit_a_curve_of_their_kind() -> None:
 @pytest.fixture(scope="module")
 def sweeps_recorded(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short set of sweeps of a rig whose truth differs from its rig file."""
-    sweeps = [sweep for sweep in standard_sweeps(rig, 1, (1.0, 1.5))
-              if sweep.axis != 1 or (sweep.amplitude > 0.6 and sweep.rate_rad_per_s > 1.2)]
+    sweeps = [
+        sweep
+        for sweep in standard_sweeps(rig, 1, (1.0, 1.5))
+        if sweep.axis != 1 or (sweep.amplitude > 0.6 and sweep.rate_rad_per_s > 1.2)
+    ]
     vessel = VesselConfig(play_width_m=0.0024, roll_slope=0.55)
-    return record_simulated(rig, sweeps, tmp_path_factory.mktemp("sweeps") / "sweeps.mcap", 4, "native", vessel=vessel,
-                            knob=KnobConfig(slack_rad=6 * DEGREE, stop_rad=80 * DEGREE))
+    return record_simulated(
+        rig,
+        sweeps,
+        tmp_path_factory.mktemp("sweeps") / "sweeps.mcap",
+        4,
+        "native",
+        vessel=vessel,
+        knob=KnobConfig(slack_rad=6 * DEGREE, stop_rad=80 * DEGREE),
+    )
 
 
 @pytest.mark.slow
@@ -116,20 +126,26 @@ def test_sweeps_of_another_catheter_are_refused(rig: Rig, sweeps_recorded: Path)
 def test_a_calibration_of_another_catheter_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.toml"
     rig_text = SIMULATED_RIG.read_text()
-    section = rig_text[rig_text.index("[transmission]"):rig_text.index("[tracker]")]
+    section = rig_text[rig_text.index("[transmission]") : rig_text.index("[tracker]")]
     other.write_text(section)
     assert load_calibrated_rig(SIMULATED_RIG, other).transmission == load_rig(SIMULATED_RIG).transmission
     other.write_text(section.replace("blazer_prime_xp", "livewire"))
-    with pytest.raises(RigFileError, match="calibrated with another catheter"):
+    with pytest.raises(InputError, match="calibrated with another catheter"):
         load_calibrated_rig(SIMULATED_RIG, other)
     other.write_text(section + "\n[control]\nloop_hz = 1\n")
-    with pytest.raises(RigFileError, match=r"wanted \[transmission\] alone"):
+    with pytest.raises(InputError, match=r"wanted \[transmission\] alone"):
         load_calibrated_rig(SIMULATED_RIG, other)
 
 
-@pytest.mark.parametrize("sweep", [
-    Sweep(0, (0.105, 0.0, 0.0), 0.010, 1.0, 1), Sweep(0, (0.03, 0.0, 0.0), 0.010, 20.0, 1),
-    Sweep(2, (0.03, 0.0, 0.0), 0.5, 1.0, 0), Sweep(1, (0.03, 0.0, 0.0), 1.0, -1.0, 1)])
+@pytest.mark.parametrize(
+    "sweep",
+    [
+        Sweep(0, (0.105, 0.0, 0.0), 0.010, 1.0, 1),
+        Sweep(0, (0.03, 0.0, 0.0), 0.010, 20.0, 1),
+        Sweep(2, (0.03, 0.0, 0.0), 0.5, 1.0, 0),
+        Sweep(1, (0.03, 0.0, 0.0), 1.0, -1.0, 1),
+    ],
+)
 def test_sweeps_beyond_the_stages_are_refused_before_anything_moves(rig: Rig, sweep: Sweep) -> None:
     with pytest.raises(ValueError, match=r"^sweeps\.0"):
         SweepLoop(rig, [sweep], lambda topic, message: None)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from host.commander import Commander
+from host.run.commander import Commander
 from protocol.commander import Commander as PlainCommander
 from protocol.topics import Command, Reply
 from protocol.zenoh_session import RequestServer, Session
-from realtime.command_gate import CommandGate
+from realtime.core.command_gate import CommandGate
 from tests.waiting import until
 
 # The rig's clock is not the one of who commands it.
@@ -58,13 +58,28 @@ def test_every_command_comes_back_with_what_became_of_it(gate: Gate, console: Se
         assert (refused.accepted, refused.reason) == (False, "refused: arm: found no board, wanted one")
         assert commander.target((0.0, 0.0, 0.04)).accepted
         assert commander.press((0.0, 0.0, 0.04), (0.0, 0.0, 1.0), 0.2).accepted
-        for give in (lambda: commander.force(0.1), commander.hold, commander.retract, commander.disarm,
-                     commander.clear_fault, commander.stop):
+        for give in (
+            lambda: commander.force(0.1),
+            commander.hold,
+            commander.retract,
+            commander.disarm,
+            commander.clear_fault,
+            commander.stop,
+        ):
             assert give().accepted
         malformed = commander.press((0.0, 0.0, 0.04), (0.0, 0.0, 2.0), 0.2)
         assert not malformed.accepted and "no unit normal" in malformed.reason
-    assert [command.action for command in gate.done] == ["arm", "target", "target", "force", "hold", "target", "disarm",
-                                                         "clear_fault", "stop"]
+    assert [command.action for command in gate.done] == [
+        "arm",
+        "target",
+        "target",
+        "force",
+        "hold",
+        "target",
+        "disarm",
+        "clear_fault",
+        "stop",
+    ]
     assert gate.gate.state().holder == ""
 
 

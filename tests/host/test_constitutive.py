@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from host.mechanics import pcar
-from host.mechanics.catheter import Catheter, ConstitutiveParameters, load_catheter
 from host.mechanics.constitutive import FrictionalWire, hysteresis_loop, stick_or_slip
+from protocol.catheter import Catheter, ConstitutiveParameters, load_catheter
 
 UP, DOWN = np.linspace(0.0, 6.0, 25), np.linspace(6.0, 0.0, 25)[1:]
 CYCLES = np.concatenate([UP, DOWN, UP[1:], DOWN])
@@ -33,12 +33,12 @@ def test_friction_makes_a_closed_loop_of_the_capstan_width() -> None:
     friction, body = 0.15, 1.0
     angle, tension = hysteresis_loop(rubbing(friction), 0.0, CYCLES, body_turning_rad=body)
     first, second = slice(0, 49), slice(48, 97)
-    assert np.allclose(angle[first], angle[second], atol=1e-8)          # the loop closes and repeats
-    up, down = 12, 36                                                    # 3 N on the way up and on the way down
+    assert np.allclose(angle[first], angle[second], atol=1e-8)  # the loop closes and repeats
+    up, down = 12, 36  # 3 N on the way up and on the way down
     assert CYCLES[up] == CYCLES[down] == pytest.approx(3.0)
     assert angle[down] > angle[up] + 0.1
     assert tension[up] < 3.0 * np.exp(-friction * body) and tension[down] > 3.0 * np.exp(friction * body)
-    work = float(np.trapezoid(CYCLES[first], angle[first]))             # the wire's pull against the bending
+    work = float(np.trapezoid(CYCLES[first], angle[first]))  # the wire's pull against the bending
     assert work > 0.05
 
 
@@ -52,6 +52,7 @@ def test_loop_widens_with_friction_and_with_the_bend_of_the_body() -> None:
     def width(friction: float, body: float) -> float:
         angle, _ = hysteresis_loop(rubbing(friction), 0.0, CYCLES[:49], body_turning_rad=body)
         return float(angle[36] - angle[12])
+
     assert width(0.0, 1.0) == pytest.approx(0.0, abs=1e-9)
     assert 0.0 < width(0.05, 1.0) < width(0.1, 1.0) < width(0.1, 2.0)
 
@@ -73,10 +74,15 @@ def test_stiffening_bends_the_loop_over() -> None:
     assert stiff[0] > plain[0]
 
 
-@given(pull=st.floats(0.0, 50.0), friction=st.floats(0.0, 1.0),
-       turning=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=6), kept=st.floats(0.0, 50.0))
+@given(
+    pull=st.floats(0.0, 50.0),
+    friction=st.floats(0.0, 1.0),
+    turning=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=6),
+    kept=st.floats(0.0, 50.0),
+)
 def test_tension_stays_in_the_capstan_band_and_a_second_step_changes_nothing(
-        pull: float, friction: float, turning: list[float], kept: float) -> None:
+    pull: float, friction: float, turning: list[float], kept: float
+) -> None:
     turns, old = np.array(turning), np.full(len(turning), kept)
     result, again = np.empty_like(old), np.empty_like(old)
     stick_or_slip(pull, turns, friction, old, result)

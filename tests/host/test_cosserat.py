@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from scipy.integrate import simpson
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from host.cli.contract_io import BadInput
 from host.mechanics import pcar
 from host.mechanics.base_force import robust_branch, solve_cold, solve_warm
 from host.mechanics.branch import CONVERGED, FOLD
-from host.mechanics.catheter import Catheter, PcarParameters, load_catheter
 from host.mechanics.cosserat import CosseratSolution, PointLoad, solve_cosserat
 from host.mechanics.cosserat_kernels import ALL_TANGENTS, EXACT, FINE, POSE, ROW, WORK, sweep
 from host.mechanics.rod import rod_record
@@ -35,6 +33,8 @@ from host.mechanics.rotations import (
 )
 from host.mechanics.stability import unstable_modes
 from host.mechanics.tip_shooting import QUICK_BELOW, load_number
+from protocol.catheter import Catheter, PcarParameters, load_catheter
+from protocol.errors import InputError
 from tests.host.rod_cases import SPATIAL, random_catheter, rod_of, uniform_catheter, unit
 from tests.references import make_spatial
 
@@ -84,7 +84,7 @@ def test_the_wrench_is_constant_in_space_and_its_moment_is_across_the_force(name
     for row in rows_at(rod, force, np.linspace(0.0, 0.08, 9)):
         R, rho, n = rotation_matrix(row[6:10]), row[:3], row[3:6]
         moment = np.cross(n, rho)
-        assert np.abs(R @ n - force).max() < 1e-12                        # the force, seen from the tip
+        assert np.abs(R @ n - force).max() < 1e-12  # the force, seen from the tip
         assert np.abs(R @ moment - np.cross(-(R @ rho), force)).max() < 1e-13  # the moment about the section
         assert abs(moment @ n) < 1e-15
 
@@ -131,8 +131,9 @@ def test_small_loads_bend_body_and_shaft_as_beams() -> None:
 
 def test_the_planar_rod_is_the_limit_of_many_arcs() -> None:
     EI, EbI, k0, force = 3e-4, 8e-4, 20.0, np.array([0.06, -0.05])
-    catheter = Catheter("both", 0.07, 0.00233, 0.0007, PcarParameters((EbI, EI), (0.07,)),
-                        random_catheter(np.random.default_rng(0)).cosserat)
+    catheter = Catheter(
+        "both", 0.07, 0.00233, 0.0007, PcarParameters((EbI, EI), (0.07,)), random_catheter(np.random.default_rng(0)).cosserat
+    )
     rod = solve_cosserat(_with_bending(catheter, EI, EbI), 0.03, k0, [0.0, -force[1], force[0]]).tip_position_m
     coarse, fine = (pcar.solve(pcar.arcs_of(catheter, 0.03, k0, cut), force).tip_position_m for cut in (0.0005, 0.00025))
     limit = fine + (fine - coarse) / 3.0
@@ -278,8 +279,14 @@ def test_the_mirror_image_of_a_load_has_the_mirror_image_of_the_shape(seed: int)
 def test_a_force_and_the_same_force_in_the_other_frame_make_one_shape(frame: str) -> None:
     first = solve_cosserat(LIVEWIRE, 0.02, 15.0, [0.004, 0.006, 0.01], frame, stations_m=[0.0, 0.03, 0.08])
     other = "tip" if frame == "base" else "base"
-    second = solve_cosserat(LIVEWIRE, 0.02, 15.0, first.force_tip_N if other == "tip" else first.force_base_N, other,
-                            stations_m=[0.0, 0.03, 0.08])
+    second = solve_cosserat(
+        LIVEWIRE,
+        0.02,
+        15.0,
+        first.force_tip_N if other == "tip" else first.force_base_N,
+        other,
+        stations_m=[0.0, 0.03, 0.08],
+    )
     assert np.abs(first.station_positions_m - second.station_positions_m).max() < 1e-10
     assert np.abs(rotation_matrix(first.tip_quaternion_wxyz) @ first.force_tip_N - first.force_base_N).max() < 1e-10
 
@@ -307,8 +314,9 @@ SCENES = [
 
 
 @pytest.mark.parametrize(("name", "d", "k0", "force", "frame", "roll", "loads"), SCENES)
-def test_jacobians_against_differences(name: str, d: float, k0: float, force: list[float], frame: str, roll: float,
-                                       loads: dict) -> None:
+def test_jacobians_against_differences(
+    name: str, d: float, k0: float, force: list[float], frame: str, roll: float, loads: dict
+) -> None:
     catheter = load_catheter(name)
 
     def at(dF: Array = np.zeros(3), dd: float = 0.0, dk: float = 0.0, dr: float = 0.0) -> CosseratSolution:
@@ -318,8 +326,9 @@ def test_jacobians_against_differences(name: str, d: float, k0: float, force: li
     for i in range(3):
         numeric = _difference(lambda h, i=i: at(dF=h * np.eye(3)[i]), 5e-4)
         assert np.abs(found.jacobian_force[:, i] - numeric).max() < 1e-7 * np.abs(found.jacobian_force).max() + 1e-7
-    for i, numeric in enumerate((_difference(lambda h: at(dd=h), 1e-4), _difference(lambda h: at(dr=h), 1e-2),
-                                 _difference(lambda h: at(dk=h), 0.1))):
+    for i, numeric in enumerate(
+        (_difference(lambda h: at(dd=h), 1e-4), _difference(lambda h: at(dr=h), 1e-2), _difference(lambda h: at(dk=h), 0.1))
+    ):
         assert np.abs(found.jacobian_actuation[:, i] - numeric).max() < 2e-7 * max(1.0, np.abs(numeric).max())
 
 
@@ -327,6 +336,7 @@ def test_sweep_tangents_against_differences_of_order_four() -> None:
     rod, force, stations = rod_of("steerocath_t", 0.02, 30.0), np.array([0.05, -0.08, 0.03]), np.array([0.0, 0.03, 0.08])
     rows = rows_at(rod, force, stations, 0.15)
     for lane, h in ((0, 1e-3), (1, 1e-3), (2, 1e-3), (3, 0.5)):
+
         def moved(x: float, lane: int = lane) -> Array:
             other, push = rod.copy(), force.copy()
             if lane < 3:
@@ -350,14 +360,19 @@ def test_several_loads_balance(insertion: float) -> None:
     weight, force = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, -0.01])
     total = 0.07 + insertion
     back = np.concatenate([np.linspace(0.0, total, 401)])
-    found = solve_cosserat(STEEROCATH, insertion, 20.0, force, stations_m=back, point_loads=loads,
-                           distributed_N_per_m=weight)
+    found = solve_cosserat(
+        STEEROCATH, insertion, 20.0, force, stations_m=back, point_loads=loads, distributed_N_per_m=weight
+    )
     assert np.allclose(found.base_force_N, force + np.sum([p.force_N for p in loads], axis=0) + weight * total, atol=1e-14)
-    places = solve_cosserat(STEEROCATH, insertion, 20.0, force, stations_m=[0.015, 0.03], point_loads=loads,
-                            distributed_N_per_m=weight).station_positions_m
+    places = solve_cosserat(
+        STEEROCATH, insertion, 20.0, force, stations_m=[0.015, 0.03], point_loads=loads, distributed_N_per_m=weight
+    ).station_positions_m
     spread = np.array([simpson(np.cross(found.station_positions_m, weight)[:, i], x=back) for i in range(3)])
-    moment = np.cross(found.tip_position_m, force) + spread + sum(
-        np.cross(r, p.force_N) for r, p in zip(places, loads, strict=True))
+    moment = (
+        np.cross(found.tip_position_m, force)
+        + spread
+        + sum(np.cross(r, p.force_N) for r, p in zip(places, loads, strict=True))
+    )
     assert np.abs(found.base_moment_Nm - moment).max() < 1e-10
 
     as_load = solve_cosserat(STEEROCATH, insertion, 20.0, point_loads=[PointLoad(0.0, force)])
@@ -420,28 +435,36 @@ def test_quaternions_and_matrices_agree() -> None:
 # Bad input
 
 
-@pytest.mark.parametrize(("change", "key"), [
-    ({"insertion_m": -0.07}, "insertion_m"), ({"insertion_m": math.nan}, "insertion_m"),
-    ({"insertion_m": 5.0}, "insertion_m"),
-    ({"curvature_per_m": math.inf}, "curvature_per_m"), ({"curvature_per_m": 1e4}, "curvature_per_m"),
-    ({"force_N": [0.0, 0.0]}, "force_N"), ({"force_N": [0.0, math.nan, 0.0]}, "force_N"),
-    ({"force_N": [0, 0, 1e4]}, "force_N"),
-    ({"force_N": "x"}, "force_N"), ({"force_frame": "world"}, "force_frame"),
-    ({"tendon_tension_N": -1.0}, "tendon_tension_N"),
-    ({"stations_m": [-0.01]}, "stations_m"), ({"stations_m": [math.nan]}, "stations_m"),
-    ({"roll_rad": math.nan}, "roll_rad"),
-    ({"point_loads": [PointLoad(0.2, [0, 0, 0.1])]}, "point_loads.0.offset_m"),
-    ({"point_loads": [PointLoad(0.0, [0, math.nan, 0.1])]}, "point_loads.0.force_N"),
-    ({"distributed_N_per_m": [0.0, 0.0]}, "distributed_N_per_m"),
-    ({"force_frame": "tip", "distributed_N_per_m": [1.0, 0.0, 0.0]}, "force_frame"),
-])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"insertion_m": -0.07}, "insertion_m"),
+        ({"insertion_m": math.nan}, "insertion_m"),
+        ({"insertion_m": 5.0}, "insertion_m"),
+        ({"curvature_per_m": math.inf}, "curvature_per_m"),
+        ({"curvature_per_m": 1e4}, "curvature_per_m"),
+        ({"force_N": [0.0, 0.0]}, "force_N"),
+        ({"force_N": [0.0, math.nan, 0.0]}, "force_N"),
+        ({"force_N": [0, 0, 1e4]}, "force_N"),
+        ({"force_N": "x"}, "force_N"),
+        ({"force_frame": "world"}, "force_frame"),
+        ({"tendon_tension_N": -1.0}, "tendon_tension_N"),
+        ({"stations_m": [-0.01]}, "stations_m"),
+        ({"stations_m": [math.nan]}, "stations_m"),
+        ({"roll_rad": math.nan}, "roll_rad"),
+        ({"point_loads": [PointLoad(0.2, [0, 0, 0.1])]}, "point_loads.0.offset_m"),
+        ({"point_loads": [PointLoad(0.0, [0, math.nan, 0.1])]}, "point_loads.0.force_N"),
+        ({"distributed_N_per_m": [0.0, 0.0]}, "distributed_N_per_m"),
+        ({"force_frame": "tip", "distributed_N_per_m": [1.0, 0.0, 0.0]}, "force_frame"),
+    ],
+)
 def test_bad_input_is_named(change: dict, key: str) -> None:
     good: dict = {"catheter": STEEROCATH, "insertion_m": 0.01, "curvature_per_m": 10.0, "force_N": [0.0, 0.05, 0.0]}
-    with pytest.raises(BadInput) as error:
+    with pytest.raises(InputError) as error:
         solve_cosserat(**(good | change))
     assert error.value.key == key
 
 
 def test_a_catheter_without_spatial_parameters_is_refused() -> None:
-    with pytest.raises(BadInput, match="cosserat"):
+    with pytest.raises(InputError, match="cosserat"):
         solve_cosserat(load_catheter("thermocool_sf"), 0.01, 10.0)

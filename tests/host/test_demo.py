@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from host.cli.main import build
-from host.recording import Recording
+from host.recordings.recording import Recording
 from tests.small_disk import fill_up
 
 

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from host.cli import flash as flash_module
 from host.cli.check_device import check_device
-from host.cli.contract_io import BadInput
 from host.cli.flash import avrdude_command, built, flash
-from realtime.board_pins import definitions
-from realtime.rig_file import load_rig, parse_rig, problems_of, read_rig_data
+from protocol.board_pins import definitions
+from protocol.errors import InputError
+from protocol.rig_file import load_rig, parse_rig, problems_of, read_rig_data
 from sim.board import BUILD_DIR
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S, until
@@ -28,8 +28,11 @@ MACHINE = ("a second", "damaged", "lost", "status frames", "records", "missing i
 @pytest.fixture(scope="module")
 def ports() -> Iterator[dict[str, Any]]:
     """Ports of a simulated rig in a process of its own."""
-    server = subprocess.Popen([sys.executable, "-m", "sim.rig_server", "--rig", str(RIG_FILE), "--board", "native"],
-                              stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(
+        [sys.executable, "-m", "sim.rig_server", "--rig", str(RIG_FILE), "--board", "native"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert server.stdout is not None
     yield json.loads(server.stdout.readline())
     server.terminate()
@@ -76,20 +79,20 @@ def test_a_device_that_is_not_there_is_said_so() -> None:
 
 
 def test_an_unknown_device_is_refused() -> None:
-    with pytest.raises(BadInput, match="tracker or force or board"):
+    with pytest.raises(InputError, match="tracker or force or board"):
         check_device("toaster")
 
 
 def test_flash_refuses_what_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(BadInput, match="atmega2560 or atmega328p"):
+    with pytest.raises(InputError, match="atmega2560 or atmega328p"):
         flash(port="/dev/ttyACM0", mcu="z80")
     monkeypatch.setattr(flash_module.shutil, "which", lambda name: None)
-    with pytest.raises(BadInput, match="apt install avrdude"):
+    with pytest.raises(InputError, match="apt install avrdude"):
         flash(port="/dev/ttyACM0")
     monkeypatch.setattr(flash_module.shutil, "which", lambda name: f"/usr/bin/{name}")
-    with pytest.raises(BadInput, match="a serial port that is there"):
+    with pytest.raises(InputError, match="a serial port that is there"):
         flash(port="/dev/nothing-here")
-    with pytest.raises(BadInput, match="an ELF file"):
+    with pytest.raises(InputError, match="an ELF file"):
         flash(port="/dev/null", image=Path("/no/such.elf"))
 
 
@@ -100,13 +103,16 @@ def pins(**changed: object) -> dict[str, Any]:
     return data
 
 
-@pytest.mark.parametrize(("changed", "says"), [
-    ({"encoders": "A"}, "board.pins.encoders: found port 'A', which has the outputs, wanted a port of its own"),
-    ({"switches": "Z"}, "board.pins.switches: found port 'Z', wanted one of A, B, C, F, K, L of the atmega2560"),
-    ({"output_shift": 2}, "board.pins.outputs: found pin PA8, which the atmega2560 has not free"),
-    ({"mcu": "atmega328p", "outputs": "D", "switches": "B", "output_shift": 1}, "found pin PD1, which the atmega328p"),
-    ({"output_shift": 8}, "board.pins.output_shift: found 8, wanted at most 7"),
-])
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"encoders": "A"}, "board.pins.encoders: found port 'A', which has the outputs, wanted a port of its own"),
+        ({"switches": "Z"}, "board.pins.switches: found port 'Z', wanted one of A, B, C, F, K, L of the atmega2560"),
+        ({"output_shift": 2}, "board.pins.outputs: found pin PA8, which the atmega2560 has not free"),
+        ({"mcu": "atmega328p", "outputs": "D", "switches": "B", "output_shift": 1}, "found pin PD1, which the atmega328p"),
+        ({"output_shift": 8}, "board.pins.output_shift: found 8, wanted at most 7"),
+    ],
+)
 def test_pins_that_conflict_or_are_not_there_are_refused_in_one_line(changed: dict[str, object], says: str) -> None:
     (problem,) = problems_of(pins(**changed))
     assert says in problem
@@ -118,7 +124,11 @@ def test_without_pins_in_the_file_the_usual_ones_of_its_processor_are_taken() ->
     assert parse_rig(data) == load_rig(RIG_FILE)
     data["board"]["pins"] = {"mcu": "atmega328p"}
     assert definitions(**parse_rig(data).board.pins.model_dump()) == [
-        "-DATMEGA328P_OUTPUTS=D", "-DATMEGA328P_OUTPUT_SHIFT=2", "-DATMEGA328P_ENCODERS=C", "-DATMEGA328P_SWITCHES=B"]
+        "-DATMEGA328P_OUTPUTS=D",
+        "-DATMEGA328P_OUTPUT_SHIFT=2",
+        "-DATMEGA328P_ENCODERS=C",
+        "-DATMEGA328P_SWITCHES=B",
+    ]
 
 
 @pytest.mark.avr

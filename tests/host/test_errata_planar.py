@@ -12,7 +12,7 @@ from host.identification.planar_model import PlanarModel
 from host.identification.recorded_shapes import RecordedShape
 from host.identification.robust_fit import Objective
 from host.mechanics import pcar
-from host.mechanics.catheter import load_catheter
+from protocol.catheter import load_catheter
 from tests.references.arcs_by_quadrature import gradient, point
 
 THERMOCOOL = load_catheter("thermocool_sf")
@@ -55,8 +55,15 @@ def test_appendix_b_dE2_dk1_prefactor() -> None:
     k1, k2, k3 = KAPPA
     l1 = LENGTH[0]
     a, b, c = angles()
-    bracket = (k2 * k3 * np.cos(a) - k2 * k3 - k1**2 * k2 * l1 * np.sin(b) + k1**2 * k3 * l1 * np.sin(b)
-               + k1**2 * k2 * l1 * np.sin(c) - k1**2 * k3 * l1 * np.sin(a) + k1 * k2 * k3 * l1 * np.sin(a))
+    bracket = (
+        k2 * k3 * np.cos(a)
+        - k2 * k3
+        - k1**2 * k2 * l1 * np.sin(b)
+        + k1**2 * k3 * l1 * np.sin(b)
+        + k1**2 * k2 * l1 * np.sin(c)
+        - k1**2 * k3 * l1 * np.sin(a)
+        + k1 * k2 * k3 * l1 * np.sin(a)
+    )
     found = pcar.kinematic_jacobian(pcar.arcs_of(THERMOCOOL, 0.0485, 15.7), KAPPA)[1, 0]
     assert found == pytest.approx(bracket / (k1**2 * k2 * k3), rel=1e-11)
     assert abs(bracket / k1**2) > 100.0 * abs(found)
@@ -66,8 +73,7 @@ def test_appendix_b_dE2_dk2_prefactor() -> None:
     k2, k3 = KAPPA[1:]
     l2 = LENGTH[1]
     a, b, c = angles()
-    bracket = (k3 * np.cos(b) - k3 * np.cos(a) - k2**2 * l2 * np.sin(b) + k2 * k3 * l2 * np.sin(b)
-               + k2**2 * l2 * np.sin(c))
+    bracket = k3 * np.cos(b) - k3 * np.cos(a) - k2**2 * l2 * np.sin(b) + k2 * k3 * l2 * np.sin(b) + k2**2 * l2 * np.sin(c)
     found = pcar.kinematic_jacobian(pcar.arcs_of(THERMOCOOL, 0.0485, 15.7), KAPPA)[1, 1]
     assert found == pytest.approx(bracket / (k2**2 * k3), rel=1e-11)
     assert abs(bracket / k2**2) > 10.0 * abs(found)
@@ -78,7 +84,7 @@ def printed_tip(kappa: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         k1, k2, k3 = kappa
         a, b, c = k1 * LENGTH[0], k1 * LENGTH[0] + k2 * LENGTH[1], float(kappa @ LENGTH)
-        x = (np.sin(a) / k1 + (np.sin(b) - np.sin(a)) / k2 + (np.sin(c) - np.sin(b)) / k3)
+        x = np.sin(a) / k1 + (np.sin(b) - np.sin(a)) / k2 + (np.sin(c) - np.sin(b)) / k3
         y = (1.0 - np.cos(a)) / k1 + (np.cos(a) - np.cos(b)) / k2 + (np.cos(b) - np.cos(c)) / k3
         return np.array([x, y])
 
@@ -120,7 +126,7 @@ def test_equation_2_20_sums_over_the_recordings_given() -> None:
 
 def test_table_2_2_errors_of_any_marker_and_of_the_tip_are_told_apart() -> None:
     shapes = recordings(4)
-    shapes[1].position_m[2] += [0.0, 0.004]      # off near the base, not at the tip
+    shapes[1].position_m[2] += [0.0, 0.004]  # off near the base, not at the tip
     model = PlanarModel(THERMOCOOL, shapes, ("stiffness",))
     names = [(p.name, p.unit, p.logarithmic) for p in model.parameters]
     left = calibrate_model(model, names).left_out[1]

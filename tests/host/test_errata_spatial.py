@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from host.estimation.spatial_residuals import quaternion_error
 from host.mechanics import thesis_reference
-from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.rotations import quaternion_of_vector, rotation_matrix
+from protocol.catheter import load_catheter
 from tests.host.rod_cases import rod_of, unit
 
 Array = NDArray[np.float64]
@@ -24,9 +24,13 @@ SOME_TURNS = [quaternion_of_vector(angle * unit(RNG)) for angle in (1.4, 1.1, 2.
 def printed_3_15(q: Array) -> Array:
     """(3.15) letter by letter, q1 the scalar: element (1, 3) is 2 (q2 q3 + q1 q3)."""
     q1, q2, q3, q4 = q
-    return np.array([[2 * (q1**2 + q2**2) - 1, 2 * (q2 * q3 - q1 * q4), 2 * (q2 * q3 + q1 * q3)],
-                     [2 * (q2 * q3 + q1 * q4), 2 * (q1**2 + q3**2) - 1, 2 * (q3 * q4 - q1 * q2)],
-                     [2 * (q2 * q4 - q1 * q3), 2 * (q2 * q4 + q1 * q2), 2 * (q1**2 + q4**2) - 1]])
+    return np.array(
+        [
+            [2 * (q1**2 + q2**2) - 1, 2 * (q2 * q3 - q1 * q4), 2 * (q2 * q3 + q1 * q3)],
+            [2 * (q2 * q3 + q1 * q4), 2 * (q1**2 + q3**2) - 1, 2 * (q3 * q4 - q1 * q2)],
+            [2 * (q2 * q4 - q1 * q3), 2 * (q2 * q4 + q1 * q2), 2 * (q1**2 + q4**2) - 1],
+        ]
+    )
 
 
 @pytest.mark.parametrize("q", SOME_TURNS)
@@ -71,8 +75,13 @@ def swept(printed: bool, tension: float, elements: int = 4000) -> Array:
         u = np.array([c[0] * m[0] + k0, c[1] * m[1], c[2] * m[2]])
         out[i] = u
         first, second = (u[0], -u[1]) if printed else (u[1], -u[0])  # F_T (m1/EI1 + k0), -F_T m2/EI2 as printed
-        d_n = np.array([-u[1] * n[2] + u[2] * n[1] - tension * first, u[0] * n[2] - u[2] * n[0] - tension * second,
-                        u[1] * n[0] - u[0] * n[1]])
+        d_n = np.array(
+            [
+                -u[1] * n[2] + u[2] * n[1] - tension * first,
+                u[0] * n[2] - u[2] * n[0] - tension * second,
+                u[1] * n[0] - u[0] * n[1],
+            ]
+        )
         d_m = np.array([-u[1] * m[2] + u[2] * m[1] + n[1], u[0] * m[2] - u[2] * m[0] - n[0], u[1] * m[0] - u[0] * m[1]])
         n, m = n - h * d_n, m - h * d_m
     return out

@@ -14,10 +14,10 @@ import pytest
 
 from host.estimation.interface import Actuation, Estimator, ForceEstimate, PoseReading
 from host.estimation.service import EstimationService, load_estimator
-from host.recording import Recording
+from host.recordings.recording import Recording
+from protocol.rig_file import Rig, load_rig
 from protocol.topics import ForceSensor, Pose, Stage
 from protocol.zenoh_session import Session
-from realtime.rig_file import Rig, load_rig
 from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
@@ -54,14 +54,26 @@ class Broken:
 
 
 def stage(time_ns: int, insertion_m: float = 0.05, known: bool = True) -> Stage:
-    return Stage(stamp_ns=time_ns, command_insertion_m=0.0, command_roll_rad=0.0, command_knob_rad=0.0,
-                 joint_insertion_m=insertion_m if known else None, joint_roll_rad=0.1, joint_curvature_per_m=15.0)
+    return Stage(
+        stamp_ns=time_ns,
+        command_insertion_m=0.0,
+        command_roll_rad=0.0,
+        command_knob_rad=0.0,
+        joint_insertion_m=insertion_m if known else None,
+        joint_roll_rad=0.1,
+        joint_curvature_per_m=15.0,
+    )
 
 
 def pose(time_ns: int, height_m: float = 0.04, missing: bool = False) -> Pose:
-    return Pose(stamp_ns=time_ns, arrival_ns=time_ns, frame=1, missing=missing,
-                position_m=None if missing else (0.0, 0.0, height_m),
-                quaternion_wxyz=None if missing else (1.0, 0.0, 0.0, 0.0))
+    return Pose(
+        stamp_ns=time_ns,
+        arrival_ns=time_ns,
+        frame=1,
+        missing=missing,
+        position_m=None if missing else (0.0, 0.0, height_m),
+        quaternion_wxyz=None if missing else (1.0, 0.0, 0.0, 0.0),
+    )
 
 
 def test_a_pose_is_answered_once_with_the_actuation_of_its_time() -> None:
@@ -100,13 +112,16 @@ def test_a_shaft_pose_of_another_time_is_not_paired() -> None:
     assert spring.asked[0][1] is None
 
 
-@pytest.mark.parametrize("messages", [
-    [("pose/tip", pose(0))],
-    [("stage", stage(0, known=False)), ("pose/tip", pose(0))],
-    [("stage", stage(0)), ("pose/tip", pose(0, missing=True))],
-    [("stage", stage(0)), ("pose/tip", pose(2_000_000_000))],
-    [("stage", stage(0)), ("pose/shaft", pose(0))],
-])
+@pytest.mark.parametrize(
+    "messages",
+    [
+        [("pose/tip", pose(0))],
+        [("stage", stage(0, known=False)), ("pose/tip", pose(0))],
+        [("stage", stage(0)), ("pose/tip", pose(0, missing=True))],
+        [("stage", stage(0)), ("pose/tip", pose(2_000_000_000))],
+        [("stage", stage(0)), ("pose/shaft", pose(0))],
+    ],
+)
 def test_without_a_pose_and_its_actuation_nothing_is_said(messages: list[tuple[str, Stage | Pose]]) -> None:
     service = EstimationService(Spring())
     for topic, message in messages:
@@ -114,18 +129,21 @@ def test_without_a_pose_and_its_actuation_nothing_is_said(messages: list[tuple[s
     assert service.answer(0) is None
 
 
-@pytest.mark.parametrize("answer", [
-    ValueError("outside the model"),
-    ZeroDivisionError("division by zero"),
-    np.linalg.LinAlgError("singular"),
-    ForceEstimate(np.array([0.0, np.nan, 0.0]), np.eye(3), True, 0.0, 0),
-    ForceEstimate(np.zeros(3), np.full((3, 3), np.inf), True, 0.0, 0),
-    ForceEstimate(np.zeros(2), np.eye(3), True, 0.0, 0),
-    ForceEstimate(np.zeros(3), -np.eye(3), True, 0.0, 0),
-    ForceEstimate(np.zeros(3), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
-    ForceEstimate(np.zeros(3), np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
-    ForceEstimate(np.zeros(3), np.eye(3), False, 7.0, 0),
-])
+@pytest.mark.parametrize(
+    "answer",
+    [
+        ValueError("outside the model"),
+        ZeroDivisionError("division by zero"),
+        np.linalg.LinAlgError("singular"),
+        ForceEstimate(np.array([0.0, np.nan, 0.0]), np.eye(3), True, 0.0, 0),
+        ForceEstimate(np.zeros(3), np.full((3, 3), np.inf), True, 0.0, 0),
+        ForceEstimate(np.zeros(2), np.eye(3), True, 0.0, 0),
+        ForceEstimate(np.zeros(3), -np.eye(3), True, 0.0, 0),
+        ForceEstimate(np.zeros(3), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
+        ForceEstimate(np.zeros(3), np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
+        ForceEstimate(np.zeros(3), np.eye(3), False, 7.0, 0),
+    ],
+)
 def test_no_force_is_given_that_cannot_be_believed(answer: ForceEstimate | Exception) -> None:
     service = EstimationService(Broken(answer))
     said = service(pose(0), None, stage(0))
@@ -151,9 +169,20 @@ def own_rig(tmp_path: Path) -> Path:
 
 def start(rig: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "host.estimator_process", str(rig), "--estimator",
-         "tests.host.test_estimator_process:make_spring", *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        [
+            sys.executable,
+            "-m",
+            "host.run.model_process",
+            str(rig),
+            "--estimator",
+            "tests.host.test_estimator_process:make_spring",
+            *options,
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
 
 
 def test_process_estimates_records_and_ends_in_order(tmp_path: Path) -> None:
@@ -194,8 +223,10 @@ def test_process_estimates_records_and_ends_in_order(tmp_path: Path) -> None:
 def test_process_refuses_what_it_cannot_start_with(tmp_path: Path) -> None:
     rig_path = own_rig(tmp_path)
     (tmp_path / "there.mcap").write_bytes(b"")
-    for options, says in ((["--estimator", "no.such:thing"], "wanted module:function"),
-                          (["--record", str(tmp_path / "there.mcap")], "exists")):
+    for options, says in (
+        (["--estimator", "no.such:thing"], "wanted module:function"),
+        (["--record", str(tmp_path / "there.mcap")], "exists"),
+    ):
         child = start(rig_path, *options)
         _, complaint = child.communicate(timeout=PATIENCE_S)
         assert child.returncode == 1 and says in complaint and "Traceback" not in complaint

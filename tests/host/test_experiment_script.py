@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from host.cli.contract_io import BadInput
 from host.cli.experiment import experiment, run_simulated
-from host.demo import SIMULATED_RIG
-from host.experiment_script import Script, check_script, perform, read_script, write_script
-from host.recording import Recording
+from host.commissioning.experiment_script import Script, check_script, perform, read_script, write_script
+from host.recordings.recording import Recording
 from protocol.commander import Acknowledgement
-from realtime.rig_file import load_rig
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
 
 RIG = load_rig(SIMULATED_RIG)
 FREE: dict[str, Any] = {
@@ -80,7 +79,7 @@ def test_a_script_written_is_read_back(tmp_path: Path) -> None:
 )
 def test_what_the_rig_must_not_do_is_bad_input(change: dict[str, Any], key: str) -> None:
     check_script(Script(**FREE), RIG)
-    with pytest.raises(BadInput) as error:
+    with pytest.raises(InputError) as error:
         check_script(Script(**{**FREE, **change}), RIG)
     assert error.value.key == key
 
@@ -96,7 +95,7 @@ def test_what_the_rig_must_not_do_is_bad_input(change: dict[str, Any], key: str)
 )
 def test_a_force_the_rig_must_not_hold_is_bad_input(change: dict[str, Any], key: str) -> None:
     assert check_script(Script(**PRESS), RIG).forces_N == (0.1, 0.2)
-    with pytest.raises(BadInput) as error:
+    with pytest.raises(InputError) as error:
         check_script(Script(**{**PRESS, **change}), RIG)
     assert error.value.key == key
 
@@ -105,18 +104,18 @@ def test_a_file_that_is_no_script_is_bad_input(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     for text, key in (("rows = [", "script"), ('says = "x"', "rig")):
         path.write_text(text)
-        with pytest.raises(BadInput) as error:
+        with pytest.raises(InputError) as error:
             read_script(path)
         assert error.value.key == key
     write_script(Script(**FREE), path)
     good = path.read_text()
     path.write_text(f"more = 1\n{good}")
-    with pytest.raises(BadInput, match="more"):
+    with pytest.raises(InputError, match="more"):
         read_script(path)
     path.write_text(good.replace("0.700,", "0.700, 1.0,"))
-    with pytest.raises(BadInput, match=r"rows.7"):
+    with pytest.raises(InputError, match=r"rows.7"):
         read_script(path)
-    with pytest.raises(BadInput, match="script"):
+    with pytest.raises(InputError, match="script"):
         read_script(tmp_path / "none.toml")
 
 
@@ -140,7 +139,7 @@ def test_without_go_nothing_is_commanded(tmp_path: Path, capsys: pytest.CaptureF
     experiment(write_script(Script(**FREE), tmp_path / "s.toml"), json=True)
     out, err = capsys.readouterr()
     assert '"good": true' in out and "nothing was moved" in err and "roll: " in err
-    with pytest.raises(BadInput, match="--go"):
+    with pytest.raises(InputError, match="--go"):
         experiment(tmp_path / "s.toml", go=True, simulated=True)
 
 
@@ -150,5 +149,5 @@ def test_the_simulated_rig_goes_where_the_script_says(tmp_path: Path) -> None:
     last = tip["x_m"][-40:]
     assert last.mean() == pytest.approx(0.0035, abs=3e-4)
     assert {row["action"] for row in recording.messages("command")} == {"take", "arm", "target", "disarm"}
-    with pytest.raises(BadInput, match="--effect"):
+    with pytest.raises(InputError, match="--effect"):
         run_simulated(Script(**FREE), RIG, tmp_path, "native", 1, ("backlash@nowhere",))

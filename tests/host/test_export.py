@@ -14,14 +14,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from host.cli.contract_io import BadInput
 from host.cli.export import export as export_command
-from host.export import export
-from host.recording import Header, Recording, RecordingWriter
+from host.recordings.export import export
+from host.recordings.recording import Header, Recording, RecordingWriter
+from protocol.errors import InputError
 from protocol.topics import Pose, RigState
 
-HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}}, catheter={"name": "x"},
-                seed=1)
+HEADER = Header(
+    rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}}, catheter={"name": "x"}, seed=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +31,26 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     with RecordingWriter(path, HEADER) as writer:
         for frame in range(40):
             seen = frame % 4 != 0
-            writer.write("pose/tip", Pose(
-                stamp_ns=frame * 25_000_000, arrival_ns=frame * 25_000_000 + 1, frame=frame, missing=not seen,
-                position_m=(0.1, -0.2, 0.3 + frame / 3) if seen else None,
-                quaternion_wxyz=(1.0, 0.0, 0.0, 0.0) if seen else None))
-            writer.write("state", RigState(stamp_ns=frame, mode="contact", safety_action="warn",
-                                           cause='a "quoted", cause; with; separators\nand lines'))
+            writer.write(
+                "pose/tip",
+                Pose(
+                    stamp_ns=frame * 25_000_000,
+                    arrival_ns=frame * 25_000_000 + 1,
+                    frame=frame,
+                    missing=not seen,
+                    position_m=(0.1, -0.2, 0.3 + frame / 3) if seen else None,
+                    quaternion_wxyz=(1.0, 0.0, 0.0, 0.0) if seen else None,
+                ),
+            )
+            writer.write(
+                "state",
+                RigState(
+                    stamp_ns=frame,
+                    mode="contact",
+                    safety_action="warn",
+                    cause='a "quoted", cause; with; separators\nand lines',
+                ),
+            )
     return Recording(path)
 
 
@@ -68,7 +83,7 @@ def run(*arguments: str) -> tuple[int, str]:
     app = typer.Typer()
     app.command()(export_command)
     result = CliRunner().invoke(app, list(arguments))
-    if isinstance(result.exception, BadInput):
+    if isinstance(result.exception, InputError):
         return 2, str(result.exception)
     return result.exit_code, result.stdout
 
@@ -102,6 +117,7 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
 def test_importing_the_command_does_not_load_the_models() -> None:
     heavy = ("numba", "scipy", "matplotlib", "zenoh")
     program = f"import sys, host.cli.export; print([name for name in {heavy} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True,
-                          cwd=Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2]
+    )
     assert done.stdout == "[]\n"

@@ -10,17 +10,28 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from host.cli.contract_io import BadInput
 from host.cli.faults import faults as command
-from host.fault_campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
-from host.reliability_page import fuzz_section, write_section
+from host.studies.faults.campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
+from host.studies.reliability_page import fuzz_section, write_section
+from protocol.errors import InputError
 from protocol.serial_codec import StreamDecoder
 from sim.fault_run import Watcher
 from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
 
-GOOD = {"detected_s": 0.03, "detected_by": "cause: board_silent", "action": "stop", "board_fault": "1", "causes": [],
-        "peak_force_N": 0.3, "moved_after_m": 0.0, "rest_s": 0.02, "rearmed": False, "final_phase": "stopped",
-        "poses_lost": 0, "counts": {}}
+GOOD = {
+    "detected_s": 0.03,
+    "detected_by": "cause: board_silent",
+    "action": "stop",
+    "board_fault": "1",
+    "causes": [],
+    "peak_force_N": 0.3,
+    "moved_after_m": 0.0,
+    "rest_s": 0.02,
+    "rearmed": False,
+    "final_phase": "stopped",
+    "poses_lost": 0,
+    "counts": {},
+}
 
 
 def result(fault: str = "link_cut", readable: bool = True, unhandled: str = "", **outcome: object) -> RunResult:
@@ -51,26 +62,35 @@ def test_a_good_outcome_breaks_no_rule() -> None:
     assert list(violations(result())) == []
 
 
-@pytest.mark.parametrize(("fault", "outcome", "says"), [
-    ("link_cut", {"detected_s": None}, "not detected"),
-    ("link_cut", {"detected_s": 0.2}, "detected only after 0.200 s"),
-    ("link_cut", {"peak_force_N": PEAK_N + 0.001}, "peak force"),
-    ("link_cut", {"rest_s": 0.06}, "still moving 60 ms"),
-    ("link_cut", {"final_phase": "contact"}, "ended in phase contact"),
-    ("link_cut", {"rearmed": True}, "moved on by itself"),
-    ("none", {}, "false alarm"),
-])
+@pytest.mark.parametrize(
+    ("fault", "outcome", "says"),
+    [
+        ("link_cut", {"detected_s": None}, "not detected"),
+        ("link_cut", {"detected_s": 0.2}, "detected only after 0.200 s"),
+        ("link_cut", {"peak_force_N": PEAK_N + 0.001}, "peak force"),
+        ("link_cut", {"rest_s": 0.06}, "still moving 60 ms"),
+        ("link_cut", {"final_phase": "contact"}, "ended in phase contact"),
+        ("link_cut", {"rearmed": True}, "moved on by itself"),
+        ("none", {}, "false alarm"),
+    ],
+)
 def test_each_rule_is_judged(fault: str, outcome: dict[str, object], says: str) -> None:
     assert any(says in words for words in violations(result(fault, **outcome)))
 
 
-@pytest.mark.parametrize(("large_s", "detected_s", "says"), [
-    (None, None, ""), (0.5, 0.59, ""), (0.5, 0.2, ""),
-    (0.5, 0.61, "detected only after 0.110 s"), (0.5, None, "not detected"),
-])
+@pytest.mark.parametrize(
+    ("large_s", "detected_s", "says"),
+    [
+        (None, None, ""),
+        (0.5, 0.59, ""),
+        (0.5, 0.2, ""),
+        (0.5, 0.61, "detected only after 0.110 s"),
+        (0.5, None, "not detected"),
+    ],
+)
 def test_a_jam_has_to_be_found_from_when_it_was_large(large_s: float | None, detected_s: float | None, says: str) -> None:
     one = result("missed_steps", large_s=large_s, detected_s=detected_s)
-    assert [words[:len(says)] for words in violations(one)] == ([says] if says else [])
+    assert [words[: len(says)] for words in violations(one)] == ([says] if says else [])
     row = by_fault([one])[0]
     assert row["must_detect"] == (large_s is not None) and row["detected"] == (detected_s is not None)
     if large_s is not None and detected_s is not None:
@@ -81,9 +101,13 @@ def test_a_jam_has_to_be_found_from_when_it_was_large(large_s: float | None, det
 def test_a_fault_is_large_once_it_was_so_without_a_break(large_ms: Sequence[int], since_s: float | None) -> None:
     now_ms = [0]
     world = SimpleNamespace(now_ns=0, edges=np.zeros(3), plant=SimpleNamespace(contact_force_N=np.zeros(3)))
-    loop = SimpleNamespace(outputs=[SimpleNamespace(cause=0)], missed_ticks=0, link=SimpleNamespace(
-        status=None, decoder=StreamDecoder()), tracker=SimpleNamespace(counters=SimpleNamespace()),
-        force_sensor=SimpleNamespace(counters=SimpleNamespace()))
+    loop = SimpleNamespace(
+        outputs=[SimpleNamespace(cause=0)],
+        missed_ticks=0,
+        link=SimpleNamespace(status=None, decoder=StreamDecoder()),
+        tracker=SimpleNamespace(counters=SimpleNamespace()),
+        force_sensor=SimpleNamespace(counters=SimpleNamespace()),
+    )
     watcher = Watcher(SimpleNamespace(world=world, loop=loop), lambda run: now_ms[0] in large_ms, 0.1)  # type: ignore[arg-type]
     for now_ms[0] in range(300):
         world.now_ns = now_ms[0] * 1_000_000
@@ -98,8 +122,17 @@ def test_an_exception_and_an_unreadable_recording_break_a_rule() -> None:
 
 def test_rows_have_the_contracts_keys() -> None:
     row = by_fault([result(), result(detected_s=None)])[0]
-    for key in ("fault", "phase", "runs", "detected", "detection_ms_p99", "peak_force_N", "moved_after_m",
-                "recordings_unreadable", "unhandled"):
+    for key in (
+        "fault",
+        "phase",
+        "runs",
+        "detected",
+        "detection_ms_p99",
+        "peak_force_N",
+        "moved_after_m",
+        "recordings_unreadable",
+        "unhandled",
+    ):
         assert key in row
     assert (row["runs"], row["detected"], row["missed"]) == (2, 1, 1)
 
@@ -121,7 +154,7 @@ def test_the_section_on_fuzzing_has_the_figures_of_the_run() -> None:
 
 def test_bad_options_are_refused() -> None:
     for arguments in ({"runs": 0}, {"jobs": 0}, {"seed": -1}, {"board": "paper"}, {"fault": ["gremlins"]}):
-        with pytest.raises(BadInput):
+        with pytest.raises(InputError):
             command(**arguments)  # type: ignore[arg-type]
 
 
@@ -131,8 +164,19 @@ def test_the_command_gives_json_a_page_and_the_same_figures_twice(tmp_path: Path
 
     app = typer.Typer()
     app.command()(command)
-    arguments = ["--runs", "3", "--seed", "5", "--json", "--jobs", "1", "--fault", "mcu_reset",
-                 "--docs", str(tmp_path / "r.md")]
+    arguments = [
+        "--runs",
+        "3",
+        "--seed",
+        "5",
+        "--json",
+        "--jobs",
+        "1",
+        "--fault",
+        "mcu_reset",
+        "--docs",
+        str(tmp_path / "r.md"),
+    ]
     told = [CliRunner().invoke(app, arguments) for _ in range(2)]
     assert [one.exit_code for one in told] == [0, 0]
     objects = [json.loads(one.stdout) for one in told]

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.benchmarks import force_grid
 from host.estimation.spatial import estimate_cosserat
+from host.studies.benchmarks import force_grid
 from tests.host.test_spatial_estimation import LIVEWIRE, STEEROCATH, INSERTION_m, posed, sensors_of
 
 

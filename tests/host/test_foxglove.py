@@ -13,17 +13,22 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from host.demo import SIMULATED_RIG
-from host.diagnosis.tables import read_table
-from host.foxglove import SCHEMAS, plain_schema
-from host.mechanics.catheter import load_catheter
-from host.recording import Header, Recording, RecordingWriter
+from host.diagnosis.model.tables import read_table
+from host.recordings.foxglove import SCHEMAS, plain_schema
+from host.recordings.recording import Header, Recording, RecordingWriter
+from protocol.catheter import load_catheter
 from protocol.messages import json_schema
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import TOPICS, ForceSensor, Log, Pose, RigState, Stage, encode
-from realtime.rig_file import load_rig
 
-PLAIN = {"boolean": (bool,), "string": (str,), "number": (int, float), "integer": (int,), "object": (dict,),
-         "array": (list,)}
+PLAIN = {
+    "boolean": (bool,),
+    "string": (str,),
+    "number": (int, float),
+    "integer": (int,),
+    "object": (dict,),
+    "array": (list,),
+}
 MS = 1_000_000
 
 
@@ -38,14 +43,42 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with RecordingWriter(path, header()) as writer:
         for tick in range(0, 1000, 10):
             now = tick * MS
-            writer.write("stage", Stage(stamp_ns=now, command_insertion_m=0.01, command_roll_rad=0.0, command_knob_rad=0.6,
-                                        joint_insertion_m=-0.08, joint_roll_rad=0.0, joint_curvature_per_m=18.0))
+            writer.write(
+                "stage",
+                Stage(
+                    stamp_ns=now,
+                    command_insertion_m=0.01,
+                    command_roll_rad=0.0,
+                    command_knob_rad=0.6,
+                    joint_insertion_m=-0.08,
+                    joint_roll_rad=0.0,
+                    joint_curvature_per_m=18.0,
+                ),
+            )
             writer.write("force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=(0.0, 0.0, 0.2)))
-            writer.write("pose/tip", Pose(stamp_ns=now, arrival_ns=now, frame=tick, missing=tick == 500,
-                                          position_m=None if tick == 500 else (0.0, -0.008, 0.027),
-                                          quaternion_wxyz=None if tick == 500 else (1.0, 0.0, 0.0, 0.0)))
-            writer.write("state", RigState(stamp_ns=now, mode="contact", safety_action="none", tip_m=(0.0, -0.008, 0.027),
-                                           target_m=(0.0, -0.0107, 0.025), force_direction=(0.0, 0.0, 1.0), force_N=0.2))
+            writer.write(
+                "pose/tip",
+                Pose(
+                    stamp_ns=now,
+                    arrival_ns=now,
+                    frame=tick,
+                    missing=tick == 500,
+                    position_m=None if tick == 500 else (0.0, -0.008, 0.027),
+                    quaternion_wxyz=None if tick == 500 else (1.0, 0.0, 0.0, 0.0),
+                ),
+            )
+            writer.write(
+                "state",
+                RigState(
+                    stamp_ns=now,
+                    mode="contact",
+                    safety_action="none",
+                    tip_m=(0.0, -0.008, 0.027),
+                    target_m=(0.0, -0.0107, 0.025),
+                    force_direction=(0.0, 0.0, 1.0),
+                    force_N=0.2,
+                ),
+            )
         writer.write("log", Log(stamp_ns=now, level="warning", source="board", text="a word"))
     return path
 
@@ -89,8 +122,12 @@ def test_every_message_fits_its_schema_and_its_channel_says_json(recording: Path
             assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             assert_fits(json.loads(message.data), json.loads(schema.data), channel.topic)
             seen.add((channel.topic, schema.name))
-    assert {("foxglove/tip", "foxglove.PoseInFrame"), ("foxglove/scene", "foxglove.SceneUpdate"),
-            ("foxglove/log", "foxglove.Log"), ("state", "RigState")} <= seen
+    assert {
+        ("foxglove/tip", "foxglove.PoseInFrame"),
+        ("foxglove/scene", "foxglove.SceneUpdate"),
+        ("foxglove/log", "foxglove.Log"),
+        ("state", "RigState"),
+    } <= seen
 
 
 def test_the_scene_has_the_catheter_up_to_the_tip_at_its_rate(recording: Path) -> None:

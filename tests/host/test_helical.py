@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
-from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.helical import chain_of, solve_helical, tip_of
 from host.mechanics.helical_kernels import back_substitute, factorize, place, screw, work_of_force
 from host.mechanics.rotations import angle_between, quaternion_of_vector, rotation_matrix
+from protocol.catheter import load_catheter
+from protocol.errors import InputError
 from tests.host.rod_cases import random_catheter, rod_of, uniform_catheter, unit
 
 Array = NDArray[np.float64]
@@ -47,8 +47,9 @@ def test_gradient_and_hessian_of_the_work_against_differences() -> None:
 
     slope, curve = slope_at(u.ravel())
     h = 1e-3
-    work = np.array([[tip_of(chain, (u.ravel() + s * h * e).reshape(n, 3))[0] @ force for s in (1, -1)]
-                     for e in np.eye(3 * n)])
+    work = np.array(
+        [[tip_of(chain, (u.ravel() + s * h * e).reshape(n, 3))[0] @ force for s in (1, -1)] for e in np.eye(3 * n)]
+    )
     assert np.abs(slope - (work[:, 0] - work[:, 1]) / (2 * h)).max() < 1e-5 * np.abs(slope).max()
     numeric = np.array([(slope_at(u.ravel() + h * e)[0] - slope_at(u.ravel() - h * e)[0]) / (2 * h) for e in np.eye(3 * n)])
     assert np.abs(curve - curve.T).max() == 0.0
@@ -129,12 +130,18 @@ def test_a_chain_that_folds_says_so() -> None:
     assert folds < 200
 
 
-@pytest.mark.parametrize(("change", "key"), [({"segments": 0}, "segments"), ({"segments": 2.5}, "segments"),
-                                             ({"segments": True}, "segments"),
-                                             ({"force_N": [0.0, math.nan, 0.0]}, "force_N"),
-                                             ({"insertion_m": -0.07}, "insertion_m")])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"segments": 0}, "segments"),
+        ({"segments": 2.5}, "segments"),
+        ({"segments": True}, "segments"),
+        ({"force_N": [0.0, math.nan, 0.0]}, "force_N"),
+        ({"insertion_m": -0.07}, "insertion_m"),
+    ],
+)
 def test_bad_input_is_named(change: dict, key: str) -> None:
     good: dict = {"catheter": STEEROCATH, "insertion_m": 0.0, "curvature_per_m": 10.0, "force_N": [0.0, 0.1, 0.0]}
-    with pytest.raises(BadInput) as error:
+    with pytest.raises(InputError) as error:
         solve_helical(**(good | change))
     assert error.value.key == key

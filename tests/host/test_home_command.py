@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 import host.cli.home as command
-from realtime.rig_file import load_rig
+from protocol.rig_file import load_rig
 from tests.realtime.conftest import RIG_FILE
 from tests.sim.board_rig import BoardRig
 

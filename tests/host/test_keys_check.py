@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from host import keys
 from host.cli.rig import rig as app
-from host.keys_check import keys_problems
+from host.security import keys
+from host.security.keys_check import keys_problems
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from tests.realtime.conftest import RIG_FILE
 
@@ -42,16 +42,22 @@ def test_what_keys_issue_makes_is_good(folder: Path, listen: list[str]) -> None:
     assert keys_problems(folder, listen) == []
 
 
-@pytest.mark.parametrize(("harm", "says"), [
-    (lambda folder: (folder / CERTIFICATE_FILE).unlink(), "certificate.pem: found No such file"),
-    (lambda folder: (folder / CA_FILE).unlink(), "ca.pem: found No such file"),
-    (lambda folder: (folder / KEY_FILE).unlink(), "key.pem: found No such file"),
-    (lambda folder: (folder / KEY_FILE).chmod(0o640), "key.pem: found mode 0640, which lets others read it, wanted 0600"),
-    (lambda folder: (folder / KEY_FILE).write_text("rubbish"), "key.pem: found no private key in it"),
-    (lambda folder: (folder / CERTIFICATE_FILE).write_text("rubbish"), "certificate.pem: found no certificate in it"),
-    (take(CA_FILE), "certificate.pem: found a certificate of another authority, wanted one of ca.pem"),
-    (take(KEY_FILE), "key.pem: found the key of another certificate"),
-])
+@pytest.mark.parametrize(
+    ("harm", "says"),
+    [
+        (lambda folder: (folder / CERTIFICATE_FILE).unlink(), "certificate.pem: found No such file"),
+        (lambda folder: (folder / CA_FILE).unlink(), "ca.pem: found No such file"),
+        (lambda folder: (folder / KEY_FILE).unlink(), "key.pem: found No such file"),
+        (
+            lambda folder: (folder / KEY_FILE).chmod(0o640),
+            "key.pem: found mode 0640, which lets others read it, wanted 0600",
+        ),
+        (lambda folder: (folder / KEY_FILE).write_text("rubbish"), "key.pem: found no private key in it"),
+        (lambda folder: (folder / CERTIFICATE_FILE).write_text("rubbish"), "certificate.pem: found no certificate in it"),
+        (take(CA_FILE), "certificate.pem: found a certificate of another authority, wanted one of ca.pem"),
+        (take(KEY_FILE), "key.pem: found the key of another certificate"),
+    ],
+)
 def test_each_thing_that_is_wrong_is_one_line(folder: Path, harm: Callable[[Path], object], says: str) -> None:
     harm(folder)
     problems = keys_problems(folder, LISTEN)
@@ -65,8 +71,10 @@ def test_time_address_role_and_a_folder_that_is_not_there(folder: Path) -> None:
     early = keys_problems(folder, LISTEN, now - datetime.timedelta(days=2))
     assert len(early) == 2 and all("is this machine's clock right?" in line for line in early)
     elsewhere = keys_problems(folder, ["tls/192.168.10.6:7448"])
-    assert elsewhere == ["network.listen: found tls/192.168.10.6:7448, wanted an address that the certificate was made for: "
-                         "192.168.10.5, rig.lab"]
+    assert elsewhere == [
+        "network.listen: found tls/192.168.10.6:7448, wanted an address that the certificate was made for: "
+        "192.168.10.5, rig.lab"
+    ]
     reader = keys.issue(folder.parent, "analysis", "reader").folder
     assert "found the certificate of reader.analysis, wanted one issued with --role rig" in keys_problems(reader, LISTEN)[0]
     assert "found no folder" in keys_problems(folder / "nowhere", LISTEN)[0]
@@ -75,7 +83,7 @@ def test_time_address_role_and_a_folder_that_is_not_there(folder: Path) -> None:
 def test_rig_check_looks_at_the_folder(folder: Path, tmp_path: Path) -> None:
     text = RIG_FILE.read_text(encoding="utf-8")
     file = tmp_path / "rig.toml"
-    file.write_text(text[:text.index("[network]")] + keys.network_lines(folder.parent, LISTEN[0]), encoding="utf-8")
+    file.write_text(text[: text.index("[network]")] + keys.network_lines(folder.parent, LISTEN[0]), encoding="utf-8")
     assert CliRunner().invoke(app, ["check", str(file)]).exit_code == 0
     os.chmod(folder / KEY_FILE, 0o644)
     told = CliRunner().invoke(app, ["check", str(file)])

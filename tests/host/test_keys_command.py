@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from host import keys
 from host.cli.main import main
-from host.services.units import UnitSettings, unit_texts
-from realtime.rig_file import load_rig, parse_rig, read_rig_data
+from host.run.service_units import UnitSettings, unit_texts
+from host.security import keys
+from protocol.rig_file import load_rig, parse_rig, read_rig_data
 from tests.realtime.conftest import RIG_FILE
 
 
@@ -33,14 +33,15 @@ def laboratory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "keys"
 
 
-def test_what_is_printed_makes_a_good_rig_file(laboratory: Path, monkeypatch: pytest.MonkeyPatch,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_printed_makes_a_good_rig_file(
+    laboratory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     capsys.readouterr()
     assert run(monkeypatch, "issue", "console", "--role", "commander", "--connect", "tls/10.0.0.5:7448") == 0
     lines = capsys.readouterr().out
     text = RIG_FILE.read_text(encoding="utf-8")
     own = laboratory / "rig.toml"
-    own.write_text(text[:text.index("[network]")] + lines, encoding="utf-8")
+    own.write_text(text[: text.index("[network]")] + lines, encoding="utf-8")
     access = load_rig(own).access
     assert access is not None and access.listen == ("tls/10.0.0.5:7448",) and access.keys == laboratory / "rig1"
     assert access.roles == {"analysis": "reader", "console": "commander"}
@@ -53,36 +54,46 @@ def test_the_zenoh_file_holds_all_and_is_private(laboratory: Path) -> None:
     assert config.get_json("scouting/multicast/enabled") == "false" and "10.0.0.5" in config.get_json("connect")
 
 
-def test_show_lists_all_and_fails_when_one_has_expired(laboratory: Path, monkeypatch: pytest.MonkeyPatch,
-                                                       capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_lists_all_and_fails_when_one_has_expired(
+    laboratory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     capsys.readouterr()
     assert run(monkeypatch, "show", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["certificates"]
     assert [(row["name"], row["role"], row["state"]) for row in rows] == [
-        ("analysis", "reader", "valid"), ("rig1", "rig", "valid")]
+        ("analysis", "reader", "valid"),
+        ("rig1", "rig", "valid"),
+    ]
     monkeypatch.setattr(keys, "_BACKDATED", datetime.timedelta(days=3))
     monkeypatch.setattr(keys, "_life", lambda days, ca: datetime.timedelta(days=-1))
     keys.issue(laboratory, "late", "reader")
     assert run(monkeypatch, "show") == 1 and "expired" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("arguments", "says"), [
-    (("init",), "directory: found"),
-    (("issue", "analysis", "--role", "reader"), "name: found"),
-    (("issue", "authority", "--role", "reader"), "name: found"),
-    (("issue", "../x", "--role", "reader"), "name: found"),
-    (("issue", "Console", "--role", "reader"), "name: found"),
-    (("issue", "new", "--role", "boss"), "role: found"),
-    (("issue", "new", "--role", "rig"), "address: found"),
-    (("issue", "new", "--role", "reader", "--address", "10.0.0.6"), "address: found"),
-    (("issue", "new", "--role", "rig", "--address", "10.0.0.300"), "address: found"),
-    (("issue", "new", "--role", "reader", "--connect", "tcp/10.0.0.5:7448"), "connect: found"),
-    (("issue", "new", "--role", "reader", "--days", "0"), "days: found"),
-    (("issue", "new", "--role", "reader", "--directory", "nowhere"), "directory: found"),
-])
-def test_what_is_refused_leaves_everything_as_it_was(laboratory: Path, monkeypatch: pytest.MonkeyPatch,
-                                                     capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
-                                                     says: str) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("init",), "directory: found"),
+        (("issue", "analysis", "--role", "reader"), "name: found"),
+        (("issue", "authority", "--role", "reader"), "name: found"),
+        (("issue", "../x", "--role", "reader"), "name: found"),
+        (("issue", "Console", "--role", "reader"), "name: found"),
+        (("issue", "new", "--role", "boss"), "role: found"),
+        (("issue", "new", "--role", "rig"), "address: found"),
+        (("issue", "new", "--role", "reader", "--address", "10.0.0.6"), "address: found"),
+        (("issue", "new", "--role", "rig", "--address", "10.0.0.300"), "address: found"),
+        (("issue", "new", "--role", "reader", "--connect", "tcp/10.0.0.5:7448"), "connect: found"),
+        (("issue", "new", "--role", "reader", "--days", "0"), "days: found"),
+        (("issue", "new", "--role", "reader", "--directory", "nowhere"), "directory: found"),
+    ],
+)
+def test_what_is_refused_leaves_everything_as_it_was(
+    laboratory: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    says: str,
+) -> None:
     def contents() -> dict[str, bytes]:
         return {str(path): path.read_bytes() for path in laboratory.parent.rglob("*") if path.is_file()}
 
@@ -94,14 +105,28 @@ def test_what_is_refused_leaves_everything_as_it_was(laboratory: Path, monkeypat
     assert contents() == before
 
 
-@pytest.mark.parametrize("changes", [
-    {"listen": ["tcp/10.0.0.5:7448"]}, {"listen": ["tls/10.0.0.5"]}, {"keys": "keys/rig1"}, {"readers": ["a", "a"]},
-    {"readers": ["console"]}, {"commanders": ["a/b"]}, {"peers": ["everybody"]}, {"reader": ["a"]},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"listen": ["tcp/10.0.0.5:7448"]},
+        {"listen": ["tls/10.0.0.5"]},
+        {"keys": "keys/rig1"},
+        {"readers": ["a", "a"]},
+        {"readers": ["console"]},
+        {"commanders": ["a/b"]},
+        {"peers": ["everybody"]},
+        {"reader": ["a"]},
+    ],
+)
 def test_a_bad_network_section_is_refused(changes: dict[str, list[str]]) -> None:
     data = read_rig_data(RIG_FILE)
-    good = {"listen": ["tls/10.0.0.5:7448"], "keys": "/keys/rig1", "readers": ["analysis"], "commanders": ["console"],
-            "peers": ["10.0.0.0/24"]}
+    good = {
+        "listen": ["tls/10.0.0.5:7448"],
+        "keys": "/keys/rig1",
+        "readers": ["analysis"],
+        "commanders": ["console"],
+        "peers": ["10.0.0.0/24"],
+    }
     assert parse_rig(data | {"network": good}).access is not None
     with pytest.raises(ValueError, match="network"):
         parse_rig(data | {"network": good | changes})

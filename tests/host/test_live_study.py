@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from host.demo import SIMULATED_RIG
-from host.experiment_script import check_script
-from host.live_study import BEGIN, CASES, END, ON_S, Row, quiet_line, round_trip, table, write_docs
+from host.commissioning.experiment_script import check_script
+from host.studies.live_study import BEGIN, CASES, END, ON_S, Row, quiet_line, round_trip, table, write_docs
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm
-from realtime.rig_file import load_rig
 from sim.effects import parse
 
 

@@ -14,15 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from host.cli.contract_io import BadInput, validate
 from host.cli.plan import _with_tuples
 from host.cli.plan import plan as cli_plan
-from host.demo import SIMULATED_RIG
 from host.navigation import PlanRequest, plan, planner, shape
 from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, winding_number
 from host.navigation.request import joints_at
 from host.navigation.timing import ACCELERATION_SHARE, SPEED_SHARE
-from realtime.rig_file import Rig, load_rig
+from protocol.errors import InputError
+from protocol.requests import validate
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 START = {"insertion_m": -0.080, "roll_rad": 0.0, "curvature_per_m": 2.0}
 
@@ -87,7 +87,7 @@ def test_the_tip_stays_in_its_chamber(rig: Rig, reach: shape.Reach, tmp_path: Pa
     answer = plan(request(tip_at(reach, -0.05, 0.8, 20.0), [chamber]), rig, tmp_path)
     assert answer is not None
     assert np.max(np.linalg.norm(answer.tip_m - [0, 0, 0.055], axis=1)) < 0.060
-    with pytest.raises(BadInput, match=r"^goal_m.*outside chamber 0"):
+    with pytest.raises(InputError, match=r"^goal_m.*outside chamber 0"):
         plan(request([0.0, -0.03, 0.13], [chamber]), rig, tmp_path)
 
 
@@ -100,30 +100,45 @@ def test_the_catheter_keeps_to_the_puncture(rig: Rig, reach: shape.Reach) -> Non
     assert answer is not None
     off = [np.min(np.linalg.norm(shape.centre_line(reach, joint, 400) - [0, 0, 0.010], axis=1)) for joint in answer.joint]
     assert max(off) < 0.0023
-    with pytest.raises(BadInput, match=r"^start.*passes the puncture"):
+    with pytest.raises(InputError, match=r"^start.*passes the puncture"):
         plan(request(goal, puncture={"point_m": [0.0, 0.02, 0.010], "radius_m": 0.002}), rig)
 
 
-@pytest.mark.parametrize(("goal", "obstacles", "words"), [
-    ([0.0, 0.2, 0.05], [], "goal that the unloaded tip can reach"),
-    ([0.0, -0.01, 0.05], [{"type": "sphere", "centre_m": [0, -0.01, 0.05], "radius_m": 0.004}],
-     "inside obstacle 0 (sphere)"),
-    ([0.0, -0.01, 0.05], [{"type": "capsule", "from_m": [-0.02, -0.01, 0.05], "to_m": [0.02, -0.01, 0.05],
-                           "radius_m": 0.004}], "inside obstacle 0 (capsule)"),
-    ([0.0, -0.01, 0.05], [{"type": "sphere", "centre_m": [0, 0, 0.02], "radius_m": 0.004}], "start.*free start"),
-    ([0.0, -0.01, 0.05], [{"type": "mesh", "file": "no_such.stl"}], "triangle mesh"),
-])
+@pytest.mark.parametrize(
+    ("goal", "obstacles", "words"),
+    [
+        ([0.0, 0.2, 0.05], [], "goal that the unloaded tip can reach"),
+        (
+            [0.0, -0.01, 0.05],
+            [{"type": "sphere", "centre_m": [0, -0.01, 0.05], "radius_m": 0.004}],
+            "inside obstacle 0 (sphere)",
+        ),
+        (
+            [0.0, -0.01, 0.05],
+            [{"type": "capsule", "from_m": [-0.02, -0.01, 0.05], "to_m": [0.02, -0.01, 0.05], "radius_m": 0.004}],
+            "inside obstacle 0 (capsule)",
+        ),
+        ([0.0, -0.01, 0.05], [{"type": "sphere", "centre_m": [0, 0, 0.02], "radius_m": 0.004}], "start.*free start"),
+        ([0.0, -0.01, 0.05], [{"type": "mesh", "file": "no_such.stl"}], "triangle mesh"),
+    ],
+)
 def test_what_cannot_be_is_refused_in_one_line(rig: Rig, goal: list[float], obstacles: list[dict], words: str) -> None:
-    with pytest.raises(BadInput) as caught:
+    with pytest.raises(InputError) as caught:
         plan(request(goal, obstacles), rig)
     assert re.search(words.replace("(", r"\(").replace(")", r"\)"), str(caught.value)) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("broken", [
-    {"goal": [0, 0, 0.05]}, {"goal_m": [0, 0]}, {"goal_m": [0, 0, 0.05], "obstacles": [{"type": "cube"}]},
-    {"goal_m": [0, 0, 0.05], "clearance_m": -1.0}])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"goal": [0, 0, 0.05]},
+        {"goal_m": [0, 0]},
+        {"goal_m": [0, 0, 0.05], "obstacles": [{"type": "cube"}]},
+        {"goal_m": [0, 0, 0.05], "clearance_m": -1.0},
+    ],
+)
 def test_a_request_that_is_not_one_is_refused(broken: dict) -> None:
-    with pytest.raises(BadInput):
+    with pytest.raises(InputError):
         validate(PlanRequest, _with_tuples({"start": START, **broken}))
 
 
@@ -159,7 +174,8 @@ def test_distances_are_those_of_geometry(tmp_path: Path) -> None:
     line = np.array([[0, 0, 0], [0, 0, 0.05]], float)
     assert Surroundings([Sphere((0.02, 0, 0.03), 0.005)]).clearance_m(line, 0.001) == pytest.approx(0.014, abs=1e-5)
     assert Surroundings([Capsule((0.02, -1, 0.03), (0.02, 1, 0.03), 0.005)]).clearance_m(line, 0.001) == pytest.approx(
-        0.014, abs=1e-5)
+        0.014, abs=1e-5
+    )
     box = trimesh.creation.box((20.0, 20.0, 20.0))
     box.export(tmp_path / "box.stl")
     mesh = load_mesh(tmp_path / "box.stl", 0.001, False)
@@ -174,7 +190,7 @@ def test_distances_are_those_of_geometry(tmp_path: Path) -> None:
 
 
 def test_the_answer_is_json(rig: Rig, reach: shape.Reach) -> None:
-    from host.cli.contract_io import plain
+    from protocol.requests import plain
 
     answer = plan(request(tip_at(reach, -0.05, 0.2, 12.0)), rig)
     assert answer is not None

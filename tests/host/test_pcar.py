@@ -15,8 +15,8 @@ from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from host.mechanics import pcar
 from host.mechanics.arc_integrals import phi, phi3
-from host.mechanics.catheter import load_catheter
 from host.mechanics.puncture import solve_through_puncture
+from protocol.catheter import load_catheter
 from tests.references import elastica
 from tests.references.arcs_by_quadrature import NODES, WEIGHTS, gradient, point, work_of_drag
 
@@ -26,8 +26,7 @@ THERMOCOOL = load_catheter("thermocool_sf")
 
 def arcs_with(length: list[float], EI: list[float], kappa0: list[float], cubic: float = 0.0) -> pcar.Arcs:
     n = len(length)
-    return pcar.Arcs(np.array(length), np.array(EI), np.array(kappa0), np.full(n, cubic), np.arange(n) > 0,
-                     np.eye(n)[0])
+    return pcar.Arcs(np.array(length), np.array(EI), np.array(kappa0), np.full(n, cubic), np.arange(n) > 0, np.eye(n)[0])
 
 
 def softened(insertion_m: float, curvature_per_m: float, softer: float, longest: float = np.inf) -> pcar.Arcs:
@@ -75,8 +74,17 @@ def test_array_form_equals_single_calls() -> None:
     arcs = [pcar.arcs_of(THERMOCOOL, case["insertion_m"], case["curvature_per_m"]) for case in cases]
     length, kappa0 = np.array([a.length_m for a in arcs]), np.array([a.unloaded_curvature_per_m for a in arcs])
     kappa, pose, status = np.empty_like(length), np.empty((50, 3)), np.empty(50, dtype=np.int64)
-    pcar.solve_many(length, arcs[0].EI_N_m2, arcs[0].cubic_stiffening_m2, kappa0,
-                    np.array([case["force_N"] for case in cases]), pcar.NO_DRAG, kappa, pose, status)
+    pcar.solve_many(
+        length,
+        arcs[0].EI_N_m2,
+        arcs[0].cubic_stiffening_m2,
+        kappa0,
+        np.array([case["force_N"] for case in cases]),
+        pcar.NO_DRAG,
+        kappa,
+        pose,
+        status,
+    )
     assert (status == 0).all()
     for i, case in enumerate(cases):
         assert np.array_equal(kappa[i], pcar.solve(arcs[i], case["force_N"]).curvature_per_m)
@@ -145,7 +153,7 @@ def test_transverse_end_load_equals_the_elliptic_integrals_of_the_elastica() -> 
     EI, length, tip_angle = 2e-4, 0.07, 1.1
     modulus = (1.0 + np.sin(tip_angle)) / 2.0
     start = np.arcsin(1.0 / np.sqrt(2.0 * modulus))
-    load = ellipk(modulus) - ellipkinc(start, modulus)              # sqrt(F L^2 / EI)
+    load = ellipk(modulus) - ellipkinc(start, modulus)  # sqrt(F L^2 / EI)
     force = EI * load**2 / length**2
     x = np.sqrt(2.0 * np.sin(tip_angle)) / load * length
     y = length - 2.0 / load * (ellipe(modulus) - ellipeinc(start, modulus)) * length
@@ -207,22 +215,23 @@ def test_pose_sensitivities_equal_high_order_differences(insertion_m: float) -> 
     for axis, unit in enumerate(np.eye(2)):
         expected = derivative(lambda h, unit=unit: pose(insertion_m, curvature, force + h * unit), 4e-4)
         assert np.allclose(by.by_force[:, axis], expected, rtol=1e-8, atol=1e-8)
-    assert np.allclose(by.by_curvature, derivative(lambda h: pose(insertion_m, curvature + h, force), 0.05),
-                       rtol=1e-8, atol=1e-9)
-    if insertion_m in (0.0, -0.0192):      # corners, where another arc begins to come out: the derivative on the way back
+    assert np.allclose(
+        by.by_curvature, derivative(lambda h: pose(insertion_m, curvature + h, force), 0.05), rtol=1e-8, atol=1e-9
+    )
+    if insertion_m in (0.0, -0.0192):  # corners, where another arc begins to come out: the derivative on the way back
         at = [pose(insertion_m - k * 1e-5, curvature, force) for k in range(3)]
         assert np.allclose(by.by_insertion, (3 * at[0] - 4 * at[1] + at[2]) / 2e-5, rtol=1e-5, atol=1e-5)
     else:
         step = 1e-4 if insertion_m > -0.06 else 1e-5
-        assert np.allclose(by.by_insertion, derivative(lambda h: pose(insertion_m + h, curvature, force), step),
-                           rtol=1e-6, atol=1e-6)
+        assert np.allclose(
+            by.by_insertion, derivative(lambda h: pose(insertion_m + h, curvature, force), step), rtol=1e-6, atol=1e-6
+        )
 
 
 def test_the_shape_is_continuous_as_arcs_slide_into_the_sheath() -> None:
     force = [-0.1, 0.15]
     for corner in (0.0, -0.0192):
-        poses = [pcar.solve(pcar.arcs_of(THERMOCOOL, corner + d, 22.0), force).tip_position_m
-                 for d in (-1e-9, 0.0, 1e-9)]
+        poses = [pcar.solve(pcar.arcs_of(THERMOCOOL, corner + d, 22.0), force).tip_position_m for d in (-1e-9, 0.0, 1e-9)]
         assert np.abs(poses[0] - poses[1]).max() < 1e-8 and np.abs(poses[2] - poses[1]).max() < 1e-8
 
 
@@ -234,8 +243,12 @@ def test_a_retracted_shaft_equals_a_catheter_made_that_short() -> None:
 
 
 @settings(max_examples=60)
-@given(insertion=st.floats(-0.06, 0.05), curvature=st.floats(-60.0, 60.0), size=st.floats(0.0, 0.35),
-       angle=st.floats(-np.pi, np.pi))
+@given(
+    insertion=st.floats(-0.06, 0.05),
+    curvature=st.floats(-60.0, 60.0),
+    size=st.floats(0.0, 0.35),
+    angle=st.floats(-np.pi, np.pi),
+)
 def test_mirroring_and_scaling(insertion: float, curvature: float, size: float, angle: float) -> None:
     force = size * np.array([np.cos(angle), np.sin(angle)])
     arcs = pcar.arcs_of(THERMOCOOL, insertion, curvature)
@@ -285,8 +298,13 @@ def test_puncture_is_the_least_energy_under_the_constraint(longest: float, stati
         bend = 0.5 * np.sum(arcs.EI_N_m2 * arcs.length_m * (k - arcs.unloaded_curvature_per_m) ** 2)
         return 1e6 * float(bend - force @ pcar.point_at(arcs, k, arcs.total_length_m)[0])
 
-    best = minimize(energy, kappa + 0.3, method="SLSQP", options={"ftol": 1e-15, "maxiter": 500},
-                    constraints={"type": "eq", "fun": lambda k: 1e3 * (pcar.point_at(arcs, k, station)[0] - target)})
+    best = minimize(
+        energy,
+        kappa + 0.3,
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 500},
+        constraints={"type": "eq", "fun": lambda k: 1e3 * (pcar.point_at(arcs, k, station)[0] - target)},
+    )
     assert np.allclose(best.x, kappa, rtol=0, atol=2e-3) and energy(kappa) <= best.fun + 1e-9
     # the reaction, put on as a load of the chain up to the hole, balances the arcs together with the tip's force
     reached = pcar.shortened(arcs, station)
@@ -310,8 +328,9 @@ def test_bad_forces_never_reach_the_kernel(force: list) -> None:
         pcar.solve(pcar.arcs_of(THERMOCOOL, 0.03, 10.0), force)
 
 
-@pytest.mark.parametrize(("insertion_m", "curvature"), [(np.nan, 1.0), (-0.07, 1.0), (-1.0, 1.0), (np.inf, 1.0),
-                                                        (0.0, np.nan)])
+@pytest.mark.parametrize(
+    ("insertion_m", "curvature"), [(np.nan, 1.0), (-0.07, 1.0), (-1.0, 1.0), (np.inf, 1.0), (0.0, np.nan)]
+)
 def test_bad_actuation_is_refused(insertion_m: float, curvature: float) -> None:
     with pytest.raises(ValueError, match=r"insertion_m|curvature_per_m"):
         pcar.arcs_of(THERMOCOOL, insertion_m, curvature)

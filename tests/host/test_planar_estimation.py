@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from host.estimation import planar
 from host.estimation.interface import Actuation, PoseReading
-from host.estimation.planar_rig import Knowledge, PlanarRigEstimator, bending_plane
+from host.estimation.planar_rig import Knowledge, PlanarRigEstimator, bending_plane, make_estimator
 from host.mechanics import pcar
-from host.mechanics.catheter import load_catheter
-from realtime.rig_file import load_rig
+from protocol.catheter import load_catheter
+from protocol.rig_file import SIMULATED_RIG, load_rig
 
 REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "planar.json").read_text())
 THERMOCOOL, BLAZER = load_catheter("thermocool_sf"), load_catheter("blazer_prime_xp")
-SIMULATED_RIG = Path(__file__).parents[2] / "host" / "rigs" / "simulated.toml"
 
 
 def pose_of(arcs: pcar.Arcs, force: NDArray) -> NDArray | None:
@@ -102,7 +101,7 @@ def test_noisy_estimates_reach_the_cramer_rao_bound_and_beat_the_two_stages() ->
     scatter = np.sqrt(np.trace(error.T @ error) / len(error))
     assert scatter < 1.1 * math.sqrt(np.trace(bound))
     normalized = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_N2[found.converged]), error)
-    assert 1.25 < np.median(normalized) < 1.55      # chi square of two: 1.386
+    assert 1.25 < np.median(normalized) < 1.55  # chi square of two: 1.386
     thesis = np.array([planar.two_stage(arcs, noisy)[0] for noisy in poses[:400]]) - force
     assert np.median(np.hypot(*error[:400].T)) < np.median(np.hypot(*thesis.T))
 
@@ -165,8 +164,12 @@ def test_poses_that_no_force_explains_are_reported_not_raised(pose: list[float])
 
 
 @settings(max_examples=40)
-@given(insertion=st.floats(-0.015, 0.05), curvature=st.floats(5.0, 45.0), size=st.floats(0.0, 0.3),
-       angle=st.floats(-math.pi, math.pi))
+@given(
+    insertion=st.floats(-0.015, 0.05),
+    curvature=st.floats(5.0, 45.0),
+    size=st.floats(0.0, 0.3),
+    angle=st.floats(-math.pi, math.pi),
+)
 def test_the_estimate_inverts_the_statics(insertion: float, curvature: float, size: float, angle: float) -> None:
     arcs, force = pcar.arcs_of(THERMOCOOL, insertion, curvature), size * np.array([math.cos(angle), math.sin(angle)])
     pose = pose_of(arcs, force)
@@ -179,11 +182,18 @@ def test_the_estimate_inverts_the_statics(insertion: float, curvature: float, si
         assert np.abs(found.force_N - force).max() < max(1e-6, 1e-6 * found.weakest_std_N)
 
 
-@pytest.mark.parametrize("change", [
-    {"pose": [np.nan, 0.0, 0.0]}, {"pose": [0.1, 0.0]}, {"covariance": np.zeros((3, 3))}, {"covariance": np.eye(2)},
-    {"covariance": -np.eye(3)}, {"prior": planar.SurfacePrior([0.0, 0.0], 0.1)},
-    {"prior": planar.SurfacePrior([1.0, 0.0], 0.0)},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"pose": [np.nan, 0.0, 0.0]},
+        {"pose": [0.1, 0.0]},
+        {"covariance": np.zeros((3, 3))},
+        {"covariance": np.eye(2)},
+        {"covariance": -np.eye(3)},
+        {"prior": planar.SurfacePrior([0.0, 0.0], 0.1)},
+        {"prior": planar.SurfacePrior([1.0, 0.0], 0.0)},
+    ],
+)
 def test_bad_input_is_refused(change: dict) -> None:
     arguments = {"pose": [0.1, 0.0, 0.0], **change}
     with pytest.raises(ValueError, match=r"found|wanted"):
@@ -196,11 +206,14 @@ def reading(arcs: pcar.Arcs, force: NDArray, back_m: float, roll_rad: float, noi
     position, angle = pcar.point_at(arcs, kappa, arcs.total_length_m - back_m)
     # roll about e3 after bending from e3 towards -e2, that is about +e1
     half, turn = 0.5 * angle, 0.5 * roll_rad
-    w, x, y, z = (math.cos(turn) * math.cos(half), math.cos(turn) * math.sin(half), math.sin(turn) * math.sin(half),
-                  math.sin(turn) * math.cos(half))
+    w, x, y, z = (
+        math.cos(turn) * math.cos(half),
+        math.cos(turn) * math.sin(half),
+        math.sin(turn) * math.sin(half),
+        math.sin(turn) * math.cos(half),
+    )
     y_axis, _ = bending_plane(roll_rad)
-    return PoseReading(position[0] * np.array([0.0, 0.0, 1.0]) + position[1] * y_axis + noise,
-                       np.array([w, x, y, z]), 123)
+    return PoseReading(position[0] * np.array([0.0, 0.0, 1.0]) + position[1] * y_axis + noise, np.array([w, x, y, z]), 123)
 
 
 def test_rig_estimator_gives_the_force_on_the_tissue_in_the_base_frame() -> None:
@@ -213,14 +226,14 @@ def test_rig_estimator_gives_the_force_on_the_tissue_in_the_base_frame() -> None
         on_tissue = -(force[0] * np.array([0.0, 0.0, 1.0]) + force[1] * y_axis)
         assert found.converged and found.stamp_ns == 123
         assert np.allclose(found.force_N, on_tissue, atol=2e-4)
-        assert found.force_N[2] > 0.1       # the tip pushes the wall outwards, along e3
+        assert found.force_N[2] > 0.1  # the tip pushes the wall outwards, along e3
         assert normal @ found.covariance_N2 @ normal == pytest.approx(0.05**2, rel=1e-6)
 
 
 def test_rig_estimator_stays_within_its_covariance_under_noise_and_play() -> None:
     rng = np.random.default_rng(11)
     rig = load_rig(SIMULATED_RIG)
-    estimator = planar.make_estimator(rig)
+    estimator = make_estimator(rig)
     assert isinstance(estimator, PlanarRigEstimator)
     offset = rig.tracker.shaft_sensor_offset_m
     normalized, converged = [], 0
@@ -238,7 +251,7 @@ def test_rig_estimator_stays_within_its_covariance_under_noise_and_play() -> Non
 
 
 def test_rig_estimator_without_shaft_sensor_and_with_bad_input() -> None:
-    estimator = planar.make_estimator(load_rig(SIMULATED_RIG))
+    estimator = make_estimator(load_rig(SIMULATED_RIG))
     arcs = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056)
     tip = reading(arcs, np.array([-0.1, 0.0]), 0.0, 0.3, np.zeros(3))
     alone = estimator.estimate(tip, None, Actuation(-0.07, 0.3, 18.0, 0))

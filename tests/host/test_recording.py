@@ -24,15 +24,20 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import Writer
 
-from host import recording as recording_module
-from host.recording import Header, Recording, RecordingWriter
-from host.recording_index import file_end, is_whole
+from host.recordings import recording as recording_module
+from host.recordings.index import file_end, is_whole
+from host.recordings.recording import Header, Recording, RecordingWriter
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 from tests.small_disk import fill_up
 from tests.waiting import PATIENCE_S
 
-HEADER = Header(rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}},
-                catheter={"name": "blazer_prime_xp"}, seed=7)
+HEADER = Header(
+    rig="simulated",
+    clock="virtual",
+    configuration={"control": {"loop_hz": 1000}},
+    catheter={"name": "blazer_prime_xp"},
+    seed=7,
+)
 
 
 def stage(time_ns: int, value: float = 0.0) -> Stage:
@@ -42,8 +47,14 @@ def stage(time_ns: int, value: float = 0.0) -> Stage:
 def pose(time_ns: int, missing: bool = False) -> Pose:
     if missing:
         return Pose(stamp_ns=time_ns, arrival_ns=time_ns, frame=0, missing=True)
-    return Pose(stamp_ns=time_ns, arrival_ns=time_ns + 25_000_000, frame=3, missing=False,
-                position_m=np.array([0.001, 0.002, 0.04]), quaternion_wxyz=(1.0, 0.0, 0.0, 0.0))
+    return Pose(
+        stamp_ns=time_ns,
+        arrival_ns=time_ns + 25_000_000,
+        frame=3,
+        missing=False,
+        position_m=np.array([0.001, 0.002, 0.04]),
+        quaternion_wxyz=(1.0, 0.0, 0.0, 0.0),
+    )
 
 
 def write(path: Path, count: int) -> Path:
@@ -92,7 +103,7 @@ def test_other_readers_read_it(tmp_path: Path) -> None:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
-        assert summary.statistics.message_count == 104 + 2     # and two poses of foxglove/tip
+        assert summary.statistics.message_count == 104 + 2  # and two poses of foxglove/tip
         schema, channel, _ = next(iter(reader.iter_messages(topics=["pose/tip"])))
         assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
 
@@ -117,7 +128,7 @@ def test_its_index_is_what_the_library_writes(tmp_path: Path) -> None:
         writer.finish()
     wanted = summary_of(by_library)
     last = wanted.chunk_indexes[-1]
-    by_us.write_bytes(by_library.read_bytes()[:last.chunk_start_offset + last.chunk_length + last.message_index_length])
+    by_us.write_bytes(by_library.read_bytes()[: last.chunk_start_offset + last.chunk_length + last.message_index_length])
     with by_us.open("rb") as stream:
         end = file_end(stream, wanted.schemas.values(), wanted.channels.values())
     by_us.write_bytes(by_us.read_bytes() + end)
@@ -145,8 +156,9 @@ def test_the_index_of_each_chunk_points_at_its_messages(tmp_path: Path) -> None:
     assert messages >= 2600 and pointed == [(Opcode.MESSAGE, True, True)] * messages
 
 
-def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(tmp_path: Path,
-                                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "fdatasync", lambda fd: None)
     monkeypatch.setattr(recording_module, "CHUNKS_PER_DESCRIPTION", 20)
     path, held = tmp_path / "a.mcap", []
@@ -158,7 +170,7 @@ def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(tmp_
                 gc.collect()
                 held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert held[1] - held[0] < 400 * 100        # the index of 400 chunks takes 600 bytes and more for each
+    assert held[1] - held[0] < 400 * 100  # the index of 400 chunks takes 600 bytes and more for each
     summary = summary_of(path)
     assert summary.statistics is not None and summary.statistics.chunk_count == len(summary.chunk_indexes) == 501
     with path.open("rb") as stream:
@@ -217,7 +229,7 @@ def test_a_flipped_bit_never_raises_and_never_lies(share: float, bit: int, whole
 
 
 def test_a_damaged_chunk_costs_that_chunk_only(whole: Path) -> None:
-    recording = altered(whole, 0.5, lambda content, place: content[:place] + b"damage" + content[place + 6:])
+    recording = altered(whole, 0.5, lambda content, place: content[:place] + b"damage" + content[place + 6 :])
     assert recording.damaged_chunks == 1
     assert 4900 <= recording.topics["stage"] < 6000
 
@@ -240,7 +252,7 @@ def test_full_disk_is_told_once_and_what_was_there_is_readable(tmp_path: Path, m
 def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
     program = textwrap.dedent("""
         import signal, sys, time
-        from host.recording import RecordingWriter
+        from host.recordings.recording import RecordingWriter
         from tests.host.test_recording import HEADER, stage
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         with RecordingWriter(sys.argv[1], HEADER) as writer:
@@ -251,8 +263,9 @@ def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
     """)
     for number, whole in ((signal.SIGTERM, True), (signal.SIGKILL, False)):
         path = tmp_path / f"{number}.mcap"
-        child = subprocess.Popen([sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE,
-                                 cwd=Path(__file__).parents[2])
+        child = subprocess.Popen(
+            [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[2]
+        )
         assert child.stdout is not None and child.stdout.readline() == b"ready\n"
         child.send_signal(number)
         child.wait(timeout=PATIENCE_S)
@@ -287,8 +300,9 @@ def test_wrong_message_for_a_topic_is_refused(tmp_path: Path) -> None:
 def test_texts_and_flags_keep_their_types(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", HEADER) as writer:
         writer.write("state", RigState(stamp_ns=1, mode="contact", safety_action="hold", cause="no fresh pose"))
-        writer.write("force/estimate", ForceEstimate(stamp_ns=1, frame="base", converged=False, published_ns=2,
-                                                     compute_us=3.0))
+        writer.write(
+            "force/estimate", ForceEstimate(stamp_ns=1, frame="base", converged=False, published_ns=2, compute_us=3.0)
+        )
     recording = Recording(tmp_path / "a.mcap")
     assert recording.table("state")["cause"].tolist() == ["no fresh pose"]
     assert recording.table("force/estimate")["converged"].dtype == np.bool_

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from host.cli.contract_io import plain
-from host.demo_summary import demo_result, print_summary
-from host.recording import Header, Recording, RecordingWriter
-from host.report import lateness_of, render, verdict_of, write_report
-from host.report_style import thinned
-from host.run_summary import spans, summarize
+from host.recordings.recording import Header, Recording, RecordingWriter
+from host.report.demo_summary import demo_result, print_summary
+from host.report.run_report import lateness_of, render, verdict_of, write_report
+from host.report.run_summary import spans, summarize
+from host.report.style import thinned
+from protocol.requests import plain
 from protocol.topics import (
     HISTOGRAM_BUCKETS,
     BoardCounters,
@@ -39,8 +39,12 @@ from protocol.topics import (
 )
 
 MS = 1_000_000
-CONFIGURATION = {"safety": {"over_force_N": 0.5}, "stages": {"insertion": {"encoder_counts_per_step": 2.0}},
-                 "name": "simulated", "control": {"loop_hz": 1000, "odd": [1.0, 2.5]}}
+CONFIGURATION = {
+    "safety": {"over_force_N": 0.5},
+    "stages": {"insertion": {"encoder_counts_per_step": 2.0}},
+    "name": "simulated",
+    "control": {"loop_hz": 1000, "odd": [1.0, 2.5]},
+}
 
 
 @dataclass
@@ -76,39 +80,112 @@ class Story:
         pressing = mode == "contact"
         force_N = self.force_N + self.swing_N * (1 if ms % 20 else -1) if pressing else 0.0
         writer.write("force/sensor", ForceSensor(stamp_ns=time_ns, arrival_ns=time_ns, force_N=(0.0, 0.0, force_N)))
-        writer.write("stage", Stage(stamp_ns=time_ns, command_insertion_m=0.01, command_roll_rad=0.0, command_knob_rad=1.0,
-                                    encoder_insertion_m=0.01, encoder_roll_rad=0.0, encoder_knob_rad=1.0))
+        writer.write(
+            "stage",
+            Stage(
+                stamp_ns=time_ns,
+                command_insertion_m=0.01,
+                command_roll_rad=0.0,
+                command_knob_rad=1.0,
+                encoder_insertion_m=0.01,
+                encoder_roll_rad=0.0,
+                encoder_knob_rad=1.0,
+            ),
+        )
         acting = self.action if 10000 <= ms < 11000 else "none"
-        writer.write("state", RigState(
-            stamp_ns=time_ns, mode=mode, safety_action=acting, cause=self.cause if acting != "none" else "",
-            target_m=(0.0, -0.01, 0.025), tip_m=(0.0, -0.01, 0.02), force_direction=(0.0, 0.0, 1.0),
-            target_force_N=0.2 if pressing else None, force_N=force_N))
+        writer.write(
+            "state",
+            RigState(
+                stamp_ns=time_ns,
+                mode=mode,
+                safety_action=acting,
+                cause=self.cause if acting != "none" else "",
+                target_m=(0.0, -0.01, 0.025),
+                tip_m=(0.0, -0.01, 0.02),
+                force_direction=(0.0, 0.0, 1.0),
+                target_force_N=0.2 if pressing else None,
+                force_N=force_N,
+            ),
+        )
         if ms % 30 == 0:
-            pose = Pose(stamp_ns=time_ns, arrival_ns=time_ns, frame=1, missing=False, quaternion_wxyz=(1.0, 0.0, 0.0, 0.0),
-                        position_m=(self.sideways_m, -0.01, 0.02))
+            pose = Pose(
+                stamp_ns=time_ns,
+                arrival_ns=time_ns,
+                frame=1,
+                missing=False,
+                quaternion_wxyz=(1.0, 0.0, 0.0, 0.0),
+                position_m=(self.sideways_m, -0.01, 0.02),
+            )
             writer.write("pose/tip", pose)
             writer.write("pose/shaft", pose)
-            writer.write("force/estimate", ForceEstimate(
-                stamp_ns=time_ns, frame="base", converged=True, force_N=(0.0, 0.0, self.force_N + self.estimate_off_N),
-                covariance_N2=np.diag([1.0, 1.0, 0.03**2]), published_ns=time_ns + 5 * MS, compute_us=50.0))
+            writer.write(
+                "force/estimate",
+                ForceEstimate(
+                    stamp_ns=time_ns,
+                    frame="base",
+                    converged=True,
+                    force_N=(0.0, 0.0, self.force_N + self.estimate_off_N),
+                    covariance_N2=np.diag([1.0, 1.0, 0.03**2]),
+                    published_ns=time_ns + 5 * MS,
+                    compute_us=50.0,
+                ),
+            )
         if ms % 1000 == 0:
             self._slow(writer, time_ns)
 
     def _slow(self, writer: RecordingWriter, time_ns: int) -> None:
         histogram = [0] * HISTOGRAM_BUCKETS
         histogram[17] = 20000
-        writer.write("loop", LoopTiming(
-            stamp_ns=time_ns, loop_hz=1000.0, ticks=20000, missed_ticks=0, tick_p50_us=20.0, tick_p99_us=30.0,
-            tick_p999_us=40.0, tick_max_us=50.0, tick_histogram=tuple(histogram)))
-        writer.write("board", BoardCounters(
-            stamp_ns=time_ns, mcu_time_us=0, state=2, fault=self.fault, inputs=0, queue_depth=2, last_setpoint=1,
-            fault_name="deadman" if self.fault else "", position_steps=(100, 5, -7), encoder_counts=(204, 5, -7),
-            crc_errors=self.crc_errors, underruns=0, rejected=0, boot_count=3, deadman_age_ms=1.0))
+        writer.write(
+            "loop",
+            LoopTiming(
+                stamp_ns=time_ns,
+                loop_hz=1000.0,
+                ticks=20000,
+                missed_ticks=0,
+                tick_p50_us=20.0,
+                tick_p99_us=30.0,
+                tick_p999_us=40.0,
+                tick_max_us=50.0,
+                tick_histogram=tuple(histogram),
+            ),
+        )
+        writer.write(
+            "board",
+            BoardCounters(
+                stamp_ns=time_ns,
+                mcu_time_us=0,
+                state=2,
+                fault=self.fault,
+                inputs=0,
+                queue_depth=2,
+                last_setpoint=1,
+                fault_name="deadman" if self.fault else "",
+                position_steps=(100, 5, -7),
+                encoder_counts=(204, 5, -7),
+                crc_errors=self.crc_errors,
+                underruns=0,
+                rejected=0,
+                boot_count=3,
+                deadman_age_ms=1.0,
+            ),
+        )
         writer.write("log", Log(stamp_ns=time_ns, level="info", source="test", text=self.log))
         if time_ns == 2000 * MS:
-            writer.write("command", Command(
-                stamp_ns=time_ns, id="c1", commander="console", expires_ns=time_ns + 1, action="target", target="contact",
-                force_N=0.2, target_m=(0.0, -0.01, 0.025), normal=(0.0, 0.0, 1.0)))
+            writer.write(
+                "command",
+                Command(
+                    stamp_ns=time_ns,
+                    id="c1",
+                    commander="console",
+                    expires_ns=time_ns + 1,
+                    action="target",
+                    target="contact",
+                    force_N=0.2,
+                    target_m=(0.0, -0.01, 0.025),
+                    normal=(0.0, 0.0, 1.0),
+                ),
+            )
             writer.write("reply", Reply(stamp_ns=time_ns, id="c1", result="accepted"))
 
 
@@ -126,7 +203,10 @@ def test_figures_are_those_that_went_in(good: Recording) -> None:
     assert summary.tip_rms_error_m == pytest.approx(0.001)
     assert summary.contact_seconds == pytest.approx(16.0, abs=0.02)
     assert [(span.name, round(span.seconds, 2)) for span in summary.modes] == [
-        ("position", 2.0), ("contact", 16.0), ("retract", 1.99)]
+        ("position", 2.0),
+        ("contact", 16.0),
+        ("retract", 1.99),
+    ]
     assert summary.board.known and summary.board.resets == 0 and summary.board.encoder_gap_steps == (2, 0, 0)
     assert summary.lost == {} and summary.worst_action == "none"
 
@@ -139,16 +219,19 @@ def test_estimate_is_judged_along_the_force_direction(good: Recording) -> None:
     assert quality.within_2sd_share == 1.0 and quality.mean_error_N == pytest.approx(0.02, abs=2e-3)
 
 
-@pytest.mark.parametrize(("story", "level", "says"), [
-    (Story(), "good", "0.200"),
-    (Story(force_N=0.25), "fair", "a tenth off"),
-    (Story(force_N=0.5, swing_N=0.2), "fair", "above the limit"),
-    (Story(action="hold", cause="no fresh pose"), "fair", "hold, no fresh pose"),
-    (Story(action="stop", cause="pose lost"), "bad", "stop, pose lost"),
-    (Story(fault=2), "bad", "deadman"),
-    (Story(crc_errors=3), "fair", "3 damaged frames"),
-    (Story(contact=False), "fair", "No contact"),
-])
+@pytest.mark.parametrize(
+    ("story", "level", "says"),
+    [
+        (Story(), "good", "0.200"),
+        (Story(force_N=0.25), "fair", "a tenth off"),
+        (Story(force_N=0.5, swing_N=0.2), "fair", "above the limit"),
+        (Story(action="hold", cause="no fresh pose"), "fair", "hold, no fresh pose"),
+        (Story(action="stop", cause="pose lost"), "bad", "stop, pose lost"),
+        (Story(fault=2), "bad", "deadman"),
+        (Story(crc_errors=3), "fair", "3 damaged frames"),
+        (Story(contact=False), "fair", "No contact"),
+    ],
+)
 def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_path: Path) -> None:
     verdict = verdict_of(summarize(story.write(tmp_path / "a.mcap")))
     assert verdict.level == level
@@ -192,13 +275,21 @@ def test_report_is_one_file_that_loads_nothing(good: Recording, tmp_path: Path) 
     for address in links.loaded:
         ElementTree.fromstring(base64.b64decode(address.partition(",")[2]))
     assert links.tags.count("figure") == 7 and page.count('class="narrow"') == 7
-    assert "name=\"viewport\"" in page and len(page) < 4_000_000
+    assert 'name="viewport"' in page and len(page) < 4_000_000
 
 
 def test_report_shows_figures_and_settings(good: Recording) -> None:
     page = render(good)
-    for text in ("0.200\u00a0N", "30\u00a0mN", "0.230\u00a0N", "1.00\u00a0mm", "blazer_prime_xp", "encoder_counts_per_step",
-                 "target contact 0.20 N: accepted", "No fault, no damaged frame"):
+    for text in (
+        "0.200\u00a0N",
+        "30\u00a0mN",
+        "0.230\u00a0N",
+        "1.00\u00a0mm",
+        "blazer_prime_xp",
+        "encoder_counts_per_step",
+        "target contact 0.20 N: accepted",
+        "No fault, no damaged frame",
+    ):
         assert text in page, text
     assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
 
@@ -218,8 +309,21 @@ def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
     assert "<script>" not in page and "<img src=x" not in page and "&lt;script&gt;" in page
 
 
-@pytest.mark.parametrize("topics", [set(), {"log"}, {"state"}, {"force/sensor"}, {"pose/tip"}, {"pose/tip", "state"},
-                                    {"stage"}, {"board", "loop"}, {"force/estimate"}, {"state", "force/estimate"}])
+@pytest.mark.parametrize(
+    "topics",
+    [
+        set(),
+        {"log"},
+        {"state"},
+        {"force/sensor"},
+        {"pose/tip"},
+        {"pose/tip", "state"},
+        {"stage"},
+        {"board", "loop"},
+        {"force/estimate"},
+        {"state", "force/estimate"},
+    ],
+)
 def test_recordings_without_some_topics_are_reported_too(topics: set[str], good: Recording, tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "part.mcap", Header("simulated", "wall", {}, {})) as writer:
         for topic in sorted(topics):
@@ -256,8 +360,19 @@ class Ran:
     interrupted: str = ""
 
 
-CONTRACT_KEYS = {"target_force_N", "force_rms_error_N", "force_peak_N", "tip_rms_error_m", "contact_seconds", "loop_hz",
-                 "tick_us", "missed_ticks", "firmware", "recording", "report"}
+CONTRACT_KEYS = {
+    "target_force_N",
+    "force_rms_error_N",
+    "force_peak_N",
+    "tip_rms_error_m",
+    "contact_seconds",
+    "loop_hz",
+    "tick_us",
+    "missed_ticks",
+    "firmware",
+    "recording",
+    "report",
+}
 
 
 def test_contract_json(good: Recording) -> None:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from host.cli.contract_io import BadInput
-from host.reproduction import control_hybrid, control_kinematics, control_rig
-from host.reproduction.report import Section, as_json, write_reproduction
-from host.reproduction.thesis_control import (
+from host.report.figure_page import Section, as_json, write_reproduction
+from host.studies.reproduction import control_hybrid, control_kinematics, control_rig
+from host.studies.reproduction.thesis_control import (
     Gains,
     contact,
     cost,
@@ -20,7 +19,8 @@ from host.reproduction.thesis_control import (
     planar_inverse,
     step_figures,
 )
-from host.reproduction.thesis_position import unloaded_tip
+from host.studies.reproduction.thesis_position import unloaded_tip
+from protocol.errors import InputError
 
 SECTION = Section("fig_1", "Fig. 1", "It is so.", "So it is <here>.", "holds", "1 of 1.")
 
@@ -28,7 +28,7 @@ SECTION = Section("fig_1", "Fig. 1", "It is so.", "So it is <here>.", "holds", "
 def test_the_report_stands_alone_and_escapes(tmp_path: Path) -> None:
     page = write_reproduction(tmp_path / "deep" / "page.html", "Title", "Lead.", [SECTION]).read_text()
     assert "Holds." in page and "&lt;here&gt;" in page and 'id="fig_1"' in page
-    assert "<script" not in page and "src=\"http" not in page
+    assert "<script" not in page and 'src="http' not in page
 
 
 def test_the_json_is_the_contracts(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_an_unknown_part_is_refused() -> None:
     app = typer.Typer()
     app.command()(reproduce)
     result = CliRunner().invoke(app, ["biology"])
-    assert isinstance(result.exception, BadInput) and "mechanics or control" in str(result.exception)
+    assert isinstance(result.exception, InputError) and "mechanics or control" in str(result.exception)
 
 
 def test_the_printed_gains_settle_and_hold_position() -> None:
@@ -98,8 +98,20 @@ def test_the_search_of_gains_does_not_get_worse() -> None:
 
 def test_sections_of_the_simulated_figures() -> None:
     sections = {section.id: section for section in [*control_kinematics.sections(), *control_hybrid.sections(True)]}
-    assert set(sections) == {"fig_7.5", "fig_7.6", "fig_7.7", "fig_7.8", "fig_7.9_7.10", "fig_7.11", "fig_7.12", "fig_7.13",
-                             "fig_7.14", "fig_7.15", "fig_7.16", "fig_7.17"}
+    assert set(sections) == {
+        "fig_7.5",
+        "fig_7.6",
+        "fig_7.7",
+        "fig_7.8",
+        "fig_7.9_7.10",
+        "fig_7.11",
+        "fig_7.12",
+        "fig_7.13",
+        "fig_7.14",
+        "fig_7.15",
+        "fig_7.16",
+        "fig_7.17",
+    }
     for name in ("fig_7.5", "fig_7.8", "fig_7.9_7.10", "fig_7.13", "fig_7.16"):
         assert sections[name].verdict == "holds", sections[name].says
     assert all(section.pictures for section in sections.values())

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.rod import rod_record
-from host.reproduction import fine_spatial, mechanics, planar, spatial, spatial_experiments, spatial_force
-from host.reproduction.report import as_json
-from host.reproduction.thesis_schemes import conventional, internal_loads, iterates
+from host.report.figure_page import as_json
+from host.studies.reproduction import fine_spatial, mechanics, planar, spatial, spatial_experiments, spatial_force
+from host.studies.reproduction.thesis_schemes import conventional, internal_loads, iterates
+from protocol.catheter import load_catheter
 
 LIVEWIRE = load_catheter("livewire")
 
@@ -43,8 +43,9 @@ def test_a_statement_that_is_not_true_is_marked_so() -> None:
 
 
 def test_a_wrong_model_turns_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spatial, "tip_pose_500", lambda rod,
-                        force: (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])))
+    monkeypatch.setattr(
+        spatial, "tip_pose_500", lambda rod, force: (np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0]))
+    )
     assert spatial.figure_3_6(True).verdict == "does_not_hold"
 
 
@@ -67,8 +68,9 @@ def test_conventional_problem_and_first_iterate_meet_the_rod() -> None:
     assert converged
     np.testing.assert_allclose(tip, solve_cosserat(LIVEWIRE, 0.0, 15.0, force).tip_position_m, atol=1e-5)
     arc = 0.07 * 15.0
-    np.testing.assert_allclose(iterates(rod, force, 1)[0][-1], [0.0, (np.cos(arc) - 1.0) / 15.0, np.sin(arc) / 15.0],
-                               atol=2e-4)
+    np.testing.assert_allclose(
+        iterates(rod, force, 1)[0][-1], [0.0, (np.cos(arc) - 1.0) / 15.0, np.sin(arc) / 15.0], atol=2e-4
+    )
 
 
 def test_unloaded_shaft_carries_only_its_tension() -> None:

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from host.cli.rig import rig as app
-from realtime.rig_file import Rig, load_rig
+from protocol.rig_file import Rig, load_rig
 from tests.realtime.conftest import RIG_FILE
 
 

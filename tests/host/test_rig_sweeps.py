@@ -10,18 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.characterization import record_simulated, standard_sweeps
-from host.demo import SIMULATED_RIG, simulated_plant
-from host.recording import Recording
-from host.rig_sweeps import duration_s, in_words
+from host.commissioning.characterization import record_simulated, standard_sweeps
+from host.commissioning.rig_sweeps import duration_s, in_words
+from host.recordings.recording import Recording
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message
-from realtime.lockstep import Arriving, Leaving
-from realtime.rig_file import Rig, load_rig
-from realtime.sweep import Sweep, SweepLoop
-from realtime.sweep_ports import RigPorts, run_sweeps
+from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.sweep import Sweep, SweepLoop
+from realtime.core.sweep_ports import RigPorts, run_sweeps
 from sim.board import Board
 from sim.tissue import TissueConfig
-from sim.world import World
+from sim.world import World, simulated_plant
 
 SHORT = [Sweep(0, (0.006, 0.0, 0.0), 0.004, 1.5, 1)]
 FREE = TissueConfig(point_m=(0.0, 0.0, 10.0))
@@ -175,13 +174,22 @@ def test_a_port_that_is_held_is_refused(rig: Rig, lines: tuple[str, str]) -> Non
         RigPorts(rig, *lines)
 
 
-@pytest.mark.parametrize(("arguments", "status", "words"), [
-    (["--real"], 2, "--yes: found \"missing\""),
-    (["--real", "--yes"], 1, "board.port: found pty:board that does not open"),
-    (["--real", "--recording", "x.mcap"], 2, "--real: found \"with --recording\""),
-    (["--real", "--yes", "--force-port", "0"], 2, "--force-port: found 0")])
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["--real"], 2, '--yes: found "missing"'),
+        (["--real", "--yes"], 1, "board.port: found pty:board that does not open"),
+        (["--real", "--recording", "x.mcap"], 2, '--real: found "with --recording"'),
+        (["--real", "--yes", "--force-port", "0"], 2, "--force-port: found 0"),
+    ],
+)
 def test_bad_requests_for_a_real_rig(arguments: list[str], status: int, words: str, tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-m", "host.cli.main", "characterize", "--dir", str(tmp_path), *arguments],
-                          capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-m", "host.cli.main", "characterize", "--dir", str(tmp_path), *arguments],
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=60,
+    )
     assert done.returncode == status and words in done.stderr and "Traceback" not in done.stderr
     assert not list(tmp_path.glob("*.mcap"))

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from host.cli.contract_io import BadInput
 from host.cli.install_services import install_services
-from host.services.supervisor import ServiceSettings, Supervisor
-from host.services.units import UnitSettings, install, undo, unit_texts
-from realtime.rig_file import load_rig, parse_rig, read_rig_data
+from host.run.service_units import UnitSettings, install, undo, unit_texts
+from protocol.errors import InputError
+from protocol.rig_file import load_rig, parse_rig, read_rig_data
+from tests.host.supervisor import ServiceSettings, Supervisor
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S
 
@@ -51,8 +51,16 @@ def test_the_units_are_tight(units: list[Path]) -> None:
 
 def test_the_loop_has_priority_watchdog_memory_and_a_processor(units: list[Path]) -> None:
     text = next(unit for unit in units if "realtime" in unit.name).read_text()
-    for line in ("Type=notify", "WatchdogSec=2", "CPUSchedulingPolicy=fifo", "LimitMEMLOCK=infinity", "NoNewPrivileges=yes",
-                 "User=seldinger", f"CPUAffinity={(os.cpu_count() or 1) - 1}", "Restart=on-failure"):
+    for line in (
+        "Type=notify",
+        "WatchdogSec=2",
+        "CPUSchedulingPolicy=fifo",
+        "LimitMEMLOCK=infinity",
+        "NoNewPrivileges=yes",
+        "User=seldinger",
+        f"CPUAffinity={(os.cpu_count() or 1) - 1}",
+        "Restart=on-failure",
+    ):
         assert line in text.splitlines()
     assert "@" not in "".join(line for line in text.splitlines() if "SystemCallFilter" not in line)
 
@@ -71,7 +79,7 @@ def test_a_file_of_someone_else_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "etc/systemd/system/seldinger-host.service"
     path.parent.mkdir(parents=True)
     path.write_text("mine")
-    with pytest.raises(BadInput, match="a place without files of that name"):
+    with pytest.raises(InputError, match="a place without files of that name"):
         install_services(rig=RIG_FILE, simulated=False, cpu=-1, root=tmp_path, take_away=False)
     assert files(tmp_path) == [path] and path.read_text() == "mine"
 
@@ -83,13 +91,13 @@ def test_what_a_unit_cannot_hold_is_refused(tmp_path: Path) -> None:
     data["force_sensor"]["address"] = "box.example"
     with pytest.raises(ValueError, match=r"force_sensor\.address"):
         unit_texts(UnitSettings(RIG_FILE, 0), parse_rig(data))
-    with pytest.raises(BadInput, match="--cpu"):
+    with pytest.raises(InputError, match="--cpu"):
         install_services(rig=RIG_FILE, simulated=False, cpu=4096, root=tmp_path, take_away=False)
 
 
 SERVICE = """
 import sys, time
-from realtime.service_notify import ServiceNotifier
+from realtime.loop.service_notify import ServiceNotifier
 manager = ServiceNotifier()
 manager.ready("disarmed")
 beat = 0
@@ -133,8 +141,18 @@ def test_the_simulated_rig_and_the_control_loop_run_as_services_and_come_back_di
     with Supervisor(ServiceSettings([sys.executable, *rig], watchdog_s=60.0, stop_s=PATIENCE_S)) as world:
         assert world.run_until(lambda: world.ready and ports.exists(), PATIENCE_S)
         named = dict(line.split("=", 1) for line in ports.read_text().splitlines())
-        loop = ["-m", "realtime", "--rig", str(RIG_FILE), "--board-port", named["BOARD_PORT"], "--tracker-port",
-                named["TRACKER_PORT"], "--force-port", named["FORCE_PORT"]]
+        loop = [
+            "-m",
+            "realtime",
+            "--rig",
+            str(RIG_FILE),
+            "--board-port",
+            named["BOARD_PORT"],
+            "--tracker-port",
+            named["TRACKER_PORT"],
+            "--force-port",
+            named["FORCE_PORT"],
+        ]
         settings = ServiceSettings([sys.executable, *loop], watchdog_s=60.0, restart_s=0.05, stop_s=PATIENCE_S)
         with Supervisor(settings) as control:
             assert control.run_until(lambda: control.ready, PATIENCE_S)

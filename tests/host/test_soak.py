@@ -4,7 +4,7 @@ import mmap
 
 import pytest
 
-from host.soak import SoakResult, _judge, page_section, resident_mb, soak
+from host.studies.soak import SoakResult, _judge, page_section, resident_mb, soak
 
 
 def test_growing_memory_is_found_and_flat_memory_is_not() -> None:

@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from host.cli.contract_io import BadInput
 from host.estimation import spatial_kernels as kernels
 from host.estimation.contact_place import estimate_contact
 from host.estimation.sensor_noise import ORIENTATION_STD_rad, POSITION_STD_m, chi_square_limit
 from host.estimation.spatial import LARGEST_FORCE_N, ForceEstimate, PoseSensor, SurfacePrior, estimate_cosserat, sample
 from host.estimation.spatial_batch import ForceTracker, estimate_batch
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
-from host.mechanics.catheter import Catheter, load_catheter
 from host.mechanics.cosserat import CosseratSolution, PointLoad, solve_cosserat
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product, rotation_matrix
+from protocol.catheter import Catheter, load_catheter
+from protocol.errors import InputError
 from tests.host.rod_cases import random_catheter, unit
 
 Array = NDArray[np.float64]
@@ -29,8 +29,9 @@ LIVEWIRE, STEEROCATH, BLAZER = (load_catheter(name) for name in ("livewire", "st
 INSERTION_m = 0.01
 
 
-def posed(catheter: Catheter, k0: float, force: Array, frame: str = "base", insertion: float = INSERTION_m,
-          roll: float = 0.0) -> CosseratSolution:
+def posed(
+    catheter: Catheter, k0: float, force: Array, frame: str = "base", insertion: float = INSERTION_m, roll: float = 0.0
+) -> CosseratSolution:
     return solve_cosserat(catheter, insertion, k0, force, frame, stations_m=OFFSETS, roll_rad=roll)
 
 
@@ -185,9 +186,17 @@ def test_the_thesis_unweighted_cost_is_worse(case: int) -> None:
 def test_covariance_follows_the_sensors() -> None:
     found = posed(STEEROCATH, 25.0, np.array([0.05, 0.08, -0.03]))
     plain = estimate_cosserat(STEEROCATH, INSERTION_m, 25.0, 2, sensors_of(found))
-    worse = estimate_cosserat(STEEROCATH, INSERTION_m, 25.0, 2, sensors_of(
-        found, position_covariance_m2=4.0 * POSITION_STD_m**2 * np.eye(3),
-        orientation_covariance_rad2=4.0 * ORIENTATION_STD_rad**2 * np.eye(3)))
+    worse = estimate_cosserat(
+        STEEROCATH,
+        INSERTION_m,
+        25.0,
+        2,
+        sensors_of(
+            found,
+            position_covariance_m2=4.0 * POSITION_STD_m**2 * np.eye(3),
+            orientation_covariance_rad2=4.0 * ORIENTATION_STD_rad**2 * np.eye(3),
+        ),
+    )
     assert np.allclose(worse.covariance_N2, 4.0 * plain.covariance_N2, rtol=1e-2)
     assert np.all(np.linalg.eigvalsh(plain.covariance_N2) > 0.0)
     assert abs(plain.weakest_std_N**2 - np.linalg.eigvalsh(plain.covariance_N2)[-1]) < 1e-12
@@ -268,8 +277,10 @@ def test_with_the_last_force_known_the_branch_next_to_it_is_kept(case: int) -> N
 
 @pytest.mark.parametrize("case", range(1, 7))
 def test_an_unreachable_pose_is_said_in_bounded_time(case: int) -> None:
-    sensors = [PoseSensor(offset, [0.1, 0.2 - 1.5 * offset, 0.3], quaternion_of_vector(np.array([0.0, 2.0 + i, 0.0])))
-               for i, offset in enumerate(OFFSETS)]
+    sensors = [
+        PoseSensor(offset, [0.1, 0.2 - 1.5 * offset, 0.3], quaternion_of_vector(np.array([0.0, 2.0 + i, 0.0])))
+        for i, offset in enumerate(OFFSETS)
+    ]
     estimate = estimate_cosserat(STEEROCATH, INSERTION_m, 20.0, case, sensors)
     assert not estimate.converged or case == 5
     assert estimate.residual > 0.05 or case == 5
@@ -280,8 +291,10 @@ def test_an_unreachable_pose_is_said_in_bounded_time(case: int) -> None:
 def test_a_tip_a_little_beyond_reach_is_said() -> None:
     found = posed(STEEROCATH, 0.0, np.zeros(3))
     for case in (1, 2):
-        stretched = [PoseSensor(s.offset_m, np.asarray(s.position_m) + [0.0, 0.0, 0.012], s.quaternion_wxyz)
-                     for s in sensors_of(found)]
+        stretched = [
+            PoseSensor(s.offset_m, np.asarray(s.position_m) + [0.0, 0.0, 0.012], s.quaternion_wxyz)
+            for s in sensors_of(found)
+        ]
         estimate = estimate_cosserat(STEEROCATH, INSERTION_m, 0.0, case, stretched)
         assert not estimate.converged and 0.1 < estimate.residual < 0.3
 
@@ -289,8 +302,10 @@ def test_a_tip_a_little_beyond_reach_is_said() -> None:
 # Contact away from the tip
 
 
-@pytest.mark.parametrize(("place", "force"), [(0.0, [0.05, 0.08, -0.03]), (0.012, [0.05, 0.08, -0.03]),
-                                              (0.025, [0.1, 0.05, 0.1]), (0.041, [0.1, 0.2, 0.1])])
+@pytest.mark.parametrize(
+    ("place", "force"),
+    [(0.0, [0.05, 0.08, -0.03]), (0.012, [0.05, 0.08, -0.03]), (0.025, [0.1, 0.05, 0.1]), (0.041, [0.1, 0.2, 0.1])],
+)
 def test_place_and_force_of_a_contact_from_three_poses(place: float, force: list[float]) -> None:
     found = solve_cosserat(STEEROCATH, INSERTION_m, 25.0, stations_m=OFFSETS, point_loads=[PointLoad(place, force)])
     estimate = estimate_contact(STEEROCATH, INSERTION_m, 25.0, sensors_of(found))
@@ -337,8 +352,13 @@ def test_tracker_and_batch_follow_a_recording(case: int) -> None:
     if case in (2, 4, 6):
         alone = estimate_batch(STEEROCATH, INSERTION_m, curvature, case, *args, workers=2)
         assert np.abs(alone.force_N - force).max() < 2e-6 and np.abs(ordered.force_N - force).max() < 2e-6
-        single = estimate_cosserat(STEEROCATH, INSERTION_m, curvature[7], case, [
-            PoseSensor(o, positions[7, i], quaternions[7, i]) for i, o in enumerate(OFFSETS)])
+        single = estimate_cosserat(
+            STEEROCATH,
+            INSERTION_m,
+            curvature[7],
+            case,
+            [PoseSensor(o, positions[7, i], quaternions[7, i]) for i, o in enumerate(OFFSETS)],
+        )
         assert np.allclose(single.covariance_N2, alone.covariance_N2[7], rtol=2e-2, atol=1e-9)
 
 
@@ -371,42 +391,71 @@ def test_chi_square_limits() -> None:
 
 
 def attempt(**change: object) -> ForceEstimate:
-    good: dict = {"catheter": STEEROCATH, "insertion_m": 0.01, "curvature_per_m": 20.0, "case": 4,
-                  "sensors": [PoseSensor(0.0, [0.0, 0.0, 0.08], [1, 0, 0, 0]), PoseSensor(0.03, [0, 0, 0.05], [1, 0, 0, 0])]}
+    good: dict = {
+        "catheter": STEEROCATH,
+        "insertion_m": 0.01,
+        "curvature_per_m": 20.0,
+        "case": 4,
+        "sensors": [PoseSensor(0.0, [0.0, 0.0, 0.08], [1, 0, 0, 0]), PoseSensor(0.03, [0, 0, 0.05], [1, 0, 0, 0])],
+    }
     return estimate_cosserat(**(good | change))
 
 
 def second(**change: object) -> list[PoseSensor]:
-    return [PoseSensor(0.0, [0.0, 0.0, 0.08], [1, 0, 0, 0]),
-            PoseSensor(**({"offset_m": 0.03, "position_m": [0, 0, 0.05], "quaternion_wxyz": [1, 0, 0, 0]} | change))]
+    return [
+        PoseSensor(0.0, [0.0, 0.0, 0.08], [1, 0, 0, 0]),
+        PoseSensor(**({"offset_m": 0.03, "position_m": [0, 0, 0.05], "quaternion_wxyz": [1, 0, 0, 0]} | change)),
+    ]
 
 
-@pytest.mark.parametrize(("change", "key"), [
-    ({"case": 7}, "case"), ({"case": True}, "case"), ({"case": 6}, "sensors"), ({"insertion_m": -0.08}, "insertion_m"),
-    ({"curvature_per_m": math.nan}, "curvature_per_m"), ({"roll_rad": math.inf}, "roll_rad"),
-    ({"sensors": second(quaternion_wxyz=[1, 0.1, 0, 0])}, "sensors.1.quaternion_wxyz"),
-    ({"sensors": second(position_m=[0, math.nan, 0])}, "sensors.1.position_m"),
-    ({"sensors": second(offset_m=-0.01)}, "sensors.offset_m"), ({"sensors": second(offset_m=0.0)}, "sensors.offset_m"),
-    ({"sensors": second(position_covariance_m2=-np.eye(3))}, "sensors.1.position_covariance_m2"),
-    ({"sensors": second(orientation_covariance_rad2=np.eye(2))}, "sensors.1.orientation_covariance_rad2"),
-    ({"previous_force_N": [0.0, math.nan, 0.0]}, "previous_force_N"), ({"largest_force_N": 0.0}, "largest_force_N"),
-    ({"prior": SurfacePrior([0, 0, 0], 0.1)}, "prior.normal"),
-    ({"prior": SurfacePrior([0, 0, 1], 0.0)}, "prior.tangential_std_N"),
-])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"case": 7}, "case"),
+        ({"case": True}, "case"),
+        ({"case": 6}, "sensors"),
+        ({"insertion_m": -0.08}, "insertion_m"),
+        ({"curvature_per_m": math.nan}, "curvature_per_m"),
+        ({"roll_rad": math.inf}, "roll_rad"),
+        ({"sensors": second(quaternion_wxyz=[1, 0.1, 0, 0])}, "sensors.1.quaternion_wxyz"),
+        ({"sensors": second(position_m=[0, math.nan, 0])}, "sensors.1.position_m"),
+        ({"sensors": second(offset_m=-0.01)}, "sensors.offset_m"),
+        ({"sensors": second(offset_m=0.0)}, "sensors.offset_m"),
+        ({"sensors": second(position_covariance_m2=-np.eye(3))}, "sensors.1.position_covariance_m2"),
+        ({"sensors": second(orientation_covariance_rad2=np.eye(2))}, "sensors.1.orientation_covariance_rad2"),
+        ({"previous_force_N": [0.0, math.nan, 0.0]}, "previous_force_N"),
+        ({"largest_force_N": 0.0}, "largest_force_N"),
+        ({"prior": SurfacePrior([0, 0, 0], 0.1)}, "prior.normal"),
+        ({"prior": SurfacePrior([0, 0, 1], 0.0)}, "prior.tangential_std_N"),
+    ],
+)
 def test_bad_input_is_named(change: dict, key: str) -> None:
-    with pytest.raises(BadInput) as error:
+    with pytest.raises(InputError) as error:
         attempt(**change)
     assert error.value.key == key
 
 
-@pytest.mark.parametrize(("change", "key"), [
-    ({"offsets_m": [0.0]}, "offsets_m"), ({"positions_m": np.full((2, 2, 3), math.nan)}, "positions_m"),
-    ({"quaternions_wxyz": np.zeros((2, 2, 4))}, "quaternions_wxyz"), ({"case": 0}, "case"),
-    ({"position_std_m": 0.0}, "position_std_m"), ({"quaternions_wxyz": np.zeros((2, 3, 4))}, "quaternions_wxyz"),
-])
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"offsets_m": [0.0]}, "offsets_m"),
+        ({"positions_m": np.full((2, 2, 3), math.nan)}, "positions_m"),
+        ({"quaternions_wxyz": np.zeros((2, 2, 4))}, "quaternions_wxyz"),
+        ({"case": 0}, "case"),
+        ({"position_std_m": 0.0}, "position_std_m"),
+        ({"quaternions_wxyz": np.zeros((2, 3, 4))}, "quaternions_wxyz"),
+    ],
+)
 def test_bad_batches_are_named(change: dict, key: str) -> None:
-    good: dict = {"catheter": STEEROCATH, "insertion_m": 0.01, "curvature_per_m": 20.0, "case": 4, "offsets_m": [0.0, 0.03],
-                  "positions_m": np.zeros((2, 2, 3)), "quaternions_wxyz": np.tile([1.0, 0.0, 0.0, 0.0], (2, 2, 1))}
-    with pytest.raises(BadInput) as error:
+    good: dict = {
+        "catheter": STEEROCATH,
+        "insertion_m": 0.01,
+        "curvature_per_m": 20.0,
+        "case": 4,
+        "offsets_m": [0.0, 0.03],
+        "positions_m": np.zeros((2, 2, 3)),
+        "quaternions_wxyz": np.tile([1.0, 0.0, 0.0, 0.0], (2, 2, 1)),
+    }
+    with pytest.raises(InputError) as error:
         estimate_batch(**(good | change))
     assert error.value.key == key

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from host.bad_subscriber import KINDS
-from host.subscriber_study import NOBODY, SAYS, Measured, Study, page_section
-from realtime.native_loop import BINS
+from host.studies.bad_subscriber import KINDS
+from host.studies.subscriber_study import NOBODY, SAYS, Measured, Study, page_section
+from realtime.loop.native_loop import BINS
 
 
 def measured(late_us: int, missed: int = 0) -> Measured:
@@ -32,10 +32,15 @@ def test_the_page_has_a_row_for_each_kind_and_one_for_comparison() -> None:
     assert figures["lateness_us"]["p50"] == pytest.approx(9.5) and "max" not in figures["lateness_us"]
 
 
-@pytest.mark.parametrize(("arguments", "says"), [
-    (["--with", "frozen,nosy"], 'with: found "nosy", wanted all, or some of ' + ", ".join(KINDS)),
-    (["--docs", "page.md"], "docs: found page.md, wanted --with beside it")])
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--with", "frozen,nosy"], 'with: found "nosy", wanted all, or some of ' + ", ".join(KINDS)),
+        (["--docs", "page.md"], "docs: found page.md, wanted --with beside it"),
+    ],
+)
 def test_what_it_refuses(arguments: list[str], says: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "host.cli.main", "latency-check", *arguments],
-                          capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "host.cli.main", "latency-check", *arguments], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 2 and says in done.stderr

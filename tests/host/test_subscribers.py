@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from host import keys
-from host.bad_subscriber import KINDS, BadSubscriber, bad_subscriber
-from host.commander import Commander
-from host.wall_clock import with_endpoint
+from host.run.commander import Commander
+from host.run.wall_clock import with_endpoint
+from host.security import keys
+from host.studies.bad_subscriber import KINDS, BadSubscriber, bad_subscriber
+from protocol.rig_file import load_rig
 from protocol.topics import TOPICS, Command, Message, Reply, RigState
 from protocol.zenoh_access import Network
 from protocol.zenoh_session import Session
-from realtime.command_gate import CommandGate
-from realtime.rig_file import load_rig
+from realtime.core.command_gate import CommandGate
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
@@ -118,8 +118,9 @@ def lines_of_the_example(arguments: list[str], session: Session, program: str) -
     reader.start()
     deadline = time.monotonic() + PATIENCE_S
     while reader.is_alive() and time.monotonic() < deadline:
-        publisher.put(RigState(stamp_ns=2_500_000_000, mode="contact", safety_action="hold", cause="no fresh pose",
-                               force_N=0.1234))
+        publisher.put(
+            RigState(stamp_ns=2_500_000_000, mode="contact", safety_action="hold", cause="no fresh pose", force_N=0.1234)
+        )
         time.sleep(0.01)
     child.kill()
     child.wait()

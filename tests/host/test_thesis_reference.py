@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from host.mechanics import thesis_reference
-from host.mechanics.catheter import load_catheter
 from host.mechanics.cosserat import solve_cosserat
+from protocol.catheter import load_catheter
 from tests.host.rod_cases import random_catheter, rod_of, unit
 
 Array = NDArray[np.float64]
@@ -19,6 +19,7 @@ OFFSETS = np.array([0.0, 0.03, 0.05])
 def test_euler_with_500_elements_is_off_by_a_tenth_of_a_millimetre() -> None:
     rng, errors = np.random.default_rng(0), []
     from host.mechanics.rod import rod_record
+
     for _ in range(40):
         catheter, k0, force = random_catheter(rng), rng.uniform(0.0, 45.0), rng.uniform(0.02, 0.25) * unit(rng)
         position, _ = thesis_reference.tip_pose_500(rod_record(catheter, 0.0, k0), force)
@@ -49,8 +50,9 @@ def test_algorithm_3_1_converges_in_a_few_passes_for_small_loads_and_not_for_lar
 def test_its_estimates_find_the_force_to_a_few_millinewton(case: int) -> None:
     catheter, force = load_catheter("livewire"), np.array([0.02, -0.02, 0.03])
     found = solve_cosserat(catheter, 0.01, 10.0, force, "tip", stations_m=OFFSETS)
-    x, sweeps = thesis_reference.estimate(rod_of("livewire", 0.01, 10.0), 0.07, case, OFFSETS, found.station_positions_m,
-                                          found.station_quaternions_wxyz)
+    x, sweeps = thesis_reference.estimate(
+        rod_of("livewire", 0.01, 10.0), 0.07, case, OFFSETS, found.station_positions_m, found.station_quaternions_wxyz
+    )
     error = np.linalg.norm(x - force)
     assert 1e-6 < error < 5e-3 and sweeps < 400
 

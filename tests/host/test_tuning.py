@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from host.demo import SIMULATED_RIG
-from host.tuning import (
+from host.commissioning.tuning import (
     FAILED_N,
     GAINS,
     cost_of,
@@ -15,8 +14,9 @@ from host.tuning import (
     tune,
     with_gains,
 )
-from realtime.records import PHASE_APPROACH, PHASE_CONTACT
-from realtime.rig_file import Rig, RigFileError, load_rig
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+from realtime.control.records import PHASE_APPROACH, PHASE_CONTACT
 from sim.ideal_rig import IdealRig, Trace
 
 
@@ -30,8 +30,9 @@ def present(rig: Rig) -> dict[str, float]:
 
 
 def flat(force_N: float, phase: int, n: int = 1000) -> Trace:
-    return Trace(np.arange(n) * 1e-3, np.full(n, force_N), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)),
-                 np.full(n, phase))
+    return Trace(
+        np.arange(n) * 1e-3, np.full(n, force_N), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.full(n, phase)
+    )
 
 
 def test_the_cost_is_the_mean_absolute_error_and_lost_contact_is_dear() -> None:
@@ -56,9 +57,9 @@ def test_the_tip_goes_where_it_is_told(rig: Rig) -> None:
 
 
 def test_gains_out_of_bounds_or_unstable_at_the_rate_are_refused(rig: Rig) -> None:
-    with pytest.raises(RigFileError, match=r"control.position_gain_per_s"):
+    with pytest.raises(InputError, match=r"control.position_gain_per_s"):
         with_gains(rig, {"position_gain_per_s": 1e4})
-    with pytest.raises(RigFileError, match="unknown key"):
+    with pytest.raises(InputError, match="unknown key"):
         with_gains(rig, {"no_such_gain": 1.0})
     with pytest.raises(ValueError, match=r"^gains: found a loop that rings at 1000 Hz"):
         stability_margin(rig, {**present(rig), "position_gain_per_s": 45.0, "force_gain_m_per_N": 0.09})

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from host.demo import DemoSettings
-from host.wall_clock import Fleet
+from host.run.demo import DemoSettings
+from host.run.wall_clock import Fleet
 from protocol.commander import Commander
+from protocol.rig_file import load_rig
 from protocol.topics import Command, Log, Message, Reply, encode
+from realtime.control.records import PHASE_CONTACT, PHASE_DISARMED, PHASE_HOLD, PHASE_STOPPED
+from realtime.control.safety import HOLD
+from realtime.core.process import RealtimeProcess
 from realtime.drivers.stepper_board import LinkPhase
-from realtime.process import RealtimeProcess
-from realtime.records import PHASE_CONTACT, PHASE_DISARMED, PHASE_HOLD, PHASE_STOPPED
-from realtime.rig_file import load_rig
-from realtime.safety import HOLD
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
@@ -128,8 +128,12 @@ def process_and_cable(tmp_path: Path) -> Iterator[tuple[RealtimeProcess, Cable]]
     settings = DemoSettings(board="native", directory=tmp_path, estimator="tests.host.no_estimator:make")
     with Fleet(settings, tmp_path / "unplugged.mcap", loop=False) as fleet:
         cable = Cable(fleet.ports["board"], tmp_path / "board")
-        process = RealtimeProcess(load_rig(fleet.rig_file), board_port=str(cable.link),
-                                  tracker_port=fleet.ports["tracker"], force_port=fleet.ports["force_port"])
+        process = RealtimeProcess(
+            load_rig(fleet.rig_file),
+            board_port=str(cable.link),
+            tracker_port=fleet.ports["tracker"],
+            force_port=fleet.ports["force_port"],
+        )
         process.start()
         yield process, cable
         process.stop()

@@ -20,14 +20,14 @@ import websockets.sync.client
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.cli.contract_io import BadInput
-from host.mechanics.catheter import load_catheter
-from host.recording import Recording
-from host.view.picture import Picture, causes_of
+from host.recordings.drawn_shape import through, twin
+from host.recordings.recording import Recording
+from host.recordings.rig_picture import Picture, causes_of
 from host.view.replay import Replay, read_findings
 from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer, three_js
-from host.view.shape import through, twin
-from realtime import safety
+from protocol.catheter import load_catheter
+from protocol.errors import InputError
+from realtime.control import safety
 from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
 from tests.waiting import free_port
 
@@ -36,6 +36,7 @@ PORT = 8447
 
 
 # The shape and the picture.
+
 
 def test_the_twin_starts_at_the_exit_and_bends_as_positive_curvature_does() -> None:
     catheter = load_catheter("blazer_prime_xp")
@@ -90,6 +91,7 @@ def test_several_causes_are_told_apart_though_their_sentences_hold_semicolons() 
 
 # The player.
 
+
 def player(path: Path, **options: Any) -> tuple[Replay, list[float]]:
     now = [100.0]
     replay = Replay(Recording(path), clock_s=lambda: now[0], **options)
@@ -125,9 +127,20 @@ def test_a_jump_back_shows_that_time_with_its_past(recording: Path) -> None:  # 
     assert replay.hello()["past"]["rows"]
 
 
-@given(text=st.one_of(st.text(max_size=60), st.builds(json.dumps, st.recursive(
-    st.none() | st.booleans() | st.floats(allow_nan=True) | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["play", "seek_s", "speed", "x"]), inner)))))
+@given(
+    text=st.one_of(
+        st.text(max_size=60),
+        st.builds(
+            json.dumps,
+            st.recursive(
+                st.none() | st.booleans() | st.floats(allow_nan=True) | st.text(max_size=8),
+                lambda inner: (
+                    st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["play", "seek_s", "speed", "x"]), inner)
+                ),
+            ),
+        ),
+    )
+)
 def test_nothing_that_a_page_sends_breaks_the_player(text: str, recording: Path) -> None:  # noqa: F811
     replay, _ = player(recording)
     assert replay.act(text)["result"] in ("accepted", "malformed")
@@ -137,21 +150,32 @@ def test_nothing_that_a_page_sends_breaks_the_player(text: str, recording: Path)
 
 def test_windows_of_a_diagnosis_are_placed_on_the_recordings_time(recording: Path, tmp_path: Path) -> None:  # noqa: F811
     report = tmp_path / "report.json"
-    report.write_text(json.dumps({
-        "verdict": "missing_physics", "fit": {}, "seconds": 1.0, "effects": [{"id": "backlash", "says": "Play of 3 mm."}],
-        "located": [{"subsystem": "insertion", "windows_s": [[0.1, 0.2], [0.4, 0.5]], "condition": "after reversals"}]}))
+    report.write_text(
+        json.dumps(
+            {
+                "verdict": "missing_physics",
+                "fit": {},
+                "seconds": 1.0,
+                "effects": [{"id": "backlash", "says": "Play of 3 mm."}],
+                "located": [
+                    {"subsystem": "insertion", "windows_s": [[0.1, 0.2], [0.4, 0.5]], "condition": "after reversals"}
+                ],
+            }
+        )
+    )
     replay, _ = player(recording, findings=read_findings(str(report)))
     hello = replay.hello()
     assert [(window["from"], window["to"]) for window in hello["windows"]] == [(0.1, 0.2), (0.4, 0.5)]
     assert hello["says"] == ["Play of 3 mm."] and hello["verdict"] == "missing_physics"
     report.write_text('{"verdict": "nothing_missing"}')
-    with pytest.raises(BadInput, match="seldinger diagnose"):
+    with pytest.raises(InputError, match="seldinger diagnose"):
         read_findings(str(report))
-    with pytest.raises(BadInput, match="--speed"):
+    with pytest.raises(InputError, match="--speed"):
         player(recording, speed=0.0)
 
 
 # The server: who may read, who may ask.
+
 
 @pytest.fixture(scope="module")
 def port(recording: Path) -> Iterator[int]:  # noqa: F811
@@ -170,8 +194,17 @@ def open_socket(port: int, host: str, *origins: str) -> socket.socket:
     page = socket.socket()
     page.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     page.connect((ADDRESS, port))
-    lines = ["GET /rig HTTP/1.1", f"Host: {host}", *(f"Origin: {origin}" for origin in origins), "Upgrade: websocket",
-             "Connection: Upgrade", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13", "", ""]
+    lines = [
+        "GET /rig HTTP/1.1",
+        f"Host: {host}",
+        *(f"Origin: {origin}" for origin in origins),
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version: 13",
+        "",
+        "",
+    ]
     page.sendall("\r\n".join(lines).encode())
     return page
 
@@ -204,8 +237,11 @@ def test_other_names_and_other_sites_read_nothing_and_ask_nothing(port: int) -> 
 
 def test_pages_get_frames_and_answers(port: int) -> None:
     results = []
-    with websockets.sync.client.connect(f"ws://{ADDRESS}:{port}/rig", origin=f"http://{ADDRESS}:{port}",  # type: ignore[arg-type]
-                                        proxy=None) as page:
+    with websockets.sync.client.connect(
+        f"ws://{ADDRESS}:{port}/rig",
+        origin=f"http://{ADDRESS}:{port}",  # type: ignore[arg-type]
+        proxy=None,
+    ) as page:
         assert json.loads(page.recv())["hello"]["kind"] == "play"
         for message in ('{"play": false}', "nonsense", b"\x00\x01", '{"x": 1}', '{"play": 1}', " " * 2000):
             page.send(message)
@@ -272,8 +308,9 @@ def test_a_page_that_stops_reading_loses_frames_and_holds_up_nobody() -> None:
     async def read_beside_a_stuck_page(port: int) -> list[int]:
         numbers: list[int] = []
         with open_socket(port, f"{ADDRESS}:{port}", f"http://{ADDRESS}:{port}"):
-            async with websockets.asyncio.client.connect(f"ws://{ADDRESS}:{port}/rig", proxy=None, max_size=None,
-                                          origin=f"http://{ADDRESS}:{port}") as reader:  # type: ignore[arg-type]
+            async with websockets.asyncio.client.connect(
+                f"ws://{ADDRESS}:{port}/rig", proxy=None, max_size=None, origin=f"http://{ADDRESS}:{port}"
+            ) as reader:  # type: ignore[arg-type]
                 while len(numbers) < 60:
                     message = json.loads(await reader.recv())
                     if "frame" in message:

@@ -11,9 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from host.demo import SIMULATED_RIG
-from host.recording import Recording
+from host.recordings.recording import Recording
 from host.view.server import ADDRESS
+from protocol.rig_file import SIMULATED_RIG
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port
 from tests.waiting import PATIENCE_S, until
@@ -22,14 +22,21 @@ ROOT = Path(__file__).parents[2]
 
 
 def seldinger(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "host.cli.main", *arguments], capture_output=True, text=True, cwd=ROOT,
-                          timeout=PATIENCE_S, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "host.cli.main", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=PATIENCE_S,
+        check=False,
+    )
 
 
 def serves(*arguments: str, port: int) -> tuple[int, str]:
     """Exit status and standard error of a command that is served from until it is interrupted."""
-    child = subprocess.Popen([sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)],
-                             stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)], stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
 
     def answers() -> bool:
         try:
@@ -57,8 +64,12 @@ def children_of(parent: int) -> list[int]:
 
 @pytest.mark.slow
 def test_sigterm_ends_what_view_has_started(tmp_path: Path) -> None:
-    child = subprocess.Popen([sys.executable, "-m", "host.cli.main", "view", "--simulated", "--dir", str(tmp_path), "--port",
-                              str(free_port())], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "host.cli.main", "view", "--simulated", "--dir", str(tmp_path), "--port", str(free_port())],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     assert child.stderr is not None
     lines = iter(child.stderr.readline, "")
     assert any("rig simulated: http" in line for line in lines)
@@ -76,9 +87,13 @@ def test_view_serves_before_the_rig_is_there() -> None:
     assert status in (0, 130) and "rig simulated" in words and "Traceback" not in words
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
-    (("play", "nowhere.mcap"), "nowhere.mcap"), (("view", "--rig", "nowhere.toml"), "nowhere.toml"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("play", "nowhere.mcap"), "nowhere.mcap"),
+        (("view", "--rig", "nowhere.toml"), "nowhere.toml"),
+    ],
+)
 def test_what_is_not_there_is_named(arguments: tuple[str, ...], told: str) -> None:
     done = seldinger(*arguments)
     assert done.returncode == 2 and told in done.stderr and done.stderr.count("\n") == 1

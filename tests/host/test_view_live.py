@@ -13,14 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.commander import Acknowledgement, Commander
-from host.demo import SIMULATED_RIG
+from host.run.commander import Acknowledgement, Commander
 from host.view.live import LiveRig, Press
 from host.view.server import ADDRESS
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
 from protocol.zenoh_session import Session
-from realtime.command_gate import CommandGate
-from realtime.rig_file import Rig, load_rig
+from realtime.core.command_gate import CommandGate
 from tests.host.test_view import MS, free_port
 from tests.waiting import PATIENCE_S, until
 
@@ -49,20 +48,50 @@ def live() -> Iterator[tuple[Session, LiveRig, list[Command]]]:
 
 def publish_until_seen(there: Session, view: LiveRig) -> dict[str, Any]:
     rig_time = [1_000_000_000]
-    messages = {"stage": Stage, "pose/tip": Pose, "force/sensor": ForceSensor, "force/estimate": ForceEstimate,
-                "state": RigState}
+    messages = {
+        "stage": Stage,
+        "pose/tip": Pose,
+        "force/sensor": ForceSensor,
+        "force/estimate": ForceEstimate,
+        "state": RigState,
+    }
     publishers = {topic: there.publisher(topic) for topic in messages}
     contents: dict[str, dict[str, Any]] = {
-        "stage": {"command_insertion_m": 0.0, "command_roll_rad": 0.0, "command_knob_rad": 0.0, "joint_insertion_m": -0.08,
-                  "joint_roll_rad": 0.0, "joint_curvature_per_m": 18.0},
-        "pose/tip": {"arrival_ns": 0, "frame": 1, "missing": False, "position_m": (0.0, -0.007, 0.028),
-                     "quaternion_wxyz": (1.0, 0.0, 0.0, 0.0)},
+        "stage": {
+            "command_insertion_m": 0.0,
+            "command_roll_rad": 0.0,
+            "command_knob_rad": 0.0,
+            "joint_insertion_m": -0.08,
+            "joint_roll_rad": 0.0,
+            "joint_curvature_per_m": 18.0,
+        },
+        "pose/tip": {
+            "arrival_ns": 0,
+            "frame": 1,
+            "missing": False,
+            "position_m": (0.0, -0.007, 0.028),
+            "quaternion_wxyz": (1.0, 0.0, 0.0, 0.0),
+        },
         "force/sensor": {"arrival_ns": 0, "force_N": (0.0, 0.0, 0.15)},
-        "force/estimate": {"frame": "base", "converged": True, "force_N": (0.0, 0.0, 0.14), "published_ns": 0,
-                           "compute_us": 1.0, "covariance_N2": (4e-4, 0, 0, 0, 4e-4, 0, 0, 0, 4e-4)},
-        "state": {"mode": "contact", "safety_action": "warn", "cause": "a pose was not used", "tip_m": (0.0, -0.007, 0.028),
-                  "force_direction": (0.0, 0.0, 1.0), "target_m": (0.0, -0.01, 0.025), "target_force_N": 0.2,
-                  "force_N": 0.15}}
+        "force/estimate": {
+            "frame": "base",
+            "converged": True,
+            "force_N": (0.0, 0.0, 0.14),
+            "published_ns": 0,
+            "compute_us": 1.0,
+            "covariance_N2": (4e-4, 0, 0, 0, 4e-4, 0, 0, 0, 4e-4),
+        },
+        "state": {
+            "mode": "contact",
+            "safety_action": "warn",
+            "cause": "a pose was not used",
+            "tip_m": (0.0, -0.007, 0.028),
+            "force_direction": (0.0, 0.0, 1.0),
+            "target_m": (0.0, -0.01, 0.025),
+            "target_force_N": 0.2,
+            "force_N": 0.15,
+        },
+    }
     frame: dict[str, Any] = {}
 
     def seen() -> bool:
@@ -99,18 +128,31 @@ def test_garbage_on_the_topics_is_counted_and_not_shown(live: tuple[Session, Liv
 def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, LiveRig, list[Command]]) -> None:
     there, view, obeyed = live
     publish_until_seen(there, view)
-    for text, action, target in (('{"button": "arm", "confirmed": true}', "arm", "none"),
-                                 ('{"button": "hold", "confirmed": true}', "hold", "none"),
-                                 ('{"button": "stop"}', "stop", "none")):
-        until(lambda text=text: (answer := view.act(text))["text"] == "no board" and answer["result"] == "refused",
-              f"the rig's answer to {action}")
+    for text, action, target in (
+        ('{"button": "arm", "confirmed": true}', "arm", "none"),
+        ('{"button": "hold", "confirmed": true}', "hold", "none"),
+        ('{"button": "stop"}', "stop", "none"),
+    ):
+        until(
+            lambda text=text: (answer := view.act(text))["text"] == "no board" and answer["result"] == "refused",
+            f"the rig's answer to {action}",
+        )
         assert (obeyed[-1].action, obeyed[-1].target) == (action, target)
     assert {command.action for command in obeyed} == {"arm", "hold", "stop"}
 
 
-@given(text=st.one_of(st.text(max_size=80), st.builds(json.dumps, st.dictionaries(
-    st.sampled_from(["button", "confirmed", "action", "target"]),
-    st.sampled_from(["arm", "stop ", "hold", "ARM", "true"]) | st.booleans() | st.none() | st.integers()))))
+@given(
+    text=st.one_of(
+        st.text(max_size=80),
+        st.builds(
+            json.dumps,
+            st.dictionaries(
+                st.sampled_from(["button", "confirmed", "action", "target"]),
+                st.sampled_from(["arm", "stop ", "hold", "ARM", "true"]) | st.booleans() | st.none() | st.integers(),
+            ),
+        ),
+    )
+)
 def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
     sent: list[str] = []
     view = LiveRig.__new__(LiveRig)

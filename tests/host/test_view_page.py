@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from host.demo import DemoSettings
-from host.recording import Recording
+from host.recordings.recording import Recording
+from host.run.demo import DemoSettings
+from host.run.wall_clock import Fleet
 from host.view.live import LiveRig
 from host.view.replay import Findings, Replay, Window
 from host.view.server import ADDRESS, ViewServer
-from host.wall_clock import Fleet
+from protocol.rig_file import load_rig
 from protocol.zenoh_session import Session
-from realtime.rig_file import load_rig
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port, running
 from tests.waiting import PATIENCE_S, until
@@ -67,7 +67,8 @@ class OpenPage:
     def confirm(self, button: str) -> None:
         """Press a button that asks once more; from the first press on where it has waited too long for that."""
         self.page.locator(f'[data-button="{button}"]').evaluate(
-            "b => { if (!b.classList.contains('asks')) b.click(); b.click(); }")
+            "b => { if (!b.classList.contains('asks')) b.click(); b.click(); }"
+        )
 
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
@@ -84,7 +85,7 @@ class OpenPage:
 
 def near(picture: np.ndarray, color: str) -> int:
     """How many pixels have about the hue of `color` (#rrggbb), whatever their brightness."""
-    wanted = np.array([int(color[i:i + 2], 16) for i in (1, 3, 5)], dtype=float)
+    wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], dtype=float)
     size = np.linalg.norm(picture, axis=-1)
     along = picture @ (wanted / np.linalg.norm(wanted)) / np.maximum(size, 1.0)
     return int(((along > 0.99) & (size > 120)).sum())
@@ -92,10 +93,15 @@ def near(picture: np.ndarray, color: str) -> int:
 
 @pytest.mark.parametrize("size", WIDTHS, ids=lambda size: f"{size[0]}px")
 def test_a_recording_is_drawn_and_can_be_moved_about_in(browser: Any, size: tuple[int, int], recording: Path) -> None:  # noqa: F811
-    findings = Findings(verdict="missing_physics", says=["Play of 3.1 mm in insertion."],
-                        windows=[Window(subsystem="insertion", condition="after reversals", span_s=(0.2, 0.4))])
-    with (running(ViewServer(Replay(Recording(recording), findings=findings), port := free_port())),
-          OpenPage(browser, port, size) as open_page):
+    findings = Findings(
+        verdict="missing_physics",
+        says=["Play of 3.1 mm in insertion."],
+        windows=[Window(subsystem="insertion", condition="after reversals", span_s=(0.2, 0.4))],
+    )
+    with (
+        running(ViewServer(Replay(Recording(recording), findings=findings), port := free_port())),
+        OpenPage(browser, port, size) as open_page,
+    ):
         page = open_page.page
         open_page.wait(lambda: open_page.text("#play") == "Again")
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
@@ -122,17 +128,43 @@ class Fake:
         self.causes = ["contact force above the limit: retracting"]
 
     def hello(self) -> dict[str, Any]:
-        return {"kind": "live", "rig": "simulated", "catheter": "blazer_prime_xp", "over_force_N": 0.5, "radius_m": 0.0012,
-                "past": {"rows": [], "estimates": [], "log": []}}
+        return {
+            "kind": "live",
+            "rig": "simulated",
+            "catheter": "blazer_prime_xp",
+            "over_force_N": 0.5,
+            "radius_m": 0.0012,
+            "past": {"rows": [], "estimates": [], "log": []},
+        }
 
     def frame(self) -> dict[str, Any]:
         now = time.monotonic()
-        return {"t": now, "mode": "retract", "action": "retract", "causes": self.causes, "force_N": 0.51,
-                "target_force_N": 0.2, "pose_age_ms": 20.0, "rejected": [0, 1],
-                "rows": [[now, 0.51, 0.2, 0.0, -0.007, 0.028, 0.0, -0.01, 0.025]],
-                "estimates": [[now, 0.5, 0.02]], "loop": None, "board": None, "silent_s": self.silent_s, "malformed": 0,
-                "scene": {"shape": [[0, 0, 0.002 * i] for i in range(15)], "gap_m": 0.001, "tip": [0, 0, 0.028],
-                          "force": [0, 0, 0.5], "estimate": [], "target": [0, -0.01, 0.025], "into": [0, 0, 1], "poses": {}}}
+        return {
+            "t": now,
+            "mode": "retract",
+            "action": "retract",
+            "causes": self.causes,
+            "force_N": 0.51,
+            "target_force_N": 0.2,
+            "pose_age_ms": 20.0,
+            "rejected": [0, 1],
+            "rows": [[now, 0.51, 0.2, 0.0, -0.007, 0.028, 0.0, -0.01, 0.025]],
+            "estimates": [[now, 0.5, 0.02]],
+            "loop": None,
+            "board": None,
+            "silent_s": self.silent_s,
+            "malformed": 0,
+            "scene": {
+                "shape": [[0, 0, 0.002 * i] for i in range(15)],
+                "gap_m": 0.001,
+                "tip": [0, 0, 0.028],
+                "force": [0, 0, 0.5],
+                "estimate": [],
+                "target": [0, -0.01, 0.025],
+                "into": [0, 0, 1],
+                "poses": {},
+            },
+        }
 
     def act(self, text: str) -> dict[str, Any]:
         self.asked.append(json.loads(text))
@@ -174,13 +206,17 @@ def test_a_running_rig_is_armed_held_and_stopped_from_the_page(browser: Any, tmp
     with Fleet(settings, tmp_path / "view.mcap") as fleet:
         fleet.wait_until_heard()
         rig = load_rig(fleet.rig_file)
-        with (Session(rig.name, [], rig.zenoh.connect) as session, closing(LiveRig(rig, session)) as live,
-              running(ViewServer(live, port := free_port())), OpenPage(browser, port, WIDTHS[0]) as open_page):
+        with (
+            Session(rig.name, [], rig.zenoh.connect) as session,
+            closing(LiveRig(rig, session)) as live,
+            running(ViewServer(live, port := free_port())),
+            OpenPage(browser, port, WIDTHS[0]) as open_page,
+        ):
 
             def held() -> bool:
                 if open_page.text("#mode") == "Holding":
                     return asked(open_page, "hold", "Hold") == "Hold: accepted."
-                asked(open_page, "clear", "Clear fault")     # of what a stall of this machine has stopped
+                asked(open_page, "clear", "Clear fault")  # of what a stall of this machine has stopped
                 if asked(open_page, "arm", "Arm") == "Arm: accepted.":
                     until(lambda: open_page.text("#mode") == "Holding", patience_s=5.0)
                 return False

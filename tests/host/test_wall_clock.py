@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from host.demo import TARGET_M, DemoSettings
-from host.recording import Recording
-from host.wall_clock import Fleet, Operator
-from sim.scenario import ContactJob
+from host.recordings.recording import Recording
+from host.run.demo import DemoSettings
+from host.run.wall_clock import Fleet, Operator
+from sim.scenario import TARGET_M, ContactJob
 
 pytestmark = pytest.mark.slow
 

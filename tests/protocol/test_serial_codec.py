@@ -63,7 +63,7 @@ def test_any_portions(messages: list[Message], sizes: list[int]) -> None:
     decoder, out, at, turn = StreamDecoder(), [], 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
-        out += decoder.feed(stream[at:at + size])
+        out += decoder.feed(stream[at : at + size])
         at, turn = at + size, turn + 1
     assert out == messages
     assert decoder.counters.crc_errors == decoder.counters.lost == decoder.counters.repeated == 0
@@ -80,7 +80,7 @@ def damaged_stream(draw: st.DrawFn) -> tuple[list[Message], bytes]:
         if kind == "flip" and pieces[at]:
             pieces[at][draw(st.integers(0, len(pieces[at]) - 1))] ^= 1 << draw(st.integers(0, 7))
         elif kind == "cut":
-            del pieces[at][draw(st.integers(0, len(pieces[at]))):]
+            del pieces[at][draw(st.integers(0, len(pieces[at]))) :]
         elif kind == "double":
             pieces.insert(at, bytearray(pieces[at]))
         elif kind == "swap":
@@ -135,14 +135,17 @@ def test_a_restarted_sender_is_heard() -> None:
     assert decoder.counters.restarts == 1
 
 
-@pytest.mark.parametrize(("name", "fields", "says"), [
-    ("NOTHING", {}, "wanted one of"),
-    ("ARM", {}, "wanted ['boot_count']"),
-    ("ARM", {"boot_count": 1, "speed": 2}, "wanted ['boot_count']"),
-    ("ARM", {"boot_count": 65536}, "wire types"),
-    ("ARM", {"boot_count": 1.5}, "wire types"),
-    ("SETPOINT", {"number": 1, "execute_us": 2, "expiry_us": 3, "position_steps": (1, 2)}, "wire types"),
-])
+@pytest.mark.parametrize(
+    ("name", "fields", "says"),
+    [
+        ("NOTHING", {}, "wanted one of"),
+        ("ARM", {}, "wanted ['boot_count']"),
+        ("ARM", {"boot_count": 1, "speed": 2}, "wanted ['boot_count']"),
+        ("ARM", {"boot_count": 65536}, "wire types"),
+        ("ARM", {"boot_count": 1.5}, "wire types"),
+        ("SETPOINT", {"number": 1, "execute_us": 2, "expiry_us": 3, "position_steps": (1, 2)}, "wire types"),
+    ],
+)
 def test_bad_fields_are_refused(name: str, fields: dict, says: str) -> None:
     with pytest.raises(ValueError, match=re.escape(says)):
         encode(name, 0, **fields)

@@ -10,15 +10,26 @@ from protocol.setpoint_encoder import BUFFER_BYTES, SETPOINT_WIRE_BYTES, encode_
 steps = st.integers(-(2**31), 2**31 - 1) | st.integers(-300, 300)
 
 
-@given(st.integers(0, 255), st.integers(0, 2**20), st.integers(-(2**40), 2**40), st.integers(-5, 70_000),
-       st.tuples(steps, steps, steps))
-def test_same_bytes_as_the_codec(sequence: int, number: int, execute_us: int, expiry_us: int,
-                                 position: tuple[int, int, int]) -> None:
+@given(
+    st.integers(0, 255),
+    st.integers(0, 2**20),
+    st.integers(-(2**40), 2**40),
+    st.integers(-5, 70_000),
+    st.tuples(steps, steps, steps),
+)
+def test_same_bytes_as_the_codec(
+    sequence: int, number: int, execute_us: int, expiry_us: int, position: tuple[int, int, int]
+) -> None:
     buffer = np.full(BUFFER_BYTES, 0xAA, np.uint8)
     n = encode_setpoint(buffer, sequence, number, execute_us, expiry_us, np.array(position, np.int64))
     assert bytes(buffer[:n]) == encode(
-        "SETPOINT", sequence, number=number % 2**16, execute_us=execute_us % 2**32,
-        expiry_us=min(max(expiry_us, 0), 65535), position_steps=position)
+        "SETPOINT",
+        sequence,
+        number=number % 2**16,
+        execute_us=execute_us % 2**32,
+        expiry_us=min(max(expiry_us, 0), 65535),
+        position_steps=position,
+    )
     assert n == SETPOINT_WIRE_BYTES
     assert (buffer[n:] == 0xAA).all()
 

@@ -56,8 +56,6 @@ def any_value(spec: Spec) -> st.SearchStrategy[Any]:
     return st.none() | value if spec.optional else value
 
 
-
-
 def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
     """`values` made to satisfy what holds between the fields of `cls`."""
     if cls is Pose:
@@ -65,8 +63,13 @@ def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
     if cls is ForceEstimate:
         return values | {"converged": False}
     if cls is Command:
-        return values | {"id": "c1", "commander": "console", "expires_ns": values["stamp_ns"], "action": "arm",
-                         "target": "none"}
+        return values | {
+            "id": "c1",
+            "commander": "console",
+            "expires_ns": values["stamp_ns"],
+            "action": "arm",
+            "target": "none",
+        }
     return values
 
 
@@ -98,8 +101,15 @@ def test_schema_describes_what_is_sent(cls: type[Message]) -> None:
 
 def pose_body(**changes: Any) -> bytes:
     body: dict[str, Any] = {
-        "schema_version": 1, "stamp_ns": 5, "sequence": 1, "arrival_ns": 6, "frame": 2, "missing": False,
-        "position_m": [0.0, 0.0, 0.04], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0], "quality_m": None,
+        "schema_version": 1,
+        "stamp_ns": 5,
+        "sequence": 1,
+        "arrival_ns": 6,
+        "frame": 2,
+        "missing": False,
+        "position_m": [0.0, 0.0, 0.04],
+        "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0],
+        "quality_m": None,
     }
     return msgpack.packb({name: value for name, value in (body | changes).items() if value != "absent"})
 
@@ -108,35 +118,38 @@ def test_the_body_used_below_is_good() -> None:
     assert decode(Pose, pose_body()).position_m == (0.0, 0.0, 0.04)
 
 
-@pytest.mark.parametrize(("payload", "says"), [
-    (b"", "wanted one msgpack map"),
-    (b"\xc1", "wanted one msgpack map"),
-    (b"\x93\x01\x02\x03", "wanted one msgpack map"),
-    (pose_body()[:-1], "wanted one msgpack map"),
-    (pose_body() + b"\x00", "wanted one msgpack map"),
-    (b"\x82\xa1a\x01\xa1a\x02", "a key twice"),
-    (b"\x00" * (MAX_PAYLOAD_BYTES + 1), f"at most {MAX_PAYLOAD_BYTES}"),
-    (b"\xdf\xff\xff\xff\xff", "wanted one msgpack map"),
-    (b"\x91" * 4000 + b"\x00", "wanted one msgpack map"),
-    (pose_body(schema_version=2), "schema_version: found 2, wanted 1"),
-    (pose_body(schema_version=True), "schema_version: found True, wanted 1"),
-    (pose_body(schema_version="absent"), "schema_version: found None"),
-    (pose_body(stamp_ns=-1), "Pose.stamp_ns: found -1"),
-    (pose_body(stamp_ns=1.0), "Pose.stamp_ns: found 1.0"),
-    (pose_body(stamp_ns=True), "Pose.stamp_ns: found True"),
-    (pose_body(frame=2**32), "Pose.frame"),
-    (pose_body(frame="absent"), "Pose.frame: found nothing"),
-    (pose_body(surprise=1), "unknown key 'surprise'"),
-    (pose_body(position_m=[0.0, math.nan, 0.0]), "Pose.position_m"),
-    (pose_body(position_m=[0.0, math.inf, 0.0]), "Pose.position_m"),
-    (pose_body(position_m=[0.0, 0.0]), "3 of finite numbers"),
-    (pose_body(position_m=[0.0, [0.0], 0.0]), "Pose.position_m"),
-    (pose_body(position_m="abc"), "Pose.position_m"),
-    (pose_body(position_m=[0, 0, "0"]), "Pose.position_m"),
-    (pose_body(position_m=None), "wanted both, or missing true"),
-    (pose_body(quaternion_wxyz=[1.1, 0.0, 0.0, 0.0]), "length 1.1, wanted 1"),
-    (pose_body(missing=0), "true or false"),
-])
+@pytest.mark.parametrize(
+    ("payload", "says"),
+    [
+        (b"", "wanted one msgpack map"),
+        (b"\xc1", "wanted one msgpack map"),
+        (b"\x93\x01\x02\x03", "wanted one msgpack map"),
+        (pose_body()[:-1], "wanted one msgpack map"),
+        (pose_body() + b"\x00", "wanted one msgpack map"),
+        (b"\x82\xa1a\x01\xa1a\x02", "a key twice"),
+        (b"\x00" * (MAX_PAYLOAD_BYTES + 1), f"at most {MAX_PAYLOAD_BYTES}"),
+        (b"\xdf\xff\xff\xff\xff", "wanted one msgpack map"),
+        (b"\x91" * 4000 + b"\x00", "wanted one msgpack map"),
+        (pose_body(schema_version=2), "schema_version: found 2, wanted 1"),
+        (pose_body(schema_version=True), "schema_version: found True, wanted 1"),
+        (pose_body(schema_version="absent"), "schema_version: found None"),
+        (pose_body(stamp_ns=-1), "Pose.stamp_ns: found -1"),
+        (pose_body(stamp_ns=1.0), "Pose.stamp_ns: found 1.0"),
+        (pose_body(stamp_ns=True), "Pose.stamp_ns: found True"),
+        (pose_body(frame=2**32), "Pose.frame"),
+        (pose_body(frame="absent"), "Pose.frame: found nothing"),
+        (pose_body(surprise=1), "unknown key 'surprise'"),
+        (pose_body(position_m=[0.0, math.nan, 0.0]), "Pose.position_m"),
+        (pose_body(position_m=[0.0, math.inf, 0.0]), "Pose.position_m"),
+        (pose_body(position_m=[0.0, 0.0]), "3 of finite numbers"),
+        (pose_body(position_m=[0.0, [0.0], 0.0]), "Pose.position_m"),
+        (pose_body(position_m="abc"), "Pose.position_m"),
+        (pose_body(position_m=[0, 0, "0"]), "Pose.position_m"),
+        (pose_body(position_m=None), "wanted both, or missing true"),
+        (pose_body(quaternion_wxyz=[1.1, 0.0, 0.0, 0.0]), "length 1.1, wanted 1"),
+        (pose_body(missing=0), "true or false"),
+    ],
+)
 def test_malformed_payloads_are_refused_in_one_line(payload: bytes, says: str) -> None:
     with pytest.raises(ValueError) as caught:
         decode(Pose, payload)
@@ -173,8 +186,15 @@ def test_nothing_bad_leaves() -> None:
 
 def test_numpy_values_travel_and_optional_nan_becomes_nil() -> None:
     values: dict[str, Any] = {
-        "stamp_ns": np.int64(7), "frame": "base", "converged": np.bool_(True), "force_N": np.array([1.0, 2.0, 3.0]),
-        "covariance_N2": np.eye(3), "residual": np.float64("nan"), "published_ns": 8, "compute_us": np.float32(2.5)}
+        "stamp_ns": np.int64(7),
+        "frame": "base",
+        "converged": np.bool_(True),
+        "force_N": np.array([1.0, 2.0, 3.0]),
+        "covariance_N2": np.eye(3),
+        "residual": np.float64("nan"),
+        "published_ns": 8,
+        "compute_us": np.float32(2.5),
+    }
     message = ForceEstimate(**values)
     back = decode(ForceEstimate, encode(message))
     assert back.force_N == (1.0, 2.0, 3.0) and back.residual is None and back.covariance_N2 == tuple(np.eye(3).ravel())
@@ -192,25 +212,34 @@ def test_long_texts_are_cut_when_sent_and_refused_when_received() -> None:
         decode(Log, msgpack.packb(body))
 
 
-@pytest.mark.parametrize(("changes", "says"), [
-    ({"action": "target"}, "wanted a kind with action target"),
-    ({"target": "hold"}, "none without"),
-    ({"action": "target", "target": "position"}, "Command.target_m"),
-    ({"action": "target", "target": "contact", "target_m": (0, 0, 0.04), "force_N": 0.2}, "no unit normal"),
-    ({"action": "target", "target": "contact", "target_m": (0, 0, 0.04), "normal": (0, 0, 2), "force_N": 0.2}, "unit"),
-    ({"force_N": 1.5}, "Command.force_N"),
-    ({"force_N": -0.1}, "Command.force_N"),
-    ({"expires_ns": 5}, "before stamp_ns"),
-    ({"action": "force"}, "Command.force_N"),
-    ({"commander": ""}, "commander: found"),
-    ({"commander": "Console"}, "commander: found"),
-    ({"commander": "a/b"}, "commander: found"),
-    ({"id": ""}, "Command.id"),
-    ({"id": "x" * 65}, "Command.id"),
-])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"action": "target"}, "wanted a kind with action target"),
+        ({"target": "hold"}, "none without"),
+        ({"action": "target", "target": "position"}, "Command.target_m"),
+        ({"action": "target", "target": "contact", "target_m": (0, 0, 0.04), "force_N": 0.2}, "no unit normal"),
+        ({"action": "target", "target": "contact", "target_m": (0, 0, 0.04), "normal": (0, 0, 2), "force_N": 0.2}, "unit"),
+        ({"force_N": 1.5}, "Command.force_N"),
+        ({"force_N": -0.1}, "Command.force_N"),
+        ({"expires_ns": 5}, "before stamp_ns"),
+        ({"action": "force"}, "Command.force_N"),
+        ({"commander": ""}, "commander: found"),
+        ({"commander": "Console"}, "commander: found"),
+        ({"commander": "a/b"}, "commander: found"),
+        ({"id": ""}, "Command.id"),
+        ({"id": "x" * 65}, "Command.id"),
+    ],
+)
 def test_incomplete_commands_are_refused(changes: dict[str, Any], says: str) -> None:
-    good: dict[str, Any] = {"stamp_ns": 10, "id": "c1", "commander": "console", "expires_ns": 20, "action": "arm",
-                            "target": "none"}
+    good: dict[str, Any] = {
+        "stamp_ns": 10,
+        "id": "c1",
+        "commander": "console",
+        "expires_ns": 20,
+        "action": "arm",
+        "target": "none",
+    }
     assert decode(Command, encode(Command(**good))).action == "arm"
     with pytest.raises(ValueError, match=says):
         encode(Command(**(good | changes)))
@@ -222,8 +251,18 @@ def test_keys_go_both_ways(name: str) -> None:
     assert topic_of(key("simulated", name)) == ("simulated", TOPICS[name])
 
 
-@pytest.mark.parametrize("bad", ["seldinger/v2/simulated/stage", "seldinger/v1/simulated/nothing", "stage", "",
-                                 "seldinger/v1/Rig/stage", "seldinger/v1/a/b/stage", "seldinger/v1/simulated/stage\n"])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "seldinger/v2/simulated/stage",
+        "seldinger/v1/simulated/nothing",
+        "stage",
+        "",
+        "seldinger/v1/Rig/stage",
+        "seldinger/v1/a/b/stage",
+        "seldinger/v1/simulated/stage\n",
+    ],
+)
 def test_other_keys_are_refused(bad: str) -> None:
     with pytest.raises(ValueError, match="key: found"):
         topic_of(bad)

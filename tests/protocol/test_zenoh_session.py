@@ -46,8 +46,9 @@ with Session("simulated", [sys.argv[1]], []) as session:
 
 @contextmanager
 def running(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    child = subprocess.Popen([sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True,
-                             cwd=Path(__file__).parents[2])
+    child = subprocess.Popen(
+        [sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
+    )
     try:
         assert child.stdout is not None and child.stdout.readline() == "up\n"
         yield child
@@ -118,8 +119,11 @@ def test_what_is_malformed_is_counted_and_never_taken(endpoint: str) -> None:
 
 
 def test_those_that_connect_to_one_listener_reach_each_other(endpoint: str) -> None:
-    with Session("simulated", [endpoint], []), Session("simulated", [], [endpoint]) as one, \
-            Session("simulated", [], [endpoint]) as other:
+    with (
+        Session("simulated", [endpoint], []),
+        Session("simulated", [], [endpoint]) as one,
+        Session("simulated", [], [endpoint]) as other,
+    ):
         publisher, latest = one.publisher("force/sensor"), other.latest("force/sensor")
         assert until(lambda: publisher.put(reading()) is None and latest.take() is not None)
 
@@ -183,11 +187,26 @@ def test_nobody_to_answer_is_no_answer(endpoint: str) -> None:
         assert console.ask(command(), timeout_s=0.2) is None
 
 
-@pytest.mark.parametrize("bad", [
-    "tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "tcp/localhost:7447", "tcp/127.0.0.1:0", "tcp/127.0.0.1:99999",
-    "tcp/127.0.0.1", "udp/127.0.0.1:7447", "tls/127.0.0.1:7447", "quic/127.0.0.1:7447", "tcp/127.0.0.1:7447#iface=eth0",
-    "tcp/[::]:7447", "unixsock-stream/", "unixsock-stream//tmp/a b", "", "tcp/127.0.0.1:7447\n",
-])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "tcp/0.0.0.0:7447",
+        "tcp/192.168.1.5:7447",
+        "tcp/localhost:7447",
+        "tcp/127.0.0.1:0",
+        "tcp/127.0.0.1:99999",
+        "tcp/127.0.0.1",
+        "udp/127.0.0.1:7447",
+        "tls/127.0.0.1:7447",
+        "quic/127.0.0.1:7447",
+        "tcp/127.0.0.1:7447#iface=eth0",
+        "tcp/[::]:7447",
+        "unixsock-stream/",
+        "unixsock-stream//tmp/a b",
+        "",
+        "tcp/127.0.0.1:7447\n",
+    ],
+)
 def test_endpoints_that_leave_this_machine_are_refused(bad: str) -> None:
     with pytest.raises(ValueError, match="endpoint: found"):
         Session("simulated", [bad], [])
@@ -216,8 +235,7 @@ def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
 
 def listening_sockets() -> set[str]:
     """Local addresses (hexadecimal, as in /proc/net) of this process' listening TCP sockets and of all its UDP ones."""
-    mine = {os.readlink(link) for link in Path("/proc/self/fd").iterdir()
-            if os.path.lexists(link)}
+    mine = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if os.path.lexists(link)}
     found = set()
     for table, states in (("tcp", {"0A"}), ("tcp6", {"0A"}), ("udp", {"07", "01"}), ("udp6", {"07", "01"})):
         for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:

@@ -1,15 +1,13 @@
 """A rig and a tick ready to run."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from realtime.configure import tick_parameters
-from realtime.records import INPUTS, OUTPUTS, STATE, new
-from realtime.rig_file import Rig, load_rig
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+from realtime.control.configure import tick_parameters
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 
-RIG_FILE = Path(__file__).parents[2] / "host" / "rigs" / "simulated.toml"
+RIG_FILE = SIMULATED_RIG
 START_NS = 1_000_000_000
 
 
@@ -40,7 +38,7 @@ class Bench:
             command[name] = value
 
     def run(self, seconds: float) -> np.record:
-        from realtime.tick import tick
+        from realtime.control.tick import tick
 
         u = self.inputs[0]
         for _ in range(round(seconds * 1000)):

@@ -4,10 +4,10 @@ import re
 import sys
 from typing import Any
 
-from realtime import records
-from realtime.clock import Clock
-from realtime.loop_thread import NativeLoop, input_mailboxes
-from realtime.tick import tick
+from realtime.control import records
+from realtime.control.tick import tick
+from realtime.loop.clock import Clock
+from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 
 
 def called_by(dispatcher: Any) -> set[str]:
@@ -22,8 +22,16 @@ def called_by(dispatcher: Any) -> set[str]:
 
 
 def main() -> None:
-    loop = NativeLoop(tick, records.new(records.PARAMS), records.new(records.STATE), records.INPUTS, records.OUTPUTS,
-                      input_mailboxes(records.INPUTS), clock=Clock.virtual(), period_ns=1_000_000)
+    loop = NativeLoop(
+        tick,
+        records.new(records.PARAMS),
+        records.new(records.STATE),
+        records.INPUTS,
+        records.OUTPUTS,
+        input_mailboxes(records.INPUTS),
+        clock=Clock.virtual(),
+        period_ns=1_000_000,
+    )
     loop.prepare()
     found = called_by(loop._run)
     for name, module in sorted(sys.modules.items()):

@@ -23,8 +23,14 @@ QUIET = AuroraEmulatorConfig(position_noise_m=0.0, orientation_noise_rad=0.0)
 class Bench:
     """Client and emulator in virtual time, in steps of `step_ns`; the tip moves so that its position tells the frame."""
 
-    def __init__(self, client: AuroraConfig | None = None, device: AuroraEmulatorConfig = QUIET,
-                 faults: tuple[Fault, ...] = (), step_ns: int = MS, seed: int = 3) -> None:
+    def __init__(
+        self,
+        client: AuroraConfig | None = None,
+        device: AuroraEmulatorConfig = QUIET,
+        faults: tuple[Fault, ...] = (),
+        step_ns: int = MS,
+        seed: int = 3,
+    ) -> None:
         self.client = AuroraClient(client)
         self.emulator = AuroraEmulator(device, seed, faults)
         self.now_ns, self.step_ns = 0, step_ns
@@ -55,6 +61,7 @@ def pose_at(time_ns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 # The recorded exchange.
+
 
 def replay(config: AuroraConfig) -> tuple[AuroraClient, int]:
     """A client brought up by the session of the vectors; asserts every byte that it sends."""
@@ -158,6 +165,7 @@ def test_an_error_to_a_poll_is_told_in_words_and_starts_anew(code: int) -> None:
 
 # Bring-up against the emulator.
 
+
 @pytest.mark.parametrize("reply", ["BX", "TX"])
 @pytest.mark.parametrize("baud", [9600, 115200, 230400, 921600])
 def test_every_speed_and_reply_brings_poses(baud: int, reply: str) -> None:
@@ -193,8 +201,7 @@ def test_an_adapter_that_swallows_breaks_is_reset_in_words_whatever_the_speed() 
 
 
 def test_a_device_that_is_not_there_is_asked_for_ever() -> None:
-    bench = Bench(AuroraConfig(reset_timeout_s=0.2, reply_timeout_s=0.2, retry_s=0.2),
-                  faults=(Fault("silent", 0, 10**18),))
+    bench = Bench(AuroraConfig(reset_timeout_s=0.2, reply_timeout_s=0.2, retry_s=0.2), faults=(Fault("silent", 0, 10**18),))
     bench.emulator.serial_break = lambda now_ns: None  # type: ignore[method-assign]
     assert bench.run(20.0) == []
     assert bench.client.counters.sessions > 10
@@ -226,8 +233,17 @@ def test_bring_up_survives_damaged_replies() -> None:
     assert bench.client.counters.damaged > 0
 
 
-@pytest.mark.parametrize(("key", "value"), [("rate_hz", 0.0), ("baud", 12345), ("reply", "GX"), ("latency_s", -1.0),
-                                            ("beeps", 10), ("poll_timeout_s", float("nan"))])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("rate_hz", 0.0),
+        ("baud", 12345),
+        ("reply", "GX"),
+        ("latency_s", -1.0),
+        ("beeps", 10),
+        ("poll_timeout_s", float("nan")),
+    ],
+)
 def test_a_configuration_out_of_bounds_is_refused_by_its_key(key: str, value: object) -> None:
     with pytest.raises(ValueError, match=key):
         AuroraConfig(**{key: value})  # type: ignore[arg-type]
@@ -235,9 +251,11 @@ def test_a_configuration_out_of_bounds_is_refused_by_its_key(key: str, value: ob
 
 # Times.
 
+
 @pytest.mark.parametrize("drift", [-50e-6, 50e-6])
-@pytest.mark.parametrize(("baud", "jitter_s", "rms_ms"), [(921600, 0.0005, 0.25), (921600, 0.003, 0.6),
-                                                         (115200, 0.0005, 0.8)])
+@pytest.mark.parametrize(
+    ("baud", "jitter_s", "rms_ms"), [(921600, 0.0005, 0.25), (921600, 0.003, 0.6), (115200, 0.0005, 0.8)]
+)
 def test_stamps_are_the_sampling_times(baud: int, jitter_s: float, rms_ms: float, drift: float) -> None:
     device = AuroraEmulatorConfig(frame_jitter_s=jitter_s, clock_error=drift)
     bench = Bench(AuroraConfig(baud=baud), device, step_ns=200_000)
@@ -245,8 +263,10 @@ def test_stamps_are_the_sampling_times(baud: int, jitter_s: float, rms_ms: float
     errors_ms = np.array([sample.stamp_ns - bench.frame_time_ns[sample.frame] for sample in samples]) / MS
     rms = float(np.sqrt(np.mean(errors_ms**2)))
     age_ms = float(np.mean([sample.arrival_ns - sample.stamp_ns for sample in samples])) / MS
-    print(f"{baud} baud, jitter {1e3 * jitter_s} ms, drift {1e6 * drift:+.0f} ppm: "
-          f"RMS {rms:.2f} ms, largest {np.max(np.abs(errors_ms)):.2f} ms, mean age on arrival {age_ms:.1f} ms")
+    print(
+        f"{baud} baud, jitter {1e3 * jitter_s} ms, drift {1e6 * drift:+.0f} ppm: "
+        f"RMS {rms:.2f} ms, largest {np.max(np.abs(errors_ms)):.2f} ms, mean age on arrival {age_ms:.1f} ms"
+    )
     assert len(samples) > 2900
     assert rms < rms_ms
     assert bench.client.clock.drift == pytest.approx(-drift, abs=40e-6)
@@ -290,9 +310,16 @@ def test_one_strange_frame_number_is_not_believed(key: str) -> None:
 
 # What the device may do.
 
-@pytest.mark.parametrize(("kind", "flags"), [
-    ("missing", PoseFlag.MISSING), ("out_of_volume", PoseFlag.MISSING | PoseFlag.OUT_OF_VOLUME),
-    ("broken", PoseFlag.MISSING | PoseFlag.SENSOR_BROKEN), ("partly", PoseFlag.PARTLY_OUT_OF_VOLUME)])
+
+@pytest.mark.parametrize(
+    ("kind", "flags"),
+    [
+        ("missing", PoseFlag.MISSING),
+        ("out_of_volume", PoseFlag.MISSING | PoseFlag.OUT_OF_VOLUME),
+        ("broken", PoseFlag.MISSING | PoseFlag.SENSOR_BROKEN),
+        ("partly", PoseFlag.PARTLY_OUT_OF_VOLUME),
+    ],
+)
 def test_flags_reach_the_samples_and_are_told_once(kind: str, flags: PoseFlag) -> None:
     fault = Fault(kind, 4_000 * MS, 5_000 * MS, handle="0A")
     bench = Bench(faults=(fault,))
@@ -358,6 +385,7 @@ def test_the_last_tool_pulled_is_waited_for() -> None:
 
 # Damage.
 
+
 def mangled_run(mangle: Callable[[bytes], bytes], seconds: float = 1.0) -> Bench:
     """A tracking bench whose device bytes then pass through `mangle`, then not; every sample is checked."""
     bench = Bench(AuroraConfig(reply_timeout_s=0.3, reset_timeout_s=1.0))
@@ -365,7 +393,8 @@ def mangled_run(mangle: Callable[[bytes], bytes], seconds: float = 1.0) -> Bench
     read = bench.emulator.read
     stop_ns = bench.now_ns + round(seconds * 1e9)
     bench.emulator.read = lambda now_ns: (  # type: ignore[method-assign]
-        mangle(read(now_ns)) if now_ns < stop_ns else read(now_ns))
+        mangle(read(now_ns)) if now_ns < stop_ns else read(now_ns)
+    )
     bench.run(seconds)
     assert any(bench.run(1.0) for _ in range(8)), "the client did not find the device again"
     for sample in bench.samples:
@@ -398,7 +427,7 @@ def test_lost_doubled_swapped_and_strange_bytes_never_become_a_pose(seed: int, h
         if not data or rng.random() > chance:
             return data
         if how == "cut":
-            return data[:rng.integers(0, len(data))]
+            return data[: rng.integers(0, len(data))]
         if how == "twice":
             return data + data
         if how == "noise":

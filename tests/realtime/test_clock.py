@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from realtime.clock import Clock, now_ns, sleep_until
+from realtime.loop.clock import Clock, now_ns, sleep_until
 
 
 def test_the_monotonic_clock_is_the_machine_s_in_python_and_in_compiled_code() -> None:

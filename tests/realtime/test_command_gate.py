@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protocol.commander import Commander
 from protocol.topics import MAX_PAYLOAD_BYTES, Command, Reply, encode
-from realtime.command_gate import AHEAD_NS, BURST, LEASE_NS, LONGEST_LIFE_NS, REMEMBERED, CommandGate, for_the_record
+from realtime.core.command_gate import AHEAD_NS, BURST, LEASE_NS, LONGEST_LIFE_NS, REMEMBERED, CommandGate, for_the_record
 
 S = 1_000_000_000
 
@@ -36,9 +36,15 @@ class Rig:
 
     def command(self, **changes: Any) -> Command:
         self.ids += 1
-        fields: dict[str, Any] = {"stamp_ns": self.now_ns, "sequence": self.ids, "id": f"c{self.ids}",
-                                  "commander": "console", "expires_ns": self.now_ns + S // 2, "action": "arm",
-                                  "target": "none"}
+        fields: dict[str, Any] = {
+            "stamp_ns": self.now_ns,
+            "sequence": self.ids,
+            "id": f"c{self.ids}",
+            "commander": "console",
+            "expires_ns": self.now_ns + S // 2,
+            "action": "arm",
+            "target": "none",
+        }
         return Command(**(fields | changes))
 
     def leased(self, name: str = "console") -> str:
@@ -62,8 +68,10 @@ def test_under_a_lease_a_command_is_obeyed() -> None:
 @pytest.mark.parametrize("action", ["arm", "disarm", "clear_fault", "release"])
 def test_without_a_lease_nothing_but_the_safe_direction(action: str) -> None:
     rig = Rig()
-    assert rig.said(rig.command(action=action)) == ("refused", "lease: found none that stands, wanted one taken before "
-                                                    "and renewed")
+    assert rig.said(rig.command(action=action)) == (
+        "refused",
+        "lease: found none that stands, wanted one taken before and renewed",
+    )
     rig.leased("other")
     assert rig.said(rig.command(action=action)) == ("refused", "lease: held by other, for another 3.0 s")
     assert rig.said(rig.command(action=action, lease="guess"))[1].startswith("lease: held by other")
@@ -150,7 +158,9 @@ def test_a_reader_commands_nothing_not_even_a_stop() -> None:
     rig = Rig(roles={"analysis": "reader", "console": "commander"})
     for action in ("take", "hold", "stop", "clock", "arm"):
         assert rig.said(rig.command(commander="analysis", action=action)) == (
-            "refused", "role: found reader, wanted commander")
+            "refused",
+            "role: found reader, wanted commander",
+        )
     assert rig.done == [] and rig.leased()
 
 
@@ -200,8 +210,14 @@ def test_a_good_command_with_one_field_spoilt_is_not_obeyed(data: st.DataObject)
     rig = Rig()
     body = msgpack.unpackb(encode(rig.command(lease=rig.leased())))
     name = data.draw(st.sampled_from(sorted(body)))
-    body[name] = data.draw(st.none() | st.integers().filter(lambda n: -2**63 <= n < 2**64) | st.text() | st.binary()
-                           | st.floats() | st.lists(st.integers(0, 9)))
+    body[name] = data.draw(
+        st.none()
+        | st.integers().filter(lambda n: -(2**63) <= n < 2**64)
+        | st.text()
+        | st.binary()
+        | st.floats()
+        | st.lists(st.integers(0, 9))
+    )
     _, reply = rig.gate.answer("console", msgpack.packb(body))
     assert reply is not None
     harmless = name in ("id", "sequence", "stamp_ns", "expires_ns", "fault", "target_m", "normal", "force_N", "lease")
@@ -211,8 +227,16 @@ def test_a_good_command_with_one_field_spoilt_is_not_obeyed(data: st.DataObject)
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(["take", "release", "arm", "hold", "disarm", "wait"]),
-                          st.sampled_from(["a", "b"]), st.integers(0, 4)), max_size=40))
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["take", "release", "arm", "hold", "disarm", "wait"]),
+            st.sampled_from(["a", "b"]),
+            st.integers(0, 4),
+        ),
+        max_size=40,
+    )
+)
 def test_only_the_holder_gets_past_the_gate(steps: list[tuple[str, str, int]]) -> None:
     rig = Rig()
     commanders = {name: rig.commander(name) for name in "ab"}
@@ -249,6 +273,8 @@ def test_refusals_are_told_at_once_and_then_counted_for_half_a_second() -> None:
     assert told().startswith("console: request: malformed: payload") and [told() for _ in range(7)] == [""] * 7
     rig.now_ns += S
     assert told().endswith("(and 7 more not told)")
-    assert rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="take")))) == \
-        "console: take: accepted"
+    assert (
+        rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="take"))))
+        == "console: take: accepted"
+    )
     assert rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="clock")))) == ""

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from realtime import backlash, constraint_frame, free_tip, hybrid, inverse_kinematics
-from realtime.configure import tick_parameters
-from realtime.intake import rotation
-from realtime.records import (
+from protocol.rig_file import Rig, parse_rig
+from realtime.control import backlash, constraint_frame, free_tip, hybrid, inverse_kinematics
+from realtime.control.configure import tick_parameters
+from realtime.control.records import (
     BACKLASH_STATE,
     COMMAND_HOLD,
     HISTORY,
@@ -18,7 +18,7 @@ from realtime.records import (
     PHASE_CONTACT,
     new,
 )
-from realtime.rig_file import Rig, parse_rig
+from realtime.core.intake import rotation
 from sim.heart import HeartConfig
 from sim.ideal_rig import IdealRig, Trace
 from sim.plant import PlantConfig
@@ -41,9 +41,16 @@ def bench(rig: Rig, heart: HeartConfig, seed: int = 0, normal: tuple = (0.0, 0.0
     out, transmission = np.zeros(3), rig.transmission
     inverse_kinematics.apply(tick_parameters(rig)[0].kinematics, WALL_m - (0.0, 0.0, 0.003), 0.0, out)
     handle = (out[0] - transmission.insertion_at_home_m) / transmission.insertion_slope + 0.5 * 0.0031
-    return IdealRig(rig, PlantConfig(
-        start_stage=(float(handle), 0.0, float(out[2])), vessel=VesselConfig(start_in_play=1.0), heart=heart,
-        tissue=TissueConfig(point_m=tuple(WALL_m), normal=normal)), seed)  # type: ignore[arg-type]
+    return IdealRig(
+        rig,
+        PlantConfig(
+            start_stage=(float(handle), 0.0, float(out[2])),
+            vessel=VesselConfig(start_in_play=1.0),
+            heart=heart,
+            tissue=TissueConfig(point_m=tuple(WALL_m), normal=normal),
+        ),
+        seed,
+    )  # type: ignore[arg-type]
 
 
 def pressed(rig: Rig, heart: HeartConfig, seconds: float = 10.0, seed: int = 0) -> Trace:
@@ -186,8 +193,12 @@ def test_past_joints_are_interpolated_and_run_out() -> None:
 
 
 vector = st.tuples(*[st.floats(-5, 5)] * 3).map(np.array)
-unit = st.tuples(*[st.floats(-1, 1)] * 4).map(np.array).filter(lambda q: np.linalg.norm(q) > 0.1).map(
-    lambda q: q / np.linalg.norm(q))
+unit = (
+    st.tuples(*[st.floats(-1, 1)] * 4)
+    .map(np.array)
+    .filter(lambda q: np.linalg.norm(q) > 0.1)
+    .map(lambda q: q / np.linalg.norm(q))
+)
 
 
 @given(quaternion=unit, value=vector)
@@ -208,8 +219,9 @@ def test_a_learned_normal_is_unit_and_near_the_commanded_one(force: np.ndarray, 
 
 
 @given(tip=vector, target=vector, force=st.floats(-1, 1))
-def test_the_selection_matrix_keeps_force_and_position_apart(rig: Rig, tip: np.ndarray, target: np.ndarray,
-                                                             force: float) -> None:
+def test_the_selection_matrix_keeps_force_and_position_apart(
+    rig: Rig, tip: np.ndarray, target: np.ndarray, force: float
+) -> None:
     """The thesis' law: across the normal only the position error, along it only the force error."""
     config, normal, out = tick_parameters(rig)[0].hybrid, np.array([0.0, 0.6, -0.8]), np.zeros(3)
     across = np.eye(3) - np.outer(normal, normal)
@@ -217,7 +229,8 @@ def test_the_selection_matrix_keeps_force_and_position_apart(rig: Rig, tip: np.n
     assert across @ out == pytest.approx(across @ (target - tip), abs=1e-9)
     error = WANTED_N - force
     assert -out @ normal == pytest.approx(
-        config.force_gain_m_per_N * error + config.force_integral_m_per_N_s * 1e-3 * error, abs=1e-9)
+        config.force_gain_m_per_N * error + config.force_integral_m_per_N_s * 1e-3 * error, abs=1e-9
+    )
 
 
 def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
@@ -231,8 +244,12 @@ def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
 @pytest.mark.parametrize("start_in_play", [-1.0, 0.0, 1.0])
 def test_in_free_space_the_insertion_that_forces_are_told_from_is_found(rig: Rig, start_in_play: float) -> None:
     """Where the body stands in its play is not known at arming, and up to the whole play wrong after the first way out."""
-    plant = PlantConfig(start_stage=(0.045, 0.0, 0.9), vessel=VesselConfig(start_in_play=start_in_play),
-                        tissue=TissueConfig(point_m=(0.0, 0.0, 1.0)), heart=STILL)
+    plant = PlantConfig(
+        start_stage=(0.045, 0.0, 0.9),
+        vessel=VesselConfig(start_in_play=start_in_play),
+        tissue=TissueConfig(point_m=(0.0, 0.0, 1.0)),
+        heart=STILL,
+    )
     run = IdealRig(rig, plant, 1)
     tip = run.plant.sensor_pose(0.0)[0]
     run.go(tip + (0.0, 0.0, 0.012), 4.0)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from realtime import inverse_kinematics as ik
-from realtime.configure import tick_parameters
-from realtime.records import CURVE_POINTS
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
+from realtime.control import inverse_kinematics as ik
+from realtime.control.configure import tick_parameters
+from realtime.control.records import CURVE_POINTS
 
 LENGTH_M = 0.110
 
@@ -29,8 +29,9 @@ def tip_of(joint: np.ndarray, curvature: float) -> np.ndarray:
     out_m = min(LENGTH_M, LENGTH_M + joint[0])
     bend = curvature * out_m
     lateral = out_m * 0.5 * bend * np.sinc(bend / (2 * np.pi)) ** 2
-    return np.array([lateral * math.sin(joint[1]), -lateral * math.cos(joint[1]),
-                     max(joint[0], 0.0) + out_m * np.sinc(bend / np.pi)])
+    return np.array(
+        [lateral * math.sin(joint[1]), -lateral * math.cos(joint[1]), max(joint[0], 0.0) + out_m * np.sinc(bend / np.pi)]
+    )
 
 
 @given(ratio=st.floats(0.0, 0.7246))
@@ -43,8 +44,9 @@ def test_both_sides_of_the_fold_reach_the_place(ratio: float) -> None:
 
 
 @given(insertion=st.floats(-0.08, 0.05), bend=st.floats(-4.9, 4.9), roll=st.floats(-3, 3), off=st.floats(-0.2, 0.2))
-def test_nearest_branch_undoes_the_arc_on_both_sides(config: np.record, insertion: float, bend: float, roll: float,
-                                                      off: float) -> None:
+def test_nearest_branch_undoes_the_arc_on_both_sides(
+    config: np.record, insertion: float, bend: float, roll: float, off: float
+) -> None:
     curvature = bend / min(LENGTH_M, LENGTH_M + insertion)
     assume(abs(curvature) < 44 and abs(bend) > 0.05)
     tip = tip_of(np.array([insertion, roll]), curvature)
@@ -60,8 +62,9 @@ def test_nearest_branch_undoes_the_arc_on_both_sides(config: np.record, insertio
 
 
 @given(st.tuples(*[st.floats(-0.12, 0.12)] * 2, st.floats(-0.02, 0.22)), st.floats(-6, 6), st.floats(-1.7, 1.7))
-def test_always_finite_and_within_the_curve(config: np.record, tip: tuple[float, float, float], roll: float,
-                                            knob: float) -> None:
+def test_always_finite_and_within_the_curve(
+    config: np.record, tip: tuple[float, float, float], roll: float, knob: float
+) -> None:
     out = np.zeros(3)
     ik.apply_nearest(config, np.array(tip), np.array([0.0, roll, knob]), out)
     assert np.all(np.isfinite(out)) and abs(out[1] - roll) <= math.pi / 2 + 1e-9
@@ -112,7 +115,8 @@ def test_what_the_tip_reaches_is_within_reach(config: np.record, insertion: floa
     assert ik.out_of_reach_m(config, tip, -0.105, 0.025, 1.6) < 1e-6
 
 
-@pytest.mark.parametrize(("tip_m", "off_m"), [
-    ((0.0, 0.0, 0.2), 0.064), ((0.0, -0.11, 0.05), 0.030), ((0.0, -0.09, -0.01), 0.05)])
+@pytest.mark.parametrize(
+    ("tip_m", "off_m"), [((0.0, 0.0, 0.2), 0.064), ((0.0, -0.11, 0.05), 0.030), ((0.0, -0.09, -0.01), 0.05)]
+)
 def test_what_it_does_not_reach_is_told_by_how_much(config: np.record, tip_m: tuple, off_m: float) -> None:
     assert ik.out_of_reach_m(config, np.array(tip_m), -0.105, 0.025, 1.6) > off_m

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realtime.configure import tick_parameters
-from realtime.latency import EDGES_US, as_contract, check_latency, coarse, percentiles_us, text_histogram
-from realtime.native_loop import BINS, count_in
-from realtime.rig_file import Rig
-from realtime.scheduling import RealtimeSettings, realtime_thread
-from realtime.tick import tick
+from protocol.rig_file import Rig
+from realtime.control.configure import tick_parameters
+from realtime.control.tick import tick
+from realtime.loop.latency import EDGES_US, as_contract, check_latency, coarse, percentiles_us, text_histogram
+from realtime.loop.native_loop import BINS, count_in
+from realtime.loop.scheduling import RealtimeSettings, realtime_thread
 
 
 def histogram_of(values_ns: list[int], bin_ns: int = 1000) -> np.ndarray:
@@ -50,8 +50,9 @@ def test_coarse_histograms_keep_every_count(values_ns: list[int]) -> None:
     histogram = histogram_of(values_ns)
     assert sum(coarse(histogram)) == len(values_ns)
     text = text_histogram({"loop": histogram, "cyclictest": histogram})
-    assert sum(int(line.split()[-1 if line.split()[-1].isdigit() else -2]) for line in text.splitlines()[1:]
-               ) == len(values_ns)
+    assert sum(int(line.split()[-1 if line.split()[-1].isdigit() else -2]) for line in text.splitlines()[1:]) == len(
+        values_ns
+    )
 
 
 def fake_cyclictest(folder: Path, body: str) -> None:
@@ -76,7 +77,7 @@ def test_ticks_and_misses_add_up_without_cyclictest(rig: Rig, monkeypatch: pytes
 def test_cyclictest_takes_every_other_slice(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     thread = {"histogram": {"2": 6, "9": 3}, "cycles": 10, "max": 31_000, "min": 2, "avg": 3.0}
     report = json.dumps({"thread": {"0": thread}})
-    fake_cyclictest(tmp_path, f'for word; do case $word in --json=*) echo \'{report}\' > "${{word#--json=}}";; esac; done\n')
+    fake_cyclictest(tmp_path, f"for word; do case $word in --json=*) echo '{report}' > \"${{word#--json=}}\";; esac; done\n")
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     found = check(rig)
     assert found["ticks"] + found["missed"] == 200
@@ -86,7 +87,8 @@ def test_cyclictest_takes_every_other_slice(rig: Rig, tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize("body", ["echo no >&2; exit 3\n", "exit 0\n"])
 def test_a_cyclictest_that_fails_is_told_and_does_not_end_the_check(
-        rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> None:
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str
+) -> None:
     fake_cyclictest(tmp_path, body)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     result = check_latency(tick, tick_parameters(rig), 1000, 0.2, None)
@@ -100,8 +102,8 @@ def test_what_the_kernel_refuses_is_one_line_and_no_error(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
-    monkeypatch.setattr("realtime.scheduling._may_lock_all", lambda: False)
-    monkeypatch.setattr("realtime.scheduling._IDLE_LATENCY_DEVICE", "/proc/self/status")
+    monkeypatch.setattr("realtime.loop.scheduling._may_lock_all", lambda: False)
+    monkeypatch.setattr("realtime.loop.scheduling._IDLE_LATENCY_DEVICE", "/proc/self/status")
     with realtime_thread(RealtimeSettings()) as granted:
         assert not (granted.priority or granted.memory_locked or granted.shallow_idle) and granted.cpu is None
         assert granted.warning is not None and "\n" not in granted.warning

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import config, njit
 
-from realtime import mailbox
-from realtime.mailbox import (
+from realtime.loop import mailbox
+from realtime.loop.mailbox import (
     NEWEST,
     Mailbox,
     Ring,
@@ -109,8 +109,7 @@ def test_a_compiled_reader_never_sees_a_torn_record_of_a_python_writer() -> None
         for number in range(1, rounds + 1):
             box.publish(words=number * 10_000 + np.arange(37))
 
-    run_together(write, lambda: found.append(
-        read_until(box.words, np.zeros(37, np.int64), np.zeros(37, np.int64), rounds)))
+    run_together(write, lambda: found.append(read_until(box.words, np.zeros(37, np.int64), np.zeros(37, np.int64), rounds)))
     assert found[0][:2] == (0, 0)
 
 
@@ -119,7 +118,8 @@ class Stopped(Exception):
 
 
 def interpreted(function: Any, at_access: Callable[[], None]) -> Callable[..., int]:
-    """`function` of realtime.mailbox as plain Python, with `at_access()` called before every access to shared words."""
+    """`function` of realtime.loop.mailbox as plain Python, with `at_access()` called before every access to shared words."""
+
     def load(words: np.ndarray, index: int) -> int:
         at_access()
         return int(words[index])
@@ -128,8 +128,14 @@ def interpreted(function: Any, at_access: Callable[[], None]) -> Callable[..., i
         at_access()
         words[index] = value
 
-    replaced = {"load_relaxed": load, "load_acquire": load, "store_relaxed": store, "store_release": store,
-                "fence_acquire": lambda: None, "fence_release": lambda: None}
+    replaced = {
+        "load_relaxed": load,
+        "load_acquire": load,
+        "store_relaxed": store,
+        "store_release": store,
+        "fence_acquire": lambda: None,
+        "fence_release": lambda: None,
+    }
     code = getattr(function, "py_func", function).__code__
     return FunctionType(code, {**vars(mailbox), **replaced})
 
@@ -195,8 +201,14 @@ def test_a_slot_that_changed_while_it_was_copied_is_refused_and_leaves_the_recor
     assert (payload == -1).all()
 
 
-@given(st.lists(st.one_of(st.just("read"), st.tuples(st.integers(-2**63, 2**63 - 1), st.floats(), st.binary(
-    min_size=5, max_size=5))), max_size=30))
+@given(
+    st.lists(
+        st.one_of(
+            st.just("read"), st.tuples(st.integers(-(2**63), 2**63 - 1), st.floats(), st.binary(min_size=5, max_size=5))
+        ),
+        max_size=30,
+    )
+)
 @settings(deadline=None, max_examples=60)
 def test_a_mailbox_gives_what_was_published_last(steps: list) -> None:
     box, last, published = Mailbox(SAMPLE), None, 0
@@ -214,7 +226,7 @@ def test_a_mailbox_gives_what_was_published_last(steps: list) -> None:
             assert record["flags"].tobytes() == last[2]
 
 
-@given(st.integers(1, 5), st.lists(st.one_of(st.just("drain"), st.integers(-2**62, 2**62)), max_size=40))
+@given(st.integers(1, 5), st.lists(st.one_of(st.just("drain"), st.integers(-(2**62), 2**62)), max_size=40))
 @settings(deadline=None, max_examples=60)
 def test_a_ring_keeps_order_and_counts_what_it_refuses(capacity: int, steps: list) -> None:
     ring, model, dropped = Ring(SAMPLE, capacity), deque(), 0

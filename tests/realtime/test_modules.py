@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from realtime import backlash, inverse_kinematics, predictor, safety, stage_limiter
-from realtime.configure import tick_parameters
-from realtime.records import BACKLASH_STATE, POSE, PREDICTOR_STATE, STAGE_STATE, new
-from realtime.rig_file import Rig
+from protocol.rig_file import Rig
+from realtime.control import backlash, inverse_kinematics, predictor, safety, stage_limiter
+from realtime.control.configure import tick_parameters
+from realtime.control.records import BACKLASH_STATE, POSE, PREDICTOR_STATE, STAGE_STATE, new
 
 
 def play(inputs: np.ndarray, width: float) -> np.ndarray:

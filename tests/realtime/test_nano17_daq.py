@@ -26,13 +26,20 @@ def pair(noise_V: float = 0.0, **faults: Fault) -> tuple[Nano17Client, Nano17Emu
     emulator = Nano17Emulator(Nano17EmulatorConfig(noise_V=noise_V), seed=3, faults=list(faults.values()))
     c = emulator.config
     calibration = Nano17Calibration(
-        np.linalg.inv(emulator.sensitivity), emulator.zeros_V, gain_per_K=c.gain_per_K, zero_V_per_K=(c.zero_V_per_K,) * 6,
-        reference_C=c.reference_C, thermistor_offset_C=c.thermistor_offset_C, thermistor_C_per_V=c.thermistor_C_per_V)
+        np.linalg.inv(emulator.sensitivity),
+        emulator.zeros_V,
+        gain_per_K=c.gain_per_K,
+        zero_V_per_K=(c.zero_V_per_K,) * 6,
+        reference_C=c.reference_C,
+        thermistor_offset_C=c.thermistor_offset_C,
+        thermistor_C_per_V=c.thermistor_C_per_V,
+    )
     return Nano17Client(calibration), emulator
 
 
-def read(client: Nano17Client, emulator: Nano17Emulator, count: int, force: object = (0.1, -0.2, 0.3),
-         start: int = 1) -> list:
+def read(
+    client: Nano17Client, emulator: Nano17Emulator, count: int, force: object = (0.1, -0.2, 0.3), start: int = 1
+) -> list:
     for index in range(start, start + count):
         emulator.sample(index * MS, np.array(force, float), np.array([1e-3, -2e-3, 3e-3]))
     volts, rate = emulator.read()
@@ -79,17 +86,27 @@ def test_a_matrix_that_is_none_is_refused(matrix: np.ndarray) -> None:
 
 
 def cal_file(units: str = "N", rows: int = 6, values: str = "1 0 0 0 0 0") -> bytes:
-    axes = "".join(f'<UserAxis Name="{name}" values="{values}" scale="2" max="12"/>'
-                   for name in ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")[:rows])
+    axes = "".join(
+        f'<UserAxis Name="{name}" values="{values}" scale="2" max="12"/>'
+        for name in ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")[:rows]
+    )
     units = f'ForceUnits="{units}" TorqueUnits="N-mm"'
     return f'<FTSensor Serial="FT1"><Calibration {units}>{axes}</Calibration></FTSensor>'.encode()
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    (b"not xml", "found no XML"), (b"<FTSensor/>", "found no Calibration"), (cal_file(units="stone"), "ForceUnits"),
-    (cal_file(rows=5), "UserAxis Tz"), (cal_file(values="1 2 3"), "found 3 values"),
-    (cal_file(values="1 2 3 4 5 nan"), "finite"), (b"<!DOCTYPE x>", "DOCTYPE"), (cal_file(), "calibration matrix"),
-])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"not xml", "found no XML"),
+        (b"<FTSensor/>", "found no Calibration"),
+        (cal_file(units="stone"), "ForceUnits"),
+        (cal_file(rows=5), "UserAxis Tz"),
+        (cal_file(values="1 2 3"), "found 3 values"),
+        (cal_file(values="1 2 3 4 5 nan"), "finite"),
+        (b"<!DOCTYPE x>", "DOCTYPE"),
+        (cal_file(), "calibration matrix"),
+    ],
+)
 def test_a_bad_calibration_file_is_refused_in_words(text: bytes, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         parse_calibration_file(text)
@@ -97,8 +114,10 @@ def test_a_bad_calibration_file_is_refused_in_words(text: bytes, says: str) -> N
 
 def test_a_calibration_file_is_read_in_si() -> None:
     rows = [" ".join("3" if row == column else "0" for column in range(6)) for row in range(6)]
-    axes = "".join(f'<UserAxis Name="{name}" values="{row}" scale="2" max="12"/>'
-                   for name, row in zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), rows, strict=True))
+    axes = "".join(
+        f'<UserAxis Name="{name}" values="{row}" scale="2" max="12"/>'
+        for name, row in zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), rows, strict=True)
+    )
     text = f'<FTSensor Serial="FT1"><Calibration ForceUnits="lbf" TorqueUnits="N-mm">{axes}</Calibration></FTSensor>'
     calibration = parse_calibration_file(text.encode())
     np.testing.assert_allclose(np.diag(calibration.matrix), [1.5 * 4.4482216152605] * 3 + [1.5e-3] * 3)
@@ -108,9 +127,14 @@ def test_a_calibration_file_is_read_in_si() -> None:
 def test_the_vectors_mean_what_they_say() -> None:
     parsed = parse_calibration_file(VECTORS["cal"].encode())
     keys = ("gain_per_K", "reference_C", "thermistor_offset_C", "thermistor_C_per_V")
-    client = Nano17Client(dataclasses.replace(
-        parsed, zero_V=np.array(VECTORS["zero_V"]), zero_V_per_K=tuple(VECTORS["zero_V_per_K"]),
-        **{key: VECTORS[key] for key in keys}))
+    client = Nano17Client(
+        dataclasses.replace(
+            parsed,
+            zero_V=np.array(VECTORS["zero_V"]),
+            zero_V_per_K=tuple(VECTORS["zero_V_per_K"]),
+            **{key: VECTORS[key] for key in keys},
+        )
+    )
     for number, row in enumerate(VECTORS["rows"], 1):
         samples = client.feed(np.array([row["V"]], float), 1000.0, number * MS)
         if row["force_N"] is None:

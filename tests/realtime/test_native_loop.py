@@ -15,12 +15,12 @@ import pytest
 from numba import config, njit
 
 from protocol.serial_codec import StreamDecoder, encode
-from realtime.atomics import load_acquire, store_release
-from realtime.clock import NOW, Clock
-from realtime.loop_thread import NativeLoop, input_mailboxes
-from realtime.mailbox import Mailbox
-from realtime.native_loop import GAP_PLACES, HEARTBEAT, LOOP, STOPPED, TICKS_DONE, _note_gap, count_in
-from realtime.records import INPUTS, OUTPUTS, PARAMS, POSE, STATE, new
+from realtime.control.records import INPUTS, OUTPUTS, PARAMS, POSE, STATE, new
+from realtime.loop.atomics import load_acquire, store_release
+from realtime.loop.clock import NOW, Clock
+from realtime.loop.loop_thread import NativeLoop, input_mailboxes
+from realtime.loop.mailbox import Mailbox
+from realtime.loop.native_loop import GAP_PLACES, HEARTBEAT, LOOP, STOPPED, TICKS_DONE, _note_gap, count_in
 from tests.waiting import PATIENCE_S
 
 PERIOD_NS = 1_000_000
@@ -46,8 +46,9 @@ def failing_tick(params, state, inputs, outputs):
 
 def make(tick=counting_tick, clock: Clock | None = None, **options) -> tuple[NativeLoop, dict[str, Mailbox]]:
     boxes = input_mailboxes(INPUTS)
-    loop = NativeLoop(tick, new(PARAMS), new(STATE), INPUTS, OUTPUTS, boxes, clock=clock or Clock.virtual(),
-                      period_ns=PERIOD_NS, **options)
+    loop = NativeLoop(
+        tick, new(PARAMS), new(STATE), INPUTS, OUTPUTS, boxes, clock=clock or Clock.virtual(), period_ns=PERIOD_NS, **options
+    )
     return loop, boxes
 
 
@@ -271,11 +272,14 @@ def test_a_loop_can_be_started_again_but_not_twice() -> None:
     assert loop.join(PATIENCE_S) and loop.reason == TICKS_DONE
 
 
-@pytest.mark.parametrize(("previous", "lateness_ns", "place"), [
-    ({"tick_ns": 10, "exchange_ns": 20}, 5_000, "woken late"),
-    ({"tick_ns": 9_000, "exchange_ns": 20}, 8_000, "in the tick"),
-    ({"tick_ns": 10, "exchange_ns": 9_000}, 8_000, "in the exchange"),
-])
+@pytest.mark.parametrize(
+    ("previous", "lateness_ns", "place"),
+    [
+        ({"tick_ns": 10, "exchange_ns": 20}, 5_000, "woken late"),
+        ({"tick_ns": 9_000, "exchange_ns": 20}, 8_000, "in the tick"),
+        ({"tick_ns": 10, "exchange_ns": 9_000}, 8_000, "in the exchange"),
+    ],
+)
 def test_the_longest_gap_names_its_place(previous: dict, lateness_ns: int, place: str) -> None:
     loop = np.zeros(1, LOOP).view(np.recarray)[0]
     loop.woke_ns, loop.tick = 1_000, 7
@@ -297,8 +301,9 @@ def test_histograms_count_everything_and_keep_the_exact_maximum() -> None:
 
 def test_records_that_do_not_fit_are_refused() -> None:
     def build(boxes: dict, outputs: np.dtype = OUTPUTS, period_ns: int = PERIOD_NS) -> None:
-        NativeLoop(counting_tick, new(PARAMS), new(STATE), INPUTS, outputs, boxes, clock=Clock.virtual(),
-                   period_ns=period_ns)
+        NativeLoop(
+            counting_tick, new(PARAMS), new(STATE), INPUTS, outputs, boxes, clock=Clock.virtual(), period_ns=period_ns
+        )
 
     with pytest.raises(ValueError, match="found none, wanted at least one"):
         build({})
@@ -318,9 +323,28 @@ def test_records_that_do_not_fit_are_refused() -> None:
 def test_the_compiled_loop_calls_neither_the_interpreter_nor_an_allocator(tmp_path: Path) -> None:
     script = Path(__file__).with_name("list_compiled_calls.py")
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    listed = subprocess.run([sys.executable, str(script)], env=environment, cwd=Path(__file__).parents[2],
-                            capture_output=True, text=True, check=True).stdout.split()
+    listed = subprocess.run(
+        [sys.executable, str(script)],
+        env=environment,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
     assert {"clock_gettime", "clock_nanosleep", "write"} <= set(listed)
-    forbidden = ("Py", "NRT_Allocate", "NRT_MemInfo_alloc", "NRT_Reallocate", "malloc", "calloc", "realloc",
-                 "numba_gil", "numba_unpickle", "numba_raise", "pthread", "puts", "printf")
+    forbidden = (
+        "Py",
+        "NRT_Allocate",
+        "NRT_MemInfo_alloc",
+        "NRT_Reallocate",
+        "malloc",
+        "calloc",
+        "realloc",
+        "numba_gil",
+        "numba_unpickle",
+        "numba_raise",
+        "pthread",
+        "puts",
+        "printf",
+    )
     assert [name for name in listed if name.startswith(forbidden)] == []

@@ -42,8 +42,7 @@ def test_tracking_replies_mean_what_the_vectors_say(vector: dict) -> None:
     assert [tool.handle for tool in reply.tools] == [wanted["handle"] for wanted in vector["tools"]]
     for tool, wanted in zip(reply.tools, vector["tools"], strict=True):
         assert (tool.state.name, int(tool.status), tool.frame) == (wanted["state"], wanted["status"], wanted["frame"])
-        for value, expected in ((tool.quaternion_wxyz, wanted["quaternion_wxyz"]),
-                                (tool.position_m, wanted["position_m"])):
+        for value, expected in ((tool.quaternion_wxyz, wanted["quaternion_wxyz"]), (tool.position_m, wanted["position_m"])):
             assert value is expected if expected is None else value == pytest.approx(expected, abs=1e-9)
         if wanted["error_m"] is not None:
             assert tool.error_m == pytest.approx(wanted["error_m"], abs=1e-12)

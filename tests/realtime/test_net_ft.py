@@ -76,10 +76,8 @@ def test_the_recorded_datagrams_mean_what_the_vectors_say() -> None:
             assert sample is None, vector["meaning"]
             continue
         assert sample is not None, vector["meaning"]
-        assert (sample.rdt_sequence, sample.status, sample.lost) == (
-            vector["sequence"], vector["status"], vector["lost"])
-        assert sample.force_N == pytest.approx(vector["force_N"]) and sample.torque_Nm == pytest.approx(
-            vector["torque_Nm"])
+        assert (sample.rdt_sequence, sample.status, sample.lost) == (vector["sequence"], vector["status"], vector["lost"])
+        assert sample.force_N == pytest.approx(vector["force_N"]) and sample.torque_Nm == pytest.approx(vector["torque_Nm"])
     c = client.counters
     assert (c.malformed, c.old, c.duplicates, c.status_errors, c.wild, c.lost, c.samples) == (2, 1, 1, 2, 1, 2, 5)
 
@@ -113,6 +111,7 @@ def test_a_calibration_that_cannot_be_is_refused() -> None:
 
 
 # Sequence.
+
 
 def test_gaps_are_counted_across_the_wrap_around() -> None:
     client = NetFtClient(CONFIG)
@@ -153,6 +152,7 @@ def test_one_record_with_a_strange_sequence_is_not_believed() -> None:
 
 
 # Faults of the device.
+
 
 def test_every_status_bit_has_words_and_only_a_latched_monitor_is_no_fault() -> None:
     for bit, text in STATUS_WORDS.items():
@@ -221,6 +221,7 @@ def test_stop_ends_the_stream_and_start_begins_it() -> None:
 
 # Times.
 
+
 @pytest.mark.parametrize("drift", [-100e-6, 100e-6])
 @pytest.mark.parametrize(("jitter_s", "rms_us"), [(0.00005, 100), (0.0005, 150)])
 def test_stamps_are_the_sampling_times(jitter_s: float, rms_us: float, drift: float) -> None:
@@ -234,6 +235,7 @@ def test_stamps_are_the_sampling_times(jitter_s: float, rms_us: float, drift: fl
 
 
 # Damage.
+
 
 def truth(sequence: int) -> int:
     return 100 * sequence

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from protocol.commander import Commander
+from protocol.rig_file import SIMULATED_RIG, parse_rig, read_rig_data
 from protocol.topics import RigState
 from protocol.zenoh_session import Session
-from realtime.process import RealtimeProcess
-from realtime.rig_file import parse_rig, read_rig_data
+from realtime.core.process import RealtimeProcess
 from tests.waiting import PATIENCE_S
 
-RIG_FILE = Path(__file__).parents[2] / "host" / "rigs" / "simulated.toml"
+RIG_FILE = SIMULATED_RIG
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def test_commands_are_answered_while_the_loop_compiles(board: str, tmp_path: Pat
         starting.start()
         try:
             answer = commander.take()
-            while answer.result == "unanswered":    # its key is not known here yet
+            while answer.result == "unanswered":  # its key is not known here yet
                 answer = commander.take()
             assert answer.accepted
             for refused in (commander.arm(), commander.disarm(), commander.target((0.0, 0.0, 0.04))):

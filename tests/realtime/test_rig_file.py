@@ -4,7 +4,8 @@ import tomllib
 
 import pytest
 
-from realtime.rig_file import RigFileError, load_rig, parse_rig
+from protocol.errors import InputError
+from protocol.rig_file import load_rig, parse_rig
 from tests.realtime.conftest import RIG_FILE
 
 
@@ -25,19 +26,22 @@ def test_the_shipped_rig_is_good() -> None:
     assert load_rig(RIG_FILE).name == "simulated"
 
 
-@pytest.mark.parametrize(("key", "value", "names"), [
-    ("safety.over_force_N", 5.0, ["safety.over_force_N", "5.0", "at most 0.5"]),
-    ("safety.stop_after_s", 10.0, ["safety.stop_after_s", "at most 0.15"]),
-    ("safety.over_force_N", float("nan"), ["safety.over_force_N", "nan"]),
-    ("stages.insertion.max_speed_unit_per_s", -1.0, ["stages.insertion.max_speed_unit_per_s", "-1.0", "above 0"]),
-    ("stages.insertion.max_speed_unit_per_s", 1.0, ["stages.insertion", "20000 steps/s"]),
-    ("control.position_gian_per_s", 1.0, ["control.position_gian_per_s", "unknown key"]),
-    ("control.loop_hz", None, ["control.loop_hz", "nothing"]),
-    ("transmission.catheter", "livewire", ["transmission.catheter", "livewire", "another catheter"]),
-    ("tracker.base_from_tracker_wxyz", [1.0, 1.0, 0.0, 0.0], ["tracker", "unit length"]),
-])
+@pytest.mark.parametrize(
+    ("key", "value", "names"),
+    [
+        ("safety.over_force_N", 5.0, ["safety.over_force_N", "5.0", "at most 0.5"]),
+        ("safety.stop_after_s", 10.0, ["safety.stop_after_s", "at most 0.15"]),
+        ("safety.over_force_N", float("nan"), ["safety.over_force_N", "nan"]),
+        ("stages.insertion.max_speed_unit_per_s", -1.0, ["stages.insertion.max_speed_unit_per_s", "-1.0", "above 0"]),
+        ("stages.insertion.max_speed_unit_per_s", 1.0, ["stages.insertion", "20000 steps/s"]),
+        ("control.position_gian_per_s", 1.0, ["control.position_gian_per_s", "unknown key"]),
+        ("control.loop_hz", None, ["control.loop_hz", "nothing"]),
+        ("transmission.catheter", "livewire", ["transmission.catheter", "livewire", "another catheter"]),
+        ("tracker.base_from_tracker_wxyz", [1.0, 1.0, 0.0, 0.0], ["tracker", "unit length"]),
+    ],
+)
 def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, names: list[str]) -> None:
-    with pytest.raises(RigFileError) as refused:
+    with pytest.raises(InputError) as refused:
         parse_rig(changed(key, value))
     message = str(refused.value)
     assert "\n" not in message
@@ -45,14 +49,20 @@ def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, 
         assert name in message, message
 
 
-@pytest.mark.parametrize(("gains", "loop"), [
-    ({"position_gain_per_s": 49.0}, "position"), ({"position_integral_per_s2": 100.0}, "position"),
-    ({"position_gain_per_s": 25.0, "loop_hz": 100}, "position"),
-    ({"force_integral_m_per_N_s": 0.5}, "force"), ({"force_gain_m_per_N": 0.0}, "force")])
+@pytest.mark.parametrize(
+    ("gains", "loop"),
+    [
+        ({"position_gain_per_s": 49.0}, "position"),
+        ({"position_integral_per_s2": 100.0}, "position"),
+        ({"position_gain_per_s": 25.0, "loop_hz": 100}, "position"),
+        ({"force_integral_m_per_N_s": 0.5}, "force"),
+        ({"force_gain_m_per_N": 0.0}, "force"),
+    ],
+)
 def test_gains_that_would_be_unstable_are_refused(gains: dict, loop: str) -> None:
     data = changed("control.law", "thesis")
     data["control"].update(gains)
-    with pytest.raises(RigFileError, match=rf"^rig file: control: found gains .* in the {loop} loop .* wanted at least 20"):
+    with pytest.raises(InputError, match=rf"^rig file: control: found gains .* in the {loop} loop .* wanted at least 20"):
         parse_rig(data)
 
 
@@ -61,13 +71,13 @@ def test_gains_that_hold_at_one_rate_may_not_at_another() -> None:
     data["control"].update(position_gain_per_s=22.0)
     assert parse_rig(data).control.law == "thesis"
     data["control"]["loop_hz"] = 100
-    with pytest.raises(RigFileError, match="at 100 Hz"):
+    with pytest.raises(InputError, match="at 100 Hz"):
         parse_rig(data)
 
 
 def test_an_unreadable_file_is_one_line(tmp_path) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "rig.toml"
     path.write_text("name = ")
-    with pytest.raises(RigFileError) as refused:
+    with pytest.raises(InputError) as refused:
         load_rig(path)
     assert "\n" not in str(refused.value) and "TOML" in str(refused.value)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from realtime.service_notify import JournalHandler, ServiceNotifier, log_handler
+from realtime.loop.service_notify import JournalHandler, ServiceNotifier, log_handler
 
 
 @pytest.fixture

@@ -30,9 +30,18 @@ class Peer:
     def __init__(self, **identity: int) -> None:
         self.sequence = 0
         self.decoder = StreamDecoder()
-        self.identity = {"protocol_hash": PROTOCOL_HASH, "firmware_version": 0x0100, "boot_count": 3, "reset_cause": 0,
-                         "mcu": 1, "timer_hz": 20_000, "axes": 3, "queue_capacity": 4, "deadman_us": 30_000,
-                         "horizon_us": 12_000} | identity
+        self.identity = {
+            "protocol_hash": PROTOCOL_HASH,
+            "firmware_version": 0x0100,
+            "boot_count": 3,
+            "reset_cause": 0,
+            "mcu": 1,
+            "timer_hz": 20_000,
+            "axes": 3,
+            "queue_capacity": 4,
+            "deadman_us": 30_000,
+            "horizon_us": 12_000,
+        } | identity
         self.refuse: dict[str, Result] = {}
         self.heard: list[str] = []
 
@@ -47,8 +56,13 @@ class Peer:
             if message.name == "HELLO":
                 out += self.send("IDENTITY", **self.identity)
             else:
-                out += self.send("ACK", command=FRAME_BY_NAME[message.name].id, command_sequence=message.sequence,
-                                 result=self.refuse.get(message.name, Result.OK), mcu_time_us=0)
+                out += self.send(
+                    "ACK",
+                    command=FRAME_BY_NAME[message.name].id,
+                    command_sequence=message.sequence,
+                    result=self.refuse.get(message.name, Result.OK),
+                    mcu_time_us=0,
+                )
         return out
 
     def status(self, **fields: object) -> bytes:
@@ -207,7 +221,7 @@ def test_any_portions_and_any_noise_before(sizes: list[int], noise: bytes) -> No
     events, at, turn = [], 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
-        events += link.feed(stream[at:at + size], MS)
+        events += link.feed(stream[at : at + size], MS)
         at, turn = at + size, turn + 1
     assert kinds(events) == [EventKind.IDENTIFIED, EventKind.STATUS]
     assert link.status is not None and link.status.last_setpoint == 9

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from realtime import safety
-from realtime.supervision import FORCE_APART_N, HOST_SILENT_NS, STEPS_APART, Supervision
+from realtime.control import safety
+from realtime.core.supervision import FORCE_APART_N, HOST_SILENT_NS, STEPS_APART, Supervision
 
 MS = 1_000_000
 ZERO = np.zeros(3, int)
@@ -47,8 +47,13 @@ def test_a_noisy_model_agrees_and_a_drifting_sensor_does_not() -> None:
         estimate = np.array([0.0, 0.03, 0.13]) + rng.normal(0.0, [0.003, 0.11, 0.22])
         supervision.estimate(np.array([0.0, 0.0, 0.2]), estimate, sample * 25 * MS)
     assert supervision.flags == 0
-    found = next(sample for sample in range(4000) if supervision.estimate(
-        np.array([0.0, 0.0, 0.2 - 0.1 * sample * 0.025]), np.array([0.0, 0.0, 0.2]), (4000 + sample) * 25 * MS))
+    found = next(
+        sample
+        for sample in range(4000)
+        if supervision.estimate(
+            np.array([0.0, 0.0, 0.2 - 0.1 * sample * 0.025]), np.array([0.0, 0.0, 0.2]), (4000 + sample) * 25 * MS
+        )
+    )
     assert FORCE_APART_N < 0.1 * found * 0.025 < FORCE_APART_N + 0.15
     assert safety.action_of(supervision.flags) == safety.RETRACT
 

@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realtime import target_predictor
-from realtime.configure import tick_parameters
-from realtime.records import TARGET_STATE, new
-from realtime.rig_file import Rig
-from realtime.target_models import BREATH_RATE, HEART_RATE, LOCAL, PLAY, STEADY, STIFFNESS, position
+from protocol.rig_file import Rig
+from realtime.control import target_predictor
+from realtime.control.configure import tick_parameters
+from realtime.control.records import TARGET_STATE, new
+from realtime.control.target_models import BREATH_RATE, HEART_RATE, LOCAL, PLAY, STEADY, STIFFNESS, position
 from sim import heart
 
 AHEAD_S = 0.040
-FORCE = {"step_ms": 1, "noise_m": 3e-5}        # the force sensor through the catheter's compliance
-POSE = {"step_ms": 25, "noise_m": 2.9e-4}      # the tracker
+FORCE = {"step_ms": 1, "noise_m": 3e-5}  # the force sensor through the catheter's compliance
+POSE = {"step_ms": 25, "noise_m": 2.9e-4}  # the tracker
 
 
 def wall_motion(seconds: float, seed: int = 3, **changes: float) -> np.ndarray:
@@ -26,8 +26,18 @@ def wall_motion(seconds: float, seed: int = 3, **changes: float) -> np.ndarray:
 class Run:
     """A predictor fed with noisy samples of a motion; errors are RMS (m) of what was foretold AHEAD_S ahead."""
 
-    def __init__(self, rig: Rig, wall_m: np.ndarray, step_ms: int, noise_m: float, seed: int = 1, after_s: float = 8.0,
-                 jitter_ms: int = 0, lost: float = 0.0, by_phase: bool = True) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        wall_m: np.ndarray,
+        step_ms: int,
+        noise_m: float,
+        seed: int = 1,
+        after_s: float = 8.0,
+        jitter_ms: int = 0,
+        lost: float = 0.0,
+        by_phase: bool = True,
+    ) -> None:
         parameters = tick_parameters(rig)[0]
         self.config = parameters.wall if step_ms < 10 else parameters.tip_wall
         self.config.by_phase = int(by_phase and step_ms >= 10)
@@ -49,8 +59,9 @@ class Run:
         self.extrapolated = self._rms(np.append(self.samples[0], self.samples[1:] + AHEAD_S * slope))
 
     def feed(self, time_ms: int, value_m: float) -> int:
-        return target_predictor.apply(self.config, self.state, 1_000_000_000 + 1_000_000 * time_ms, value_m, 0.0, 0.0,
-                                      self.noise_m ** 2)
+        return target_predictor.apply(
+            self.config, self.state, 1_000_000_000 + 1_000_000 * time_ms, value_m, 0.0, 0.0, self.noise_m**2
+        )
 
     def _rms(self, foretold: object) -> float:
         return float(np.sqrt(np.mean((np.asarray(foretold)[self.kept] - self.truth[self.kept]) ** 2)))
@@ -91,7 +102,7 @@ def test_an_irregular_beat_is_foretold_to_half_of_holding_by_poses(rig: Rig, see
 def test_the_phase_knows_any_wave(rig: Rig) -> None:
     """A second harmonic as strong as half the first is part of the learned wave."""
     run = Run(rig, wall_motion(40.0, beat_Hz=1.3, second_harmonic=0.5), **POSE)
-    first, second = (float(np.hypot(*run.state.beat.wave_m[2 * h:2 * h + 2])) for h in range(2))
+    first, second = (float(np.hypot(*run.state.beat.wave_m[2 * h : 2 * h + 2])) for h in range(2))
     assert second == pytest.approx(0.5 * first, rel=0.2)
 
 

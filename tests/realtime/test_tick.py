@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realtime import safety
-from realtime.records import (
+from protocol.rig_file import Rig, parse_rig
+from realtime.control import safety
+from realtime.control.records import (
     COMMAND_CONTACT,
     COMMAND_HOLD,
     COMMAND_POSITION,
@@ -20,8 +21,7 @@ from realtime.records import (
     STATE,
     new,
 )
-from realtime.rig_file import Rig, parse_rig
-from realtime.tick import tick
+from realtime.control.tick import tick
 from tests.realtime.conftest import Bench
 
 
@@ -156,8 +156,14 @@ vector = st.tuples(any_float, any_float, any_float)
 
 
 @settings(max_examples=200)
-@given(poses=st.lists(vector, min_size=1, max_size=8), forces=st.lists(vector, min_size=8, max_size=8),
-       target=vector, wanted=any_float, kind=st.integers(0, 4), step_ms=st.integers(1, 60))
+@given(
+    poses=st.lists(vector, min_size=1, max_size=8),
+    forces=st.lists(vector, min_size=8, max_size=8),
+    target=vector,
+    wanted=any_float,
+    kind=st.integers(0, 4),
+    step_ms=st.integers(1, 60),
+)
 def test_outputs_are_finite_for_any_inputs(rig, poses, forces, target, wanted, kind, step_ms) -> None:  # type: ignore[no-untyped-def]
     bench = Bench(rig)
     armed(bench)

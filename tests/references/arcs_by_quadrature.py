@@ -94,8 +94,9 @@ def follow(length: NDArray, EI: NDArray, kappa0: NDArray, force: NDArray, step: 
         kappa, load = found, reached
 
 
-def _correct(length: NDArray, EI: NDArray, kappa0: NDArray, force: NDArray, kappa: NDArray, load: float,
-             tangent: NDArray, last: bool) -> tuple[float, NDArray]:
+def _correct(
+    length: NDArray, EI: NDArray, kappa0: NDArray, force: NDArray, kappa: NDArray, load: float, tangent: NDArray, last: bool
+) -> tuple[float, NDArray]:
     n = length.size
     for _ in range(25):
         mean, by = moments(length, kappa, force)

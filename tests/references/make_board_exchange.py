@@ -62,8 +62,10 @@ def main() -> None:
         turns = exchange(rig)
     finally:
         rig.close()
-    about = ("Recorded: seldinger-atmega2560.elf in simavr and the client, limits of tests/sim/board_rig.py. at_us: end of "
-             "the millisecond in which to_board was sent; of from_board: when the piece had left the board.")
+    about = (
+        "Recorded: seldinger-atmega2560.elf in simavr and the client, limits of tests/sim/board_rig.py. at_us: end of "
+        "the millisecond in which to_board was sent; of from_board: when the piece had left the board."
+    )
     rows = ",\n".join(json.dumps(turn) for turn in turns)
     head = f'{{"about": {json.dumps(about)},\n"events": {json.dumps(rig.events)},\n"turns": [\n'
     PATH.write_text(f"{head}{rows}\n]}}\n", encoding="utf-8")

@@ -130,10 +130,12 @@ def checked_pose(parts, force, moment):
     y = shoot(parts, force, moment, AT_THE_END)
     state = np.concatenate([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], force, moment])
     for part in parts:
+
         def slope(_s, v, part=part):
             out = np.empty(13)
             rates(v, part[1:4], part[4], out)
             return out
+
         state = solve_ivp(slope, (0.0, part[0]), state, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
     growth = np.exp(parts[:, 0].sum() * np.sqrt(np.linalg.norm(force) * parts[:, 1:4].max()))
     assert np.abs(state[:7] - y[:7]).max() < max(2e-11, 1e-13 * growth), np.abs(state[:7] - y[:7]).max()
@@ -155,8 +157,12 @@ def catheter_inputs(count):
     rng = np.random.default_rng(SEED + 1)
     for i in range(count):
         v = rng.normal(size=3)
-        yield (list(STIFFNESS)[i % 2], rng.uniform(0.0, 0.05), rng.uniform(0.0, 60.0),
-               rng.uniform(0.0, 0.35) * v / np.linalg.norm(v))
+        yield (
+            list(STIFFNESS)[i % 2],
+            rng.uniform(0.0, 0.05),
+            rng.uniform(0.0, 60.0),
+            rng.uniform(0.0, 0.35) * v / np.linalg.norm(v),
+        )
 
 
 def entry(parts, force):
@@ -178,8 +184,17 @@ def main() -> None:
         s = 1.0 / np.array(STIFFNESS[name])
         catheters.append(entry(np.array([[insertion, *s[3:], 0.0], [0.07, *s[:3], k0]]), force))
         print(len(catheters), name, np.linalg.norm(force), catheters[-1], flush=True)
-    lines = ["{", f'"seed": {SEED},', '"uniform": [', ",\n".join(json.dumps(e) for e in uniform), '],', '"catheters": [',
-             ",\n".join(json.dumps(e) for e in catheters), "]", "}"]
+    lines = [
+        "{",
+        f'"seed": {SEED},',
+        '"uniform": [',
+        ",\n".join(json.dumps(e) for e in uniform),
+        "],",
+        '"catheters": [',
+        ",\n".join(json.dumps(e) for e in catheters),
+        "]",
+        "}",
+    ]
     TARGET.write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(sum("fold" in e for e in uniform), "folds of", len(uniform))
 

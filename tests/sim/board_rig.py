@@ -11,8 +11,11 @@ import pytest
 from realtime.drivers.stepper_board import AxisLimits, BoardStatus, EventKind, LinkPhase, StepperBoardLink
 from sim.board import Board, BoardSlice
 
-LIMITS = (AxisLimits(16_000, 640_000, -10**6, 10**6), AxisLimits(12_223, 244_462, -10**6, 10**6),
-          AxisLimits(12_223, 244_462, -10**6, 10**6))
+LIMITS = (
+    AxisLimits(16_000, 640_000, -(10**6), 10**6),
+    AxisLimits(12_223, 244_462, -(10**6), 10**6),
+    AxisLimits(12_223, 244_462, -(10**6), 10**6),
+)
 LEAD_US = 3000
 MILLISECOND_US = 1000
 

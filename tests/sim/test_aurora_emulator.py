@@ -114,10 +114,24 @@ def test_setup_commands_are_refused_while_tracking(text: str) -> None:
     assert console.device.tracking
 
 
-@pytest.mark.parametrize(("name", "parameters", "error"), [
-    ("GX", "0001", "01"), ("COMM", "90000", "23"), ("COMM", "5", "07"), ("VER", "9", "23"), ("BEEP", "0", "23"),
-    ("PHSR", "09", "23"), ("PINIT", "0C", "08"), ("PINIT", "A", "07"), ("PENA", "0AD", "0E"), ("PENA", "0AX", "09"),
-    ("PDIS", "0A", "0E"), ("PHINF", "0A00", "07"), ("PHF", "0A", "08")])
+@pytest.mark.parametrize(
+    ("name", "parameters", "error"),
+    [
+        ("GX", "0001", "01"),
+        ("COMM", "90000", "23"),
+        ("COMM", "5", "07"),
+        ("VER", "9", "23"),
+        ("BEEP", "0", "23"),
+        ("PHSR", "09", "23"),
+        ("PINIT", "0C", "08"),
+        ("PINIT", "A", "07"),
+        ("PENA", "0AD", "0E"),
+        ("PENA", "0AX", "09"),
+        ("PDIS", "0A", "0E"),
+        ("PHINF", "0A00", "07"),
+        ("PHF", "0A", "08"),
+    ],
+)
 def test_wrong_commands_get_their_error_code(name: str, parameters: str, error: str) -> None:
     console = Console()
     console.ask("INIT")
@@ -215,8 +229,11 @@ def test_frozen_poses_come_under_new_frame_numbers() -> None:
 
 def test_noise_has_the_stated_size_and_no_colour_unless_asked() -> None:
     for correlation_s, lag_one in ((0.0, 0.0), (0.1, np.exp(-0.25))):
-        config = AuroraEmulatorConfig(handles=("0A",), noise_correlation_s=correlation_s, **{
-            **QUIET, "position_noise_m": 0.00029, "orientation_noise_rad": 0.0035})
+        config = AuroraEmulatorConfig(
+            handles=("0A",),
+            noise_correlation_s=correlation_s,
+            **{**QUIET, "position_noise_m": 0.00029, "orientation_noise_rad": 0.0035},
+        )
         emulator = AuroraEmulator(config, 7)
         poses = []
         for _ in range(6000):
@@ -283,13 +300,15 @@ def test_an_unknown_fault_and_a_wrong_number_of_poses_are_refused() -> None:
 def conversation(seed: int, chunks: list[int], step_ns: int) -> bytes:
     """All that the device says to a fixed talk, sent in pieces of the sizes in `chunks` and read every `step_ns`."""
     device = AuroraEmulator(AuroraEmulatorConfig(), seed)
-    talk = b"".join(ndi.command(*text.split(":")) for text in (
-        "INIT:", "PHSR:02", "PINIT:0A", "PENA:0AD", "TSTART:", "BX:0001", "TX:0001", "BX:0001"))
+    talk = b"".join(
+        ndi.command(*text.split(":"))
+        for text in ("INIT:", "PHSR:02", "PINIT:0A", "PENA:0AD", "TSTART:", "BX:0001", "TX:0001", "BX:0001")
+    )
     said, now_ns, at, piece = b"", 0, 0, 0
     while now_ns < 2_000 * MS:
         if at < len(talk):
             size = chunks[piece % len(chunks)]
-            device.feed(talk[at:at + size], 0)
+            device.feed(talk[at : at + size], 0)
             at, piece = at + size, piece + 1
             continue
         now_ns += step_ns

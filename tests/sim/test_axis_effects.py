@@ -32,7 +32,7 @@ def sine(amplitude: float, frequency_Hz: float, seconds: float = 4.0) -> np.ndar
 
 def area(x: np.ndarray, y: np.ndarray, period: int) -> float:
     """Loop area over the last period."""
-    return abs(float(np.trapezoid(y[-period - 1:], x[-period - 1:])))
+    return abs(float(np.trapezoid(y[-period - 1 :], x[-period - 1 :])))
 
 
 def response(effect: Effect, frequency_Hz: float, amplitude: float = 0.01) -> complex:
@@ -49,7 +49,7 @@ def test_backlash_parts_two_flanks_by_its_width_at_any_amplitude_and_rate() -> N
     for amplitude, frequency in ((0.005, 0.5), (0.010, 0.5), (0.005, 2.0)):
         lost = sine(amplitude, frequency)
         lost = lost - drive(Effect("backlash", "insertion", {"width_m": 0.002}), lost)
-        later = lost[int(1.0 / frequency / DT):]
+        later = lost[int(1.0 / frequency / DT) :]
         assert np.ptp(later) == pytest.approx(0.002, rel=1e-6)
 
 
@@ -82,8 +82,10 @@ def test_presliding_friction_enters_along_a_curve_and_remembers_inner_loops() ->
 
 def test_load_dependent_friction_opens_with_the_load() -> None:
     x = sine(0.005, 0.5)
-    areas = [area(x, drive(Effect("load_dependent_friction", "insertion"), x, np.full_like(x, load)), 2000)
-             for load in (0.0, 0.2, 0.4)]
+    areas = [
+        area(x, drive(Effect("load_dependent_friction", "insertion"), x, np.full_like(x, load)), 2000)
+        for load in (0.0, 0.2, 0.4)
+    ]
     assert areas[0] < 1e-12 and areas[2] == pytest.approx(2 * areas[1], rel=0.05)
 
 
@@ -95,8 +97,10 @@ def test_stribeck_friction_sticks_and_slips_when_slow_only() -> None:
 
 
 def test_viscous_loop_grows_with_frequency() -> None:
-    areas = [area(sine(0.005, f), drive(Effect("viscous_friction", "insertion"), sine(0.005, f)), round(1000 / f))
-             for f in (0.5, 1.0, 2.0)]
+    areas = [
+        area(sine(0.005, f), drive(Effect("viscous_friction", "insertion"), sine(0.005, f)), round(1000 / f))
+        for f in (0.5, 1.0, 2.0)
+    ]
     assert areas[1] == pytest.approx(2 * areas[0], rel=0.03) and areas[2] == pytest.approx(4 * areas[0], rel=0.06)
 
 
@@ -125,8 +129,10 @@ def test_clock_drift_delays_more_and_more() -> None:
 def test_compliance_gives_way_in_proportion_and_a_hardening_spring_by_less() -> None:
     x = np.zeros(1000)
     for port, sign in (("insertion", 1), ("roll", 1), ("knob", -1), ("shape", -1)):
-        soft, hard = ([drive(Effect(name, port), x, np.full(1000, load))[-1] for load in (0.1, 0.2)]
-                      for name in ("compliance", "nonlinear_stiffness"))
+        soft, hard = (
+            [drive(Effect(name, port), x, np.full(1000, load))[-1] for load in (0.1, 0.2)]
+            for name in ("compliance", "nonlinear_stiffness")
+        )
         assert soft[1] == pytest.approx(2 * soft[0]) and np.sign(soft[0]) == sign
         assert abs(hard[1]) < 2 * abs(hard[0]) or port in ("knob", "shape")
 
@@ -201,11 +207,14 @@ def test_nothing_happens_before_the_start() -> None:
 
 
 def test_bad_effects_are_refused_by_name() -> None:
-    for bad, says in ((Effect("backlash", "wrist"), "port"), (Effect("whip", "knob"), "whip"),
-                      (Effect("backlash", "insertion", {"width": 1.0}), "'width'"),
-                      (Effect("backlash", "insertion", {"width_m": -1.0}), "width_m"),
-                      (Effect("backlash", "insertion", {"width_m": float("nan")}), "width_m"),
-                      (Effect("backlash", "insertion", start_s=-1.0), "start_s")):
+    for bad, says in (
+        (Effect("backlash", "wrist"), "port"),
+        (Effect("whip", "knob"), "whip"),
+        (Effect("backlash", "insertion", {"width": 1.0}), "'width'"),
+        (Effect("backlash", "insertion", {"width_m": -1.0}), "width_m"),
+        (Effect("backlash", "insertion", {"width_m": float("nan")}), "width_m"),
+        (Effect("backlash", "insertion", start_s=-1.0), "start_s"),
+    ):
         with pytest.raises(ValueError, match=says):
             pack([bad])
 

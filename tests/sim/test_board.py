@@ -46,13 +46,23 @@ def cruise(rig: BoardRig, milliseconds: int, steps_per_ms: tuple[int, int, int])
 
 def assert_clean(rig: BoardRig) -> None:
     s = rig.status
-    assert (s.crc_errors, s.sequence_errors, s.underruns, s.rejected, s.expired, s.overflows, s.late, s.rx_overruns,
-            s.encoder_errors) == (0,) * 9, s
+    assert (
+        s.crc_errors,
+        s.sequence_errors,
+        s.underruns,
+        s.rejected,
+        s.expired,
+        s.overflows,
+        s.late,
+        s.rx_overruns,
+        s.encoder_errors,
+    ) == (0,) * 9, s
     counters = rig.link.decoder.counters
     assert counters.crc_errors == counters.lost == counters.repeated == 0
 
 
 # --- motion ---------------------------------------------------------------------------------------------------------
+
 
 def test_commanded_is_made_is_reported(armed: BoardRig) -> None:
     path = ramped_moves(240, seed=1)
@@ -118,8 +128,10 @@ def test_native_and_avr_agree() -> None:
 
 # --- stopping -------------------------------------------------------------------------------------------------------
 
-def assert_stopped_on_a_ramp(rig: BoardRig, commanded: np.ndarray, steps_per_ms: tuple[int, int, int], since_us: int,
-                             within_us: int) -> None:
+
+def assert_stopped_on_a_ramp(
+    rig: BoardRig, commanded: np.ndarray, steps_per_ms: tuple[int, int, int], since_us: int, within_us: int
+) -> None:
     """At rest in time, off the last command by no more than the queue and a uniform deceleration, ever slower."""
     for axis, limits in enumerate(LIMITS):
         speed = 1000 * abs(steps_per_ms[axis])
@@ -209,6 +221,7 @@ def test_a_restarted_processor_is_a_fault(armed: BoardRig, how: str) -> None:
 
 # --- set-points that must not be executed ---------------------------------------------------------------------------
 
+
 def test_expired_setpoints_are_counted_and_not_executed(armed: BoardRig) -> None:
     armed.follow(np.zeros((5, 3), np.int64))
     for _ in range(10):
@@ -251,7 +264,7 @@ def apply_damage(frames: list[bytes], faults: list[tuple[str, int, int]]) -> lis
         if kind == "flip" and piece:
             piece[where // 8 % len(piece)] ^= 1 << where % 8
         elif kind == "cut":
-            del piece[where % (len(piece) + 1):]
+            del piece[where % (len(piece) + 1) :]
         elif kind == "double":
             pieces.insert(at % len(pieces), bytearray(piece))
         elif kind == "swap":
@@ -304,6 +317,7 @@ def test_damaged_setpoints_are_not_executed(faults: list[tuple[str, int, int]]) 
 
 
 # --- the child ------------------------------------------------------------------------------------------------------
+
 
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="board kind: found 'steel'"):

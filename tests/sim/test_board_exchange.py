@@ -27,11 +27,14 @@ def test_the_client_understands_what_was_recorded() -> None:
     for turn in TURNS:
         sent = bytes.fromhex(turn["to_board"])
         for message in decoder.feed(sent):
-            if message.name != "SETPOINT":      # an answer counts for what was asked: asked again, it is the same bytes
+            if message.name != "SETPOINT":  # an answer counts for what was asked: asked again, it is the same bytes
                 assert link._command(message.name, **message.fields) in sent
         for piece in turn["from_board"]:
-            told += [event for event in link.feed(bytes.fromhex(piece["hex"]), piece["at_us"] * 1000)
-                     if event.kind is not EventKind.STATUS]
+            told += [
+                event
+                for event in link.feed(bytes.fromhex(piece["hex"]), piece["at_us"] * 1000)
+                if event.kind is not EventKind.STATUS
+            ]
     assert [event.message for event in told] == RECORDED["events"]
     status = link.status
     assert status is not None and (status.rejected, status.crc_errors) == (6, 1) and status.position_steps[0] == -16_000
@@ -52,8 +55,9 @@ def test_every_board_answers_the_recorded_commands_alike(kind: tuple[str, str]) 
     answers: dict[str, list[tuple[str, dict[str, Any]]]] = {}
     for name, stream in (("recorded", pieces()), ("now", _answers_of(*kind))):
         decoder = StreamDecoder()
-        answers[name] = [(message.name, message.fields) for piece, _ in stream for message in decoder.feed(piece)
-                         if message.name == "ACK"]
+        answers[name] = [
+            (message.name, message.fields) for piece, _ in stream for message in decoder.feed(piece) if message.name == "ACK"
+        ]
     for name in answers:
         for _, fields in answers[name]:
             fields.pop("mcu_time_us")

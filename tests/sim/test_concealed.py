@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from sim import concealed, concealed_generic, concealed_nominal, concealed_rig, concealed_system
-from sim.concealed import Plan
-from sim.concealed_menu import MENU, UNLISTED
-from sim.concealed_signals import KINDS, QUIET_S, coloured, lost, presses, signal, windows
-from sim.concealed_system import Planted
+from sim.concealed import generic as concealed_generic
+from sim.concealed import nominal as concealed_nominal
+from sim.concealed import rig as concealed_rig
+from sim.concealed import suite as concealed
+from sim.concealed import system as concealed_system
+from sim.concealed.menu import MENU, UNLISTED
+from sim.concealed.signals import KINDS, QUIET_S, coloured, lost, presses, signal, windows
+from sim.concealed.suite import Plan
+from sim.concealed.system import Planted
 from sim.effects import Effect, pack
 
 GENERIC = ("transmission", "axis", "impedance")

@@ -49,7 +49,7 @@ def test_the_switch_is_found_to_the_step(stage: Stage) -> None:
     true_minus_named = int(stage.rig.position[0]) - int(status.position_steps[0])
     assert abs(true_minus_named - (SWITCH_STEPS - HOME.at_steps)) <= 2
     assert not stage.rig.link.armed and status.fault == Fault.NONE and not status.inputs & 1
-    assert 2 <= stage.homing.difference_steps <= 0.01 * HOME.speed_steps_per_s   # what the fast touch ran on
+    assert 2 <= stage.homing.difference_steps <= 0.01 * HOME.speed_steps_per_s  # what the fast touch ran on
     assert int(status.position_steps[0]) > HOME.at_steps and stage.rig.position[1:].tolist() == [0, 0]
     stage.rig.run_ms(50)
     assert int(stage.rig.position[0]) - int(stage.rig.status.position_steps[0]) == true_minus_named
@@ -68,11 +68,15 @@ def test_the_slow_touch_is_within_a_step(stage: Stage) -> None:
     assert SLOW_STEPS_PER_S * 0.003 < 1.0
 
 
-@pytest.mark.parametrize(("switches", "says"), [
-    ({}, "found no change of the lower switch after 7"),
-    ({0: lambda steps: True}, "found no change of the lower switch after 7"),
-    ({1: lambda steps: steps <= SWITCH_STEPS}, "found another switch than the lower one"),
-    ({4: lambda steps: steps <= SWITCH_STEPS}, "found another switch than the lower one")])
+@pytest.mark.parametrize(
+    ("switches", "says"),
+    [
+        ({}, "found no change of the lower switch after 7"),
+        ({0: lambda steps: True}, "found no change of the lower switch after 7"),
+        ({1: lambda steps: steps <= SWITCH_STEPS}, "found another switch than the lower one"),
+        ({4: lambda steps: steps <= SWITCH_STEPS}, "found another switch than the lower one"),
+    ],
+)
 def test_what_is_wired_wrong_is_said_and_nothing_moves_on(stage: Stage, switches: dict, says: str) -> None:
     stage.switches = switches
     with pytest.raises(HomingFailed, match=says):

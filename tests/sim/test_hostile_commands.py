@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from protocol.rig_file import load_rig
 from protocol.topics import MAX_PAYLOAD_BYTES, Command, Message, Reply, decode, encode
-from realtime.records import PHASE_STOPPED
-from realtime.rig_file import load_rig
+from realtime.control.records import PHASE_STOPPED
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
@@ -46,9 +46,19 @@ class Tapped(Scenario):
 
     def forged(self, **changes: object) -> Command:
         now_ns = self.loop.now_ns
-        return Command(**{"stamp_ns": now_ns, "sequence": 10_000, "id": "forged", "commander": "intruder",  # type: ignore[arg-type]
-                          "expires_ns": now_ns + 100_000_000, "action": "target", "target": "position",
-                          "target_m": (0.0, 0.0, 0.05)} | changes)
+        return Command(
+            **{
+                "stamp_ns": now_ns,
+                "sequence": 10_000,
+                "id": "forged",
+                "commander": "intruder",  # type: ignore[arg-type]
+                "expires_ns": now_ns + 100_000_000,
+                "action": "target",
+                "target": "position",
+                "target_m": (0.0, 0.0, 0.05),
+            }
+            | changes
+        )
 
 
 Attack = Callable[[Tapped, int], tuple[str, bytes]]
@@ -66,8 +76,15 @@ def replayed_under_a_new_id(run: Tapped, number: int) -> tuple[str, bytes]:
 
 def stale(run: Tapped, number: int) -> tuple[str, bytes]:
     now_ns = run.loop.now_ns
-    return "scenario", encode(run.forged(commander="scenario", lease=run.commander._lease, id=f"s{number}",
-                                         stamp_ns=max(now_ns - 2 * 10**9, 0), expires_ns=now_ns - 10**6))
+    return "scenario", encode(
+        run.forged(
+            commander="scenario",
+            lease=run.commander._lease,
+            id=f"s{number}",
+            stamp_ns=max(now_ns - 2 * 10**9, 0),
+            expires_ns=now_ns - 10**6,
+        )
+    )
 
 
 def from_a_reader(run: Tapped, number: int) -> tuple[str, bytes]:
@@ -128,8 +145,20 @@ def undisturbed() -> Moved:
     return result
 
 
-@pytest.mark.parametrize("attack", [replayed, replayed_under_a_new_id, stale, from_a_reader, without_the_lease,
-                                    with_a_stolen_lease, under_another_name, malformed, oversized])
+@pytest.mark.parametrize(
+    "attack",
+    [
+        replayed,
+        replayed_under_a_new_id,
+        stale,
+        from_a_reader,
+        without_the_lease,
+        with_a_stolen_lease,
+        under_another_name,
+        malformed,
+        oversized,
+    ],
+)
 def test_no_edge_moves_for_it(attack: Attack, undisturbed: Moved) -> None:
     with LibraryBoard() as board:
         run = Tapped(board, {"analysis": "reader"})
@@ -190,9 +219,14 @@ def armed() -> Iterator[Tapped]:
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(payload=st.binary(max_size=MAX_PAYLOAD_BYTES + 500) | st.dictionaries(
-    st.sampled_from(["schema_version", "id", "action", "target", "lease", "commander", "expires_ns", "stamp_ns"]),
-    st.none() | st.integers(-2**63, 2**63) | st.text(max_size=20)).map(msgpack.packb), name=st.text(max_size=40))
+@given(
+    payload=st.binary(max_size=MAX_PAYLOAD_BYTES + 500)
+    | st.dictionaries(
+        st.sampled_from(["schema_version", "id", "action", "target", "lease", "commander", "expires_ns", "stamp_ns"]),
+        st.none() | st.integers(-(2**63), 2**63) | st.text(max_size=20),
+    ).map(msgpack.packb),
+    name=st.text(max_size=40),
+)
 def test_nothing_random_moves_a_rig_at_rest(armed: Tapped, payload: bytes, name: str) -> None:
     before = moved(armed)
     armed.loop.request(name, payload)

@@ -1,7 +1,7 @@
 """Bad cables: nothing is touched without a fault, each kind of fault does what it says, the seed decides."""
 
 from protocol.serial_codec import StreamDecoder, encode
-from realtime.lockstep import Arriving, Leaving
+from realtime.core.lockstep import Arriving, Leaving
 from sim.line_noise import LineNoise
 from sim.sensor_faults import Fault
 

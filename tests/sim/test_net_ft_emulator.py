@@ -19,8 +19,9 @@ START, STOP, BIAS = (bytes.fromhex(VECTORS["requests"][k]["hex"]) for k in (1, 0
 STILL = NetFtEmulatorConfig(force_noise_N=0.0, torque_noise_Nm=0.0, jitter_s=0.0)
 
 
-def run(device: NetFtEmulator, seconds: float, force_N: tuple[float, float, float] = (0.0, 0.0, 0.2),
-        start_ns: int | None = None) -> list[tuple[int, ...]]:
+def run(
+    device: NetFtEmulator, seconds: float, force_N: tuple[float, float, float] = (0.0, 0.0, 0.2), start_ns: int | None = None
+) -> list[tuple[int, ...]]:
     """Records that arrive while the load stands for `seconds`."""
     first_ns = device.next_sample_ns if start_ns is None else start_ns
     while device.next_sample_ns < first_ns + seconds * 1e9:
@@ -104,9 +105,20 @@ def test_beyond_the_range_the_gauges_saturate_and_the_status_says_so() -> None:
     assert beyond[2] == 0x80020000 and beyond[5] == pytest.approx(25_500_000)
 
 
-@pytest.mark.parametrize(("kind", "value"), [("drop", 0.2), ("duplicate", 0.2), ("reorder", 0.2), ("silent", 0.0),
-                                             ("saturated", 0.0), ("broken", 0.0), ("drift", 0.5), ("frozen", 0.0),
-                                             ("bit_errors", 0.01)])
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("drop", 0.2),
+        ("duplicate", 0.2),
+        ("reorder", 0.2),
+        ("silent", 0.0),
+        ("saturated", 0.0),
+        ("broken", 0.0),
+        ("drift", 0.5),
+        ("frozen", 0.0),
+        ("bit_errors", 0.01),
+    ],
+)
 def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str, value: float) -> None:
     config = NetFtEmulatorConfig(force_noise_N=0.001)
     device = NetFtEmulator(config, 5, [Fault(kind, 1_000 * MS, 2_000 * MS, value=value)])
@@ -120,8 +132,10 @@ def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str, value: float) -> No
     sequences = np.array([record[0] for record in during])
     forces = np.array([record[5] for record in during]) * 1e-6
     seen = {
-        "drop": abs(len(during) - 800) < 60, "duplicate": abs(len(during) - 1200) < 60,
-        "reorder": bool(np.any(np.diff(sequences) < 0)), "silent": len(during) == 0,
+        "drop": abs(len(during) - 800) < 60,
+        "duplicate": abs(len(during) - 1200) < 60,
+        "reorder": bool(np.any(np.diff(sequences) < 0)),
+        "silent": len(during) == 0,
         "saturated": {record[2] for record in during} == {0x80020000},
         "broken": {record[2] for record in during} == {0x80000100},
         "drift": bool(len(forces)) and abs(float(forces[-1:].sum()) - 0.7) < 0.01,

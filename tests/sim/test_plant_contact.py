@@ -19,8 +19,8 @@ from sim.vessel import VesselConfig
 
 STILL = HeartConfig(beat_m=0.0, respiration_m=0.0)
 NO_PLAY = VesselConfig(play_width_m=0.0)
-KNOB = 0.517         # 14.5 1/m, the demo's bend
-HOLD_M = 0.00548     # stage reading that presses 0.2 N on the wall at rest
+KNOB = 0.517  # 14.5 1/m, the demo's bend
+HOLD_M = 0.00548  # stage reading that presses 0.2 N on the wall at rest
 
 
 def pressed(tissue: TissueConfig, heart: HeartConfig = STILL, stage_m: float = HOLD_M, steps: int = 2000) -> Plant:
@@ -68,8 +68,11 @@ def test_a_still_catheter_feels_the_beat_by_a_tenth_of_a_newton() -> None:
 
 
 def test_touching_fast_on_a_stiff_wall_does_not_ring() -> None:
-    plant = Plant(PlantConfig(vessel=NO_PLAY, tissue=TissueConfig(stiffness_N_per_m=20000.0), heart=STILL,
-                              start_stage=(0.0, 0.0, KNOB)))
+    plant = Plant(
+        PlantConfig(
+            vessel=NO_PLAY, tissue=TissueConfig(stiffness_N_per_m=20000.0), heart=STILL, start_stage=(0.0, 0.0, KNOB)
+        )
+    )
     forces = []
     for n in range(1500):
         plant.step(1e-3, (min(0.05 * n * 1e-3, HOLD_M), 0.0, KNOB))
@@ -92,8 +95,11 @@ def test_nonlinear_tissue_stiffens_with_depth(tissue: TissueConfig) -> None:
 
 
 def test_hunt_crossley_and_relaxation_part_loading_from_unloading() -> None:
-    for tissue in (TissueConfig(hunt_crossley_s_per_m=30.0), TissueConfig(viscosity_N_s_per_m=2.0),
-                   TissueConfig(relaxing_N_per_m=500.0, relaxation_s=0.3)):
+    for tissue in (
+        TissueConfig(hunt_crossley_s_per_m=30.0),
+        TissueConfig(viscosity_N_s_per_m=2.0),
+        TissueConfig(relaxing_N_per_m=500.0, relaxation_s=0.3),
+    ):
         plant = pressed(tissue, HeartConfig(respiration_m=0.0))
         work = 0.0
         last = plant.truth()["depth_m"]
@@ -126,7 +132,8 @@ def test_regular_heart_is_two_sines() -> None:
         plant.step(1e-3, (0.0, 0.0, 0.0))
         t = n * 1e-3
         assert plant.truth()["heart_m"] == pytest.approx(
-            0.001 * np.sin(4 * np.pi * t) + 0.0004 * np.sin(0.66 * np.pi * t), abs=1e-9)
+            0.001 * np.sin(4 * np.pi * t) + 0.0004 * np.sin(0.66 * np.pi * t), abs=1e-9
+        )
 
 
 def test_irregular_heart_varies_from_beat_to_beat_by_seed_and_never_jumps() -> None:
@@ -154,8 +161,9 @@ MODEST = st.tuples(st.floats(-0.02, 0.06), st.floats(-3, 3), st.floats(-1.6, 1.6
 
 
 @settings(max_examples=40)
-@given(st.lists(st.one_of(STAGES, MODEST), min_size=1, max_size=12), st.sampled_from([1e-4, 1e-3, 0.01]),
-       st.floats(0.0, 1.0))
+@given(
+    st.lists(st.one_of(STAGES, MODEST), min_size=1, max_size=12), st.sampled_from([1e-4, 1e-3, 0.01]), st.floats(0.0, 1.0)
+)
 def test_finite_for_any_finite_stages(targets: list[tuple[float, float, float]], dt_s: float, friction: float) -> None:
     plant = Plant(PlantConfig(tissue=TissueConfig(friction=friction, hunt_crossley_s_per_m=10.0)))
     for target in targets:
@@ -202,7 +210,16 @@ def test_the_kernels_give_the_same_numbers_without_the_compiler() -> None:
         "for n in range(12):\n"
         "    plant.step(1e-3, (0.0006 * n, 0.1, 0.4))\n"
         "    pose, wrench = plant.measured_pose(0), plant.measured_wrench()\n"
-        "print(*(f'{v:.9f}' for v in (*plant.sensor_pose(0.0)[0], *pose.position_m, *wrench[0])))\n")
-    outputs = [subprocess.run([sys.executable, "-c", program], env=os.environ | {"NUMBA_DISABLE_JIT": disable}, text=True,
-                              capture_output=True, check=True).stdout for disable in ("0", "1")]
+        "print(*(f'{v:.9f}' for v in (*plant.sensor_pose(0.0)[0], *pose.position_m, *wrench[0])))\n"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env=os.environ | {"NUMBA_DISABLE_JIT": disable},
+            text=True,
+            capture_output=True,
+            check=True,
+        ).stdout
+        for disable in ("0", "1")
+    ]
     assert outputs[0] == outputs[1] != ""

@@ -28,8 +28,9 @@ def knob_for(curvature_per_m: float) -> float:
     return float(np.sign(curvature_per_m) * (k.slack_rad + abs(curvature_per_m) * (k.stop_rad - k.slack_rad) / 45.0))
 
 
-def rested(exposed_m: float, curvature_per_m: float, tissue: TissueConfig = FAR, cells: int = 55,
-           roll_rad: float = 0.0) -> Plant:
+def rested(
+    exposed_m: float, curvature_per_m: float, tissue: TissueConfig = FAR, cells: int = 55, roll_rad: float = 0.0
+) -> Plant:
     """A plant that has come to rest with so much of the shaft out, by slow enough steps."""
     catheter = replace(CATHETERS["blazer_prime_xp"], distal_cells=cells)
     vessel = VesselConfig(play_width_m=0.0, home_insertion_m=exposed_m - catheter.distal_length_m)
@@ -81,9 +82,11 @@ def test_body_behind_the_distal_shaft_has_its_own_stiffness_and_no_curvature() -
 
 def elastica(length: float, curvature: float, force: float) -> tuple[float, float, float]:
     """(axial, lateral, angle) of the tip of a clamped planar rod under an axial push, on the branch next to the arc."""
+
     def shot(curvature_base: float) -> np.ndarray:
         def slope(s: float, y: np.ndarray) -> list[float]:
             return [curvature + y[1] / EI1, -force * np.sin(y[0]), np.cos(y[0]), np.sin(y[0])]
+
         return solve_ivp(slope, (0.0, length), [0.0, curvature_base, 0.0, 0.0], rtol=1e-11, atol=1e-13).y[:, -1]
 
     moment = brentq(lambda m: shot(m)[1], 0.0, 3.0 * force * length, xtol=1e-14)
@@ -91,8 +94,9 @@ def elastica(length: float, curvature: float, force: float) -> tuple[float, floa
     return axial, lateral, angle
 
 
-@pytest.mark.parametrize(("exposed", "curvature", "wall"),
-                         [(0.0264, 14.0, 0.025), (0.0400, 20.0, 0.028), (0.0600, 20.0, 0.033)])
+@pytest.mark.parametrize(
+    ("exposed", "curvature", "wall"), [(0.0264, 14.0, 0.025), (0.0400, 20.0, 0.028), (0.0600, 20.0, 0.033)]
+)
 def test_large_axial_load_follows_the_elastica(exposed: float, curvature: float, wall: float) -> None:
     plant = rested(exposed, curvature, TissueConfig(point_m=(0.0, 0.0, wall)))
     force = float(plant.contact_force_N[2])

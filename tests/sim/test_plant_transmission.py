@@ -17,8 +17,9 @@ from sim.vessel import VesselConfig
 FREE = PlantConfig(tissue=TissueConfig(point_m=(0.0, 0.0, 1.0)))
 
 
-def sweep(axis: int, amplitude: float, rate_rad_per_s: float, config: PlantConfig = FREE,
-          dt_s: float = 1e-3) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def sweep(
+    axis: int, amplitude: float, rate_rad_per_s: float, config: PlantConfig = FREE, dt_s: float = 1e-3
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Input and truths over the second of two sine periods on one axis."""
     plant, stage, inputs = Plant(config), np.zeros(3), []
     truths: dict[str, list[float]] = {"insertion_m": [], "roll_rad": [], "curvature_per_m": []}

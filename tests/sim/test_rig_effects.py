@@ -18,8 +18,12 @@ KNOB, HOLD_M = 0.517, 0.00548
 
 def plant_with(*effects: Effect, tissue: TissueConfig = FAR, heart: HeartConfig = STILL, seed: int = 0) -> Plant:
     """The demo's catheter without play, with effects."""
-    return Plant(PlantConfig(vessel=VesselConfig(play_width_m=0.0), tissue=tissue, heart=heart, effects=effects,
-                             start_stage=(0.0, 0.0, KNOB)), seed)
+    return Plant(
+        PlantConfig(
+            vessel=VesselConfig(play_width_m=0.0), tissue=tissue, heart=heart, effects=effects, start_stage=(0.0, 0.0, KNOB)
+        ),
+        seed,
+    )
 
 
 def run(plant: Plant, seconds: float, insertion_m: float = 0.0, roll_rad: float = 0.0, knob_rad: float = KNOB) -> np.ndarray:
@@ -69,8 +73,10 @@ def test_second_contact_sets_in_at_its_clearance_and_follows_its_spring() -> Non
 
 
 def test_hardening_gives_less_than_the_linear_shaft() -> None:
-    soft, hard = (plant_with(*effects, tissue=TissueConfig()) for effects in
-                  ((), (Effect("nonlinear_stiffness", "shape", {"cubic_m2": 0.002}),)))
+    soft, hard = (
+        plant_with(*effects, tissue=TissueConfig())
+        for effects in ((), (Effect("nonlinear_stiffness", "shape", {"cubic_m2": 0.002}),))
+    )
     for insertion in (0.0046, 0.0052):
         run(soft, 1.0, insertion), run(hard, 1.0, insertion)
     assert hard.contact_force_N[2] > soft.contact_force_N[2] * 1.02
@@ -219,8 +225,10 @@ def test_quantized_dropped_and_wild_samples() -> None:
 
 def test_every_effect_of_the_force_sensor_changes_the_reading_and_nothing_else() -> None:
     for name in CATALOGUE["force_sensor"]:
-        plant, nominal = (plant_with(*e, tissue=TissueConfig(), heart=HeartConfig()) for e in
-                          ((Effect(name, "force_sensor", {"axis": 2.0} if name == "periodic_disturbance" else {}),), ()))
+        plant, nominal = (
+            plant_with(*e, tissue=TissueConfig(), heart=HeartConfig())
+            for e in ((Effect(name, "force_sensor", {"axis": 2.0} if name == "periodic_disturbance" else {}),), ())
+        )
         differences = []
         for n in range(3000):
             for p in (plant, nominal):

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.rig_file import load_rig
 from protocol.topics import Message
-from realtime.lockstep import Leaving
-from realtime.records import PHASE_CONTACT
-from realtime.rig_file import load_rig
+from realtime.control.records import PHASE_CONTACT
+from realtime.core.lockstep import Leaving
 from sim.board import Board
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
@@ -49,7 +49,7 @@ def test_the_tip_comes_to_the_wall_and_holds(board: Board) -> None:
     assert outcome.steps_commanded == outcome.steps_on_pins == outcome.steps_reported
     assert outcome.steps_commanded != [0, 0, 0]
     force = np.array([m.force_N for m in heard["state"] if m.mode == "contact"])  # type: ignore[attr-defined]
-    assert 0.05 < np.mean(force[len(force) // 2:]) < 0.4
+    assert 0.05 < np.mean(force[len(force) // 2 :]) < 0.4
     assert run.world.peak_force_N < 0.5
 
 
@@ -65,8 +65,9 @@ with Board(sys.argv[1]) as board:
 
 
 def digest_of(kind: str, seed: int) -> str:
-    done = subprocess.run([sys.executable, "-c", PROGRAM, kind, str(seed)], cwd=HERE, capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, kind, str(seed)], cwd=HERE, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip()
 
 

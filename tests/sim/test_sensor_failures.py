@@ -5,11 +5,11 @@ from collections import deque
 import numpy as np
 import pytest
 
+from protocol.rig_file import load_rig
 from protocol.topics import ForceEstimate, Message
-from realtime import safety
-from realtime.force_source import ESTIMATE, SENSOR
-from realtime.records import PHASE_APPROACH, PHASE_CONTACT, PHASE_RETRACT, PHASE_STOPPED
-from realtime.rig_file import load_rig
+from realtime.control import safety
+from realtime.control.force_source import ESTIMATE, SENSOR
+from realtime.control.records import PHASE_APPROACH, PHASE_CONTACT, PHASE_RETRACT, PHASE_STOPPED
 from sim.forked_board import forkable_board
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
@@ -65,9 +65,16 @@ class Job:
         if not near:
             return None
         force_N = (0.0, 0.0, near[0] + 0.015 + 0.02 * float(self._rng.standard_normal()))
-        return ForceEstimate(stamp_ns=tip.stamp_ns, frame="base", converged=True, published_ns=tip.stamp_ns,
-                             force_N=force_N, covariance_N2=tuple(np.diag([4e-4] * 3).ravel()), residual=0.0,
-                             compute_us=100.0)
+        return ForceEstimate(
+            stamp_ns=tip.stamp_ns,
+            frame="base",
+            converged=True,
+            published_ns=tip.stamp_ns,
+            force_N=force_N,
+            covariance_N2=tuple(np.diag([4e-4] * 3).ravel()),
+            residual=0.0,
+            compute_us=100.0,
+        )
 
     def fail(self, sensor: str, kind: str, seconds: float) -> None:
         """From now on, for `seconds`."""

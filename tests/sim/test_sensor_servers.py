@@ -43,12 +43,14 @@ class Rig:
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
     start_ns = time.monotonic_ns()
-    aurora = AuroraPty(AuroraEmulator(AuroraEmulatorConfig(start_ns=start_ns, init_s=0.05, reset_s=0.1), 1),
-                       tmp_path / "aurora")
+    aurora = AuroraPty(
+        AuroraEmulator(AuroraEmulatorConfig(start_ns=start_ns, init_s=0.05, reset_s=0.1), 1), tmp_path / "aurora"
+    )
     net_ft = NetFtUdp(NetFtEmulator(NetFtEmulatorConfig(start_ns=start_ns), 2))
     pose = (np.array([0.01, -0.02, -0.15]), np.array([1.0, 0.0, 0.0, 0.0]))
-    servers = SensorServers(aurora, lambda time_ns: [pose, pose], net_ft,
-                            lambda time_ns: (np.array([0.0, 0.0, 0.2]), np.zeros(3)))
+    servers = SensorServers(
+        aurora, lambda time_ns: [pose, pose], net_ft, lambda time_ns: (np.array([0.0, 0.0, 0.2]), np.zeros(3))
+    )
     servers.start()
     yield Rig(aurora, net_ft, servers)
     servers.stop()
@@ -57,8 +59,12 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 
 def test_an_aurora_on_a_pty_is_read_unplugged_and_found_again(rig: Rig, tmp_path: Path) -> None:
-    thread = AuroraThread(lambda: open_serial(str(tmp_path / "aurora"), 9600), rig.poses.append,
-                          AuroraConfig(poll_timeout_s=2.0), rig.events.append)
+    thread = AuroraThread(
+        lambda: open_serial(str(tmp_path / "aurora"), 9600),
+        rig.poses.append,
+        AuroraConfig(poll_timeout_s=2.0),
+        rig.events.append,
+    )
     thread.start()
     until(lambda: len(rig.poses) > 20, "poses")
     assert rig.aurora.emulator.baud == 921600
@@ -80,8 +86,9 @@ def test_an_aurora_on_a_pty_is_read_unplugged_and_found_again(rig: Rig, tmp_path
 def test_a_net_ft_box_is_read_biased_unplugged_and_found_again(rig: Rig) -> None:
     calibration = fetch_calibration("127.0.0.1", rig.net_ft.web_port, timeout_s=PATIENCE_S)
     assert calibration.counts_per_N == 1e6
-    thread = NetFtThread("127.0.0.1", rig.forces.append, NetFtConfig(calibration, silent_after_s=1.0), rig.events.append,
-                         rig.net_ft.rdt_port)
+    thread = NetFtThread(
+        "127.0.0.1", rig.forces.append, NetFtConfig(calibration, silent_after_s=1.0), rig.events.append, rig.net_ft.rdt_port
+    )
     thread.start()
     until(lambda: len(rig.forces) > 100, "forces")
     assert rig.forces[-1].force_N == pytest.approx([0.0, 0.0, 0.2], abs=0.03)
@@ -113,8 +120,7 @@ def test_the_page_is_served_and_nothing_else(rig: Rig) -> None:
 
 def test_a_port_that_is_not_there_is_tried_for_ever(tmp_path: Path) -> None:
     events: list[DeviceEvent] = []
-    thread = AuroraThread(lambda: open_serial(str(tmp_path / "nothing"), 9600), lambda sample: None,
-                          on_event=events.append)
+    thread = AuroraThread(lambda: open_serial(str(tmp_path / "nothing"), 9600), lambda sample: None, on_event=events.append)
     thread.start()
     until(lambda: thread.failures >= 2, "two attempts")
     thread.stop()
@@ -128,8 +134,9 @@ def test_what_a_callback_raises_ends_the_thread_and_is_kept(rig: Rig) -> None:
 
     hook, threading.excepthook = threading.excepthook, lambda args: None
     try:
-        thread = NetFtThread("127.0.0.1", fail, NetFtConfig(fetch_calibration("127.0.0.1", rig.net_ft.web_port)),
-                             port=rig.net_ft.rdt_port)
+        thread = NetFtThread(
+            "127.0.0.1", fail, NetFtConfig(fetch_calibration("127.0.0.1", rig.net_ft.web_port)), port=rig.net_ft.rdt_port
+        )
         thread.start()
         until(lambda: not thread.is_alive(), "the thread to end")
     finally:

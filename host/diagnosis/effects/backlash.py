@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.operators import play
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.operators import play
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.effects.latency import rows
-from host.diagnosis.operators import shift
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.operators import shift
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
 def damping(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 BRISTLES = 2e-3  # of the travel: friction that builds up over less is dry friction, over more presliding
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.operators import lag
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.operators import lag
 
 
 def taus(s: Scale) -> Parameter:

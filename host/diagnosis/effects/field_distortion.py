@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 MIDDLE_M, REACH_M = np.array([0.0, 0.0, 0.03]), 0.03
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.effects.presliding_friction import build_up, yielding
-from host.diagnosis.operators import capstan, dahl
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.operators import capstan, dahl
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:

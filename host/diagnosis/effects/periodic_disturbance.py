@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
 HALF_TURN = np.pi  # pitch of an angle beyond which it is once a turn: that is whip

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.effects.coulomb_friction import BRISTLES
-from host.diagnosis.operators import dahl, maxwell_slip
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.operators import dahl, maxwell_slip
 
 
 def build_up(s: Scale, longest: float, count: int) -> Parameter:

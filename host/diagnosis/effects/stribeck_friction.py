@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.operators import dahl
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.operators import dahl
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:

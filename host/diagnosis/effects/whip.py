@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.effect import Array, Context, Effect, Parameter, Scale
-from host.diagnosis.operators import whip
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.operators import whip
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -1,6 +1,6 @@
 """False alarms against the noise of the force sensor: concealed null cases of the rig with a worse sensor.
 
-    python -m tests.host.diagnosis.noisy_force --cases 10 --force-noise 0.001 0.01 0.03 0.1
+python -m tests.host.diagnosis.noisy_force --cases 10 --force-noise 0.001 0.01 0.03 0.1
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
-from sim import concealed, concealed_system
-from sim.concealed import Drawn, Plan
+from sim.concealed import suite as concealed
+from sim.concealed import system as concealed_system
+from sim.concealed.suite import Drawn, Plan
 
 
 def rig(seed: int, index: int) -> Drawn:

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.diagnosis.force_kernel import sides
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.estimation.force_kernel import sides
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
-from host.diagnosis.verdict import as_json
+from host.diagnosis.report.verdict import as_json
 
 ARM = """
 name = "arm"

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from host.cli.contract_io import BadInput
 from host.cli.diagnose import diagnose
+from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
 KEYS = {"verdict", "located", "effects", "fit", "seconds"}
@@ -65,11 +65,11 @@ def test_report_needs_nothing_from_outside(made: tuple[dict, str]) -> None:
 
 def test_misuse_is_bad_input(tmp_path: Path) -> None:
     nominal, files = planted.transmission(tmp_path, "none", 0)
-    with pytest.raises(BadInput, match="--nominal"):
+    with pytest.raises(InputError, match="--nominal"):
         diagnose([str(files[0])])
-    with pytest.raises(BadInput, match="--without"):
+    with pytest.raises(InputError, match="--without"):
         diagnose([str(files[0])], str(nominal), without=["backlsh"])
-    with pytest.raises(BadInput, match="recording"):
+    with pytest.raises(InputError, match="recording"):
         diagnose([str(tmp_path / "none.csv")], str(nominal), quiet=True)
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli.contract_io import BadInput
-from host.diagnosis.chains import channels_of
-from host.diagnosis.dataset import Recording, find_files, load, thin
-from host.diagnosis.nominal import NominalSpec, read_nominal
-from host.diagnosis.tables import read_table
+from host.diagnosis.model.dataset import Recording, find_files, load, thin
+from host.diagnosis.model.nominal import NominalSpec, read_nominal
+from host.diagnosis.model.tables import read_table
+from host.diagnosis.models import channels_of
+from protocol.errors import InputError
 
 TOML = """
 name = "t"
@@ -88,7 +88,7 @@ def test_heldout_patterns_choose_recordings(tmp_path: Path) -> None:
         False,
         True,
     ]
-    with pytest.raises(BadInput, match=r"data\.heldout"):
+    with pytest.raises(InputError, match=r"data\.heldout"):
         read(tmp_path, [table(tmp_path / f"{k}.csv") for k in "ab"], text)
 
 
@@ -115,12 +115,12 @@ def test_thinning_averages(tmp_path: Path) -> None:
     ],
 )
 def test_bad_nominals_name_the_key(tmp_path: Path, old: str, new: str, key: str) -> None:
-    with pytest.raises(BadInput) as caught:
+    with pytest.raises(InputError) as caught:
         read(tmp_path, [table(tmp_path / "x.csv")], TOML.replace(old, new))
     assert caught.value.key == key
 
 
 def test_no_files_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SELDINGER_DATA", raising=False)
-    with pytest.raises(BadInput, match="recording"):
+    with pytest.raises(InputError, match="recording"):
         find_files(spec(tmp_path), [], None)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from host.cli.diagnose import diagnose
-from host.diagnosis.excitation import SHAPES, Span, family
+from host.diagnosis.design.excitation import SHAPES, Span, family
 from tests.host.diagnosis.planted import CABLE, coloured
 
 Array = np.ndarray

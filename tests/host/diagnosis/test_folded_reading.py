@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import TransferFunction, lsim
 
-from host.diagnosis import noise
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.estimation import noise
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
-from host.diagnosis.verdict import as_json
+from host.diagnosis.report.verdict import as_json
 
 NOMINAL = """
 name = "belt drive"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from host.diagnosis.chains.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
-from host.diagnosis.fit import free, jacobian, size_of
-from host.diagnosis.force_kernel import along, run_axis, slot_array
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.estimation.fit import free, jacobian, size_of
+from host.diagnosis.estimation.force_kernel import along, run_axis, slot_array
+from host.diagnosis.model.nominal import read_nominal
+from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
 from host.diagnosis.pipeline import prepare
-from host.diagnosis.search import fit_nominal
+from host.diagnosis.selection.search import fit_nominal
 from tests.host.diagnosis import rig_cases
 
 
@@ -148,6 +148,7 @@ def test_contact_is_the_equilibrium_of_two_springs() -> None:
 def test_quaternions_become_rotations() -> None:
     q = np.array([[np.cos(0.2)], [0.0], [0.0], [np.sin(0.2)]])
     assert rotation_logs(np.eye(3)[:, :, None], matrices(q))[:, 0] == pytest.approx([0, 0, 0.4])
+
 
 def test_slopes_of_the_nominal_parameters_are_those_of_the_smallest_step(tmp_path: Path) -> None:
     nominal, files = rig_cases.write(tmp_path, rig_cases.Truth(), 3, recordings=1)

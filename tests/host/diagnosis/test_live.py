@@ -5,13 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from host.demo import SIMULATED_RIG
-from host.diagnosis import live
-from host.diagnosis.live import Watch
-from host.diagnosis.live_twin import Listener
+from host.diagnosis.live.twin import Listener
+from host.diagnosis.live.watch import Watch
+from host.diagnosis.live.watch import watch as live
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 from protocol.zenoh_session import Session
-from realtime.rig_file import load_rig
 from sim.effects import Effect, parse
 from sim.plant import Plant, PlantConfig
 from tests.waiting import free_port, until
@@ -30,14 +29,26 @@ def messages(effects: tuple[Effect, ...], seconds: float, seed: int = 1) -> Iter
     for now in range(STEP_NS, round(seconds * 1e9), STEP_NS):
         t = now * 1e-9
         begin = min(t, 1.0)
-        handle = begin * np.array([0.003 * np.sin(2.0 * t) + 0.001 * np.sin(5.3 * t), 0.5 * np.sin(1.1 * t),
-                                   0.6 + 0.12 * np.sin(0.9 * t)])
+        handle = begin * np.array(
+            [0.003 * np.sin(2.0 * t) + 0.001 * np.sin(5.3 * t), 0.5 * np.sin(1.1 * t), 0.6 + 0.12 * np.sin(0.9 * t)]
+        )
         plant.step(1e-3, handle)
         ms = now // STEP_NS
         if ms % 5 == 0:
             a, b, c = map(float, handle)
-            yield now, "stage", Stage(stamp_ns=now, command_insertion_m=a, command_roll_rad=b, command_knob_rad=c,
-                                      encoder_insertion_m=a, encoder_roll_rad=b, encoder_knob_rad=c)
+            yield (
+                now,
+                "stage",
+                Stage(
+                    stamp_ns=now,
+                    command_insertion_m=a,
+                    command_roll_rad=b,
+                    command_knob_rad=c,
+                    encoder_insertion_m=a,
+                    encoder_roll_rad=b,
+                    encoder_knob_rad=c,
+                ),
+            )
             force = plant.measured_wrench()[0] + 1e-3 * rng.standard_normal(3)
             yield now, "force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=tuple(map(float, force)))
         if ms % 25 == 0:
@@ -51,8 +62,14 @@ def _pose(plant: Plant, tool: int, now: int, frame: int, rng: np.random.Generato
     position = shown.position_m + 2.9e-4 * rng.standard_normal(3)
     quaternion = shown.quaternion_wxyz + 1.75e-3 * rng.standard_normal(4)
     quaternion /= np.linalg.norm(quaternion)
-    return Pose(stamp_ns=now, arrival_ns=now + 30 * STEP_NS, frame=frame, missing=rng.random() < 0.02,
-                position_m=tuple(map(float, position)), quaternion_wxyz=tuple(map(float, quaternion)))
+    return Pose(
+        stamp_ns=now,
+        arrival_ns=now + 30 * STEP_NS,
+        frame=frame,
+        missing=rng.random() < 0.02,
+        position_m=tuple(map(float, position)),
+        quaternion_wxyz=tuple(map(float, quaternion)),
+    )
 
 
 def alarms(effects: tuple[Effect, ...], seconds: float = END_S, seed: int = 1) -> list[Alarm]:
@@ -71,9 +88,13 @@ def test_silent_where_nothing_is_missing() -> None:
 
 @pytest.mark.parametrize(
     ("planted", "cause"),
-    [("backlash@insertion:width_m=0.002", "backlash"), ("latency@pose_sensor:delay_s=0.06", "latency"),
-     ("sensor_bias@pose_sensor:x_m=0.001", "sensor_bias"), ("whip@roll:amplitude_rad=0.3", "periodic_disturbance"),
-     ("base_motion@base:rise_s=1", "base_motion")],
+    [
+        ("backlash@insertion:width_m=0.002", "backlash"),
+        ("latency@pose_sensor:delay_s=0.06", "latency"),
+        ("sensor_bias@pose_sensor:x_m=0.001", "sensor_bias"),
+        ("whip@roll:amplitude_rad=0.3", "periodic_disturbance"),
+        ("base_motion@base:rise_s=1", "base_motion"),
+    ],
 )
 def test_alarm_within_ten_seconds_of_the_effect(planted: str, cause: str) -> None:
     found = alarms((parse(f"{planted},start_s={ON_S}"),))
@@ -109,7 +130,7 @@ def test_rows_are_even_and_lost_frames_stay_empty() -> None:
 
 def test_watch_publishes_what_it_finds() -> None:
     heard = sorted(messages((parse(f"latency@pose_sensor:delay_s=0.06,start_s={ON_S}"),), END_S), key=lambda h: h[0])
-    chunks = [[(topic, message, b"") for _, topic, message in heard[k: k + 40]] for k in range(0, len(heard), 40)]
+    chunks = [[(topic, message, b"") for _, topic, message in heard[k : k + 40]] for k in range(0, len(heard), 40)]
     said: list[str] = []
 
     class Bus:

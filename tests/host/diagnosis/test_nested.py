@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
-from host.diagnosis.verdict import as_json
+from host.diagnosis.report.verdict import as_json
 from tests.host.diagnosis import planted
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli.contract_io import BadInput
-from host.diagnosis.nominal import effect_of, read_nominal
+from host.diagnosis.model.nominal import effect_of, read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
-from host.diagnosis.report import switches
-from host.diagnosis.verdict import as_json
+from host.diagnosis.report.page import switches
+from host.diagnosis.report.verdict import as_json
+from protocol.errors import InputError
 from tests.host.diagnosis import noisy_force, planted, rig_cases
 
 CALLABLE = """
@@ -85,7 +85,7 @@ def test_nothing_missing_behind_a_python_function(tmp_path: Path) -> None:
 def test_a_function_that_is_not_there_is_bad_input(tmp_path: Path, function: str) -> None:
     nominal, files = lever(tmp_path, 0.0)
     nominal.write_text(CALLABLE.replace("lever:reach", function))
-    with pytest.raises(BadInput, match=re.escape("callable.function")):
+    with pytest.raises(InputError, match=re.escape("callable.function")):
         run(nominal, files)
 
 
@@ -104,7 +104,7 @@ def test_what_the_report_says_to_switch_on_is_not_missed_again(tmp_path: Path) -
     "text", ["backlash", "backlash@nowhere:width_rad=1", "backlash@cable:width_m=1", "backlash@cable:width_rad=wide"]
 )
 def test_an_effect_that_cannot_be_is_bad_input(tmp_path: Path, text: str) -> None:
-    with pytest.raises(BadInput, match="effect"):
+    with pytest.raises(InputError, match="effect"):
         run(*planted.transmission(tmp_path, "none", 1), text)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from host.diagnosis import operators as op
+from host.diagnosis.model import operators as op
 
 signals = arrays(np.float64, st.integers(5, 60), elements=st.floats(-3.0, 3.0, width=32))
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.diagnosis.effect import candidates
-from host.diagnosis.equivalence import standings
-from host.diagnosis.fit import Fit, Problem, finish, minimize
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
+from host.diagnosis.model.effect import candidates
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import prepare
-from host.diagnosis.screening import screen
-from host.diagnosis.search import Found, _exchange, _grow, fit_nominal
+from host.diagnosis.selection.equivalence import standings
+from host.diagnosis.selection.screening import screen
+from host.diagnosis.selection.search import Found, _exchange, _grow, fit_nominal
 from tests.host.diagnosis import planted
 
 Array = np.ndarray

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from host.cli.diagnose import nominal_path
-from host.diagnosis.dataset import find_files
-from host.diagnosis.nominal import read_nominal
+from host.diagnosis.model.dataset import find_files
+from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
-from host.diagnosis.verdict import as_json
+from host.diagnosis.report.verdict import as_json
 
 FOLDER = Path(os.environ.get("SELDINGER_DATA", Path(__file__).parents[3] / ".." / "shared" / "data"))
 pytestmark = [pytest.mark.data, pytest.mark.slow]

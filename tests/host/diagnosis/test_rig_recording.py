@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from host.cli.contract_io import BadInput
 from host.cli.diagnose import diagnose, nominal_path
-from host.demo import DemoSettings, run_lockstep
-from host.diagnosis.chains import build
-from host.diagnosis.nominal import read_nominal
-from host.diagnosis.rig_recording import knob_gain, rig_of, rig_rows, staleness
+from host.diagnosis.model.nominal import read_nominal
+from host.diagnosis.model.rig_recording import knob_gain, rig_of, rig_rows, staleness
+from host.diagnosis.models import build
+from host.run.demo import DemoSettings, run_lockstep
+from protocol.errors import InputError
 
 LATE = "rate_lag@pose_sensor"  # the simulated shaft gives way with a retardation of 4 ms, of which the twin knows nothing
 
@@ -102,5 +102,5 @@ def test_what_is_no_recording_of_a_rig_is_bad_input(tmp_path: Path) -> None:
     table = tmp_path / "table.csv"
     table.write_text("time_s,x\n0,1\n")
     for path in (table, tmp_path / "none.mcap"):
-        with pytest.raises(BadInput, match="recording"):
+        with pytest.raises(InputError, match="recording"):
             diagnose([str(path)], "rig", quiet=True)

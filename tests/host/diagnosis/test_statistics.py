@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.diagnosis import noise
-from host.diagnosis.dataset import Recording
-from host.diagnosis.evidence import compare, correlation_time, whiteness
-from host.diagnosis.locate import inside, joined, windows
-from host.diagnosis.model import Piece
-from host.diagnosis.uncertainty import _jackknife
+from host.diagnosis.estimation import noise
+from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
+from host.diagnosis.estimation.uncertainty import _jackknife
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.model import Piece
+from host.diagnosis.selection.locate import inside, joined, windows
 
 
 def ar1(rng: np.random.Generator, n: int, phi: float, sigma: float = 1.0) -> np.ndarray:

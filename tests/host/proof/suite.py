@@ -5,8 +5,8 @@ import json
 import sys
 from pathlib import Path
 
-from sim import concealed
-from sim.concealed import Plan
+from sim.concealed import suite as concealed
+from sim.concealed.suite import Plan
 
 SEED = 77
 DRAFTS = (

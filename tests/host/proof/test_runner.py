@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from host.cli.contract_io import BadInput
 from host.cli.prove import Bar, prove
-from host.proof import baselines, picture, workers
-from host.proof.runner import Settings, open_seal
-from host.proof.runner import prove as run
+from host.studies.proof import baselines, picture, workers
+from host.studies.proof.runner import Settings, open_seal
+from host.studies.proof.runner import prove as run
+from protocol.errors import InputError
 from tests.host.proof import suite
 
 N = len(suite.DRAFTS)
@@ -116,7 +116,7 @@ def test_a_stopped_run_goes_on_where_it_was(fresh: Fresh, tmp_path: Path) -> Non
 def test_a_folder_of_another_suite_is_refused(fresh: Fresh) -> None:
     folder = fresh()
     (folder / "suite.json").write_text(json.dumps({"seed": 1, "cases": 5}))
-    with pytest.raises(BadInput, match="--dir"):
+    with pytest.raises(InputError, match="--dir"):
         outcome(folder, "false")
 
 
@@ -157,7 +157,7 @@ def test_two_workers_on_loopback_and_one_is_lost(built: Built, tmp_path: Path) -
 
 def test_no_scheduler_is_one_line(built: Built) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    with pytest.raises(BadInput, match="--scheduler"):
+    with pytest.raises(InputError, match="--scheduler"):
         list(workers.on_cluster({"case_0000": built[0] / "cases" / "case_0000"}, ["false"], 1.0, "tcp://127.0.0.1:9"))
 
 
@@ -215,7 +215,7 @@ def test_command_prints_a_table_and_keeps_its_result(
         finder=None,
     )
     assert json.loads(capsys.readouterr().out)["labels_sha256"]
-    with pytest.raises(BadInput, match="--cases"):
+    with pytest.raises(InputError, match="--cases"):
         prove(
             cases=0,
             seed=1,
@@ -228,7 +228,7 @@ def test_command_prints_a_table_and_keeps_its_result(
             baselines=False,
             finder=None,
         )
-    with pytest.raises(BadInput, match="--resume"):
+    with pytest.raises(InputError, match="--resume"):
         prove(
             cases=N,
             seed=1,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from host.proof.equation_form import right_form
-from host.proof.scoring import gap_closed, judge, parameters, window_f1
-from host.proof.table import KEYS, tabulate
+from host.studies.proof.equation_form import right_form
+from host.studies.proof.scoring import gap_closed, judge, parameters, window_f1
+from host.studies.proof.table import KEYS, tabulate
 from tests.host.proof.suite import answer
 
 PLANTED = {

@@ -1,0 +1,122 @@
+"""The sweeps of a characterization on a real rig's ports, recorded; nothing moves before somebody has said that it may."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple
+
+from host.recordings.recording import RecordingWriter, header_of
+from protocol.rig_file import AXES, Rig
+from protocol.topics import Message
+from realtime.core.sweep import MOVE_SPEED, REST_S, Sweep, SweepLoop
+from realtime.core.sweep_ports import RigPorts, run_sweeps
+from realtime.drivers.net_ft import RDT_PORT
+from realtime.loop.scheduling import RealtimeSettings
+
+_UNITS = (("mm", 1e3), ("deg", 57.29577951308232), ("deg", 57.29577951308232))
+
+
+class PortNames(NamedTuple):
+    """Where the devices are; None: where the rig file says."""
+
+    board: str | None = None
+    tracker: str | None = None
+    force: int = RDT_PORT
+
+
+def in_words(sweeps: Sequence[Sweep]) -> str:
+    """What will move, how far, and for how long: to be read before it is allowed."""
+    parts = []
+    for axis, (unit, scale) in enumerate(_UNITS):
+        swing = [
+            (s.centre[axis] - s.amplitude * (s.axis == axis), s.centre[axis] + s.amplitude * (s.axis == axis))
+            for s in sweeps
+        ]
+        low, high = min(span[0] for span in swing), max(span[1] for span in swing)
+        parts.append(f"{AXES[axis]} {low * scale:.0f} to {high * scale:.0f} {unit}")
+    return f"stages will move: {', '.join(parts)} (from home); about {duration_s(sweeps) / 60:.0f} min"
+
+
+def duration_s(sweeps: Sequence[Sweep]) -> float:
+    """How long the sweeps take (s), from stages at home."""
+    total, place = 0.0, (0.0, 0.0, 0.0)
+    for sweep in sweeps:
+        total += max(abs(a - b) / speed for a, b, speed in zip(sweep.centre, place, MOVE_SPEED, strict=True))
+        total += REST_S + sweep.seconds
+        place = sweep.centre
+    return total
+
+
+def record_on_rig(
+    rig: Rig,
+    sweeps: Sequence[Sweep],
+    path: Path,
+    ports: PortNames = PortNames(),
+    progress: Callable[[float], None] = lambda share: None,
+) -> Path:
+    """Drive `sweeps` on the rig at its ports, then record them into `path`. SIGINT and SIGTERM brake the stages and disarm.
+
+    Nothing is written while the stages move: a disk, or a thread that writes to it, may hold the loop up for longer than
+    the board waits for a set-point. What there is of sweeps broken off is written as well.
+    Raises ValueError (sweeps that the stages cannot do) and OSError (a port that does not open, or is held by another
+    process) before anything moves; RuntimeError where the sweeps were broken off.
+    """
+    heard: list[tuple[str, Message]] = []
+
+    def publish(topic: str, message: Message) -> None:
+        heard.append((topic, message))
+
+    loop = SweepLoop(rig, sweeps, publish)
+    with (
+        RigPorts(rig, ports.board, ports.tracker, ports.force) as lines,
+        RecordingWriter(path, header_of(rig, "wall", None, {"job": "characterize"})) as recording,
+    ):
+        try:
+            with _stopping() as stop:
+                run_sweeps(loop, lines, each=_told(loop, progress), stop=stop.is_set, settings=RealtimeSettings())
+        except OSError as gone:
+            loop.break_off(f"board: {gone}")
+        for topic, message in heard:
+            recording.write(topic, message, message.stamp_ns)
+        if not loop.problem and recording.failure:
+            loop.problem = recording.failure
+    if loop.problem:
+        lost = "".join(f"; {device}: {why}" for device, why in lines.failures.items())
+        raise RuntimeError(f"characterize: {loop.problem}{lost}; the sweeps were broken off")
+    return path
+
+
+def _told(loop: SweepLoop, progress: Callable[[float], None]) -> Callable[[], None]:
+    told = -1.0
+
+    def each() -> None:
+        nonlocal told
+        if loop.progress != told:
+            told = loop.progress
+            progress(told)
+
+    return each
+
+
+class _stopping:
+    """While it lasts, SIGINT and SIGTERM set the event that it gives, instead of ending the process."""
+
+    def __init__(self) -> None:
+        self._event, self._before = threading.Event(), dict[int, Any]()
+
+    def __enter__(self) -> threading.Event:
+        def on_signal(number: int, frame: FrameType | None) -> None:
+            self._event.set()
+
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, on_signal)
+        return self._event
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,1 @@
+"""Experiments that tell indistinguishable models apart, and their scripts."""

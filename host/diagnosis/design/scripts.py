@@ -1,0 +1,36 @@
+"""Scripts of the experiments that a diagnosis proposes: TOML that a rig's commander gives, for other data timed inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from host.diagnosis.design.experiment import Design, plain, planned
+from host.diagnosis.pipeline import Diagnosis
+
+
+def write_scripts(result: Diagnosis, folder: Path) -> list[Path]:
+    """One file for each experiment, beside the report. Raises OSError, InputError where a rig's limits forbid one."""
+    out = []
+    for number, design in enumerate(planned(result), start=1):
+        path = folder / f"experiment_{number}"
+        if hasattr(plain(result.problem), "excitations"):
+            from host.diagnosis.design.rig_experiment import script_of, write_script
+
+            model = plain(result.problem)
+            script = script_of(model, result.problem, result.found.best, design.excitation, design.inputs, design.says)
+            out.append(write_script(script, path.with_suffix(".toml")))
+        else:
+            out.append(write_table(result, design, path.with_suffix(".csv")))
+    return out
+
+
+def write_table(result: Diagnosis, design: Design, path: Path) -> Path:
+    """Inputs over time (s) in SI units, as columns of the channels' names."""
+    units = result.problem.pieces[0].recording.units
+    names = [f"{name} ({units[name]})" if units.get(name) else name for name in design.inputs]
+    table = np.column_stack((design.excitation.time_s, *design.inputs.values()))
+    head = ",".join(["time (s)" if result.problem.pieces[0].recording.timed else "sample", *names])
+    np.savetxt(path, table, fmt="%.7g", delimiter=",", header=f"{design.says}\n{head}", comments="# ")
+    return path

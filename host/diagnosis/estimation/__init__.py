@@ -1,0 +1,1 @@
+"""Parameter estimation: noise, free-run fits, evidence and confidence intervals."""

@@ -1,0 +1,173 @@
+"""What a model gains on held-out samples when residuals are coloured: sample size, log-likelihood, paired blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from host.diagnosis.model.model import Piece
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+FEWEST_BLOCKS = 6
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Gain in log-likelihood, one-sided p-value that there is none, and the share of the error that went, in the output
+    that gained most.
+
+    `excess`: share of that output's error before that is above noise; `excesses` (outputs,): the same afterwards.
+    `independent` and `log_ratio` (outputs,): effective sample sizes, and logarithms of the ratio of mean squares.
+    """
+
+    log_likelihood: float
+    p_value: float
+    share: float
+    excess: float = 1.0
+    independent: Array = field(default_factory=lambda: np.zeros(0))
+    log_ratio: Array = field(default_factory=lambda: np.zeros(0))
+    excesses: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def correlation_time(r: Array, longest: int | None = None) -> float:
+    """Integrated autocorrelation time (samples) of `r` (n,), NaN where not used; summed while pairs of lags stay
+    positive (Geyer 1992).
+    """
+    good = np.isfinite(r)
+    n = int(good.sum())
+    if n < 20:
+        return 1.0
+    x = np.where(good, r, 0.0)
+    size = 1 << int(np.ceil(np.log2(2 * x.size)))
+    power = np.abs(np.fft.rfft(x, size)) ** 2
+    count = np.fft.irfft(np.abs(np.fft.rfft(good.astype(float), size)) ** 2, size)[: x.size]
+    covariance = np.fft.irfft(power, size)[: x.size] / np.maximum(count, 1.0)
+    if covariance[0] <= 0.0:
+        return 1.0
+    rho = covariance / covariance[0]
+    limit = min(longest or x.size // 3, x.size // 3)
+    total = 1.0
+    for k in range(1, limit, 2):
+        pair = rho[k] + (rho[k + 1] if k + 1 < limit else 0.0)
+        if pair <= 0.03:
+            break
+        total += 2.0 * pair
+    return float(np.clip(total, 1.0, n / 4.0))
+
+
+def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array) -> Gain:
+    """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit`, `heldout` or `both`).
+
+    Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
+    is divided by
+    the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is
+    gained.
+    """
+    independent, log_ratio, excess, excess_after = (np.zeros(floor.size) for _ in range(4))
+    by_output: list[list[float]] = []
+    for row in range(floor.size):
+        b2, a2, n_eff, times = _pooled(pieces, which, before, after, row)
+        if n_eff < 3.0:
+            continue
+        level_b, level_a = b2 + 1e-6 * floor[row] ** 2, a2 + 1e-6 * floor[row] ** 2
+        independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
+        excess[row] = max(0.0, 1.0 - floor[row] ** 2 / level_b)
+        excess_after[row] = max(0.0, 1.0 - 1.5 * floor[row] ** 2 / level_a)
+        by_output.append(_blocks(pieces, which, before, after, row, times, level_a))
+    gain = 0.5 * float(independent @ log_ratio)
+    top = int(np.argmax(independent * log_ratio))
+    share = float(1.0 - np.exp(-log_ratio[top]))
+    return Gain(gain, _p_value(by_output), share, float(excess[top]), independent, log_ratio, excess_after)
+
+
+def _p_value(by_output: list[list[float]]) -> float:
+    """The smaller of: all outputs together, and the surest output times their number (Bonferroni)."""
+    if not by_output:
+        return 1.0
+    together = _sign_of_mean(np.concatenate([np.array(blocks) for blocks in by_output]))
+    alone = min(_sign_of_mean(np.array(blocks)) for blocks in by_output)
+    return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
+
+
+def _asked(piece: Piece, which: str) -> Mask:
+    return np.asarray(piece.fit | piece.heldout) if which == "both" else np.asarray(getattr(piece, which))
+
+
+def _pooled(
+    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int
+) -> tuple[float, float, float, list[float]]:
+    sum_b = sum_a = count = n_eff = 0.0
+    times = []
+    for piece, b, a in zip(pieces, before, after, strict=True):
+        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        n = int(mask.sum())
+        if n < 20:
+            times.append(1.0)
+            continue
+        tau = correlation_time(np.where(mask, a[row], np.nan))
+        times.append(tau)
+        sum_b += float(np.sum(b[row][mask] ** 2))
+        sum_a += float(np.sum(a[row][mask] ** 2))
+        count += n
+        n_eff += n / tau
+    return sum_b / max(count, 1.0), sum_a / max(count, 1.0), n_eff, times
+
+
+def _blocks(
+    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int, times: list[float], level: float
+) -> list[float]:
+    found = []
+    for piece, b, a, tau in zip(pieces, before, after, times, strict=True):
+        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+        gained = (b[row][mask] ** 2 - a[row][mask] ** 2) / level
+        length = int(max(4.0 * tau, gained.size / 24.0, 8.0))
+        parts = max(1, gained.size // length)
+        if gained.size >= 20:
+            found += [float(np.sum(part)) for part in np.array_split(gained, parts)]
+    return found
+
+
+def _sign_of_mean(blocks: Array) -> float:
+    """One-sided p-value that independent blocks do not gain: the smaller of t test and signed ranks (blocks of unlike
+    size), doubled.
+    """
+    if blocks.size < FEWEST_BLOCKS:
+        return 0.5 if blocks.size == 0 or np.mean(blocks) <= 0 else 0.04
+    spread = np.std(blocks) + 1e-300
+    t = np.mean(blocks) / (spread / np.sqrt(blocks.size))
+    by_mean = stats.t.sf(t, blocks.size - 1)
+    by_rank = stats.wilcoxon(blocks, alternative="greater").pvalue if np.any(blocks != 0.0) else 1.0
+    return float(np.clip(2.0 * min(by_mean, by_rank), 1e-300, 1.0))
+
+
+def whiteness(residuals: list[Array], masks: list[Mask], lags: int = 25) -> float:
+    """p-value that whitened residuals (each (n,), unit variance if the model is right) are white with no more than noise
+    power.
+
+    Ljung-Box over `lags`, pooled over recordings, together with a chi-square test of the level; the smaller p-value,
+    doubled.
+    """
+    q = dof = power = count = 0.0
+    for r, mask in zip(residuals, masks, strict=True):
+        good = mask & np.isfinite(r)
+        n = int(good.sum())
+        if n < 4 * lags:
+            continue
+        x = np.where(good, r - np.mean(r[good]), 0.0)
+        c0 = float(x @ x) / n
+        for k in range(1, lags + 1):
+            pairs = int(np.sum(good[k:] & good[:-k]))
+            rho = float(x[k:] @ x[:-k]) / max(pairs, 1) / c0
+            q += rho * rho * pairs
+        dof += lags
+        power += float(np.sum(r[good] ** 2))
+        count += n
+    if count == 0:
+        return 1.0
+    kurtosis = 3.0
+    level = stats.norm.sf((power / count - 1.0) / np.sqrt((kurtosis - 1.0) / count))
+    return float(min(1.0, 2.0 * min(stats.chi2.sf(q, dof), level)))

@@ -1,0 +1,268 @@
+"""Free-run simulation-error fits: robust Levenberg-Marquardt on scaled parameters, all recordings jointly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.model.model import Act, Model, Piece
+
+Array = npt.NDArray[np.float64]
+HUBER = 4.0  # residuals beyond this many scales pull with constant force
+FAR = 1e6
+
+
+@dataclass(frozen=True)
+class Term:
+    """An active effect with its parameter declarations."""
+
+    candidate: Candidate
+    parameters: tuple[Parameter, ...]
+
+
+@dataclass
+class Fit:
+    """A structure with fitted values. `values`: nominal parameters, then those of each term."""
+
+    terms: tuple[Term, ...]
+    values: Array
+    residuals: list[Array] = field(default_factory=list)  # per piece (outputs, n): measured - simulated
+    jacobian: Array | None = None
+    cost: float = np.inf
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Keys of the active candidates."""
+        return tuple(term.candidate.key for term in self.terms)
+
+
+@dataclass
+class Problem:
+    """A model, its prepared recordings and the noise of each output. `scale` (outputs,) weighs residuals."""
+
+    model: Model
+    pieces: list[Piece]
+    noise: list[Noise]
+    scale: Array
+    columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
+
+    def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
+        """All parameters of a structure, nominal first."""
+        return [*self.model.parameters, *(p for term in terms for p in term.parameters)]
+
+    def simulate(self, piece: Piece, terms: tuple[Term, ...], values: Array) -> Array:
+        """Outputs (outputs, n) of one recording."""
+        out = self.model.simulate(piece, *self.parted(terms, values))
+        return np.where(np.abs(out) < 1e150, out, 1e150)
+
+    def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[Act]]:
+        """Nominal parameters, and every effect with its own."""
+        at = len(self.model.parameters)
+        nominal, acts = values[:at], []
+        for term in terms:
+            acts.append((term.candidate, values[at : at + len(term.parameters)]))
+            at += len(term.parameters)
+        return nominal, acts
+
+    def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
+        """Measured minus simulated, NaN outside the part asked for (`fit`, `heldout` or `all`)."""
+        out = []
+        for piece in self.pieces:
+            mask = np.ones(piece.n, dtype=bool) if which == "all" else getattr(piece, which)
+            if not mask.any():
+                out.append(np.full_like(piece.y, np.nan))
+                continue
+            out.append(np.where(mask, piece.y - self.simulate(piece, terms, values), np.nan))
+        return out
+
+    def stacked(self, terms: tuple[Term, ...], values: Array) -> Array:
+        """Weighted residuals of the samples to fit, one vector; missing samples are zero."""
+        rows = []
+        for piece in self.pieces:
+            if piece.fit.any():
+                r = (piece.y - self.simulate(piece, terms, values))[:, piece.fit] / self.scale[:, None]
+                rows.append(np.clip(np.nan_to_num(r, nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
+        return np.concatenate(rows)
+
+
+def free(parameters: list[Parameter]) -> list[int]:
+    """Indices of parameters that may move."""
+    return [index for index, p in enumerate(parameters) if p.high > p.low]
+
+
+def size_of(p: Parameter, value: float) -> float:
+    """Natural size of a signed parameter."""
+    if p.step > 0.0:
+        return p.step
+    return max(abs(value), max((abs(g) for g in p.grid), default=0.0)) or 1.0
+
+
+def _moved(p: Parameter, value: float, by: float) -> float:
+    """`value` moved by `by` in the parameter's own scale, kept in bounds."""
+    new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + by * size_of(p, value)
+    return float(min(max(new, p.low), p.high))
+
+
+def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, sizes: list[float]) -> Array:
+    """Rate of the weighted simulation by each free parameter in its own scale, by one-sided differences that stay in
+    bounds.
+    """
+    parameters = problem.parameters(terms)
+    columns = []
+    for index in free(parameters):
+        p = parameters[index]
+        step = 1e-3 if p.log else 1e-3 * sizes[index]
+        moved = values.copy()
+        up = values[index] * (1.0 + step) if p.log else values[index] + step
+        down = values[index] * (1.0 - step) if p.log else values[index] - step
+        moved[index] = up if up <= p.high else down
+        by = (moved[index] / values[index] - 1.0) if p.log else (moved[index] - values[index]) / sizes[index]
+        columns.append((base - problem.stacked(terms, moved)) / by)
+    return np.array(columns).T if columns else np.zeros((base.size, 0))
+
+
+def robust(r: Array) -> tuple[float, Array]:
+    """Huber cost and square-root weights."""
+    size = np.abs(r)
+    inside = size <= HUBER
+    cost = float(np.sum(np.where(inside, 0.5 * r * r, HUBER * size - 0.5 * HUBER**2)))
+    return cost, np.sqrt(np.where(inside, 1.0, HUBER / np.maximum(size, 1e-300)))
+
+
+def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: int = 40, tolerance: float = 1e-7) -> Fit:
+    """Values that minimize the Huber cost of the weighted simulation error, from `start`."""
+    parameters = problem.parameters(terms)
+    values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])
+    r = problem.stacked(terms, values)
+    cost, w = robust(r)
+    damping = 1e-3
+    J = np.zeros((r.size, 0))
+    moving = free(parameters)
+    for _ in range(rounds if moving else 0):
+        sizes = [size_of(p, v) for p, v in zip(parameters, values, strict=True)]
+        J = jacobian(problem, terms, values, r, sizes)
+        A, g = (J * w[:, None]).T @ (J * w[:, None]), J.T @ (w * w * r)
+        diagonal = np.maximum(np.diag(A), 1e-12 * (np.max(np.diag(A)) + 1e-300))
+        better = False
+        for _ in range(8):
+            by = _solve(A, g, diagonal, damping)
+            trial = values.copy()
+            for place, index in enumerate(moving):
+                p = parameters[index]
+                trial[index] = (
+                    _moved(p, values[index], by[place])
+                    if p.log
+                    else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
+                )
+            r_new = problem.stacked(terms, trial)
+            cost_new, w_new = robust(r_new)
+            if cost_new < cost:
+                better = True
+                break
+            damping = max(damping * 6.0, 1e-6)
+        if not better:
+            break
+        gained = (cost - cost_new) / cost
+        values, r, cost, w = trial, r_new, cost_new, w_new
+        damping = max(damping / 8.0, 1e-9)
+        if gained < tolerance:
+            break
+    return Fit(terms, values, jacobian=J, cost=cost)
+
+
+def _solve(A: Array, g: Array, diagonal: Array, damping: float) -> Array:
+    scale = np.sqrt(diagonal)
+    M = A / np.outer(scale, scale) + damping * np.eye(A.shape[0])
+    return np.asarray(np.linalg.lstsq(M, g / scale, rcond=1e-13)[0] / scale)
+
+
+def reweigh(problem: Problem, fit: Fit) -> None:
+    """Scale of each output: what this fit leaves, robustly, but no less than the noise."""
+    left: list[list[Array]] = [[] for _ in problem.model.outputs]
+    for piece in problem.pieces:
+        if piece.fit.any():
+            r = piece.y - problem.simulate(piece, fit.terms, fit.values)
+            for row, rest in zip(r[:, piece.fit], left, strict=True):
+                rest.append(row[np.isfinite(row)])
+    for index, rest in enumerate(left):
+        together = np.concatenate(rest) if rest else np.zeros(0)
+        rms = float(np.sqrt(np.mean(together**2))) if together.size else 1.0
+        problem.scale[index] = max(rms, problem.noise[index].sigma, 1e-12)
+    for piece in problem.pieces:
+        piece.extra["weight"] = problem.scale
+
+
+def finish(problem: Problem, fit: Fit) -> Fit:
+    """`fit` with its residuals on every sample."""
+    fit.residuals = [piece.y - problem.simulate(piece, fit.terms, fit.values) for piece in problem.pieces]
+    return fit
+
+
+def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
+    """Displacement that each port still needs at the start of each recording, after `fit` (with residuals)."""
+    n = len(problem.model.parameters)
+    out = []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        first = slice(0, max(5, round(0.3 / piece.recording.dt_s)) if piece.recording.timed else 5)
+        needs = {
+            port.name: problem.model.needs(piece, port, fit.values[:n], residual)[first] for port in problem.model.ports
+        }
+        out.append({name: float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0 for name, need in needs.items()})
+    return out
+
+
+def get_starts(problem: Problem) -> list[dict[str, float]]:
+    """Starts of memory of every recording."""
+    return [dict(piece.start) for piece in problem.pieces]
+
+
+def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
+    """Puts starts of memory back."""
+    for piece, start in zip(problem.pieces, given, strict=True):
+        piece.start.clear()
+        piece.start.update(start)
+
+
+def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, float]) -> Array:
+    """Start values of a term: grid values for nonlinear parameters, projected amplitudes for linear ones."""
+    return np.array([linear_value.get(p.name, nonlinear.get(p.name, p.grid[0] if p.grid else 0.0)) for p in term.parameters])
+
+
+def tuned(term: Term, lines: Array) -> tuple[Parameter, ...]:
+    """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual."""
+    return tuple(
+        replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3])
+        if p.name == "frequency" and p.unit == "Hz" and any(q.linear for q in term.parameters)
+        else p
+        for p in term.parameters
+    )
+
+
+def lines_of(residuals: list[Array], dt_s: float, count: int = 5) -> Array:
+    """Frequencies (Hz) at which the residuals' spectra, summed over outputs in units of their own power, stand highest."""
+    size = 1 << int(np.ceil(np.log2(2 * max(r.shape[1] for r in residuals))))
+    power = np.zeros(size // 2 + 1)
+    for r in residuals:
+        x = np.nan_to_num(r)
+        x = (x - x.mean(axis=1, keepdims=True)) * np.hanning(x.shape[1])
+        each = np.abs(np.fft.rfft(x, size, axis=1)) ** 2
+        power += np.max(each / (np.median(each, axis=1, keepdims=True) + 1e-300), axis=0)
+    inside = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    best = inside[np.argsort(-power[inside])[:count]]
+    return np.asarray(best / (size * dt_s))
+
+
+def grid_points(parameters: tuple[Parameter, ...], most: int) -> Iterator[dict[str, float]]:
+    """Combinations of grid values of the parameters that are not linear, thinned to about `most`."""
+    from itertools import product
+
+    rest = [p for p in parameters if not p.linear]
+    points = list(product(*(p.grid for p in rest)))
+    step = max(1, int(np.ceil(len(points) / most)))
+    for point in points[::step]:
+        yield {p.name: value for p, value in zip(rest, point, strict=True)}

@@ -1,0 +1,145 @@
+"""Effects that are known and switched on in the nominal model, so that only what is still missing is looked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Candidate, Parameter, Port, candidates
+from host.diagnosis.model.model import Act, Model, Piece, scale_of
+from host.diagnosis.model.nominal import EffectSpec
+from protocol.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+
+class Known:
+    """`inner` with effects of the vocabulary switched on; their parameters join the nominal ones and are refitted
+    with them.
+    """
+
+    def __init__(self, inner: Model, effects: list[EffectSpec], recordings: list[Recording]) -> None:
+        self.inner = inner
+        for name in (
+            "kind",
+            "outputs",
+            "ports",
+            "quiet_inputs",
+            "screen_samples",
+            "fit_samples",
+            "coarsest_s",
+            "travel",
+            "moves",
+            "unlisted_at",
+            "taken",
+        ):
+            setattr(self, name, getattr(inner, name))
+        pieces = [inner.prepare(recording) for recording in recordings]
+        self.acts: list[tuple[Candidate, tuple[Parameter, ...]]] = []
+        for spec in effects:
+            candidate = chosen(inner, spec, recordings[0].timed)
+            scale = scale_of(inner, pieces, candidate.port, candidate, 1e-3)
+            self.acts.append((candidate, placed(candidate, candidate.effect.parameters(scale, candidate.form), spec)))
+        self.own = len(inner.parameters)
+        self.parameters = (*inner.parameters, *(p for _, parameters in self.acts for p in parameters))
+        self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.acts}
+        if hasattr(inner, "settle"):
+            self.settle = lambda piece, theta: inner.settle(piece, theta[: self.own])
+        if hasattr(inner, "begin_anew"):
+            self.begin_anew = lambda piece, theta, acts: inner.begin_anew(
+                piece, theta[: self.own], self.with_known(theta, acts)
+            )
+        if hasattr(inner, "sensitivity"):
+            self.sensitivity = self._sensitivity
+            self.change = lambda piece, theta, *rest: inner.change(piece, theta[: self.own], *rest)  # type: ignore[attr-defined]
+
+    def prepare(self, recording: Recording) -> Piece:
+        """As the model without effects."""
+        return self.inner.prepare(recording)
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """Start values of the model, then the values given for the effects."""
+        return np.concatenate([self.inner.guess(pieces), [p.grid[0] for _, parameters in self.acts for p in parameters]])
+
+    def with_known(self, theta: Array, acts: list[Act]) -> list[Act]:
+        """`acts` and the known ones, with their share of `theta`."""
+        known, at = [], self.own
+        for candidate, parameters in self.acts:
+            known.append((candidate, theta[at : at + len(parameters)]))
+            at += len(parameters)
+        return [*known, *acts]
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Outputs (outputs, n) with the known effects at work."""
+        return self.inner.simulate(piece, theta[: self.own], self.with_known(theta, acts))
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """As the model without effects."""
+        return self.inner.motion(piece, port)
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """As the model without effects."""
+        return self.inner.needs(piece, port, theta[: self.own], residual)
+
+    def _sensitivity(self, piece: Piece, theta: Array, axis: str, acts: list[Act]) -> Any:
+        inner: Any = self.inner
+        return inner.sensitivity(piece, theta[: self.own], axis, self.with_known(theta, acts))
+
+
+def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
+    """The candidate that `spec` names. Raises InputError with those there are."""
+    pool = candidates(model.ports, timed)
+    at = [c for c in pool if c.effect.id == spec.id and spec.at in (c.port.name, c.port.subsystem)]
+    if not at:
+        raise InputError(
+            "effect",
+            f"{spec.id}@{spec.at}",
+            "one of " + ", ".join(dict.fromkeys(f"{c.effect.id}@{c.port.name}" for c in pool)),
+        )
+    exact = [c for c in at if c.form == spec.form and c.source == (spec.source or c.source) and fits(c, spec)]
+    if not exact:
+        raise InputError(
+            f"effect {spec.id}@{spec.at}",
+            f"source {spec.source!r}, form {spec.form!r}, {', '.join(spec.values)}",
+            "a source and form of " + ", ".join(f"({c.source!r}, {c.form!r})" for c in at),
+        )
+    return exact[0]
+
+
+def fits(candidate: Candidate, spec: EffectSpec) -> bool:
+    """Whether the keys of `spec` begin with the names of the candidate's parameters (units follow)."""
+    from host.diagnosis.model.effect import Scale
+
+    size = Scale("x", 1.0, -1.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True, "x")
+    names = [p.name for p in candidate.effect.parameters(size, candidate.form)]
+    return all(any(key.startswith(name) for name in names) for key in spec.values)
+
+
+def placed(candidate: Candidate, parameters: tuple[Parameter, ...], spec: EffectSpec) -> tuple[Parameter, ...]:
+    """`parameters` that start at the values given, renamed so that they tell effect and place. Raises InputError for a
+    key unknown.
+    """
+    from dataclasses import replace
+
+    keys = {p.key: p for p in parameters}
+    for key in spec.values:
+        if key not in keys:
+            raise InputError(f"effect {candidate.effect.id}@{candidate.port.name}", key, "one of " + ", ".join(keys))
+    out = []
+    for key, p in keys.items():
+        value = spec.values.get(key, p.grid[0])
+        bounds = (min(p.low, value), max(p.high, value)) if spec.free else (value, value)
+        out.append(
+            replace(
+                p,
+                name=f"{candidate.effect.id}_{candidate.port.name}_{p.name}",
+                grid=(value,),
+                low=bounds[0],
+                high=bounds[1],
+                step=p.step or abs(value) or 1.0,
+            )
+        )
+    return tuple(out)

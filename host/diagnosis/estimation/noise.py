@@ -1,0 +1,182 @@
+"""Sensor noise from the quiescent parts of a recording: level, colour, wild samples. Never from the residual to explain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.operators import fill, quantum
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+ORDER = 3
+SHORTEST = 30  # samples of a stretch that counts
+SETTLING = 3.0  # first halves' variance against that of the second ones, from which on an output is still settling
+QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one channel: `sigma` in its unit, `ar` (p,) coefficients of e[t] = sum ar[k] e[t-1-k] + w, and its source."""
+
+    sigma: float
+    ar: Array
+    source: str
+
+    @property
+    def correlation_samples(self) -> float:
+        """Integrated autocorrelation time in samples (1 for white noise)."""
+        gain = 1.0 - float(np.sum(self.ar))
+        flat = float(np.sum(autocovariance_of(self.ar)[:1]))
+        return float(np.clip(1.0 / (gain * gain * flat), 1.0, 1e4)) if gain > 0 and flat > 0 else 1.0
+
+    def whiten(self, residual: Array) -> Array:
+        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN beside
+        missing samples.
+        """
+        out = residual.copy()
+        for k, a in enumerate(self.ar):
+            out[k + 1 :] -= a * residual[: -k - 1]
+        out[: self.ar.size] = np.nan
+        return out / (self.sigma / np.sqrt(autocovariance_of(self.ar)[0]))
+
+
+def autocovariance_of(ar: Array, length: int = 400) -> Array:
+    """Autocovariance at lag 0 of the process with unit innovations, by its impulse response. Shape (1,)."""
+    response = np.zeros(length)
+    response[0] = 1.0
+    for t in range(1, length):
+        for k in range(min(ar.size, t)):
+            response[t] += ar[k] * response[t - 1 - k]
+    return np.array([float(response @ response)])
+
+
+def quiescent(inputs: list[Array], dt_s: float, timed: bool) -> Mask:
+    """Samples at which no input has moved (beyond resolution and 0.2 % of range) for half a second around them."""
+    half = max(5, round(0.25 / dt_s)) if timed else 5
+    still = np.ones(inputs[0].size, dtype=bool)
+    for values in inputs:
+        line = fill(values)
+        span = np.ptp(line)
+        limit = max(2.1 * quantum(values), 0.002 * span)
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, half, mode="edge"), 2 * half + 1)
+        still &= (windows.max(axis=1) - windows.min(axis=1)) <= limit
+    return still
+
+
+def runs(mask: Mask, shortest: int) -> list[slice]:
+    """Stretches of True at least `shortest` long."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
+    return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= shortest]
+
+
+def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
+    """Noise of one channel from several recordings. `outputs[i]` (n_i,), `still[i]` its quiescent samples."""
+    stretches = [
+        values[part]
+        for values, mask in zip(outputs, still, strict=True)
+        for part in runs(mask & np.isfinite(values), SHORTEST)
+    ]
+    pieces = []
+    for piece in _settled(stretches):
+        line = np.polynomial.polynomial.polyfit(np.arange(piece.size), piece, 1)
+        pieces.append(piece - np.polynomial.polynomial.polyval(np.arange(piece.size), line))
+    step = max((quantum(values) for values in outputs), default=0.0)
+    floor = step / np.sqrt(12.0)
+    if sum(piece.size for piece in pieces) < 100:
+        return Noise(
+            max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
+        )
+    table = []
+    for piece in pieces:
+        spread = 1.4826 * np.median(np.abs(piece - np.median(piece))) + 1e-300
+        tame = np.clip(piece, -5 * spread, 5 * spread) if spread > 1e-200 else piece
+        table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
+    lags = _typical(np.array(table), np.array([piece.size for piece in pieces]))
+    sigma = float(np.sqrt(max(lags[0], 0.0)))
+    if sigma <= floor:
+        return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
+    return Noise(sigma, autoregression(lags), "quiescent parts")
+
+
+def _settled(stretches: list[Array]) -> list[Array]:
+    """Without their first halves as long as these vary far more than the second ones, as they do where the inputs stand
+    but the output is still on its way; too few to judge by are left as they are.
+    """
+    while len(stretches) >= 4:
+        halves = [(piece[: piece.size // 2], piece[piece.size // 2 :]) for piece in stretches]
+        if np.median([np.var(first) / (np.var(second) + 1e-300) for first, second in halves]) < SETTLING:
+            break
+        stretches = [second for _, second in halves if second.size >= SHORTEST]
+    return stretches
+
+
+def _typical(table: Array, sizes: Array) -> Array:
+    """Mean of the autocovariances (pieces, lags), by size, over the pieces of middling level: one that holds a jump
+    does not count.
+    """
+    order = np.argsort(table[:, 0])
+    place = (np.cumsum(sizes[order]) - 0.5 * sizes[order]) / sizes.sum()
+    middle = order[(place > 0.15) & (place < 0.85)] if order.size > 3 else order[: max(1, order.size - 1)]
+    middle = middle if middle.size else order
+    return np.asarray(np.average(table[middle], axis=0, weights=sizes[middle]))
+
+
+def autoregression(lags: Array) -> Array:
+    """Coefficients (p,) of the autoregressive process with the autocovariances `lags` (p + 1,)."""
+    from scipy.linalg import solve_toeplitz
+
+    damped = lags.copy()
+    damped[0] *= 1.0 + 1e-6
+    return np.asarray(solve_toeplitz(damped[:-1], damped[1:]))
+
+
+def _high_frequency(outputs: list[Array]) -> float:
+    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum.
+
+    A mean of few periodograms scatters, and its quietest twentieth lies below the noise even if that is white: it is
+    put where a twentieth of chi-squared is (Welch 1967).
+    """
+    from scipy.signal import welch
+    from scipy.stats import chi2
+
+    spread = []
+    for values in outputs:
+        if np.count_nonzero(np.isfinite(values)) > 64:
+            line = fill(values)
+            size = min(256, line.size // 4)
+            freedom = 2.0 * (1 + (line.size - size) // (size - size // 2))
+            _, power = welch(line, fs=1.0, nperseg=size, window="blackman")
+            low = chi2.ppf(QUIETEST, freedom) / freedom
+            spread.append(np.sqrt(0.5 * np.quantile(power[1:-1], QUIETEST) / low))
+    return float(np.median(spread)) if spread else 0.0
+
+
+def by_steps(x: Array, sigma: float, correlation: float, longest: int = 8) -> tuple[float, float]:
+    """Noise of `x` (n,) by its steps over 1 ... `longest` samples: standard deviation and correlation time (samples), no
+    less than given.
+
+    Half the mean square of a step over k samples is sigma^2 (1 - rho_k); medians, so that the few large steps of a
+    mismatch do not count.
+    """
+    good = x[np.isfinite(x)]
+    if good.size < 10 * longest:
+        return sigma, correlation
+    size = np.array([np.median(np.abs(good[k:] - good[:-k])) for k in range(1, longest + 1)]) * 1.4826 / np.sqrt(2.0)
+    level = float(np.max(size))
+    if level <= sigma:
+        return sigma, correlation
+    rho = 1.0 - (size / level) ** 2
+    first = int(np.argmax(rho < 0.05)) if np.any(rho < 0.05) else longest
+    return level, max(correlation, 1.0 + 2.0 * float(np.sum(rho[:first])))
+
+
+def wild(values: Array, sigma: float) -> Mask:
+    """Samples that lie alone, far (12 sigma and 8 local spreads) from the median of their seven neighbours."""
+    line = fill(values)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, 3, mode="edge"), 7)
+    middle = np.median(windows, axis=1)
+    spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
+    return np.asarray((np.abs(line - middle) > 12.0 * sigma + 8.0 * spread) & np.isfinite(values))

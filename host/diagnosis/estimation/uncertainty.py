@@ -1,0 +1,142 @@
+"""Confidence intervals that stand coloured residuals and modules that are not quite true: a jackknife over blocks longer
+than the correlation time, the residual's own level and colour, and the scatter between halves of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.fit import Fit, Problem, free, jacobian, size_of
+
+Array = npt.NDArray[np.float64]
+LARGER = 0.95  # chance below which scatter between recordings stays, if formulas are true
+
+
+def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[float, float]]:
+    """Interval of every parameter (nominal, then effects) of `fit`; those held have none (value twice).
+
+    Linearized at the fit, in each parameter's own scale (logarithm for positive ones). The half-width is the larger of two,
+    neither of which may be trusted alone: the level of what is left, each output's counted by its correlation time; and
+    the jackknife over blocks of at least four correlation times, whose quantile is Student's with as many degrees of
+    freedom as blocks carry the parameter (Satterthwaite): sums of squared scores fall short where few blocks do (Bell and
+    McCaffrey 2002). A module whose formula is not quite the true one errs alike all through one excitation and otherwise
+    in the next. Sums of scores over halves of recordings, held-out ones too, show that: where these scatter more than
+    chance would, the interval is made of them.
+    """
+    parameters = problem.parameters(fit.terms)
+    sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=True)]
+    base = problem.stacked(fit.terms, fit.values)
+    J = np.column_stack([jacobian(problem, fit.terms, fit.values, base, sizes), _by_begin(problem, fit, base)])
+    inverse = _inverse(J.T @ J)
+    quantile = float(stats.norm.ppf(0.5 + 0.5 * level))
+    even = np.sqrt(np.maximum(np.diag(inverse @ _coloured(problem, J, base) @ inverse), 0.0))
+    spread, freedom = _jackknife(_blocks(problem, J, base))
+    fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
+    coarse, count = _across_recordings(problem, fit, sizes, inverse)
+    scattered = coarse > stats.f.ppf(LARGER, count - 1, np.maximum(freedom, 2.0)) * (fine / quantile) ** 2
+    wide = float(stats.t.ppf(0.5 + 0.5 * level, count - 1)) * np.sqrt(np.maximum(coarse, 0.0))
+    widths = np.where(scattered, np.maximum(wide, fine), fine)
+    out = [(float(v), float(v)) for v in fit.values]
+    for place, index in enumerate(free(parameters)):
+        p, value, half = parameters[index], float(fit.values[index]), float(widths[place])
+        if p.log:
+            half = min(half, 20.0)
+            low, high = value * np.exp(-half), value * np.exp(half)
+        else:
+            low, high = value - half * sizes[index], value + half * sizes[index]
+        out[index] = (float(max(low, p.low)), float(min(high, p.high)))
+    return out
+
+
+def _inverse(A: Array) -> Array:
+    """Inverse of a matrix of products, scaled; directions that the data do not show have none."""
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-12 * (np.max(np.diag(A), initial=0.0) + 1e-300)))
+    return np.asarray(np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-11) / np.outer(scale, scale))
+
+
+def _across_recordings(problem: Problem, fit: Fit, sizes: list[float], inverse: Array) -> tuple[Array, int]:
+    """Variances from the scatter of scores between halves of recordings, fitted and held-out ones alike; their number."""
+    both = replace(problem, pieces=[replace(piece, fit=piece.fit | piece.heldout) for piece in problem.pieces])
+    base = both.stacked(fit.terms, fit.values)
+    J = jacobian(both, fit.terms, fit.values, base, sizes)
+    J = np.column_stack([J, np.zeros((base.size, inverse.shape[0] - J.shape[1]))])
+    scores, at, rows = [], 0, len(problem.model.outputs)
+    for piece, given in zip(both.pieces, problem.pieces, strict=True):
+        n = int(piece.fit.sum())
+        part = slice(at, at + rows * n)
+        products = (J[part] * base[part, None]).reshape(rows, n, -1).sum(axis=0)
+        at += rows * n
+        for mask in (given.fit[piece.fit], given.heldout[piece.fit]):
+            scores += [half.sum(axis=0) for half in np.array_split(products[mask], 2) if half.size]
+    S, count = np.array(scores), len(scores)
+    share = sum(p.fit.sum() for p in problem.pieces) / max(sum(p.fit.sum() for p in both.pieces), 1)
+    covariance = inverse @ (S.T @ S * (share * count / max(count - 1, 1))) @ inverse
+    return np.diag(covariance), max(count, 2)
+
+
+def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
+    """Rate of the weighted simulation by the state from which each recording runs freely, where a model has one: it
+    is estimated too.
+    """
+    columns = []
+    for piece in problem.pieces:
+        if piece.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in piece.extra:
+            begin, spread = piece.extra["begin"], piece.extra["measured"][1]
+            for k in range(2):
+                piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+                columns.append(base - problem.stacked(fit.terms, fit.values))
+            piece.extra["begin"] = begin
+    used = [column for column in columns if np.any(column)]
+    return np.array(used).T if used else np.zeros((base.size, 0))
+
+
+def _parts(problem: Problem, J: Array, base: Array) -> Iterator[tuple[Array, Array]]:
+    """Weighted residuals (outputs, n) and their rates (outputs, n, parameters) of each recording that is fitted."""
+    at, rows = 0, len(problem.model.outputs)
+    for piece in problem.pieces:
+        n = int(piece.fit.sum())
+        if n:
+            yield base[at : at + rows * n].reshape(rows, n), J[at : at + rows * n].reshape(rows, n, -1)
+            at += rows * n
+
+
+def _coloured(problem: Problem, J: Array, base: Array) -> Array:
+    """Covariance of J^T r for residuals of their own level and correlation time in every output and recording."""
+    total = np.zeros((J.shape[1], J.shape[1]))
+    for r, rates in _parts(problem, J, base):
+        for row, rate in zip(r, rates, strict=True):
+            seen = row[row != 0.0]
+            if seen.size:
+                total += rate.T @ rate * float(np.mean(seen**2)) * correlation_time(np.where(row != 0.0, row, np.nan))
+    return total
+
+
+def _blocks(problem: Problem, J: Array, base: Array) -> list[tuple[Array, Array]]:
+    """J^T J and J^T r of blocks of time, all outputs of a block together."""
+    found = []
+    for r, rates in _parts(problem, J, base):
+        n = r.shape[1]
+        tau = max(correlation_time(row) for row in r)
+        for part in np.array_split(np.arange(n), int(np.clip(n / max(4.0 * tau, 10.0), 1, 60))):
+            rate = rates[:, part].reshape(-1, J.shape[1])
+            found.append((rate.T @ rate, rate.T @ r[:, part].ravel()))
+    return found
+
+
+def _jackknife(blocks: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Standard deviations of the parameters by leaving out one block at a time, and their degrees of freedom."""
+    whole, count = np.sum([A for A, _ in blocks], axis=0), len(blocks)
+    changes, expected = [], []
+    for A, score in blocks:
+        inverse = _inverse(whole - A)
+        changes.append(inverse @ score)
+        expected.append(np.maximum(np.diag(inverse @ A @ inverse), 0.0))
+    S, E = np.array(changes), np.array(expected)
+    spread = np.sqrt((count - 1) / count * np.sum(S**2, axis=0))
+    freedom = np.sum(E, axis=0) ** 2 / np.maximum(np.sum(E**2, axis=0), 1e-300)
+    return spread, np.maximum(freedom, 1.0)

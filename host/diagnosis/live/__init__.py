@@ -1,0 +1,1 @@
+"""The running rig compared with its twin, window by window."""

@@ -1,0 +1,215 @@
+"""Recordings: columns become channels in SI units on an even time line, split into parts to fit and parts held out."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
+from host.diagnosis.model.rig_recording import rig_rows
+from host.diagnosis.model.tables import is_table, read_table
+from protocol.errors import InputError
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+BLOCKS_OF_A_LONE_RECORDING = 10
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording. `channels` maps name to (n,) SI values; `fit` and `heldout` are masks (n,) over samples.
+
+    `time_s` counts from the first sample, or from the first recording where all share a clock; `begin_s` is where that
+    is in the file.
+    """
+
+    name: str
+    time_s: Array
+    dt_s: float
+    timed: bool
+    channels: dict[str, Array]
+    fit: Mask
+    heldout: Mask
+    units: dict[str, str] = field(default_factory=dict)
+    begin_s: float = 0.0
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return int(self.time_s.size)
+
+
+def find_files(spec: NominalSpec, named: list[str], data_folder: str | None) -> list[Path]:
+    """Files named on the command line (folders are opened), or those of the TOML in the data folder. Raises InputError."""
+    found: list[Path] = []
+    for name in named:
+        path = Path(name)
+        if path.is_dir():
+            patterns = [Path(pattern).name for pattern in spec.data.files] or ["*"]
+            inside = sorted(p for p in path.rglob("*") if p.is_file() and is_table(p))
+            found += [p for p in inside if any(fnmatch(p.name, pattern) for pattern in patterns)] or inside
+        else:
+            found.append(path)
+    if not named:
+        folder = data_folder or os.environ.get("SELDINGER_DATA", "")
+        for pattern in spec.data.files:
+            found += sorted(Path(folder).glob(pattern)) if folder else []
+    if not found:
+        wanted = "at least one table (name files, or set SELDINGER_DATA / --data to the folder that holds data.files)"
+        raise InputError("recording", named or spec.data.files, wanted)
+    return found
+
+
+def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
+    """Recordings of `files`; `needed`: the channels of the model; those in `optional` may be absent. Raises InputError."""
+    pieces: list[Recording] = []
+    read = rig_rows if spec.recorded_rig else read_table
+    wholes = [_one(spec, path.name, read(path), needed, optional) for path in files]
+    shared = one_clock(wholes)
+    first = min(whole.time_s[0] for whole in wholes)
+    for path, whole in zip(files, wholes, strict=True):
+        begin = float(first if shared else whole.time_s[0])
+        whole = replace(whole, time_s=whole.time_s - begin, begin_s=begin)
+        cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
+        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [
+            whole
+        ]
+    return _split(pieces, spec.data.heldout)
+
+
+def one_clock(recordings: list[Recording]) -> bool:
+    """Whether the recordings lie one after the other on one clock, so that phases and drifts run on through all."""
+    spans = sorted((r.time_s[0], r.time_s[-1]) for r in recordings)
+    return len(spans) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(spans))
+
+
+def _one(
+    spec: NominalSpec, name: str, columns: dict[str, Array], needed: dict[str, ChannelSpec], optional: set[str]
+) -> Recording:
+    channels = {}
+    for key, channel in needed.items():
+        if channel.column in columns:
+            channels[key] = channel.sign * channel.scale * columns[channel.column] + channel.offset
+        elif key not in optional:
+            raise InputError(f"channels.{key}.column", channel.column, f"a column of {name}: {', '.join(sorted(columns))}")
+    n = max(values.size for values in channels.values())
+    short = [key for key, values in channels.items() if values.size != n]
+    if short:
+        raise InputError(f"channels.{short[0]}", f"{channels[short[0]].size} rows in {name}", f"{n} rows")
+    if n < 50:
+        raise InputError("recording", f"{n} rows in {name}", "at least 50 rows")
+    channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
+    time_s, timed = _time_line(spec, name, columns, n)
+    dt_s = float(np.median(np.diff(time_s)))
+    if timed and np.max(np.abs(np.diff(time_s) - dt_s)) > 0.2 * dt_s:
+        time_s, channels = _even(time_s, dt_s, channels)
+    nothing = np.zeros(time_s.size, dtype=bool)
+    units = {key: channel.unit for key, channel in needed.items()}
+    return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units)
+
+
+def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:
+    if spec.data.time is not None:
+        if spec.data.time not in columns:
+            raise InputError("data.time", spec.data.time, f"a column of {name}: {', '.join(sorted(columns))}")
+        time_s = columns[spec.data.time]
+        if not np.all(np.isfinite(time_s)) or np.any(np.diff(time_s) < 0) or time_s[-1] <= time_s[0]:
+            raise InputError("data.time", f"{spec.data.time} of {name} not increasing", "seconds that increase")
+        return time_s, True
+    if spec.data.rate_Hz is not None:
+        return np.arange(n) / spec.data.rate_Hz, True
+    return np.arange(n, dtype=np.float64), False
+
+
+def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+    """Even grid; a grid point further than one and a half periods from any sample stays missing."""
+    grid = np.arange(time_s[0], time_s[-1] + 0.5 * dt_s, dt_s)
+    after = np.clip(np.searchsorted(time_s, grid), 1, time_s.size - 1)
+    hole = (time_s[after] - time_s[after - 1]) > 3.0 * dt_s
+    even = {}
+    for key, values in channels.items():
+        good = np.isfinite(values)
+        if np.count_nonzero(good) < 2:
+            even[key] = np.full(grid.size, np.nan)
+            continue
+        line = np.interp(grid, time_s[good], values[good])
+        missing = np.interp(grid, time_s, (~good).astype(float)) > 0.49
+        even[key] = np.where(missing | hole, np.nan, line)
+    return grid, even
+
+
+def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recording:
+    if not 0 <= first < last <= whole.n:
+        raise InputError("data.pieces.rows", [first, last], f"0 <= first < last <= {whole.n}")
+    start = max(0, first - lead)
+    part = slice(start, last)
+    use = np.arange(start, last) >= first
+    channels = {key: values[part] for key, values in whole.channels.items()}
+    return replace(
+        whole,
+        name=name,
+        time_s=whole.time_s[part] - whole.time_s[start],
+        channels=channels,
+        fit=use,
+        heldout=use,
+        begin_s=whole.begin_s + float(whole.time_s[start]),
+    )
+
+
+def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recording]:
+    used = [p.fit if p.fit.any() else np.ones(p.n, dtype=bool) for p in pieces]
+    if patterns is not None:
+        out = [any(fnmatch(p.name, pattern) for pattern in patterns) for p in pieces]
+        if len(pieces) > 1 and (all(out) or not any(out)):
+            raise InputError(
+                "data.heldout",
+                patterns,
+                "patterns that match some recordings, not all: " + ", ".join(p.name for p in pieces),
+            )
+        if len(pieces) == 1:
+            patterns = None
+    if patterns is None and len(pieces) >= 3:
+        out = [index % 3 == 1 for index in range(len(pieces))]
+    elif patterns is None:
+        return [replace(p, fit=u & ~b, heldout=u & b) for p, u in zip(pieces, used, strict=True) for b in [_blocks(p.n)]]
+    nothing = [np.zeros(p.n, dtype=bool) for p in pieces]
+    return [
+        replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(pieces, used, nothing, out, strict=True)
+    ]
+
+
+def _blocks(n: int) -> Mask:
+    """Alternate blocks: the held-out ones of a lone recording."""
+    return (np.arange(n) * BLOCKS_OF_A_LONE_RECORDING // n) % 2 == 1
+
+
+def thin(recording: Recording, factor: int) -> Recording:
+    """`recording` with `factor` samples averaged into one; missing samples are left out of the average."""
+    if factor <= 1:
+        return recording
+    n = recording.n // factor
+
+    def average(values: Array) -> Array:
+        blocks = values[: n * factor].reshape(n, factor)
+        good = np.isfinite(blocks)
+        count = good.sum(axis=1)
+        total = np.where(good, blocks, 0.0).sum(axis=1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def every(mask: Mask) -> Mask:
+        return np.asarray(mask[: n * factor].reshape(n, factor).all(axis=1))
+
+    return replace(
+        recording,
+        time_s=average(recording.time_s),
+        dt_s=recording.dt_s * factor,
+        channels={key: average(values) for key, values in recording.channels.items()},
+        fit=every(recording.fit),
+        heldout=every(recording.heldout),
+    )

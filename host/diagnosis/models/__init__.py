@@ -1,0 +1,63 @@
+"""Nominal models, one file a kind; `build` makes the one a TOML asks for, `channels_of` says what it reads."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from host.diagnosis.model.model import Model
+from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
+from protocol.errors import InputError
+
+
+def build(spec: NominalSpec) -> Model:
+    """The nominal model of `spec`."""
+    if spec.kind == "transmission":
+        from host.diagnosis.models.transmission import Transmission
+
+        return cast(Model, Transmission(spec))
+    if spec.kind == "impedance":
+        from host.diagnosis.models.impedance import Impedance
+
+        return cast(Model, Impedance(spec))
+    if spec.kind == "axis":
+        from host.diagnosis.models.axis import Axis
+
+        return cast(Model, Axis(spec))
+    if spec.recorded_rig:
+        from host.diagnosis.models.recorded_rig import RecordedRig
+
+        return RecordedRig(spec)
+    if spec.kind == "rig":
+        from host.diagnosis.models.rig import Rig
+
+        return Rig(spec)
+    from host.diagnosis.models.external import External
+
+    return External(spec)
+
+
+def channels_of(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:
+    """Channels the model reads, and which of them may be absent. Raises InputError where one is not declared."""
+    if spec.kind == "rig":
+        from host.diagnosis.models.rig import rig_channels
+
+        return rig_channels(spec)
+    names: list[str] = []
+    optional: set[str] = set()
+    for link in spec.link:
+        names += [link.input, link.output, *link.load, *link.others]
+    if spec.axis is not None:
+        names += [spec.axis.input, spec.axis.output]
+        if spec.axis.controller is not None:
+            names += [spec.axis.controller.reference]
+            if spec.axis.controller.added:
+                names.append(spec.axis.controller.added)
+                optional.add(spec.axis.controller.added)
+    if spec.impedance is not None:
+        names += [spec.impedance.input, spec.impedance.output, *spec.impedance.load, *spec.impedance.others]
+    if spec.callable is not None:
+        names += [*spec.callable.inputs, *spec.callable.outputs, *spec.callable.load]
+    for name in names:
+        if name not in spec.channels:
+            raise InputError(name, "no such channel", "one of [channels]: " + ", ".join(spec.channels))
+    return {name: spec.channels[name] for name in dict.fromkeys(names)}, optional

@@ -1,0 +1,286 @@
+"""Force in, motion out: m a + c v + k x = force + offset, simulated freely, from recorded force or under a controller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.force_kernel import run_axis, slot_array
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.operators import fill, smooth_derivatives
+from host.diagnosis.models import balance
+
+Array = npt.NDArray[np.float64]
+SMOOTHING_S = 0.02
+
+
+class Axis:
+    """Nominal model of kind `axis`.
+
+    With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
+    without a spring, the axis would run away from any recording: then the force that its measured motion needs is
+    compared with the input instead (`balance.py`).
+    """
+
+    kind = "axis"
+    fit_samples = 1000000000
+    coarsest_s = 0.0
+    screen_samples = 20000
+
+    def __init__(self, spec: NominalSpec) -> None:
+        if spec.axis is None:
+            raise ValueError("axis: found nothing, wanted a section")
+        self.spec = spec.axis
+        self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
+        self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
+        outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
+        if self.spec.controller is not None or not self.free_run:
+            outputs.append(Output(self.spec.input, force, name))
+        self.outputs = tuple(outputs)
+        self.ports = (
+            Port(name, "force", name, tuple(o.channel for o in outputs)),
+            Port(f"{name}_drive", "timing+limit+mode", name, (self.spec.output,)),
+            Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
+        )
+        defaults = {
+            "mass": (1.0, f"{force} s2/{motion}"),
+            "damping": (1.0, f"{force} s/{motion}"),
+            "stiffness": (1.0, f"{force}/{motion}"),
+            "offset": (0.0, force),
+        }
+        parameters = []
+        for term in self.spec.terms:
+            value, free = spec.start(term, defaults[term][0])
+            low, high = (value, value) if not free else (-np.inf, np.inf) if term == "offset" else (1e-12, 1e12)
+            parameters.append(Parameter(term, defaults[term][1], (value,), low, high, log=term != "offset" and free))
+        self.given = [term for term in self.spec.terms if term in spec.parameters]
+        self.parameters = tuple(parameters)
+        self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
+        if "stiffness" not in self.spec.terms:
+            self.taken |= {"softening:", "contact_nonlinear:"}
+        self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
+        self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None and self.free_run else ()
+        self.moves = {name: self.spec.output}
+        self.quiet_inputs = (self.spec.input,)
+
+    def prepare(self, recording: Recording) -> Piece:
+        """Input up-sampled to half sub-steps; start taken from the measured motion."""
+        spec = self.spec
+        names = [spec.input]
+        if spec.controller is not None:
+            names += [name for name in (spec.controller.reference, spec.controller.added) if name in recording.channels]
+        y = stack(recording, [o.channel for o in self.outputs])
+        piece = Piece(recording, y, recording.fit, recording.heldout, filled(recording, names))
+        motion = fill(recording.channels[spec.output])
+        window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
+        x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
+        name = spec.subsystem
+        reads = {
+            "position": (x, v),
+            "velocity": (np.cumsum(x) * recording.dt_s, x),
+            "acceleration": (np.zeros_like(x), np.zeros_like(x)),
+        }
+        piece.inputs[f"motion:{name}"] = reads[spec.reads][0]
+        begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
+        piece.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
+        piece.extra.update(
+            begin=np.array(begin),
+            x=x,
+            v=v,
+            substeps=self._substeps(piece),
+            tolerance=tolerance_of(motion, float(np.ptp(motion))),
+        )
+        piece.extra["units"] = {
+            **self.units,
+            name: self.units[spec.input],
+            f"motion:{name}": self.units[spec.output],
+            f"{name}_drive": self.units[spec.input],
+            f"{name}_reading": self.units[spec.output],
+        }
+        piece.extra["steps"] = upsample(piece.inputs[spec.input], 2 * piece.extra["substeps"], spec.hold)
+        if not self.free_run:
+            piece.y = np.zeros_like(y)
+            piece.y[:, ~np.isfinite(recording.channels[spec.output])] = np.nan
+            balance.prepare(piece, motion, SMOOTHING_S, spec.hold, piece.extra["steps"])
+        return piece
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """Equation-error estimate in the frequency domain where the TOML gives no value: U = (-w^2 m + i w c + k) X."""
+        given = np.array([p.grid[0] for p in self.parameters])
+        if len(self.given) == len(self.spec.terms):
+            return given
+        rows, sides = [], []
+        for piece in pieces:
+            if not piece.fit.any():
+                continue
+            u, y = piece.inputs[self.spec.input], fill(piece.recording.channels[self.spec.output])
+            window = np.hanning(u.size)
+            U, Y = np.fft.rfft(window * (u - u.mean())), np.fft.rfft(window * (y - y.mean()))
+            s = 2j * np.pi * np.fft.rfftfreq(u.size, piece.recording.dt_s)
+            keep = (np.abs(s) > 0) & (np.abs(U) > 0.02 * np.max(np.abs(U)))
+            X = Y[keep] / s[keep] ** ("position", "velocity", "acceleration").index(self.spec.reads)
+            columns = {"mass": s[keep] ** 2 * X, "damping": s[keep] * X, "stiffness": X, "offset": np.zeros_like(X)}
+            rows.append(np.array([columns[term] for term in self.spec.terms]).T)
+            sides.append(U[keep])
+        A, b = np.concatenate(rows), np.concatenate(sides)
+        size = np.linalg.norm(A, axis=0) + 1e-300
+        A, b = np.concatenate((A.real, A.imag)), np.concatenate((b.real, b.imag))
+        found = np.linalg.lstsq(A / size, b, rcond=1e-12)[0] / size
+        pick = [
+            value if term in self.given or not np.isfinite(f) or (p.log and f <= 0) else f
+            for term, value, f, p in zip(self.spec.terms, given, found, self.parameters, strict=True)
+        ]
+        return np.array(pick)
+
+    def restarts(self, pieces: list[Piece]) -> list[Array]:
+        """Nominal parameters over a range of time constants and dampings, each with the gain that gives the measured RMS.
+
+        Parameters that the TOML holds keep their values.
+        """
+        used = [piece for piece in pieces if piece.fit.any()] if self.free_run and self.spec.controller is None else []
+        if not used:
+            return []
+        slowest_s = max(float(piece.recording.time_s[-1]) for piece in used) / 8.0
+        times_s = np.geomspace(3.0 * used[0].recording.dt_s, slowest_s, 9)
+        measured = np.sqrt(np.nanmean(np.concatenate([piece.y[0][piece.fit] for piece in used]) ** 2))
+        found = []
+        for law in [law for time_s in times_s for law in self._laws(float(time_s))]:
+            theta = np.array([law[term] for term in self.spec.terms])
+            run = np.concatenate([self.simulate(piece, theta, [])[0][piece.fit] for piece in used])
+            rms = float(np.sqrt(np.mean(run**2)))
+            if np.isfinite(rms) and rms > 0.0:
+                theta = theta * rms / measured
+                held = [p.grid[0] if p.high <= p.low else t for p, t in zip(self.parameters, theta, strict=True)]
+                found.append(np.array(held))
+        return found
+
+    def _laws(self, time_s: float) -> list[dict[str, float]]:
+        """Laws of unit gain and one time constant: oscillators where a spring holds a position, else slowing down."""
+        if self.spec.reads == "position" and "stiffness" in self.spec.terms:
+            slowed = [{"mass": time_s**2, "damping": 2.0 * ratio * time_s, "stiffness": 1.0} for ratio in (0.1, 0.4, 1.0)]
+        else:
+            slowed = [{"mass": time_s, "damping": 1.0, "stiffness": spring / time_s} for spring in (1e-9, 1.0)]
+        return [{**law, "offset": 0.0} for law in slowed]
+
+    def _substeps(self, piece: Piece) -> int:
+        return 2 if self.spec.controller is not None or "stiffness" not in self.spec.terms else 3
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Outputs in free run. Shape (outputs, n)."""
+        spec, extra = self.spec, piece.extra
+        linear = np.zeros(4)
+        for term, value in zip(spec.terms, theta, strict=True):
+            linear[("mass", "damping", "stiffness", "offset").index(term)] = value
+        if "mass" not in spec.terms:
+            linear[0] = 1.0
+        steps = extra["steps"]
+        drive = [act for act in acts if act[0].port.name == f"{spec.subsystem}_drive"]
+        if drive:
+            changed = apply_acts(piece.inputs[spec.input], drive, f"{spec.subsystem}_drive", piece, None)
+            steps = upsample(changed, 2 * extra["substeps"], spec.hold)
+        slots = [
+            candidate.effect.slots(values, candidate.form)
+            for candidate, values in acts
+            if candidate.effect.slots is not None
+        ]
+        p = slot_array([*slots, {"stiffness": float(linear[2])}])
+        load = np.zeros(piece.n)
+        if spec.controller is not None:
+            c = spec.controller
+            control = np.array([c.position_gain_per_s, c.velocity_gain, c.force_gain, c.force_limit])
+            reference = np.vstack([piece.inputs[c.reference], piece.inputs.get(c.added, load)])
+        else:
+            control, reference = np.zeros(0), load[None, :]
+        if not self.free_run:
+            return balance.error(piece, linear, steps, spec.hold, p, piece.start.get(spec.subsystem, 0.0))
+        run = run_axis(
+            steps,
+            extra["substeps"],
+            piece.recording.dt_s,
+            linear,
+            p,
+            extra["begin"],
+            load,
+            control,
+            reference,
+            piece.start.get(spec.subsystem, 0.0),
+            float(piece.recording.time_s[0]),
+        )
+        motion = run[("position", "velocity", "acceleration").index(spec.reads)]
+        motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
+        return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
+
+    def begin_anew(self, piece: Piece, theta: Array, acts: list[Act]) -> None:
+        """Position and speed at the first sample, as measured there and as the free run wants them, each by its own
+        variance.
+
+        Only a motion read as position is begun so: its first speed is a derivative of noise, and its error rings on.
+        """
+        if not self.free_run or self.spec.controller is not None or self.spec.reads != "position":
+            return
+        begin, spread, _ = piece.extra["measured"]
+        piece.extra["begin"] = begin
+        r = piece.y[0] - self.simulate(piece, theta, acts)[0]
+        columns = []
+        for k in range(2):
+            piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+            columns.append((piece.y[0] - self.simulate(piece, theta, acts)[0] - r) * -1.0)
+        used = np.isfinite(r)
+        A, b = np.array(columns).T[used], r[used]
+        sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
+        by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
+        piece.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """Motion at the force port, force at the drive, reading at the sensor."""
+        if port.name == f"{self.spec.subsystem}_drive":
+            return piece.inputs[self.spec.input]
+        return piece.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else piece.extra["x"]
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of
+        size).
+        """
+        if len(self.outputs) == 2 or not self.free_run:
+            return np.asarray(residual[-1])
+        if port.name.endswith("_reading"):
+            return np.asarray(residual[0])
+        size = dict(zip(self.spec.terms, theta, strict=False)).get("stiffness", 1.0)
+        return np.asarray(residual[0] * size)
+
+
+def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> tuple[Array, float]:
+    """Standard deviations (2,) of position and speed at the first sample, read off a cubic over `window` samples; and
+    the noise.
+    """
+    first = slice(0, min(motion.size, 20 * window))
+    noise = float(np.std((motion - smooth)[first])) * float(np.sqrt(window / max(window - 4.0, 1.0)))
+    t = np.arange(window) * dt_s
+    covariance = np.linalg.inv(np.vander(t / t[-1], 4, increasing=True).T @ np.vander(t / t[-1], 4, increasing=True))
+    return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300), noise
+
+
+def upsample(u: Array, factor: int, hold: str) -> Array:
+    """Input at `factor` points per sample, (n * factor + 1,). zero: held; linear; band_limited: sinc (whole record,
+    by Fourier).
+    """
+    n = u.size
+    if hold == "zero":
+        return np.append(np.repeat(u, factor), u[-1])
+    if hold == "linear":
+        return np.append(np.interp(np.arange(n * factor) / factor, np.arange(n), u), u[-1])
+    from scipy.signal import resample
+
+    pad = min(n - 1, 400)
+    mirrored = np.concatenate((u[pad:0:-1], u, u[-2 : -pad - 2 : -1]))
+    size = 2 ** math.ceil(math.log2(mirrored.size))
+    mirrored = np.pad(mirrored, (0, size - mirrored.size), mode="linear_ramp", end_values=mirrored[0])
+    fine = resample(mirrored, size * factor)
+    return np.asarray(fine[pad * factor : (pad + n) * factor + 1])

@@ -1,0 +1,133 @@
+"""Motion in, force out: force = m a + c v + k x + ratio * load + offset, with the force terms of the vocabulary added."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.force_kernel import along, slot_array
+from host.diagnosis.estimation.noise import estimate, quiescent
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
+
+Array = npt.NDArray[np.float64]
+SMOOTHING_S = 0.03
+CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
+
+
+class Impedance:
+    """Nominal model of kind `impedance`."""
+
+    kind = "impedance"
+    fit_samples = 24000
+    coarsest_s = 0.02
+    screen_samples = 24000
+
+    def __init__(self, spec: NominalSpec) -> None:
+        if spec.impedance is None:
+            raise ValueError("impedance: found nothing, wanted a section")
+        self.spec = spec.impedance
+        self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        force, motion, name = self.units[self.spec.output], self.units[self.spec.input], self.spec.subsystem
+        self.outputs = (Output(self.spec.output, force, name),)
+        loads, others = tuple(self.spec.load), tuple(self.spec.others)
+        self.ports = (
+            Port(name, "force", name, (self.spec.output,), loads, others),
+            Port(f"{name}_reading", "drift+timing+limit+mix", name, (self.spec.output,), (), others),
+        )
+        unit = {
+            "mass": f"{force} s2/{motion}",
+            "damping": f"{force} s/{motion}",
+            "stiffness": f"{force}/{motion}",
+            "offset": force,
+        }
+        self.terms: list[tuple[str, str]] = []
+        parameters = []
+        for term in self.spec.terms:
+            for source in loads if term == "load" else ("",):
+                key = term if term != "load" else "load_ratio" if len(loads) == 1 else f"load_ratio_{source}"
+                load_unit = self.units.get(source, "")
+                value, free = spec.start(key, 0.0)
+                bounds = (-np.inf, np.inf) if free else (value, value)
+                text = unit.get(term, "" if load_unit == force else f"{force}/{load_unit}")
+                parameters.append(Parameter(key, text, (value,), *bounds, linear=True))
+                self.terms.append((term, source))
+        self.parameters = tuple(parameters)
+        have = {"damping": "viscous_friction:", "mass": "added_mass"}
+        self.taken = frozenset(have[term] for term in self.spec.terms if term in have)
+        if "stiffness" not in self.spec.terms:
+            self.taken |= {"contact_nonlinear:", "softening:"}
+        self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
+        self.unlisted_at = ((name, f"{name}_reading"),)
+        self.moves = {name: self.spec.input}
+        self.quiet_inputs = (self.spec.input, *loads)
+
+    def prepare(self, recording: Recording) -> Piece:
+        """Motion smoothed to velocity and acceleration without phase."""
+        piece = Piece(
+            recording,
+            stack(recording, [self.spec.output]),
+            recording.fit,
+            recording.heldout,
+            filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]),
+        )
+        motion = piece.inputs[self.spec.input]
+        noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
+        window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
+        x, v, a = smooth_derivatives(motion, recording.dt_s, window)
+        piece.inputs[f"motion:{self.spec.subsystem}"] = motion
+        tolerance = tolerance_of(motion, float(np.ptp(motion)))
+        if noise < CLEAN * tolerance:
+            x = motion  # smoothing would round its reversals, and friction with them
+        piece.extra.update(v=v, a=a, x=x, tolerance=tolerance)
+        name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
+        piece.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
+        return piece
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """Start values of the TOML; linear parameters find their place from anywhere."""
+        return np.array([p.grid[0] for p in self.parameters])
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Force along the measured motion. Shape (1, n)."""
+        extra = piece.extra
+        force = np.zeros(piece.n)
+        given = {"mass": extra["a"], "damping": extra["v"], "stiffness": extra["x"], "offset": 1.0}
+        stiffness = 0.0
+        for (term, source), value in zip(self.terms, theta, strict=True):
+            force = force + value * (piece.inputs[source] if term == "load" else given[term])
+            stiffness = value if term == "stiffness" else stiffness
+        here = [(candidate, values) for candidate, values in acts if candidate.effect.slots is not None]
+        for source in dict.fromkeys(candidate.source for candidate, _ in here):
+            filled_slots = [
+                candidate.effect.slots(values, candidate.form)
+                for candidate, values in here
+                if candidate.source == source and candidate.effect.slots is not None
+            ]
+            load = piece.inputs[source] if source else np.zeros(piece.n)
+            p = slot_array([*filled_slots, {"stiffness": float(stiffness)}])
+            force = force + along(
+                extra["x"],
+                extra["v"],
+                extra["a"],
+                load,
+                piece.recording.time_s,
+                piece.recording.dt_s,
+                extra["tolerance"],
+                piece.start.get(self.spec.subsystem, 0.0),
+                p,
+            )
+        return np.asarray(apply_acts(force, acts, f"{self.spec.subsystem}_reading", piece, None))[None, :]
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """The measured motion, or the measured force for the reading port."""
+        if port.name == self.spec.subsystem:
+            return piece.inputs[self.spec.input]
+        return np.where(np.isfinite(piece.y[0]), piece.y[0], np.nanmedian(piece.y[0]))
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """The residual is a force already."""
+        return np.asarray(residual[0])

@@ -1,0 +1,111 @@
+"""The rig as its recordings describe it: the twin of the live watch, refitted; the wall moves, so that force is an input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.design.excitation import Excitation
+from host.diagnosis.design.rig_experiment import rig_excitations
+from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.live.twin import Twin
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Port
+from host.diagnosis.model.model import Act, Piece
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.rig_recording import knob_gain, rig_of
+from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS
+from host.recordings.recording import Recording as RigRecording
+from protocol.catheter import Catheter, CosseratParameters
+from protocol.errors import InputError
+
+Array = npt.NDArray[np.float64]
+FREE = ("insertion_offset", "roll_slope", "roll_offset", "knob_gain", "knob_offset", "bending_stiffness")
+EI = [name for name, _, _ in PARAMETERS].index("bending_stiffness")
+POSE_ROWS = 12
+NUDGE_N = 1e-3
+
+
+class RecordedRig(Twin):
+    """Nominal model of kind `rig` with `recorded = true`. Poses are compared; forces load the shape.
+
+    Known play and knob curve are taken off the handle beforehand (rig_recording); offsets, slope, gain and bending
+    stiffness are refitted.
+    """
+
+    scripted = (*HANDLES, *FORCE)
+
+    def __init__(self, spec: NominalSpec) -> None:
+        rig = rig_of(spec._files)
+        super().__init__(rig, catheter_of(RigRecording(spec._files[0]).catheter))
+        self.recorded_on = rig
+        wanted = []
+        for p in self.parameters:
+            value, free = spec.start(KEYS.get(p.name, p.name), knob_gain(rig) if p.name == "knob_gain" else p.grid[0])
+            if p.name not in FREE or not free:
+                wanted.append(replace(p, grid=(value,), low=value, high=value, log=False))
+            elif p.name == "bending_stiffness":
+                wanted.append(replace(p, grid=(value,), low=0.02 * value, high=50.0 * value, log=True))
+            else:
+                wanted.append(replace(p, grid=(value,), low=-np.inf, high=np.inf))
+        self.rigidity = self.parameters[EI].grid[0]
+        self.parameters = tuple(wanted)
+        self.outputs = self.outputs[:POSE_ROWS]
+        self.ports = tuple(port for port in self.ports if port.name != "contact")
+
+    def prepare(self, recording: Recording) -> Piece:
+        """As the twin does, the force as it was averaged about each frame; it is no output."""
+        piece = super().prepare(recording)
+        piece.y = piece.y[:POSE_ROWS]
+        return piece
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Poses (12, n) of tip and shaft."""
+        return super().simulate(piece, theta, acts)[:POSE_ROWS]
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """As the chain has it; for the force sensor, the force along the wall's normal that the poses would need."""
+        if port.name != "force_sensor":
+            return super().needs(piece, port, theta, residual)
+        given = piece.extra["force"]
+        base = self.simulate(piece, theta, [])
+        piece.extra["force"] = given + NUDGE_N * self.normal[:, None]
+        slope = (self.simulate(piece, theta, []) - base) / NUDGE_N
+        piece.extra["force"] = given
+        weight = piece.extra.get("weight", np.ones(POSE_ROWS))[:, None]
+        slope = np.where(np.isfinite(residual), slope, 0.0) / weight
+        return np.asarray(np.sum(slope * np.nan_to_num(residual) / weight, axis=0) / (np.sum(slope**2, axis=0) + 1e-12))
+
+    def excitations(self, problem: Problem, best: Fit) -> list[tuple[Excitation, dict[str, Array]]]:
+        """Motions that this rig can make in an experiment."""
+        return rig_excitations(self, problem, best)
+
+    def settle(self, piece: Piece, theta: Array) -> None:
+        """Lets the rod model correct the chain at these nominal parameters."""
+        self.softness = self.rigidity / float(theta[EI])
+        self.correct(piece, theta)
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """The calibrated values."""
+        return np.array([p.grid[0] for p in self.parameters])
+
+
+def catheter_of(data: dict[str, Any]) -> Catheter:
+    """The catheter as a recording's header has it. Raises InputError for one without spatial mechanics."""
+    if not data.get("cosserat"):
+        raise InputError("recording.catheter", data.get("name", "nothing"), "a catheter with spatial mechanics (cosserat)")
+    try:
+        return Catheter(
+            data["name"],
+            data["distal_length_m"],
+            data["diameter_m"],
+            data["pull_wire_offset_m"],
+            cosserat=CosseratParameters(**data["cosserat"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            "recording.catheter", str(error), "the catheter's parameters as this version records them"
+        ) from None

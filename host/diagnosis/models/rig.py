@@ -1,0 +1,433 @@
+"""The catheter rig's twin: handle -> insertion, roll, curvature -> shape -> contact -> sensors, a port at every link."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.noise import by_steps, estimate, quiescent
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Candidate, Context, Parameter, Port
+from host.diagnosis.model.model import Act, Output, Piece, apply_acts, tolerance_of
+from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
+from host.diagnosis.model.operators import calm, fill
+from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, drag_along, matrices, rotation_logs, shapes
+from protocol.errors import InputError
+
+Array = npt.NDArray[np.float64]
+HANDLES = {
+    "handle_insertion": ("handle_insertion_m", "m"),
+    "handle_roll": ("handle_roll_rad", "rad"),
+    "handle_knob": ("handle_knob_rad", "rad"),
+}
+TIP = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
+SHAFT = tuple(name.replace("tip", "shaft") for name in TIP)
+FORCE = ("force_x_N", "force_y_N", "force_z_N")
+PARAMETERS = (
+    ("insertion_gain", "", 1.0),
+    ("insertion_offset", "m", 0.0),
+    ("roll_slope", "", 1.0),
+    ("roll_offset", "rad", 0.0),
+    ("knob_gain", "1/(m rad)", 30.0),
+    ("knob_offset", "1/m", 0.0),
+    ("bending_stiffness", "N m2", 3e-4),
+    ("wall_distance", "m", 0.04),
+    ("wall_stiffness", "N/m", 1000.0),
+)
+TOUCH_M = 1e-3  # natural size of a place: slopes by its thousandth stay within the depth of a press
+KEYS = {
+    "insertion_offset": "insertion_offset_m",
+    "roll_offset": "roll_offset_rad",
+    "knob_gain": "knob_gain_per_m_rad",
+    "knob_offset": "knob_offset_per_m",
+    "bending_stiffness": "bending_stiffness_N_m2",
+    "wall_distance": "wall_distance_m",
+    "wall_stiffness": "wall_stiffness_N_per_m",
+}
+AXES = ("insertion", "roll", "knob")
+FAINT = 0.5  # noise of the force sensor over RMS of the force, above which the force is taken from the chain
+
+
+def rig_channels(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:
+    """Channels of the rig under their default columns, renamed where `[channels]` says so; shaft and force may be absent."""
+    needed = {name: ChannelSpec(column=column, unit=unit) for name, (column, unit) in HANDLES.items()}
+    needed |= {name: ChannelSpec(column=name, unit=_unit(name)) for name in (*TIP, *SHAFT, *FORCE)}
+    for name, channel in spec.channels.items():
+        if name not in needed:
+            raise InputError(f"channels.{name}", name, "one of " + ", ".join(needed))
+        needed[name] = channel
+    return needed, {*SHAFT, *FORCE}
+
+
+def _unit(name: str) -> str:
+    return name.rsplit("_", 1)[1] if name.endswith(("_m", "_N")) else ""
+
+
+class Rig:
+    """Nominal model of kind `rig`. Outputs: tip position and turn, shaft position and turn, force; three rows each."""
+
+    kind = "rig"
+    fit_samples = 6000
+    coarsest_s = 0.04
+    screen_samples = 4000
+    taken: frozenset[str] = frozenset()
+
+    def __init__(self, spec: NominalSpec) -> None:
+        if spec.rig is None:
+            raise ValueError("rig: found nothing, wanted a section")
+        self.spec = spec.rig
+        normal = np.array(self.spec.wall_normal)
+        if not np.linalg.norm(normal) > 0.0:
+            raise InputError("rig.wall_normal", self.spec.wall_normal, "a vector that is not zero")
+        self.normal = normal / np.linalg.norm(normal)
+        parameters = []
+        for name, unit, default in PARAMETERS:
+            value, free = spec.start(KEYS.get(name, name), default)
+            positive = name in ("bending_stiffness", "wall_stiffness")
+            low, high = (value, value) if not free else (0.02 * value, 50.0 * value) if positive else (-np.inf, np.inf)
+            step = TOUCH_M if unit == "m" else abs(value) or 1.0
+            parameters.append(Parameter(name, unit, (value,), low, high, log=positive and free, step=step))
+        self.parameters = tuple(parameters)
+        self.outputs = tuple(
+            [
+                Output(f"{part}_{axis}", unit, subsystem)
+                for part, unit, subsystem in (
+                    ("tip", "m", "shape"),
+                    ("tip_turn", "rad", "shape"),
+                    ("shaft", "m", "shape"),
+                    ("shaft_turn", "rad", "shape"),
+                    ("force", "N", "contact"),
+                )
+                for axis in "xyz"
+            ]
+        )
+        loads = {"insertion": ("axial_force",), "roll": (), "knob": ("axial_force",)}
+        poses = tuple(o.channel for o in self.outputs)
+        self.ports = tuple(
+            [
+                Port(
+                    axis,
+                    "motion+turn" if axis == "roll" else "motion",
+                    axis,
+                    poses,
+                    loads[axis],
+                    tuple(f"handle_{other}" for other in AXES if other != axis),
+                    ("axial_force", "curvature"),
+                )
+                for axis in AXES
+            ]
+            + [
+                Port(name, kind, name, poses)
+                for name, kind in (
+                    ("shape", "shape"),
+                    ("contact", "contact"),
+                    ("pose_sensor", "pose"),
+                    ("force_sensor", "forces"),
+                    ("base", "base"),
+                )
+            ]
+        )
+        units = {"insertion": "m", "roll": "rad", "knob": "rad"}
+        self.travel = (*((axis, f"handle_{axis}", units[axis]) for axis in AXES), ("force", "axial_force", "N"))
+        self.unlisted_at = tuple((axis, axis) for axis in AXES)
+        self.moves = {axis: f"handle_{axis}" for axis in AXES}
+        self.quiet_inputs = tuple(HANDLES)
+
+    def prepare(self, recording: Recording) -> Piece:
+        """Poses as positions and rotation matrices; forces bridged; loads derived."""
+        n = recording.n
+        channels = recording.channels
+        missing = np.full(n, np.nan)
+        inputs = {name: fill(channels[name]) for name in HANDLES}
+        for axis in AXES:
+            inputs[f"motion:{axis}"] = inputs[f"handle_{axis}"]
+        force = np.vstack([channels.get(name, missing) for name in FORCE])
+        poses = [np.vstack([channels.get(name, missing) for name in names]) for names in (TIP, SHAFT)]
+        extra: dict[str, Any] = {
+            "force": np.vstack(
+                [calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)]
+            )
+        }
+        for axis in AXES:
+            motion = inputs[f"handle_{axis}"]
+            extra[f"tolerance:{axis}"] = tolerance_of(motion, float(np.ptp(motion)))
+        units = {
+            "insertion": "m",
+            "output:insertion": "m",
+            "roll": "rad",
+            "output:roll": "rad",
+            "knob": "rad",
+            "output:knob": "1/m",
+            "shape": "1/m",
+            "contact": "N",
+            "pose_sensor": "m",
+            "force_sensor": "N",
+            "base": "m",
+            "axial_force": "N",
+            "curvature": "1/m",
+            "handle_insertion": "m",
+            "handle_roll": "rad",
+            "handle_knob": "rad",
+        }
+        extra["units"] = units
+        inputs["axial_force"] = self.normal @ extra["force"]
+        theta = np.array([p.grid[0] for p in self.parameters])
+        inputs["curvature"] = theta[4] * inputs["handle_knob"] + theta[5]
+        piece = Piece(
+            recording, np.full((len(self.outputs), n), np.nan), recording.fit, recording.heldout, inputs, extra=extra
+        )
+        given, extra["force"] = extra["force"], np.zeros((3, n))
+        run = self._run(piece, theta, [])
+        extra["force"] = given
+        extra["reference"] = (run["tip_R"], run["shaft_R"])
+        rows = []
+        for pose, reference in zip(poses, extra["reference"], strict=True):
+            norm = np.sqrt(np.sum(pose[3:] ** 2, axis=0))
+            good = np.isfinite(pose).all(axis=0) & (np.abs(norm - 1.0) < 0.05)
+            turn = rotation_logs(reference, matrices(np.where(good, pose[3:], np.array([1.0, 0.0, 0.0, 0.0])[:, None])))
+            rows += [np.where(good, pose[:3], np.nan), np.where(good, turn, np.nan)]
+        piece.y = np.vstack([*rows, force])
+        return piece
+
+    def _force_noise(self, recording: Recording, inputs: dict[str, Array], force: Array) -> list[tuple[float, float]]:
+        still = [quiescent([inputs[name] for name in HANDLES], recording.dt_s, recording.timed)]
+        found = [estimate([row], still) for row in force]
+        return [(noise.sigma, noise.correlation_samples) for noise in found]
+
+    def settle(self, piece: Piece, theta: Array) -> None:
+        """Recorded force as the shape's input: simulated contact force plus what of the difference is surely not noise.
+
+        Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant
+        of contact. Where the sensor says next to nothing (noise above FAINT of the force), the simulated force goes on
+        following the parameters in the fit, so that force and stiffness cannot drift off together.
+        """
+        recorded = piece.y[12:15]
+        if not np.isfinite(recorded).any():
+            piece.extra["force"] = self._run(piece, theta, [])["force"]
+            return
+        simulated = self.simulate(piece, theta, [])[12:15]
+        sigmas = [
+            by_steps(row, *s)
+            for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)
+        ]
+        beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
+        piece.extra["force"] = simulated + beyond
+        noise = max(self._force_noise(piece.recording, piece.inputs, recorded))[0]
+        if noise > FAINT * float(np.sqrt(np.mean(np.sum(piece.extra["force"] ** 2, axis=0)))):
+            piece.extra["beyond"] = beyond
+        else:
+            piece.extra.pop("beyond", None)
+        piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """The calibrated values of the TOML."""
+        return np.array([p.grid[0] for p in self.parameters])
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Outputs (15, n), free run from the handle and the recorded force."""
+        run = self._run(piece, theta, acts)
+        reference = piece.extra["reference"]
+        return np.vstack(
+            [
+                run["tip"],
+                rotation_logs(reference[0], run["tip_R"]),
+                run["shaft"],
+                rotation_logs(reference[1], run["shaft_R"]),
+                run["force"],
+            ]
+        )
+
+    def links(self, piece: Piece, theta: Array, acts: list[Act]) -> tuple[Array, Array, Array]:
+        """Insertion, roll and curvature (n,) behind the three axes."""
+        out = []
+        for index, axis in enumerate(AXES):
+            signal = apply_acts(piece.inputs[f"handle_{axis}"], acts, axis, piece, "input")
+            signal = theta[2 * index] * signal + theta[2 * index + 1]
+            out.append(apply_acts(signal, acts, axis, piece, "output"))
+        return out[0], out[1], out[2]
+
+    def _run(self, piece: Piece, theta: Array, acts: list[Act]) -> dict[str, Any]:
+        insertion, roll, kappa = self.links(piece, theta, acts)
+        n = piece.n
+        state: dict[str, Any] = {
+            "insertion": insertion,
+            "roll": roll,
+            "kappa": kappa,
+            "flex": np.full(n, 1.0 / theta[6]),
+            "extra": np.zeros((3, n)),
+            "load": np.zeros((3, n)),
+            "point": np.zeros((3, n)),
+            "point_at": np.zeros(n),
+            "push": piece.extra["force"],
+            "shift": np.zeros((3, n)),
+            "normal": self.normal,
+            "distal": self.spec.distal_length_m,
+        }
+        state["push"] = 2.0 * state["push"] - _vector(state["push"], acts, "force_sensor", piece)
+        prompt = state["push"]
+        state = _changed(state, acts, "shape", piece)
+        slow = state["push"] - prompt
+        state = _changed(state, acts, "base", piece)
+        shape = self._shapes(piece, state)
+        free, soft = shape[4:]
+        placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
+        law: dict[str, Any] = {
+            "gap": self.normal @ placed - theta[7] - (self.normal @ soft) * (self.normal @ slow),
+            "stiffness": np.full(n, theta[8]),
+            "exponent": 1.0,
+            "reference": 1e-3,
+            "damping": 0.0,
+            "crossley": 0.0,
+            "relax": 0.0,
+            "relax_time": 0.0,
+            "friction": 0.0,
+            "friction_distance": 1e-3,
+        }
+        law = _changed(law, acts, "contact", piece)
+        normal_force = _pressed(law, self.normal @ soft, piece.recording.dt_s)
+        force = self.normal[:, None] * normal_force
+        if "beyond" in piece.extra:
+            shape = self._shapes(piece, {**state, "push": force + piece.extra["beyond"]})
+        run = _posed(shape, state)
+        if law["friction"]:
+            along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
+            drag = law["friction"] * drag_along(along, law["friction_distance"])
+            normal_force = _pressed(law, self.normal @ soft + np.sum(soft * drag, axis=0), piece.recording.dt_s)
+            force = (self.normal[:, None] + drag) * normal_force
+        run["force"] = _vector(force, acts, "force_sensor", piece)
+        return _changed(run, acts, "pose_sensor", piece)
+
+    def _shapes(self, piece: Piece, state: dict[str, Any]) -> tuple[Array, ...]:
+        """Kernel call; the last two results are kept, since contact and sensors change without the shape."""
+        key = tuple(
+            hash(np.ascontiguousarray(state[name]).tobytes())
+            for name in ("insertion", "roll", "kappa", "push", "extra", "load", "point", "point_at", "flex")
+        )
+        kept: dict[Any, tuple[Array, ...]] = piece.extra.setdefault("kept", {})
+        if key not in kept:
+            while len(kept) > 1:
+                kept.pop(next(iter(kept)))
+            kept[key] = shapes(
+                state["insertion"],
+                state["roll"],
+                state["kappa"],
+                -state["push"],
+                state["extra"],
+                state["load"],
+                state["point"],
+                state["point_at"],
+                state["flex"],
+                1.0 / self.spec.torsion_to_bending,
+                self.spec.distal_length_m,
+                self.spec.shaft_sensor_offset_m,
+                self.normal,
+                NODES,
+                WEIGHTS,
+            )
+        return kept[key]
+
+    def change(self, piece: Piece, theta: Array, S: dict[str, Array], candidate: Candidate, values: Array) -> Array:
+        """Linearized change of outputs (15, n) by a candidate at an axis, for screening. `S`: sensitivity of each axis."""
+        axis = candidate.port.name
+        index = AXES.index(axis)
+        q = piece.inputs[f"handle_{axis}"]
+        gain = theta[2 * index]
+        side = candidate.effect.side
+        signal = q if side == "input" else gain * q + theta[2 * index + 1]
+        moved = apply_acts(signal, [(candidate, values)], axis, piece, side) - signal
+        return np.asarray(S[axis] * (moved if side == "input" else moved / gain))
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """Handle motion at the axes; else a signal of the port's unit that shows its size."""
+        if port.name in AXES:
+            return piece.inputs[f"handle_{port.name}"]
+        if port.name in ("contact", "force_sensor"):
+            return piece.inputs["axial_force"]
+        return piece.inputs["curvature"] if port.name == "shape" else np.nan_to_num(piece.y[0]) - np.nan_to_num(piece.y[2])
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """What the port would have to add: least squares over the pose rows by the port's sensitivity; residual
+        itself at the sensors.
+        """
+        if port.name in AXES:
+            S = self.sensitivity(piece, theta, port.name)
+            weight = piece.extra.get("weight", np.ones(len(self.outputs)))[:12, None]
+            r = np.nan_to_num(residual[:12]) / weight
+            s = np.where(np.isfinite(residual[:12]), S[:12], 0.0) / weight
+            return np.asarray(np.sum(s * r, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300))
+        row = 14 if port.name in ("contact", "force_sensor") else 0
+        return np.asarray(residual[row])
+
+    def sensitivity(self, piece: Piece, theta: Array, axis: str, acts: list[Act] | None = None) -> Array:
+        """Change of outputs (15, n) per change of the signal that enters `axis`, by a central difference."""
+        index = AXES.index(axis)
+        step = 1e-5 if axis == "insertion" else 1e-4
+        out = []
+        for sign in (1.0, -1.0):
+            moved = theta.copy()
+            moved[2 * index + 1] += sign * step * theta[2 * index]
+            out.append(self.simulate(piece, moved, acts or []))
+        return np.asarray((out[0] - out[1]) / (2.0 * step))
+
+
+def _pressed(law: dict[str, Any], soft: Array, dt_s: float) -> Array:
+    """Normal force (n,) of the contact law on a shaft of compliance `soft` (n,) along the normal."""
+    return np.asarray(
+        contact(
+            law["gap"],
+            soft,
+            law["stiffness"],
+            law["exponent"],
+            law["reference"],
+            law["damping"],
+            law["crossley"],
+            law["relax"],
+            law["relax_time"],
+            dt_s,
+        )
+    )
+
+
+def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:
+    """Tip and shaft of `shape` where the base has moved them."""
+    run: dict[str, Any] = dict(zip(("tip", "tip_R", "shaft", "shaft_R"), shape, strict=False))
+    for name in ("tip", "shaft"):
+        run[name] = run[name] + state["shift"]
+        if "turn" in state:
+            run[name] = np.einsum("abn,bn->an", state["turn"], run[name])
+            run[f"{name}_R"] = np.einsum("abn,bcn->acn", state["turn"], run[f"{name}_R"])
+    return run
+
+
+def _changed(state: dict[str, Any], acts: list[Act], port: str, piece: Piece) -> dict[str, Any]:
+    """`state` after the acts at a port of the rig's own kinds; they change it by key."""
+    here = sorted((act for act in acts if act[0].port.name == port), key=lambda act: act[0].effect.order)
+    if not here:
+        return state
+    state = dict(state)
+    for candidate, values in here:
+        if candidate.effect.apply is not None:
+            state = candidate.effect.apply(state, _context(piece, candidate.source), values, candidate.form)  # type: ignore[arg-type,assignment]
+    return state
+
+
+def _vector(force: Array, acts: list[Act], port: str, piece: Piece) -> Array:
+    """A force (3, n) as its sensor would read it."""
+    for candidate, values in sorted((act for act in acts if act[0].port.name == port), key=lambda act: act[0].effect.order):
+        if candidate.effect.apply is not None:
+            force = candidate.effect.apply(force, _context(piece, candidate.source), values, candidate.form)
+    return force
+
+
+def _context(piece: Piece, source: str) -> Context:
+    return Context(
+        piece.recording.time_s,
+        piece.recording.dt_s,
+        piece.inputs["motion:insertion"],
+        0.0,
+        0.0,
+        piece.inputs[source] if source else None,
+        piece.extra,
+    )

@@ -1,0 +1,124 @@
+"""Motion in, motion out: each link is output = gain * input + offset, with ports before and after the gain."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.nominal import LinkSpec, NominalSpec
+from host.diagnosis.model.operators import lag
+
+Array = npt.NDArray[np.float64]
+
+
+class Transmission:
+    """Nominal model of kind `transmission`; several links may share channels."""
+
+    kind = "transmission"
+    fit_samples = 24000
+    coarsest_s = 0.02
+    screen_samples = 24000
+    taken: frozenset[str] = frozenset()
+
+    def __init__(self, spec: NominalSpec) -> None:
+        self.links: list[LinkSpec] = spec.link
+        self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        names = [
+            link.subsystem if len(spec.link) == 1 or _alone(link, spec) else f"{link.subsystem}_{link.output}"
+            for link in spec.link
+        ]
+        self.names = names
+        self.outputs = tuple(Output(link.output, self.units[link.output], link.subsystem) for link in self.links)
+        ports: list[Port] = []
+        parameters: list[Parameter] = []
+        for name, link in zip(names, self.links, strict=True):
+            turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
+            ports += [
+                Port(name, turn, link.subsystem, (link.output,), tuple(link.load), tuple(link.others)),
+                Port(f"{name}_reading", "drift", link.subsystem, (link.output,)),
+            ]
+            prefix = "" if len(self.links) == 1 else f"{name}_"
+            ratio = (
+                ""
+                if self.units[link.input] == self.units[link.output]
+                else f"{self.units[link.output]}/{self.units[link.input]}"
+            )
+            for key, unit, default in (("gain", ratio, 1.0), ("offset", self.units[link.output], 0.0)):
+                value, free = spec.start(prefix + key, default)
+                bound = np.inf if free else value
+                parameters.append(Parameter(prefix + key, unit, (value,), -bound if free else value, bound, linear=True))
+            for order in range(link.lag_order):
+                value, _ = spec.start(f"{prefix}time_constant_{order + 1}", 1.0)
+                parameters.append(Parameter(f"{prefix}time_constant_{order + 1}", "s", (value,), 1e-6, 1e6, log=True))
+        self.ports, self.parameters = tuple(ports), tuple(parameters)
+        used = dict.fromkeys(name for link in self.links for name in (link.input, *link.load))
+        self.travel = tuple((name.replace("_", " "), name, self.units[name]) for name in used)
+        self.unlisted_at = tuple((name, name) for name in names)
+        self.moves = {name: link.input for name, link in zip(names, self.links, strict=True)}
+        self.quiet_inputs = tuple(
+            dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load])
+        )
+
+    def prepare(self, recording: Recording) -> Piece:
+        """Inputs bridged, outputs stacked."""
+        names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *link.others)))
+        piece = Piece(
+            recording,
+            stack(recording, [link.output for link in self.links]),
+            recording.fit,
+            recording.heldout,
+            filled(recording, names),
+        )
+        units: dict[str, str] = dict(self.units)
+        for name, link in zip(self.names, self.links, strict=True):
+            motion = piece.inputs[link.input]
+            piece.extra[f"tolerance:{name}"] = tolerance_of(motion, float(np.ptp(motion)))
+            units[name], units[f"output:{name}"] = self.units[link.input], self.units[link.output]
+            units[f"{name}_reading"] = self.units[link.output]
+        piece.extra["units"] = units
+        return piece
+
+    def guess(self, pieces: list[Piece]) -> Array:
+        """Start values of the TOML; linear parameters find their place from anywhere."""
+        return np.array([p.grid[0] for p in self.parameters])
+
+    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+        """Every link's output, free run. Shape (outputs, n)."""
+        out = np.empty_like(piece.y)
+        at = 0
+        for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
+            signal = apply_acts(piece.inputs[link.input], acts, name, piece, "input")
+            signal = theta[at] * signal + theta[at + 1]
+            for constant in theta[at + 2 : at + 2 + link.lag_order]:
+                signal = lag(signal, piece.recording.dt_s, float(constant))
+            at += 2 + link.lag_order
+            signal = apply_acts(signal, acts, name, piece, "output")
+            out[row] = apply_acts(signal, acts, f"{name}_reading", piece, None)
+        return out
+
+    def motion(self, piece: Piece, port: Port) -> Array:
+        """Nominal input of the link, or its measured output for the reading port."""
+        for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
+            if port.name == name:
+                return piece.inputs[link.input]
+            if port.name == f"{name}_reading":
+                return np.where(np.isfinite(piece.y[row]), piece.y[row], np.nanmedian(piece.y[row]))
+        raise KeyError(port.name)
+
+    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+        """Residual divided by the gain."""
+        at = 0
+        for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
+            if port.name == name:
+                return np.asarray(residual[row] / (theta[at] or 1.0))
+            if port.name == f"{name}_reading":
+                return np.asarray(residual[row])
+            at += 2 + link.lag_order
+        raise KeyError(port.name)
+
+
+def _alone(link: LinkSpec, spec: NominalSpec) -> bool:
+    return sum(other.subsystem == link.subsystem for other in spec.link) == 1

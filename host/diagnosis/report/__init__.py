@@ -1,0 +1,1 @@
+"""The result of a diagnosis: verdict, pictures and page."""

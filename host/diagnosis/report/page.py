@@ -1,0 +1,222 @@
+"""The report of a diagnosis: one HTML file that a rig engineer reads top down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from textwrap import wrap
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from host.diagnosis.pipeline import Diagnosis
+from host.diagnosis.report.pictures import pictures, shown
+from host.diagnosis.report.quantities import interval, quantity, short
+
+TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
+NBSP = "\u00a0"
+
+
+class Line(NamedTuple):
+    """One figure with its name and what it is held against."""
+
+    name: str
+    value: str
+    beside: str = ""
+
+
+class Row(NamedTuple):
+    """One candidate of the table."""
+
+    step: str
+    name: str
+    likelihood: str
+    p_value: str
+    share: str
+    taken: bool
+
+
+def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    piece, _, row = shown(result)
+    samples = sum(p.n for p in result.full.pieces)
+    text = environment.get_template("diagnosis.html.j2").render(
+        title=headline(result, verdict),
+        eyebrow=f"Diagnosis of {result.spec.name}",
+        lead=lead(result, verdict),
+        footer=f"{len(result.full.pieces)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
+        lines=lines(result, verdict),
+        pictures=pictures(result),
+        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
+        nominal=_nominal(result),
+        candidates=candidates(result),
+        located=[{**place, "times": times(place)} for place in verdict["located"]],
+        scripts=[Path(path).name for path in verdict.get("scripts", ())],
+        on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
+        partly=result.rest.left,
+        noises=_noises(result),
+        output=result.model.outputs[row].channel.replace("_", " "),
+        recording=piece.recording.name,
+        switches=switches(result),
+        heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
+        verdict=verdict["verdict"],
+    )
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def words(effect_id: str) -> str:
+    """An id as people write it."""
+    return effect_id.replace("_", " ")
+
+
+def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
+    """The verdict in one sentence."""
+    names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
+    if verdict["verdict"] == "nothing_missing":
+        return "Nothing is missing: the nominal model explains these recordings"
+    if verdict["verdict"] == "mismatch_not_identified":
+        return "There is a mismatch, and no known effect accounts for it"
+    return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1])
+
+
+def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
+    """What stands under the verdict."""
+    fit = verdict["fit"]
+    unit = fit["unit"]
+    if verdict["verdict"] == "nothing_missing":
+        return "No effect of the vocabulary improves the fit of recordings that were not used to fit."
+    it = "it" if len(verdict["effects"]) == 1 else "them"
+    said = f"With {it} the error on recordings that were not used to fit falls from "
+    before, after = (quantity(fit[key], unit).replace(" ", NBSP) for key in ("rmse_before", "rmse_after"))
+    said += f"{before} to {after}."
+    if verdict["verdict"] == "mismatch_not_identified":
+        return (
+            "What was tried stands below; its parts are probably stand-ins for something else."
+            if verdict["effects"]
+            else "Windows and conditions stand below."
+        )
+    return said
+
+
+def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
+    """Key figures."""
+    fit = verdict["fit"]
+    before, after, noise = (
+        quantity(fit[key], fit["unit"]).replace(" ", NBSP) for key in ("rmse_before", "rmse_after", "noise_floor")
+    )
+    found = [Line("held-out error, nominal", before, "refitted"), Line("held-out error, extended", after, f"noise {noise}")]
+    if verdict["located"]:
+        found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
+    if result.found.best.terms:
+        found.append(Line("mismatch still left", f"{100 * result.rest.left:.1f}{NBSP}%", "of what was above noise"))
+    return found
+
+
+def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
+    """Name and unit of every effect's parameters by their keys."""
+    return {p.key: (p.name, p.unit) for term in result.found.best.terms for p in term.parameters}
+
+
+def times(place: dict[str, Any], most: int = 3) -> str:
+    """When a place is at fault: the longest windows, recording by recording."""
+    told = []
+    for name, spans in place["windows_by_recording"].items():
+        longest = sorted(sorted(spans, key=lambda s: s[0] - s[1])[:most])
+        if spans:
+            more = f" and {len(spans) - most} more" if len(spans) > most else ""
+            told.append(f"{name}: " + ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest) + more)
+    return "; ".join(told[:most]) + (f"; and {len(told) - most} more recordings" if len(told) > most else "")
+
+
+def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
+    """An effect with its numbers as text."""
+    rows = []
+    for key, p in effect["parameters"].items():
+        name, unit = units.get(key, (key, ""))
+        low, high = p["ci95"]
+        rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"])))
+    return {
+        **effect,
+        "name": words(effect["id"]),
+        "where": words(effect["subsystem"]),
+        "rows": rows,
+        "alike": [words(name.replace("@", " at ")) for name in effect["indistinguishable_from"]],
+        "script": [
+            line
+            for text in effect["experiment_to_tell_apart"].splitlines()
+            for line in wrap(text, 88, subsequent_indent="    ")
+        ],
+        "gain": short(effect["evidence"]["heldout_log_likelihood_gain"]),
+        "p": short(effect["evidence"]["p_value"]),
+    }
+
+
+def switches(result: Diagnosis) -> tuple[str, str]:
+    """What switches the effects on in the nominal model: options of the command line, and lines for its TOML file."""
+    options, tables = [], []
+    at = len(result.model.parameters)
+    for term in result.found.best.terms:
+        values = result.found.best.values[at : at + len(term.parameters)]
+        at += len(term.parameters)
+        c = term.candidate
+        if c.effect.id == "unlisted":
+            continue
+        texts = {key: text for key, text in (("source", c.source), ("form", c.form)) if text}
+        numbers = {p.key: f"{float(v):.6g}" for p, v in zip(term.parameters, values, strict=True) if p.high > p.low}
+        told = [f"{key}={value}" for key, value in (texts | numbers).items()]
+        options.append(f"--effect '{c.effect.id}@{c.port.name}:{','.join(told)}'")
+        lines_ = [
+            f'id = "{c.effect.id}"',
+            f'at = "{c.port.name}"',
+            *(f'{key} = "{value}"' for key, value in texts.items()),
+            "values = { " + ", ".join(f"{key} = {value}" for key, value in numbers.items()) + " }",
+        ]
+        tables.append("\n".join(["[[effect]]", *lines_]))
+    return "\n".join(options), "\n\n".join(tables)
+
+
+def candidates(result: Diagnosis) -> list[Row]:
+    """What was fitted in full, step by step."""
+    rows = []
+    for count, step in enumerate(result.found.steps, start=1):
+        if step.move == "backward":
+            rows.append(
+                Row(
+                    str(count),
+                    f"{words(step.key)} dropped again",
+                    short(step.gain.log_likelihood),
+                    short(step.gain.p_value),
+                    "",
+                    False,
+                )
+            )
+        for trial in step.trials[:6]:
+            rows.append(
+                Row(
+                    str(count),
+                    words(trial.candidate.key.replace("@", " at ").replace("(", " (")),
+                    short(trial.heldout.log_likelihood),
+                    short(trial.heldout.p_value),
+                    f"{100 * trial.heldout.share:.1f} %",
+                    trial.candidate.key == step.key,
+                )
+            )
+    return rows
+
+
+def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
+    spans = result.intervals
+    return [
+        (words(p.name), quantity(float(v), p.unit), interval(a, b, p.unit, float(v)) if p.high > p.low else "held")
+        for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)
+    ]
+
+
+def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
+    return [
+        (words(o.channel), quantity(n.sigma, o.unit), f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+        for o, n in zip(result.model.outputs, result.full.noise, strict=True)
+    ]

@@ -1,0 +1,224 @@
+"""Pictures of a diagnosis: the chain with its faulty link, recording against both models, the loop, the fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from host.diagnosis.model.effect import Port
+from host.diagnosis.model.model import Piece
+from host.diagnosis.pipeline import Diagnosis
+from host.diagnosis.report.quantities import scaled
+from host.diagnosis.selection.locate import joined
+from host.report.style import ESTIMATED, FAINT, INK, MEASURED, MUTED, TRUTH, Picture, legend_above, picture, thinned
+
+Array = npt.NDArray[np.float64]
+FAULT, SHADE = "#b03a32", "#f6e3da"
+ORDER = ("base", "insertion", "roll", "knob", "shape", "contact", "pose_sensor", "force_sensor")  # along the rig
+ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9}
+SIDE_BY_SIDE = ("pose_sensor", "force_sensor")
+
+
+def shown(result: Diagnosis) -> tuple[Piece, int, int]:
+    """The held-out recording (piece, its index) and output that show the mismatch best."""
+    row = result.figures.primary
+
+    def gain(index: int) -> float:
+        piece = result.full.pieces[index]
+        mask = piece.heldout
+        if not mask.any():
+            return -1.0
+        change = result.found.nominal_full.residuals[index][row][mask] - result.found.best_full.residuals[index][row][mask]
+        return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
+
+    index = max(range(len(result.full.pieces)), key=gain)
+    return result.full.pieces[index], index, row
+
+
+def chain(result: Diagnosis) -> Picture:
+    """The links from input to output; those at fault in red."""
+    names = list(dict.fromkeys(port.subsystem for port in result.model.ports))
+    names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
+    if len(names) == 1:
+        names = [result.model.quiet_inputs[0], *names, result.model.outputs[0].channel]
+    bad = {location.subsystem for location in result.located}
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        axes.set_axis_off()
+        per_row = 3 if narrow else 4
+        rows = int(np.ceil(len(names) / per_row))
+        axes.set(xlim=(-0.5, per_row - 0.5), ylim=(-rows + 0.45, 0.55))
+        for k, name in enumerate(names):
+            x, y = k % per_row, -(k // per_row)
+            colour = FAULT if name in bad else INK
+            axes.text(
+                x,
+                y,
+                name.replace("_", " "),
+                ha="center",
+                va="center",
+                color=colour,
+                fontsize=9.5,
+                fontweight="bold" if name in bad else "normal",
+                bbox={
+                    "boxstyle": "round,pad=0.45",
+                    "fc": SHADE if name in bad else "#ffffff",
+                    "ec": colour if name in bad else FAINT,
+                },
+            )
+            if x == 0 and k > 0:
+                axes.annotate("", (-0.31, y), (-0.48, y), arrowprops=ARROW)
+            if k + 1 < len(names) and (name, names[k + 1]) != SIDE_BY_SIDE:
+                last = x == per_row - 1
+                axes.annotate("", (x + (0.48 if last else 0.62), y), (x + (0.31 if last else 0.40), y), arrowprops=ARROW)
+
+    words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
+    height = 0.55 * np.ceil(len(names) / 4) + 0.1
+    return picture(draw, float(height), float(0.55 * np.ceil(len(names) / 3) + 0.1), "The chain", words, "")
+
+
+def over_time(result: Diagnosis) -> Picture:
+    """Recording and both models, and below what each leaves; windows of the mismatch shaded."""
+    piece, index, row = shown(result)
+    output = result.model.outputs[row]
+    t = piece.recording.time_s + piece.recording.begin_s
+    size, unit = scaled(output.unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
+    y = piece.y[row] / size
+    nominal = y - result.found.nominal_full.residuals[index][row] / size
+    best = y - result.found.best_full.residuals[index][row] / size
+    spans = joined([span for place in result.located for span in place.windows_s[piece.recording.name]])
+    floor = result.figures.floor[row] / size
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.0))
+        for axes in (top, bottom):
+            for a, b in spans:
+                axes.axvspan(a, b, color=SHADE, lw=0)
+        bins = 300 if narrow else 700
+        for values, colour, label, width in (
+            (y, MEASURED, "recorded", 1.6),
+            (nominal, FAULT, "nominal, refitted", 1.0),
+            (best, INK, "extended", 1.0),
+        ):
+            if label != "extended" or result.found.best.terms:
+                top.plot(*thinned(t, values, bins), color=colour, lw=width, label=label)
+        bottom.axhspan(-floor, floor, color="#e6edf3", lw=0)
+        bottom.plot(*thinned(t, y - nominal, bins), color=FAULT, lw=0.9)
+        if result.found.best.terms:
+            bottom.plot(*thinned(t, y - best, bins), color=INK, lw=0.9)
+        top.set_ylabel(f"{output.channel.replace('_', ' ')} ({unit})")
+        bottom.set_ylabel(f"left ({unit})")
+        bottom.set_xlabel("time (s)" if piece.recording.timed else "sample")
+        legend_above(top, 2 if narrow else 3)
+
+    unused = "" if piece.fit.any() else ", not used to fit"
+    caption = f"Recording {piece.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
+    return picture(
+        draw,
+        4.3,
+        4.6,
+        "Recording and models over time",
+        f"{output.channel} over time: recorded, nominal and extended model.",
+        caption,
+    )
+
+
+def loop(result: Diagnosis) -> Picture | None:
+    """Input against what the nominal model leaves: memory shows as a loop."""
+    ports = {port.name: port for port in result.model.ports}
+    name = next(
+        (
+            term.candidate.port.name
+            for term in result.found.best.terms
+            if term.candidate.port.kind.split("+")[0] in ("motion", "force")
+        ),
+        None,
+    )
+    if name is None:
+        return None
+    port: Port = ports[name]
+    piece, index, _ = shown(result)
+    row = most_moved(result, index, port.subsystem)
+    size, unit = scaled(result.model.outputs[row].unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
+    x = result.model.motion(piece, port)
+    left = result.found.nominal_full.residuals[index][row] / size
+    extra = left - result.found.best_full.residuals[index][row] / size
+    travel = next(
+        (f"{words} ({unit})" for words, key, unit in result.model.travel if key.endswith(name)), result.model.travel[0][0]
+    )
+    if port.kind.startswith("motion") and name not in ("insertion", "roll", "knob"):
+        travel = f"{result.model.travel[0][0]} ({result.model.travel[0][2]})"
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes: Axes = figure.add_subplot()
+        step = max(1, x.size // 6000)
+        axes.plot(x[::step], left[::step], ".", color=ESTIMATED, ms=2.0, label="recording minus nominal")
+        axes.plot(x[::step], extra[::step], color=INK, lw=1.0, label="what the effects add")
+        axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
+        legend_above(axes, 1 if narrow else 2)
+
+    return picture(
+        draw,
+        3.3,
+        3.0,
+        "Loop",
+        "Input against what the nominal model leaves, and what the effects add.",
+        "A loop means memory or rate; a single curve means neither.",
+    )
+
+
+def most_moved(result: Diagnosis, index: int, subsystem: str) -> int:
+    """The output in which the effects at `subsystem` show most, over the noise."""
+    channels = [channel for place in result.located if place.subsystem == subsystem for channel in place.channels]
+    rows = [row for row, output in enumerate(result.model.outputs) if output.channel in channels]
+
+    def weight(row: int) -> float:
+        full = result.found
+        change = full.nominal_full.residuals[index][row] - full.best_full.residuals[index][row]
+        good = change[np.isfinite(change)]
+        return float(np.std(good)) / max(result.figures.floor[row], 1e-300) if good.size else 0.0
+
+    return max(rows, key=weight) if rows else result.figures.primary
+
+
+def before_after(result: Diagnosis) -> Picture:
+    """RMS error on held-out samples of every output, before and after, over the noise."""
+    figures = result.figures
+    rows = [row for row in range(len(figures.before)) if np.isfinite(figures.before[row])]
+    names = [result.model.outputs[row].channel.replace("_", " ") for row in rows]
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        place = np.arange(len(rows))[::-1]
+        before, after = figures.before[rows] / figures.floor[rows], figures.after[rows] / figures.floor[rows]
+        axes.hlines(place, after, before, color=FAINT, lw=4)
+        axes.plot(before, place, "o", color=FAULT, ms=5, label="nominal, refitted")
+        axes.plot(after, place, "o", color=INK, ms=5, label="extended")
+        axes.axvline(1.0, color=TRUTH, lw=0.9, ls=":")
+        axes.set_xscale("log")
+        axes.set_yticks(place, names)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set(
+            xlabel="RMS error on held-out samples, in units of the noise (dotted: the noise itself)",
+            ylim=(-0.6, len(rows) - 0.4),
+        )
+        if narrow:
+            axes.set_xlabel("held-out error / noise")
+        axes.margins(x=0.08)
+        legend_above(axes, 2)
+
+    height = 0.24 * len(rows) + 0.95
+    return picture(draw, height, height + 0.1, "Fit before and after", "Held-out error of each output before and after.", "")
+
+
+def pictures(result: Diagnosis) -> dict[str, Any]:
+    """All pictures of the report by name."""
+    return {"chain": chain(result), "time": over_time(result), "loop": loop(result), "fit": before_after(result)}

@@ -1,0 +1,156 @@
+"""The findings as the JSON object that the contract asks for, with one plain sentence for each effect."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from host.diagnosis.design.experiment import lines as experiment_lines
+from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.pipeline import Diagnosis, Location, rms
+from host.diagnosis.selection.equivalence import Standing
+from host.diagnosis.selection.locate import joined
+
+NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the rest is said not to be noise
+PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
+
+
+def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
+    """One JSON object exactly as the contract has it."""
+    figures = result.figures
+    primary = figures.primary
+    per_channel = {
+        output.channel: {
+            "rmse_before": figures.before[row],
+            "rmse_after": figures.after[row],
+            "noise_floor": figures.floor[row],
+            "unit": output.unit,
+            "whiteness_p_before": figures.white_before[row],
+            "whiteness_p_after": figures.white_after[row],
+        }
+        for row, output in enumerate(result.model.outputs)
+        if np.isfinite(figures.before[row])
+    }
+    return {
+        "verdict": result.verdict,
+        "located": [_located(location) for location in result.located],
+        "effects": effects(result),
+        "fit": {
+            "heldout": True,
+            "rmse_before": figures.before[primary],
+            "rmse_after": figures.after[primary],
+            "noise_floor": figures.floor[primary],
+            "unit": result.model.outputs[primary].unit,
+            "per_channel": per_channel,
+            "per_recording": per_recording(result),
+            "nominal_parameters": nominal_parameters(result),
+            "whiteness_p_before": figures.white_before[primary],
+            "whiteness_p_after": figures.white_after[primary],
+        },
+        "seconds": seconds,
+    }
+
+
+def _located(location: Location) -> dict[str, Any]:
+    return {
+        "subsystem": location.subsystem,
+        "channels": location.channels,
+        "windows_s": every_window(location),
+        "windows_by_recording": {name: [list(span) for span in spans] for name, spans in location.windows_s.items()},
+        "condition": location.condition.says if location.condition else "all along",
+        "residual_share": location.residual_share,
+    }
+
+
+def nominal_parameters(result: Diagnosis) -> dict[str, dict[str, Any]]:
+    """Parameters of the nominal model as refitted beside the effects, with intervals."""
+    return {
+        p.key: {"value": float(v), "ci95": [float(a), float(b)]}
+        for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, result.intervals, strict=False)
+    }
+
+
+def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
+    """RMS error before and after of every channel in every recording that was held out, by their names."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for piece, before, after in zip(
+        result.full.pieces, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True
+    ):
+        if piece.heldout.any():
+            found[piece.recording.name] = {
+                output.channel: {"rmse_before": rms([b[piece.heldout]]), "rmse_after": rms([a[piece.heldout]])}
+                for output, b, a in zip(result.model.outputs, before, after, strict=True)
+                if np.isfinite(b[piece.heldout]).any()
+            }
+    return found
+
+
+def every_window(location: Location) -> list[list[float]]:
+    """Windows of all recordings in order, those that overlap made one: recordings may lie on one clock, or each start
+    at zero.
+    """
+    return [list(span) for span in joined([span for spans in location.windows_s.values() for span in spans])]
+
+
+def effects(result: Diagnosis) -> list[dict[str, Any]]:
+    """One entry for every effect of the best model, strongest evidence first."""
+    entries = []
+    at = len(result.model.parameters)
+    for term, standing in zip(result.found.best.terms, result.standings, strict=True):
+        count = len(term.parameters)
+        values, spans = result.found.best.values[at : at + count], result.intervals[at : at + count]
+        at += count
+        entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
+    ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
+    white = result.figures.white_after[result.figures.primary] > NOT_WHITE
+    if ranked and result.rest.sure and result.rest.left > PARTLY:
+        ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of it is left."
+    elif ranked and not white:
+        ranked[0]["says"] += " What is left on held-out samples is small but not yet white noise."
+    return ranked
+
+
+def _effect(
+    result: Diagnosis, parameters: tuple[Parameter, ...], values: Any, spans: Any, standing: Standing
+) -> dict[str, Any]:
+    candidate = standing.candidate
+    shown = {
+        p.key: {"value": float(v), "ci95": [float(a), float(b)]}
+        for p, v, (a, b) in zip(parameters, values, spans, strict=True)
+        if p.high > p.low
+    }
+    return {
+        "id": candidate.effect.id,
+        "subsystem": candidate.port.subsystem,
+        "says": sentence(candidate, parameters, values),
+        "equation": equation(candidate),
+        "parameters": shown,
+        "evidence": {"heldout_log_likelihood_gain": standing.gain.log_likelihood, "p_value": standing.gain.p_value},
+        "indistinguishable_from": [other.name for other in standing.alike],
+        "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
+    }
+
+
+def sentence(candidate: Candidate, parameters: tuple[Parameter, ...], values: Any) -> str:
+    """The effect's own words with its values put in."""
+    against = candidate.effect.id.endswith("friction") and all(
+        float(v) <= 0.0 for p, v in zip(parameters, values, strict=True) if p.linear
+    )
+    text = {
+        p.name: f"{abs(float(v)) if against else float(v):.3g} {p.unit}".strip()
+        for p, v in zip(parameters, values, strict=True)
+    }
+    text["source"] = candidate.source.replace("_", " ")
+    said = re.sub(r"\{(\w+)\}", lambda m: text.get(m.group(1), m.group(1)), candidate.effect.says)
+    return said[:1].upper() + said[1:] + (" The output counts it negative." if against else "")
+
+
+def equation(candidate: Candidate) -> str:
+    """The effect's equation, its load or other channel named."""
+    return (
+        re.sub(r"\b(load|other)\b", candidate.source, candidate.effect.equation)
+        if candidate.source
+        else candidate.effect.equation
+    )

@@ -1,0 +1,1 @@
+"""Which effects are missing: screening, search, indistinguishable models, localization."""

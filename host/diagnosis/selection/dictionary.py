@@ -1,0 +1,391 @@
+"""Is the rest foretold by anything: simple forms of the recorded signals, each seen through the nominal model.
+
+A form is a product, a power, a wave or a memory (play, lag) of signals, of no parameter but its size. Its response is what
+the model's outputs would change if it were added at a port. Forms are weighed where the outputs are precise (in contact the
+force shows micrometres of insertion, free motion does not), seen past the nominal parameters, chosen on samples to fit,
+judged on those held out: sparse regression on a library (Brunton, Proctor, Kutz 2016), memory added, by a known noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import compare
+from host.diagnosis.estimation.fit import Fit, Problem, Term, free, size_of
+from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale
+from host.diagnosis.model.model import Piece
+from host.diagnosis.model.operators import lag, play
+
+Array = npt.NDArray[np.float64]
+PLAYS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # widths, parts of the span
+LAGS_S = (0.05, 0.2, 0.6, 2.0, 6.0)
+WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
+MOST_SIGNALS = 4
+MOST_FORMS = 2  # joined to foretell
+BEST = 6  # forms that are worth a refit
+AS_SHORT = 0.03  # of its gain a shorter form may lack and still be taken
+SURE_LIKELIHOOD = 8.0  # log-likelihood that forms have to gain, in either part, before a rest counts as mismatch
+SMALLEST_SHARE = 0.02  # of some output's error
+SURE = 0.2  # p-value over held-out blocks; few of them may hold all of the mismatch
+NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
+
+
+@dataclass(frozen=True)
+class Form:
+    """`text` in names of columns; `evaluate` gives (n,) of a recording; `length`: symbols in it."""
+
+    text: str
+    evaluate: Callable[[Piece], Array]
+    length: int
+
+
+@dataclass(frozen=True)
+class Foretold:
+    """What the best forms at one place take from the rest. `forms`: the singles worth a refit with their sizes, best first;
+    `port`: None for a reading.
+    """
+
+    subsystem: str
+    port: Port | None
+    log_likelihood: float
+    p_value: float
+    share: float
+    trained: float
+    forms: tuple[tuple[Form, float], ...] = ()
+    power: float = 0.0  # fall of the held-out squared error, over noise, summed over outputs
+
+    @property
+    def sure(self) -> bool:
+        """Whether the rest is foretold better than chance allows, on samples to fit and on those held out."""
+        return (
+            min(self.log_likelihood, self.trained) > SURE_LIKELIHOOD and self.share > SMALLEST_SHARE and self.p_value < SURE
+        )
+
+
+def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
+    """The library at one port: its motion, the signals beside it, their rates, magnitudes, waves, memory and products."""
+    signals = [s for s in _signals(problem, fit, port) if s.span > 1e-9 * s.largest][:MOST_SIGNALS]
+    timed = problem.pieces[0].recording.timed
+    factors = [_factors(s, timed) for s in signals]
+    out = [form for group in factors for form in group]
+    out += [form for s in signals for form in _memories(s, timed)]
+    for i, group in enumerate(factors):
+        for k, other in enumerate(factors[i:]):
+            out += [_product(a, b) for at, a in enumerate(group) for b in (other[at:] if k == 0 else other)]
+    if timed and signals:
+        x, rate = factors[0][0], factors[0][-2]
+        out += [_product(_product(x, x), rate), _product(x, _product(rate, rate))]
+    return out
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """A signal that forms are made of: its column, its unit, its values in a recording, its sizes over all of them."""
+
+    name: str
+    unit: str
+    values: Callable[[Piece], Array]
+    span: float
+    largest: float
+
+
+def _signals(problem: Problem, fit: Fit, port: Port) -> Iterator[_Signal]:
+    first = problem.pieces[0]
+    units = first.recording.units | first.extra.get("units", {})
+    own = problem.model.moves[port.name]
+    sources: dict[str, Callable[[Piece], Array]] = {own: _own(problem, fit, port)}
+    for key in (*port.others, *port.loads):
+        if key != own and key in first.inputs:
+            sources.setdefault(key, lambda p, key=key: p.inputs[key])  # type: ignore[misc]
+    for key, values in sources.items():
+        together = np.concatenate([values(p) for p in problem.pieces])
+        unit = units.get(key) or units.get(port.name, "") if key == own else units.get(key, "")
+        yield _Signal(
+            problem.columns.get(key, key), unit, values, float(np.ptp(together)), float(np.max(np.abs(together))) or 1.0
+        )
+
+
+def _own(problem: Problem, fit: Fit, port: Port) -> Callable[[Piece], Array]:
+    """The motion at a port: recorded, or simulated where it is itself an output, since what was read of that holds the
+    residual.
+    """
+    channels = [output.channel for output in problem.model.outputs]
+    if problem.model.moves[port.name] not in channels:
+        return lambda p: problem.model.motion(p, port)
+    row, known = channels.index(problem.model.moves[port.name]), {}  # type: ignore[var-annotated]
+
+    def simulated(piece: Piece) -> Array:
+        if id(piece) not in known:
+            known[id(piece)] = problem.simulate(piece, fit.terms, fit.values)[row]
+        return np.asarray(known[id(piece)])
+
+    return simulated
+
+
+def _factors(signal: _Signal, timed: bool) -> list[Form]:
+    """The signal and what it may enter a product as; its rate and that one's magnitude come last."""
+    name, x = signal.name, signal.values
+    out = [Form(name, x, 1), Form(f"abs({name})", lambda p: np.abs(x(p)), 2)]
+    if signal.unit == "rad":
+        for k, text in ((1.0, name), (2.0, f"2*{name}")):
+            out.append(Form(f"cos({text})", lambda p, k=k: np.cos(k * x(p)), 2))  # type: ignore[misc]
+            out.append(Form(f"sin({text})", lambda p, k=k: np.sin(k * x(p)), 2))  # type: ignore[misc]
+    if timed:
+        out.append(Form(f"rate({name})", lambda p: _rate(x(p), p), 2))
+        out.append(Form(f"abs(rate({name}))", lambda p: np.abs(_rate(x(p), p)), 3))
+    return out
+
+
+def _rate(values: Array, piece: Piece) -> Array:
+    return np.asarray(np.gradient(values, piece.recording.dt_s))
+
+
+def _memories(signal: _Signal, timed: bool) -> Iterator[Form]:
+    name, x = signal.name, signal.values
+    for part in PLAYS:
+        width = float(f"{part * signal.span:.4g}")
+        yield Form(f"play({name}, {width:.4g})", lambda p, w=width: play(x(p), 0.5 * w, 0.0), 3)  # type: ignore[misc]
+    for cycles in WAVES:
+        k = float(f"{2.0 * np.pi * cycles / signal.span:.4g}")
+        yield Form(f"sin({k:.4g}*{name})", lambda p, k=k: np.sin(k * x(p)), 3)  # type: ignore[misc]
+        yield Form(f"cos({k:.4g}*{name})", lambda p, k=k: np.cos(k * x(p)), 3)  # type: ignore[misc]
+    yield Form(f"{name}^3", lambda p: x(p) ** 3, 3)
+    for seconds in LAGS_S if timed else ():
+        yield Form(f"lag({name}, {seconds:g})", lambda p, s=seconds: lag(x(p), p.recording.dt_s, s), 3)  # type: ignore[misc]
+
+
+def _product(a: Form, b: Form) -> Form:
+    text = f"{a.text}^2" if a is b else f"{a.text}*{b.text}"
+    return Form(text, lambda p: a.evaluate(p) * b.evaluate(p), a.length + b.length)
+
+
+def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
+    """The form as an effect at `port`: its size is to be refitted with everything else. Its values are laid out in
+    `Piece.extra` first (`lay_out`).
+    """
+
+    def parameters(s: Scale, which: str) -> tuple[Parameter, ...]:
+        return (Parameter("amplitude", "", (size,), -np.inf, np.inf, linear=True, step=abs(size) or 1.0),)
+
+    def apply(signal: Array, c: Context, p: Array, which: str) -> Array:
+        return np.asarray(signal + p[0] * c.extra["equations"][form.text])
+
+    effect = Effect(
+        "unlisted",
+        port.kind.split("+")[0],
+        76,
+        parameters,
+        "None of the known effects: the mismatch follows an equation found by search.",
+        form.text,
+        apply,
+        side="input",
+    )
+    return Candidate(effect, port, "", "search")
+
+
+def lay_out(pieces: list[Piece], form: Form) -> None:
+    """Values of a form for every recording, where its effect finds them."""
+    for piece in pieces:
+        piece.extra.setdefault("equations", {})[form.text] = form.evaluate(piece)
+
+
+def foretell(problem: Problem, fit: Fit, floor: Array, only: str = "") -> list[Foretold]:
+    """The best forms at each port where an equation may stand, and, if the model has many outputs, in each of them alone;
+    or at the port `only`.
+    """
+    ports = {port.name: port for port in problem.model.ports}
+    used = _measured(fit)
+    rates = [_slopes(problem, fit, piece) for piece in problem.pieces]
+    found = []
+    for name, target in problem.model.unlisted_at:
+        if only not in ("", name):
+            continue
+        forms = forms_at(problem, fit, ports[name])
+        if forms:
+            responses = _responses(problem, fit, ports[target], forms)
+            found.append(_best(problem, fit, floor, rates, forms, responses, ports[name].subsystem, ports[name]))
+            if hasattr(problem.model, "sensitivity") and not only:
+                table = [r.table for r in responses]
+                found += [
+                    _best(problem, fit, floor, rates, forms, _alone(problem, row, table), output.subsystem, None)
+                    for row, output in enumerate(problem.model.outputs)
+                    if used[row] and name == problem.model.unlisted_at[0][0]
+                ]
+    return found
+
+
+def _measured(fit: Fit) -> list[bool]:
+    return [any(np.isfinite(r[row]).any() for r in fit.residuals) for row in range(len(fit.residuals[0]))]
+
+
+@dataclass(frozen=True)
+class Response:
+    """Change of the outputs (outputs, n) of one recording by each form: `slope` (outputs, n) times `table` (forms, n), or
+    `whole` (forms, outputs, n).
+    """
+
+    table: Array
+    slope: Array | None = None
+    whole: Array | None = None
+
+    def to(self, chosen: list[int], sizes: Array) -> Array:
+        """Change by the forms `chosen`, of these sizes."""
+        if self.slope is not None:
+            return np.asarray(self.slope * (sizes @ self.table[chosen]))
+        assert self.whole is not None
+        return np.asarray(np.tensordot(sizes, self.whole[chosen], 1))
+
+
+def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> list[Response]:
+    sensitivity = getattr(problem.model, "sensitivity", None)
+    nominal, acts = problem.parted(fit.terms, fit.values)
+    out = []
+    for piece in problem.pieces:
+        table = np.array([np.nan_to_num(form.evaluate(piece)) for form in forms])
+        if sensitivity is not None:
+            out.append(Response(table, np.nan_to_num(sensitivity(piece, nominal, target.name, acts))))
+            continue
+        base = problem.simulate(piece, fit.terms, fit.values)
+        need = float(np.nanstd(problem.model.needs(piece, target, nominal, piece.y - base))) or 1e-6
+        whole = np.zeros((len(forms), *base.shape))
+        for index, (form, values) in enumerate(zip(forms, table, strict=True)):
+            size = 0.1 * need / (float(np.std(values)) or 1.0)
+            term = Term(equation_at(target, form), ())
+            piece.extra.setdefault("equations", {})[form.text] = values
+            moved = problem.model.simulate(piece, nominal, [*acts, (term.candidate, np.array([size]))])
+            whole[index] = np.nan_to_num((moved - base) / size)
+        out.append(Response(table, whole=whole))
+    return out
+
+
+def _alone(problem: Problem, row: int, tables: list[Array]) -> list[Response]:
+    """Forms added to one output's reading."""
+    unit = np.zeros((len(problem.model.outputs), 1))
+    unit[row] = 1.0
+    return [Response(table, np.broadcast_to(unit, p.y.shape)) for table, p in zip(tables, problem.pieces, strict=True)]
+
+
+def _slopes(problem: Problem, fit: Fit, piece: Piece) -> Array:
+    """Change of the outputs by each free parameter in its own size, (parameters, outputs, n)."""
+    base = problem.simulate(piece, fit.terms, fit.values)
+    parameters, out = problem.parameters(fit.terms), []
+    for index in free(parameters):
+        p, value = parameters[index], float(fit.values[index])
+        step = 1e-3 * (abs(value) if p.log else size_of(p, value))
+        moved = fit.values.copy()
+        moved[index] = value + step if value + step <= p.high else value - step
+        out.append(np.nan_to_num((problem.simulate(piece, fit.terms, moved) - base) / 1e-3))
+    return np.array(out) if out else np.zeros((0, *base.shape))
+
+
+def _best(
+    problem: Problem,
+    fit: Fit,
+    floor: Array,
+    slopes: list[Array],
+    forms: list[Form],
+    responses: list[Response],
+    subsystem: str,
+    port: Port | None,
+) -> Foretold:
+    """Greedy choice among `forms`, one more as long as held-out samples are foretold better."""
+    sums = _Sums(problem, fit, floor, slopes, responses)
+    best = Foretold(subsystem, port, 0.0, 1.0, 0.0, 0.0)
+    chosen: list[int] = []
+    worth: tuple[tuple[Form, float], ...] = ()
+    for _ in range(MOST_FORMS):
+        gain = sums.gains(chosen)
+        order = _by_gain(gain, forms)
+        if not order:
+            break
+        worth = worth or tuple((forms[k], float(sums.sizes([k])[0])) for k in order[:BEST])
+        chosen = [*chosen, order[0]]
+        sizes = sums.sizes(chosen)
+        after = [
+            r - response.to(chosen, sizes) + np.tensordot(sums.absorbed(chosen, sizes), slope, 1)
+            for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
+        ]
+        held = compare(problem.pieces, "heldout", fit.residuals, after, floor)
+        trained = compare(problem.pieces, "fit", fit.residuals, after, floor)
+        likelihood = held.log_likelihood - len(chosen)
+        if likelihood > best.log_likelihood:
+            power = fallen(problem, fit.residuals, after, floor)
+            best = Foretold(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
+    return replace(best, forms=worth)
+
+
+def fallen(problem: Problem, before: list[Array], after: list[Array], floor: Array) -> float:
+    """Fall of the mean squared error on held-out samples, over each output's noise, summed over those where it fell."""
+    total = 0.0
+    for row in range(floor.size):
+        pairs = [(b[row][p.heldout], a[row][p.heldout]) for p, b, a in zip(problem.pieces, before, after, strict=True)]
+        change = np.concatenate([b**2 - a**2 for b, a in pairs])
+        change = change[np.isfinite(change)]
+        total += max(float(np.mean(change)), 0.0) / floor[row] ** 2 if change.size else 0.0
+    return total
+
+
+def _by_gain(gain: Array, forms: list[Form]) -> list[int]:
+    """Forms by their gain, a shorter one before a longer one that gains hardly more."""
+    order = [int(k) for k in np.argsort(-gain) if gain[k] > 0.0][: 4 * BEST]
+    return sorted(order, key=lambda k: -gain[k] * (1.0 - AS_SHORT * forms[k].length))
+
+
+class _Sums:
+    """Inner products, over the samples to fit and in units of noise, of forms, parameters and residual."""
+
+    def __init__(self, problem: Problem, fit: Fit, floor: Array, slopes: list[Array], responses: list[Response]) -> None:
+        unit = np.maximum(floor, 1e-300)[:, None]
+        count, rates = len(responses[0].table), len(slopes[0])
+        gram, cross, pull = np.zeros((count, count)), np.zeros((count, rates)), np.zeros(count)
+        own, start = np.zeros((rates, rates)), np.zeros(rates)
+        for piece, residual, slope, response in zip(problem.pieces, fit.residuals, slopes, responses, strict=True):
+            mask = piece.fit
+            if not mask.any():
+                continue
+            seen = np.isfinite(residual[:, mask])
+            r = np.where(seen, residual[:, mask], 0.0) / unit
+            r = np.clip(np.where(seen, r, 0.0), -1e6, 1e6)
+            J = np.where(seen, slope[:, :, mask], 0.0) / unit
+            J = np.where(np.any(seen, axis=1)[None, :, None], J, 0.0)
+            own += np.einsum("kon,lon->kl", J, J)
+            start += np.einsum("kon,on->k", J, r)
+            if response.slope is not None:
+                table = response.table[:, mask]
+                s = np.where(seen, response.slope[:, mask], 0.0) / unit
+                gram += (table * np.sum(s * s, axis=0)) @ table.T
+                cross += table @ np.einsum("on,kon->kn", s, J).T
+                pull += table @ np.sum(s * r, axis=0)
+            else:
+                assert response.whole is not None
+                D = (np.where(seen, response.whole[:, :, mask], 0.0) / unit).reshape(count, -1)
+                gram += D @ D.T
+                cross += D @ J.reshape(rates, -1).T
+                pull += D @ r.ravel()
+        size = np.sqrt(np.diag(own))
+        size[size == 0.0] = 1.0
+        self.inverse = np.linalg.pinv(own / np.outer(size, size), rcond=1e-9) / np.outer(size, size) if rates else own
+        self.cross, self.size = cross, np.diag(gram)
+        self.gram, self.pull = gram - cross @ self.inverse @ cross.T, pull - cross @ self.inverse @ start
+
+    def gains(self, chosen: list[int]) -> Array:
+        """Fall of half the squared error by each form, beside those chosen."""
+        left, size = self.pull, np.diag(self.gram)
+        if chosen:
+            solved = np.linalg.lstsq(self.gram[np.ix_(chosen, chosen)], self.gram[chosen], rcond=1e-10)[0]
+            left = self.pull - self.pull[chosen] @ solved
+            size = size - np.sum(self.gram[chosen] * solved, axis=0)
+        seen = size > NEW * self.size + 1e-300
+        return np.where(seen, 0.5 * left**2 / np.where(seen, size, 1.0), 0.0)
+
+    def sizes(self, chosen: list[int]) -> Array:
+        """Sizes of the forms chosen."""
+        return np.asarray(np.linalg.lstsq(self.gram[np.ix_(chosen, chosen)], self.pull[chosen], rcond=1e-10)[0])
+
+    def absorbed(self, chosen: list[int], sizes: Array) -> Array:
+        """What the parameters take up of the forms chosen."""
+        return np.asarray(self.inverse @ (self.cross[chosen].T @ sizes))

@@ -1,0 +1,118 @@
+"""Models that the data cannot tell from the best: rivals in each effect's place, refitted, compared on held-out blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.dictionary import equation_at
+from host.diagnosis.selection.screening import term_of, without
+from host.diagnosis.selection.search import Found
+from host.diagnosis.selection.trial import Trial
+from host.diagnosis.symbolic.unlisted import Rest, equations_for
+
+Array = npt.NDArray[np.float64]
+MOST_RIVALS = 4
+TRIED = 8  # rivals refitted in an effect's place at most
+NEAR = 0.5  # a rival must have earned this part of the winner's likelihood when it was tried first
+CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart,
+CHANCE = 0.01  # nor above this p-value,
+ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most,
+MISFIT = 0.05  # or by less than this part of the mismatch there, and
+PART = 0.25  # what it lacks is less than this part of what the effect earned: the modules themselves are idealized
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Evidence of one effect of the best model, and what could stand in its place."""
+
+    candidate: Candidate
+    gain: Gain  # on held-out samples
+    both: Gain  # on all samples
+    alike: tuple[Candidate, ...]
+
+
+def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
+    """For every effect of the best structure: its gain over the structure without it, and its equals."""
+    out = []
+    for term in found.best.terms:
+        terms, values = without(found.best, problem, (term.candidate.key,))
+        less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+        gain = compare(problem.pieces, "heldout", less.residuals, found.best.residuals, floor)
+        both = compare(problem.pieces, "both", less.residuals, found.best.residuals, floor)
+        alike = _equals(problem, found, term.candidate, less, both, floor)
+        alike += _better_said(problem, found, term.candidate, less, floor)
+        out.append(Standing(term.candidate, gain, both, alike))
+    return out
+
+
+def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
+    """`standing` where known effects leave a rest that is no noise: the strongest may stand for something in no list."""
+    if not standing or not rest.doubtful:
+        return standing
+    first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
+    named = standing[first]
+    forms = rest.foretold.forms if rest.foretold is not None else ()
+    if not forms or any(other.effect.id == "unlisted" for other in named.alike):
+        return standing
+    unknown = equation_at(named.candidate.port, *forms[0])
+    return [*standing[:first], replace(named, alike=(*named.alike, unknown)), *standing[first + 1 :]]
+
+
+def _better_said(problem: Problem, found: Found, candidate: Candidate, less: Fit, floor: Array) -> tuple[Candidate, ...]:
+    """An equation of no listed effect that does plainly better in the place of `candidate`: this may be a stand-in."""
+    if candidate.effect.id == "unlisted":
+        return ()
+    for trial in equations_for(problem, less, candidate.port, floor):
+        ahead = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
+        if ahead.log_likelihood > CANNOT_TELL:
+            return (trial.candidate,)
+    return ()
+
+
+def _equals(
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, floor: Array
+) -> tuple[Candidate, ...]:
+    """Rivals in the place of `candidate` that neither held-out samples nor all together tell from it."""
+    best = found.best
+    kept: list[Candidate] = []
+    for trial in _rivals(found, candidate)[:TRIED]:
+        term = term_of(problem, trial.candidate, less)
+        start = trial.fit.values[-len(term.parameters) :]
+        other = finish(
+            problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
+        )
+        ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
+        held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
+        rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
+        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned, rival):
+            kept.append(trial.candidate)
+    return tuple(kept)
+
+
+def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
+    """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did."""
+    active = {term.candidate.key for term in found.best.terms}
+    names = {candidate.name, *(term.candidate.name for term in found.best.terms)}
+    kept: dict[str, Trial] = {}
+    for step in (s for s in found.steps if any(trial.candidate.key == candidate.key for trial in s.trials)):
+        most = max(trial.score for trial in step.trials)
+        for trial in step.trials:
+            if trial.candidate.key not in active and trial.candidate.name not in names and trial.score > NEAR * most:
+                kept.setdefault(trial.candidate.name, trial)
+    return sorted(kept.values(), key=lambda trial: -trial.score)
+
+
+def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain) -> bool:
+    """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
+    if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > CHANCE and held.p_value > CHANCE):
+        return True
+    top = int(np.argmax(earned.independent * earned.log_ratio))
+    best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
+    near = ahead.share < ALIKE or best - other < MISFIT * best
+    return bool(near and ahead.log_likelihood < PART * earned.log_likelihood)

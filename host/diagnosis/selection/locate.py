@@ -1,0 +1,148 @@
+"""Where and when: windows of the mismatch, and the condition that gathers most of it, under false-discovery control."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.model.model import Piece
+from host.diagnosis.model.operators import fill, since_reversal
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+AVERAGE_S, JOIN_S, SHORTEST_S = 0.5, 0.5, 0.3
+SHIFTS = 60
+FALSE_DISCOVERY = 0.05
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Words, share of the mismatch's energy under it, share of samples under it, p-value by circular shifts."""
+
+    says: str
+    energy_share: float
+    sample_share: float
+    p_value: float
+
+
+def moving_rms(values: Array, dt_s: float) -> Array:
+    """RMS of `values` (n,) over half a second around each sample."""
+    width = max(3, round(AVERAGE_S / dt_s) | 1)
+    power = np.convolve(np.where(np.isfinite(values), values, 0.0) ** 2, np.ones(width), mode="same")
+    count = np.convolve(np.isfinite(values).astype(float), np.ones(width), mode="same")
+    return np.sqrt(power / np.maximum(count, 1.0))
+
+
+def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
+    """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed,
+    short pieces dropped.
+    """
+    rms = moving_rms(fill(mismatch), dt_s)
+    high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], high.astype(np.int8), [0]))))
+    spans = [[time_s[a], time_s[b - 1]] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return joined([(float(a), float(b)) for a, b in spans])
+
+
+def joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Windows in order, those nearer than half a second made one, those shorter than 0.3 s dropped."""
+    out: list[list[float]] = []
+    for a, b in sorted(spans):
+        if out and a - out[-1][1] < JOIN_S:
+            out[-1][1] = max(out[-1][1], b)
+        else:
+            out.append([a, b])
+    return [(a, b) for a, b in out if b - a >= SHORTEST_S]
+
+
+def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
+    """Samples that fall into `spans`."""
+    mask = np.zeros(time_s.size, dtype=bool)
+    for a, b in spans:
+        mask |= (time_s >= a) & (time_s <= b)
+    return mask
+
+
+def mismatch_of(problem: Problem, nominal: Fit, best: Fit) -> list[Array]:
+    """What the effects add to the refitted nominal model, per piece (outputs, n); without effects, the nominal residual."""
+    if not best.terms:
+        return nominal.residuals
+    return [n - b for n, b in zip(nominal.residuals, best.residuals, strict=True)]
+
+
+def features(problem: Problem, piece: Piece) -> dict[str, Array]:
+    """Signals a condition may speak of, by words; every one (n,)."""
+    found: dict[str, Array] = {}
+    dt = piece.recording.dt_s
+    for name, key, _ in problem.model.travel:
+        values = fill(piece.inputs[key])
+        span = float(np.ptp(values)) or 1.0
+        found[f"distance from reversals of {name}"] = since_reversal(values, 0.01 * span)
+        found[f"size of {name}"] = np.abs(values)
+        found[f"place of {name}"] = values
+        if piece.recording.timed:
+            width = max(3, round(0.05 / dt) | 1)
+            found[f"speed of {name}"] = np.abs(np.gradient(np.convolve(values, np.ones(width) / width, mode="same"), dt))
+    if piece.recording.timed:
+        found["time"] = piece.recording.time_s
+    return found
+
+
+def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1) -> Condition | None:
+    """The condition under which the mismatch of output `row` gathers most, beyond its share of samples; None if none is
+    sure.
+
+    `stride`: every so many samples are looked at.
+    """
+    energy, tables = [], []
+    for piece, m in zip(problem.pieces, mismatch, strict=True):
+        energy.append(np.where(np.isfinite(m[row]), m[row], 0.0)[::stride] ** 2)
+        tables.append({name: values[::stride] for name, values in features(problem, piece).items()})
+    together = np.concatenate(energy)
+    total = float(together.sum())
+    if total <= 0.0:
+        return None
+    rng = np.random.default_rng(0)
+    shifts = rng.integers(together.size // 10, together.size - together.size // 10, SHIFTS)
+    found: list[tuple[float, Condition]] = []
+    for name in tables[0]:
+        values = np.concatenate([table[name] for table in tables])
+        for share in (0.15, 0.3, 0.5):
+            for side in ("below", "above"):
+                limit = float(np.quantile(values, share if side == "below" else 1.0 - share))
+                mask = values <= limit if side == "below" else values >= limit
+                held = float(together[mask].sum()) / total
+                part = float(mask.mean())
+                if held - part < 0.1 or not 0.02 < part < 0.7:
+                    continue
+                by_chance = np.array([float(np.roll(together, s)[mask].sum()) / total for s in shifts])
+                z = (held - by_chance.mean()) / (by_chance.std() + 1e-12)
+                p = max(float(np.mean(by_chance >= held)), float(np.exp(-0.5 * z * z)) if z > 0 else 1.0)
+                found.append((held - part, Condition(_words(name, side, limit, problem), held, part, p)))
+    return _discover(found)
+
+
+def _discover(found: list[tuple[float, Condition]]) -> Condition | None:
+    """Largest excess among those that pass Benjamini and Hochberg's bound."""
+    if not found:
+        return None
+    order = sorted(found, key=lambda item: item[1].p_value)
+    passed = [k for k, (_, c) in enumerate(order) if c.p_value <= FALSE_DISCOVERY * (k + 1) / len(order)]
+    if not passed:
+        return None
+    return max(order[: passed[-1] + 1], key=lambda item: item[0])[1]
+
+
+def _words(name: str, side: str, limit: float, problem: Problem) -> str:
+    unit = next((unit for channel, _, unit in problem.model.travel if name.endswith(f" of {channel}")), "")
+    if name == "time":
+        return f"{'before' if side == 'below' else 'after'} {limit:.3g} s"
+    kind, channel = name.split(" of ", 1)
+    if kind == "distance from reversals":
+        where = "within" if side == "below" else "further than"
+        return f"{where} {limit:.3g} {unit} {'of' if side == 'below' else 'from'} {channel} reversals"
+    unit = f"{unit}/s" if kind == "speed" else unit
+    return f"{kind} of {channel} {side} {limit:.3g} {unit}".rstrip()

@@ -1,0 +1,35 @@
+"""New starts of the nominal parameters for an effect that hides them: a reading without sign leads their fit astray."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from host.diagnosis.estimation.fit import Fit, Problem, robust, starts
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.screening import Screened, enough, term_of
+
+HIDES = frozenset({"rectified_sensor"})
+KEPT = 3
+
+
+def hidden(problem: Problem, nominal: Fit, pool: list[Candidate]) -> list[Screened]:
+    """Candidates that the refitted nominal model cannot vouch for, each with nominal parameters of its own to start from.
+
+    A model that offers `restarts` says which parameters are worth a try; those that leave the least with the effect are
+    kept.
+    """
+    own = getattr(problem.model, "restarts", None)
+    few = enough(problem)
+    found = []
+    for candidate in pool if own is not None else ():
+        if candidate.effect.id not in HIDES:
+            continue
+        term = term_of(problem, candidate, nominal)
+        begin = starts(term, {}, {})
+        tried = [np.concatenate((theta, begin)) for theta in own(few.pieces)]  # type: ignore[misc]
+        tried.sort(key=lambda values: robust(few.stacked((term,), values))[0])
+        item = Screened(candidate, term, (), 0.0, [begin] * KEPT)
+        found.append(replace(item, nominal=[values[: -begin.size] for values in tried[:KEPT]]))
+    return found

@@ -1,0 +1,307 @@
+"""Screening: what the signature of each candidate, seen past all active parameters, would take from the residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import process_time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.fit import Fit, Problem, Term, grid_points, jacobian, lines_of, size_of, starts, tuned
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.model import scale_of
+
+Array = npt.NDArray[np.float64]
+Tell = Callable[[str, float], None]
+SCREEN_ROWS = 24000  # residuals to screen by, about
+AT_REST = frozenset({"periodic_disturbance", "sensor_drift"})  # seen without any motion of their port
+GRID = 160  # grid points of one candidate at most
+STEPPED_SAMPLES = 150  # of each output and recording, to look for steps in
+SCAN_SECONDS = 0.4  # time to screen one candidate, about
+
+
+def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
+    """`candidate` with bounds and start values for these recordings."""
+    n = len(problem.model.parameters)
+    needs = [
+        problem.model.needs(piece, candidate.port, fit.values[:n], residual)[piece.fit]
+        for piece, residual in zip(problem.pieces, fit.residuals, strict=True)
+        if piece.fit.any()
+    ]
+    together = np.concatenate(needs)
+    rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
+    scale = scale_of(problem.model, problem.pieces, candidate.port, candidate, rms)
+    parameters = candidate.effect.parameters(scale, candidate.form)
+    if problem.model.kind == "impedance":
+        parameters = tuple(replace(p, low=-np.inf) if p.linear and p.low == 0.0 else p for p in parameters)
+    return Term(candidate, parameters)
+
+
+def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Term, ...], Array]:
+    """Terms and values of `fit` but for the candidates named in `drop`."""
+    n = len(problem.model.parameters)
+    terms, values, at = [], list(fit.values[:n]), n
+    for term in fit.terms:
+        part = fit.values[at : at + len(term.parameters)]
+        at += len(term.parameters)
+        if term.candidate.key not in drop:
+            terms.append(term)
+            values += list(part)
+    return tuple(terms), np.array(values)
+
+
+def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
+    """Active candidates that `candidate` would replace (it contains them), or None if it may not join."""
+    drop = []
+    for term in fit.terms:
+        other = term.candidate
+        if other.port.name != candidate.port.name:
+            continue
+        if other.effect.id == candidate.effect.id and other.source == candidate.source:
+            if other.form == candidate.form and other.effect.order == candidate.effect.order:
+                return None
+            if other.effect.id not in ("creep_relaxation", "periodic_disturbance"):
+                drop.append(other.key)
+        elif other.effect.id in candidate.effect.contains or (
+            candidate.effect.family and candidate.effect.family == other.effect.family
+        ):
+            drop.append(other.key)
+        elif candidate.effect.id in other.effect.contains:
+            return None
+    return tuple(drop)
+
+
+@dataclass
+class Screened:
+    """A candidate with its promise by projection and the start values that earned it.
+
+    nominal: nominal parameters to start from beside each of `begin`, where they are not those of the fit so far.
+    """
+
+    candidate: Candidate
+    term: Term
+    drop: tuple[str, ...]
+    promise: float
+    begin: list[Array]
+    nominal: list[Array] = field(default_factory=list)
+
+
+@dataclass
+class Point:
+    """One grid point: energy taken, start values of the term, and what it leaves."""
+
+    taken: float
+    begin: Array
+    left: Array
+
+
+def screen(
+    problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell, known_Hz: tuple[float, ...] = ()
+) -> list[Screened]:
+    """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
+    search). `known_Hz`: frequencies to try besides those that stand out.
+    """
+    problem = _smaller(problem)
+    r = problem.stacked(fit.terms, fit.values)
+    found = []
+    bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
+    few = _independent(problem, r)
+    slopes = _slopes(problem, fit)
+    used = [
+        np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
+    ]
+    lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
+    resting = _resting(problem)
+    began = process_time()
+    problem.stacked(fit.terms, fit.values)
+    most = int(np.clip(SCAN_SECONDS / max(process_time() - began, 1e-5), 12, GRID))
+    for count, candidate in enumerate(pool):
+        tell("screening", count / len(pool))
+        drop = replaced_by(fit, candidate)
+        if drop is None or (candidate.port.name in resting and candidate.effect.id not in AT_REST and not candidate.source):
+            continue
+        if drop not in bases:
+            terms, values = without(fit, problem, drop)
+            base = problem.stacked(terms, values) if drop else r
+            parameters = problem.parameters(terms)
+            J = jacobian(problem, terms, values, base, [size_of(p, v) for p, v in zip(parameters, values, strict=True)])
+            Q = np.linalg.qr(J)[0] if J.shape[1] else J
+            bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
+        terms, values, base, Q, rest = bases[drop]
+        term = _stepped(problem, fit, term_of(problem, candidate, fit))
+        quick = slopes is not None and candidate.port.name in slopes[0]
+        if not term.parameters:
+            continue
+        points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes, lines)
+        if not points:
+            continue
+        points.sort(key=lambda point: point.taken, reverse=True)
+        reference = float(r @ r)
+        left = max(float(rest @ rest) - points[0].taken, 1e-300)
+        n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
+        promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters)
+        found.append(Screened(candidate, term, drop, float(promise), [point.begin for point in points[:3]]))
+    return sorted(found, key=lambda item: item.promise, reverse=True)
+
+
+def _resting(problem: Problem) -> set[str]:
+    """Ports at which nothing ever moves: no effect that is made of their motion can be seen there."""
+    found = set()
+    for port in problem.model.ports:
+        if port.kind.startswith("motion"):
+            spans = [np.ptp(problem.model.motion(piece, port)[piece.fit]) for piece in problem.pieces if piece.fit.any()]
+            sizes = [np.max(np.abs(problem.model.motion(piece, port))) for piece in problem.pieces]
+            if max(spans) <= 1e-9 * max(sizes):
+                found.add(port.name)
+    return found
+
+
+Slopes = list[dict[str, Array]]
+
+
+def _slopes(problem: Problem, fit: Fit) -> Slopes | None:
+    """Sensitivity of the outputs to each axis, per piece, where the model offers it."""
+    sensitivity = getattr(problem.model, "sensitivity", None)
+    if sensitivity is None:
+        return None
+    n = len(problem.model.parameters)
+    acts, at = [], n
+    for term in fit.terms:
+        acts.append((term.candidate, fit.values[at : at + len(term.parameters)]))
+        at += len(term.parameters)
+    axes = [port.name for port in problem.model.ports if port.kind.startswith("motion")]
+    return [
+        {axis: sensitivity(piece, fit.values[:n], axis, acts) for axis in axes}
+        if piece.fit.any()
+        else {axis: piece.y for axis in axes}
+        for piece in problem.pieces
+    ]
+
+
+def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slopes) -> Array:
+    """Weighted change of the outputs by the last term, linearized at its axis."""
+    term = terms[-1]
+    n = len(problem.model.parameters)
+    rows = []
+    for piece, S in zip(problem.pieces, slopes, strict=True):
+        if piece.fit.any():
+            change = problem.model.change(piece, trial[:n], S, term.candidate, trial[-len(term.parameters) :])  # type: ignore[attr-defined]
+            rows.append(np.where(np.isfinite(piece.y), change, 0.0)[:, piece.fit] / problem.scale[:, None])
+    return np.concatenate([row.ravel() for row in rows])
+
+
+def enough(problem: Problem) -> Problem:
+    """The problem with enough recordings to fit, spread over all; the rest neither fitted nor simulated."""
+    used = [index for index, piece in enumerate(problem.pieces) if piece.fit.any()]
+    count = max(
+        1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used))))
+    )
+    chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
+    pieces = [
+        piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool))
+        for index, piece in enumerate(problem.pieces)
+    ]
+    return replace(problem, pieces=pieces)
+
+
+def _smaller(problem: Problem) -> Problem:
+    """Few recordings, every so many samples of them: enough to screen by."""
+    few = enough(problem)
+    stride = max(1, int(sum(piece.fit.sum() for piece in few.pieces) * len(problem.noise) / SCREEN_ROWS))
+    pieces = [replace(piece, fit=piece.fit & (np.arange(piece.n) % stride == 0)) for piece in few.pieces]
+    return replace(problem, pieces=pieces)
+
+
+def _independent(problem: Problem, left: Array) -> float:
+    """Independent samples to fit in what would be `left`, weighted and stacked."""
+    total, at, rows = 0.0, 0, len(problem.noise)
+    for piece in problem.pieces:
+        n = int(piece.fit.sum())
+        for row in left[at : at + rows * n].reshape(rows, n) if n else ():
+            used = int(np.count_nonzero(row))
+            total += used / correlation_time(np.where(row != 0.0, row, np.nan)) if used else 0.0
+        at += rows * n
+    return total
+
+
+def _stepped(problem: Problem, fit: Fit, term: Term) -> Term:
+    """A quantization with the steps at which the residual goes with the saw tooth of its readings as simulated."""
+    if term.candidate.effect.id != "quantization":
+        return term
+    unit = "N" if term.candidate.port.kind == "forces" else "m"
+    rows = [row for row, output in enumerate(problem.model.outputs) if output.unit == unit]
+    if not rows:
+        return term
+    x, r = [], []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        for row in rows:
+            good = piece.fit & np.isfinite(residual[row])
+            every = max(1, int(good.sum()) // STEPPED_SAMPLES)
+            x.append((piece.y[row] - residual[row])[good][::every])
+            r.append(residual[row][good][::every] / problem.scale[row])
+    place, rest = np.concatenate(x), np.concatenate(r)
+    low, high = 1.2 * min(problem.scale[row] for row in rows), 12.0 * max(problem.scale[row] for row in rows)
+    span = float(np.max(np.abs(place))) if place.size else 0.0
+    if not span > high:
+        return replace(term, parameters=tuple(replace(p, grid=()) for p in term.parameters))
+    turns = np.arange(1.0 / high, 1.0 / low, 0.2 / span)
+    goes = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
+    best = turns[np.argsort(goes)[:3]]
+    p = term.parameters[0]
+    return replace(
+        term, parameters=(replace(p, grid=tuple(1.0 / k for k in best), low=0.5 * low, high=2.0 * high, step=0.01 * low),)
+    )
+
+
+def _scan(
+    problem: Problem,
+    terms: tuple[Term, ...],
+    values: Array,
+    term: Term,
+    base: Array,
+    Q: Array,
+    rest: Array,
+    most: int,
+    slopes: Slopes | None,
+    lines: Array,
+) -> list[Point]:
+    """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`."""
+    points: list[Point] = []
+    most_taken = 0.0
+    linear = [p for p in term.parameters if p.linear]
+    for point in grid_points(tuned(term, lines), max(5, most // max(len(linear), 1))):
+        columns = []
+        options: list[Any] = [*linear] or [None]
+        for p in options:
+            amplitude = {q.name: 0.0 for q in linear}
+            if p is not None:
+                amplitude[p.name] = size_of(p, 0.0)
+            trial = np.concatenate((values, starts(term, amplitude, point)))
+            fast = slopes is not None and term.candidate.port.name in slopes[0]
+            columns.append(
+                _fast(problem, terms, trial, slopes) if fast and slopes is not None else base - problem.stacked(terms, trial)
+            )
+        D = np.array(columns)
+        B = D @ Q
+        G, g = D @ D.T - B @ B.T, D @ rest
+        size = np.sqrt(np.maximum(np.diag(G), 1e-300))
+        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < 1e-10:
+            continue
+        a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
+        if linear:
+            a = np.array(
+                [min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)]
+            )
+        elif not 0.2 < a[0] < 5.0:
+            continue
+        taken = float(2.0 * a @ g - a @ G @ a)
+        amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
+        left = rest
+        if taken > most_taken:
+            most_taken, left = taken, rest - (a @ D - Q @ (B.T @ a))
+        points.append(Point(taken, starts(term, amplitude, point), left))
+    return points

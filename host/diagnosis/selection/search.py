@@ -1,0 +1,390 @@
+"""Which effects are missing: joint refits; forward, upgrade, swap and backward moves on held-out evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.fit import (
+    Fit,
+    Problem,
+    Term,
+    finish,
+    first_needs,
+    get_starts,
+    minimize,
+    reweigh,
+    set_starts,
+)
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.model import Piece
+from host.diagnosis.selection.dictionary import Form
+from host.diagnosis.selection.restart import hidden
+from host.diagnosis.selection.screening import Screened, enough, screen, without
+from host.diagnosis.selection.trial import (
+    ENOUGH,
+    PRICE,
+    SMALLEST_EXCESS,
+    SMALLEST_SHARE,
+    Trial,
+    at_bound,
+    good_enough,
+    rank,
+    related,
+    weighty,
+)
+
+Array = npt.NDArray[np.float64]
+Tell = Callable[[str, float], None]
+FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and of these at one port
+FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
+MOST_EFFECTS, MOST_STEPS = 5, 10
+DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
+EXCHANGES, RIVALS, RIVAL = 2, 4, 0.4  # rounds, rivals fitted in each place, and the least part of the best one's promise
+SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
+REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
+
+
+@dataclass
+class Step:
+    """One move of the search, for the report."""
+
+    move: str
+    key: str
+    gain: Gain
+    trials: list[Trial] = field(default_factory=list)
+
+
+@dataclass
+class Found:
+    """Nominal fit, best fit, the moves between, trials fitted beside the best structure, and its equations."""
+
+    nominal: Fit
+    best: Fit
+    steps: list[Step]
+    forms: list[Form] = field(default_factory=list)
+    nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
+    best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
+
+
+def settle(problem: Problem, values: Array) -> None:
+    """Lets a model that needs it prepare its recordings for these nominal parameters."""
+    own = getattr(problem.model, "settle", None)
+    for piece in problem.pieces if own is not None else ():
+        own(piece, values)  # type: ignore[misc]
+    begin_anew(problem, Fit((), values))
+
+
+def begin_anew(problem: Problem, fit: Fit) -> None:
+    """Lets a model that runs freely from a measured state find that state anew."""
+    own = getattr(problem.model, "begin_anew", None)
+    for piece in problem.pieces if own is not None else ():
+        own(piece, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
+
+
+def refined(problem: Problem, fit: Fit) -> Fit:
+    """`fit` brought to its end on all samples, together with the states that recordings begin from."""
+    for _ in range(2 if hasattr(problem.model, "begin_anew") else 1):
+        begin_anew(problem, fit)
+        fit = minimize(problem, fit.terms, fit.values)
+    return finish(problem, fit)
+
+
+def fit_nominal(problem: Problem) -> Fit:
+    """Nominal parameters refitted on all samples to fit; sets the weights of outputs and the start of memories.
+
+    A model that takes a measured output as an input too (`settle`) has it freed of noise before each fit, with what it
+    simulates itself:
+    errors in a variable that the fit takes for exact would bend its parameters.
+    """
+    fit = Fit((), problem.model.guess(problem.pieces))
+    for _ in range(3):
+        settle(problem, fit.values)
+        reweigh(problem, fit)
+        fit = minimize(problem, (), fit.values)
+    settle(problem, fit.values)
+    reweigh(problem, fit)
+    finish(problem, fit)
+    set_starts(problem, first_needs(problem, fit))
+    return fit
+
+
+def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
+    """Full joint refit of one candidate from its best starts."""
+    terms, values = without(base, problem, item.drop)
+    few = enough(problem)
+    begins = [np.concatenate((values, b)) for b in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]]
+    if item.nominal:
+        begins = [np.concatenate(both) for both in zip(item.nominal, item.begin, strict=True)]
+    fits = [minimize(few, (*terms, item.term), begin, rounds=FIRST_ROUNDS, tolerance=1e-4) for begin in begins]
+    fit = min(fits, key=lambda f: f.cost)
+    fit = minimize(few, fit.terms, fit.values, rounds=MORE_ROUNDS, tolerance=1e-4)
+    if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
+        fit = minimize(problem, fit.terms, fit.values, rounds=1)
+    fit = finish(problem, fit)
+    begun = get_starts(problem)
+    fit = _restart(problem, fit, item.candidate)
+    after = get_starts(problem)
+    set_starts(problem, begun)
+    heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
+    trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
+    both = compare(problem.pieces, "both", base.residuals, fit.residuals, floor)
+    return Trial(
+        item.candidate,
+        fit,
+        heldout,
+        trained,
+        both,
+        both.log_likelihood - PRICE * (len(fit.values) - len(base.values)),
+        after,
+        bool(item.drop),
+        problem.pieces[0].recording.dt_s,
+        any(piece.heldout.any() and not piece.fit.any() for piece in problem.pieces),
+    )
+
+
+def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
+    """Refit with the memory at the candidate's port started, in each recording, where that recording fits best."""
+    if candidate.effect.id not in REMEMBER:
+        return fit
+    port = candidate.port.name
+    for _ in range(2):
+        before = get_starts(problem)
+        reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
+        for piece in problem.pieces:
+            _best_start(problem, fit, piece, port, reach)
+        trial = minimize(problem, fit.terms, fit.values, rounds=6, tolerance=1e-4)
+        if not trial.cost < fit.cost:
+            set_starts(problem, before)
+            break
+        better = trial.cost < 0.98 * fit.cost
+        fit = finish(problem, trial)
+        if not better:
+            break
+    return fit
+
+
+def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
+    n = len(problem.model.parameters)
+    needs = [
+        problem.model.needs(piece, candidate.port, fit.values[:n], r)
+        for piece, r in zip(problem.pieces, fit.residuals, strict=True)
+    ]
+    return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
+
+
+def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: float) -> None:
+    """Start of memory at `port` that leaves the least error in `piece`: a scan over [-reach, reach], then its best
+    cell halved.
+    """
+
+    def error(start: float) -> float:
+        piece.start[port] = start
+        r = (piece.y - problem.simulate(piece, fit.terms, fit.values)) / problem.scale[:, None]
+        return float(np.nansum(np.minimum(r * r, 16.0)))
+
+    old = piece.start.get(port, 0.0)
+    tried = {float(s): error(float(s)) for s in (*np.linspace(-reach, reach, 9), old)}
+    step = 0.125 * reach
+    for _ in range(4):
+        middle = min(tried, key=lambda s: tried[s])
+        for s in (middle - step, middle + step):
+            tried[s] = error(s)
+        step *= 0.5
+    best = min(tried, key=lambda s: tried[s])
+    piece.start[port] = best if tried[best] < 0.9999 * tried[old] else old
+
+
+def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
+    """Nominal refit, then moves until none is earned; then detours by other first effects, where two may do better."""
+    tell("refitting the nominal model", 0.0)
+    nominal = fit_nominal(problem)
+    floor = np.array([noise.sigma for noise in problem.noise])
+    found = Found(nominal, nominal, [])
+    _grow(problem, found, pool, floor, 0.0, tell)
+    found = _detour(problem, found, pool, floor, tell)
+    _exchange(problem, found, pool, floor, tell)
+    if found.best.terms:
+        found.best = refined(problem, found.best)
+    return found
+
+
+def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
+    """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
+    best, steps = found.best, found.steps
+    while len(best.terms) < MOST_EFFECTS and len(steps) < MOST_STEPS:
+        ranked = screen(problem, best, pool, tell)
+        trials = []
+        promising = _varied([item for item in ranked if item.promise > 3.0])
+        if not best.terms:
+            promising += hidden(problem, best, pool)
+        for count, item in enumerate(promising):
+            tell(f"fitting {item.candidate.key}", count / len(promising))
+            trials.append(try_fit(problem, best, item, floor))
+        rank(trials, best)
+        winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
+        if winner is None:
+            steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
+            break
+        move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
+        steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
+        earned += winner.both.log_likelihood
+        best = _taken(problem, winner)
+        if len(best.terms) > 1:
+            best = _swap(problem, best, floor, steps)
+        best = _prune(problem, best, floor, steps)
+    found.best = best
+
+
+def _taken(problem: Problem, trial: Trial) -> Fit:
+    """The fit of a trial brought to its end, memories started and outputs weighed as it has them."""
+    set_starts(problem, trial.starts)
+    best = refined(problem, trial.fit)
+    reweigh(problem, best)
+    return best
+
+
+def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> Found:
+    """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
+    screening promises beside them would outdo all that was found.
+    """
+    if not found.best.terms:
+        return found
+    begun, scale = get_starts(problem), problem.scale.copy()
+    best, first = found, found.steps[0]
+    top = first.trials[0].score
+    for trial in _rivals(first.trials, found.best, found.best.terms[0].candidate)[:DETOURS]:
+        if trial.score < WORTH * top or not good_enough(trial, found.nominal):
+            continue
+        base = _taken(problem, trial)
+        ranked = screen(problem, base, pool, tell)
+        if (
+            not ranked
+            or _total(problem, found.nominal, base, floor) + ranked[0].promise
+            < _total(problem, found.nominal, best.best, floor) + len(best.best.terms) * ENOUGH
+        ):
+            continue
+        other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
+        _grow(problem, other, pool, floor, trial.both.log_likelihood, tell)
+        ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
+        more = max(len(other.best.values) - len(best.best.values), 0)
+        if ahead.log_likelihood > ENOUGH + PRICE * more and len(other.best.terms) <= len(best.best.terms) + 1:
+            best, begun, scale = other, get_starts(problem), problem.scale.copy()
+    set_starts(problem, begun)
+    problem.scale[:] = scale
+    for piece in problem.pieces:
+        piece.extra["weight"] = problem.scale
+    begin_anew(problem, best.best)
+    return best
+
+
+def _total(problem: Problem, nominal: Fit, fit: Fit, floor: Array) -> float:
+    """Likelihood on all samples that a structure has earned, less the price of its parameters."""
+    gain = compare(problem.pieces, "both", nominal.residuals, fit.residuals, floor)
+    return gain.log_likelihood - PRICE * (len(fit.values) - len(nominal.values))
+
+
+def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+    """Each effect's rivals refitted beside the others: one that only stood in for several has to leave now."""
+    for term in best.terms:
+        step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
+        rest, values = without(best, problem, (term.candidate.key,))
+        for trial in _rivals(step.trials if step else [], best, term.candidate)[:SWAPS]:
+            new = trial.fit.terms[-1]
+            begin = np.concatenate((values, trial.fit.values[-len(new.parameters) :]))
+            other = finish(problem, minimize(problem, (*rest, new), begin, rounds=MORE_ROUNDS, tolerance=1e-4))
+            ahead = compare(problem.pieces, "both", best.residuals, other.residuals, floor)
+            more = len(other.values) - len(best.values)
+            if ahead.log_likelihood > ENOUGH + PRICE * max(more, 0) and not at_bound(other):
+                steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
+                return refined(problem, other)
+    return best
+
+
+def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+    """Each of several effects taken out, and all candidates screened anew for its place: what was the best beside nothing
+    may not be the best beside the others.
+    """
+    for _ in range(EXCHANGES):
+        before = found.best.names
+        for term in found.best.terms:
+            if len(found.best.terms) > 1 or _frequencies(found.best, term):
+                _in_place_of(problem, found, term, pool, floor, tell)
+        found.best = _prune(problem, found.best, floor, found.steps)
+        if found.best.names == before or len(found.best.terms) < 2:
+            return
+
+
+def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
+    """Frequencies (Hz) that were fitted for `term`: no rival should miss them for lack of a start."""
+    at = len(fit.values) - sum(len(t.parameters) for t in fit.terms[fit.terms.index(term) :])
+    pairs = zip(term.parameters, fit.values[at : at + len(term.parameters)], strict=True)
+    return tuple(float(value) for p, value in pairs if p.name == "frequency" and p.unit == "Hz")
+
+
+def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+    known = _frequencies(found.best, term)
+    terms, values = without(found.best, problem, (term.candidate.key,))
+    less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+    ranked = [item for item in screen(problem, less, pool, tell, known) if item.promise > 3.0 and not item.drop]
+    own = [item for item in ranked if item.candidate.key == term.candidate.key]
+    top = max((item.promise for item in ranked), default=0.0)
+    others = [item for item in ranked if item not in own and item.promise > RIVAL * top]
+    trials = [try_fit(problem, less, item, floor) for item in [*own, *_varied(others)[:RIVALS]]]
+    rank(trials, less)
+    found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+    winner = next((trial for trial in trials if good_enough(trial, less)), None)
+    if winner is None or winner.candidate.key == term.candidate.key:
+        return
+    ahead = compare(problem.pieces, "both", found.best.residuals, winner.fit.residuals, floor)
+    more = len(winner.fit.values) - len(found.best.values)
+    if ahead.log_likelihood > (ENOUGH if more >= 0 else -PRICE) + PRICE * more:
+        found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
+        found.best = _taken(problem, winner)
+
+
+def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]:
+    """Trials of other effects, the likeliest of each name first; none that acts already, no finer shape of `candidate`."""
+    active = {term.candidate.key for term in best.terms}
+    kept: dict[str, Trial] = {}
+    for trial in trials:
+        other = trial.candidate
+        if other.key not in active and other.key != candidate.key and not trial.replaced and not related(candidate, other):
+            kept.setdefault(other.name, trial)
+    return list(kept.values())
+
+
+def _varied(items: list[Screened]) -> list[Screened]:
+    """The most promising, few of one effect or port so that rivals of other kinds get their chance."""
+    kept: list[Screened] = []
+    for item in items:
+        same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
+        here = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
+        if same < 3 and here < AT_ONE_PORT:
+            kept.append(item)
+        if len(kept) == FULL_FITS:
+            break
+    return kept
+
+
+def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+    """Backward: drop what no longer earns its place."""
+    dropped = True
+    while dropped and len(best.terms) > 1:
+        dropped = False
+        for term in best.terms:
+            terms, values = without(best, problem, (term.candidate.key,))
+            less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
+            gain = compare(problem.pieces, "both", less.residuals, best.residuals, floor)
+            held = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
+            least = 0.5 * max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
+            few = gain.log_likelihood < ENOUGH + PRICE * len(term.parameters)
+            if few or gain.share < least or held.log_likelihood < 0.0:
+                best, dropped = less, True
+                steps.append(Step("backward", term.candidate.key, gain))
+                break
+    return best

@@ -1,0 +1,1 @@
+"""Physics outside the vocabulary: an equation found by search."""

@@ -1,0 +1,141 @@
+"""Unlisted physics: an equation for the latent signal, searched over memory operators, believed only after a refit."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.model.effect import Port
+from host.diagnosis.model.model import Piece
+from host.diagnosis.model.operators import lag, play
+from host.diagnosis.selection.dictionary import Form
+
+Array = npt.NDArray[np.float64]
+ROWS = 2500
+LONGEST = 14  # symbols in an equation
+SEEDS = (1, 2)
+TELLING = 0.1  # precision of a sample, over the mean, from which it is searched
+
+
+def features(problem: Problem, piece: Piece, port: Port) -> Array:
+    """Feature table (n, features) of one recording; the same scales in every recording."""
+    return np.array([values for values, _ in described(problem, piece, port)]).T
+
+
+def described(problem: Problem, piece: Piece, port: Port) -> list[tuple[Array, str]]:
+    """Features and their text in the names of columns: the motion, its memory, its rate, the other inputs and their
+    rates.
+    """
+    x, span, dt = problem.model.motion(piece, port), _span(problem, port), piece.recording.dt_s
+    name = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
+    out = [(x / span, f"({name} / {span:.6g})")]
+    for part in (0.1, 0.4):
+        out.append(
+            ((x - play(x, 0.5 * part * span, 0.0)) / span, f"(({name} - play({name}, {part * span:.6g})) / {span:.6g})")
+        )
+    if piece.recording.timed:
+        duration = max(float(p.recording.time_s[-1] - p.recording.time_s[0]) for p in problem.pieces)
+        out.append(_rated(problem, piece, name, lambda p: problem.model.motion(p, port)))
+        for time_constant in (max(5 * dt, 0.005 * duration), 0.1 * duration):
+            out.append(
+                ((x - lag(x, dt, time_constant)) / span, f"(({name} - lag({name}, {time_constant:.6g})) / {span:.6g})")
+            )
+    for other in dict.fromkeys((*port.loads, *port.others)):
+        if other in piece.inputs:
+            size = float(np.sqrt(np.mean(np.concatenate([p.inputs[other] for p in problem.pieces]) ** 2))) or 1.0
+            text = problem.columns.get(other, other)
+            out.append((piece.inputs[other] / size, f"({text} / {size:.6g})"))
+            if piece.recording.timed and other in port.others:
+                out.append(_rated(problem, piece, text, lambda p, other=other: p.inputs[other]))  # type: ignore[misc]
+    return out
+
+
+def _rated(problem: Problem, piece: Piece, name: str, signal: Callable[[Piece], Array]) -> tuple[Array, str]:
+    """Rate of a signal over the RMS rate of all recordings, and its text."""
+
+    def rate(p: Piece) -> Array:
+        return np.gradient(signal(p), p.recording.dt_s)
+
+    size = float(np.sqrt(np.mean(np.concatenate([rate(p) for p in problem.pieces]) ** 2))) or 1.0
+    return rate(piece) / size, f"(rate({name}) / {size:.6g})"
+
+
+def _span(problem: Problem, port: Port) -> float:
+    return float(np.ptp(np.concatenate([problem.model.motion(piece, port) for piece in problem.pieces]))) or 1.0
+
+
+def latent(problem: Problem, fit: Fit, piece: Piece, residual: Array, port: Port) -> tuple[Array, Array]:
+    """What the port would have to add to explain the residual, (n,), NaN where nothing was measured; and its precision (n,),
+    relative.
+    """
+    nominal, acts = problem.parted(fit.terms, fit.values)
+    seen = np.isfinite(residual)
+    slope = getattr(problem.model, "sensitivity", None)
+    if slope is None:
+        need = problem.model.needs(piece, port, nominal, residual)
+        return np.where(seen.any(axis=0), need, np.nan), np.ones(piece.n)
+    unit = np.array([noise.sigma for noise in problem.noise])[:, None]
+    s, r = np.where(seen, slope(piece, nominal, port.name, acts), 0.0) / unit, np.where(seen, residual, 0.0) / unit
+    precision = np.sum(s * s, axis=0)
+    return np.where(precision > 0.0, np.sum(s * r, axis=0) / np.maximum(precision, 1e-300), np.nan), precision
+
+
+def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
+    """Equations for the latent signal by genetic programming, on the samples to fit that tell of it; short ones first."""
+    from pyoperon.sklearn import SymbolicRegressor
+
+    tables, targets, precisions = [], [], []
+    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+        F, (z, precision) = features(problem, piece, port), latent(problem, fit, piece, residual, port)
+        mask = piece.fit & np.isfinite(z)
+        tables.append(F[mask])
+        targets.append(z[mask])
+        precisions.append(precision[mask])
+    X, z, precision = np.concatenate(tables), np.concatenate(targets), np.concatenate(precisions)
+    telling = precision > TELLING * float(np.mean(precision))
+    X, z = X[telling], z[telling]
+    size = float(np.sqrt(np.mean(z**2))) or 1.0
+    step = max(1, len(X) // ROWS)
+    cut = len(X) // step * step
+    X = X[:cut].reshape(-1, step, X.shape[1]).mean(axis=1)
+    z = np.clip(z[:cut].reshape(-1, step).mean(axis=1) / size, -8.0, 8.0)
+    names, found = [text for _, text in described(problem, problem.pieces[0], port)], []
+    for seed in SEEDS:
+        regressor = SymbolicRegressor(
+            allowed_symbols="add,sub,mul,div,sin,exp,abs,square,tanh,constant,variable",
+            population_size=300,
+            generations=60,
+            max_length=LONGEST,
+            max_depth=6,
+            optimizer_iterations=3,
+            n_threads=1,
+            random_state=seed,
+            max_time=5,
+            objectives=["r2", "length"],
+        )
+        regressor.fit(X, z)
+        front = getattr(regressor, "pareto_front_", [])
+        for item in front:
+            found.append(_form(regressor, item, names, size, lambda p: features(problem, p, port)))
+    unique = {form.text: (form, on_table) for form, on_table in found if form.length <= LONGEST}
+    ranked = sorted(unique.values(), key=lambda f: float(np.mean((f[1](X) / size - z) ** 2)) * (1.0 + 0.02 * f[0].length))
+    return [form for form, _ in ranked[:3]]
+
+
+def _form(
+    regressor: object, item: dict, names: list[str], size: float, table: Callable[[Piece], Array]
+) -> tuple[Form, Callable[[Array], Array]]:
+    """A tree of the search as a form, and as a function of the feature table (n, features)."""
+    tree = item["tree"]
+    text = regressor.get_model_string(tree, 4)  # type: ignore[attr-defined]
+    readable = re.sub(r"X(\d+)", lambda m: names[int(m.group(1)) - 1], text)
+
+    def on_table(X: Array) -> Array:
+        out = np.asarray(regressor.evaluate_model(tree, np.asarray(X, dtype=np.float32)), dtype=np.float64)  # type: ignore[attr-defined]
+        return size * np.clip(np.where(np.isfinite(out), out, 0.0), -20.0, 20.0)
+
+    return Form(readable, lambda p: on_table(table(p)), int(getattr(tree, "Length", LONGEST))), on_table

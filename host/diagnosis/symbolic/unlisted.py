@@ -1,0 +1,183 @@
+"""What is left after the known effects: is it predictable, and does an equation found by search explain it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.evidence import compare
+from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
+from host.diagnosis.model.effect import Port
+from host.diagnosis.selection.dictionary import Foretold, Form, equation_at, fallen, foretell, lay_out
+from host.diagnosis.selection.screening import Screened, term_of, without
+from host.diagnosis.selection.search import Found, Step, try_fit
+from host.diagnosis.selection.trial import ENOUGH, SMALLEST_EXCESS, SMALLEST_SHARE, Trial, rank
+from host.diagnosis.symbolic.symbolic import search_equation
+
+Array = npt.NDArray[np.float64]
+Tell = Callable[[str, float], None]
+MUCH = 0.15  # share of the mismatch that one known effect may leave; two at a port may leave half of that, and so on:
+# several effects that pile up and still do not fit stand for something that is in no list
+MEASURED = 2.0  # times a noise level from quiescent parts, beyond which the rest is not noise where effects are named,
+MEASURED_BARE = 3.0  # and where none is;
+BLURRED = 1.15  # and this is how well it is known: what is left within it may be noise
+GUESSED = 8.0  # times a level guessed from the spectrum, whose colour is not known
+TRIED_FORMS = 3  # refitted in the place of an effect that is named
+CHOSEN = 15.0  # log-likelihood an equation has to gain on samples to fit
+UNLIKELY = 0.1  # p-value it has to reach on held-out blocks
+NEAR = 0.7  # of the gain of an equation, at which a known effect refused by the search keeps it from being named
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What known effects leave. `foretold`: at the place where it is most so; `left`: share of the nominal mismatch still
+    there.
+    """
+
+    foretold: Foretold | None
+    left: float
+    doubtful: bool = False  # known effects are named, but they are probably stand-ins
+    loud: bool = False  # more is left than noise can be, foretold or not
+
+    @property
+    def sure(self) -> bool:
+        """Whether there is a mismatch that the finder knows to be there."""
+        return self.loud or (self.foretold is not None and self.foretold.sure)
+
+
+def left_over(problem: Problem, found: Found, floor: Array) -> float:
+    """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
+    mattered most; noise may be larger than its estimate by BLURRED.
+    """
+    shares, weights = [], []
+    for row in range(floor.size):
+        before = _power(problem, found.nominal.residuals, row) - floor[row] ** 2
+        after = _power(problem, found.best.residuals, row) - (BLURRED * floor[row]) ** 2
+        if before > 0.0:
+            shares.append(float(np.clip(after / before, 0.0, 1.0)))
+            weights.append(before / floor[row] ** 2)
+    return shares[int(np.argmax(weights))] if shares else 0.0
+
+
+def _above_noise(problem: Problem, found: Found, floor: Array) -> bool:
+    """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
+    guessed.
+    """
+    measured = MEASURED if found.best.terms else MEASURED_BARE
+    return any(
+        _power(problem, found.best.residuals, row)
+        > ((measured if noise.source == "quiescent parts" else GUESSED) * floor[row]) ** 2
+        for row, noise in enumerate(problem.noise)
+    )
+
+
+def _power(problem: Problem, residuals: list[Array], row: int) -> float:
+    parts = [r[row][piece.heldout] for piece, r in zip(problem.pieces, residuals, strict=True)]
+    together = np.concatenate(parts)
+    together = together[np.isfinite(together)]
+    return float(np.mean(together**2)) if together.size else 0.0
+
+
+def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Rest:
+    """Looks at the rest, and adds an equation to `found.best` where one earns its place."""
+    ports = {port.name: port for port in problem.model.ports}
+    pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
+    tell("is the rest foretold by anything", 0.0)
+    places = foretell(problem, found.best, floor)
+    rest = _rest(problem, found, floor, places)
+    crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
+    if not rest.sure or rest.foretold is None or (crowd and rest.left < MUCH / crowd[0][1]):
+        return rest
+    likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
+    for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
+        if _equation_instead(problem, found, floor, *pairs[place], tell, evolve=number == 0):
+            return _rest(problem, found, floor, foretell(problem, found.best, floor))
+    return replace(rest, doubtful=bool(crowd))
+
+
+def _rest(problem: Problem, found: Found, floor: Array, places: list[Foretold]) -> Rest:
+    best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
+    explained = fallen(problem, found.nominal.residuals, found.best.residuals, floor)
+    told = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
+    left = max(left_over(problem, found, floor), told)
+    return Rest(best, left, loud=_above_noise(problem, found, floor))
+
+
+def _equation_instead(
+    problem: Problem, found: Found, floor: Array, port: Port, target: Port, tell: Tell, evolve: bool
+) -> bool:
+    """Puts an equation in the place of all effects at its port, if it earns its place and does better than they.
+
+    `evolve`: search by genetic programming too, where no form of the library says it all.
+    """
+    tell("searching an equation", 0.0)
+    there = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.name in (port.name, target.name))
+    terms, values = without(found.best, problem, there)
+    base = finish(problem, minimize(problem, terms, values, rounds=8)) if there else found.best
+    sized = [form for place in foretell(problem, base, floor) if place.port is port for form in place.forms]
+    trials = [_tried(problem, base, floor, target, form, size) for form, size in sized]
+    forms = [form for form, _ in sized]
+    rank(trials, base)
+    winner = next((trial for trial in trials if _earned(trial)), None)
+    if evolve and (winner is None or _left(problem, found, winner.fit, floor) > MUCH):
+        evolved = search_equation(problem, base, port)
+        trials += [_tried(problem, base, floor, target, form, 1.0) for form in evolved]
+        forms += evolved
+        rank(trials, base)
+        winner = next((trial for trial in trials if _earned(trial)), None)
+    if winner is None or not _better_than_known(problem, found, floor, winner, bool(there)):
+        return False
+    found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
+    found.steps.append(Step("equation", winner.candidate.key, winner.heldout, trials))
+    found.best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
+    reweigh(problem, found.best)
+    return True
+
+
+def equations_for(problem: Problem, less: Fit, port: Port, floor: Array) -> list[Trial]:
+    """The best forms of the library at `port`, or at the one whose reading it is, each refitted beside `less`."""
+    target = next((b for a, b in problem.model.unlisted_at if port.name in (a, b)), None)
+    if target is None:
+        return []
+    ports = {p.name: p for p in problem.model.ports}
+    name = next(a for a, b in problem.model.unlisted_at if b == target)
+    sized = [form for place in foretell(problem, less, floor, name) for form in place.forms]
+    return [_tried(problem, less, floor, ports[target], form, size) for form, size in sized[:TRIED_FORMS]]
+
+
+def _earned(trial: Trial) -> bool:
+    """Whether an equation earns its place: in either part of the samples, and by what it takes of the error above noise.
+
+    Chosen among hundreds on the samples to fit, it has to gain more there than a listed effect; few held-out blocks may hold
+    all of the mismatch, so these have less of a say.
+    """
+    gain = trial.heldout
+    return (
+        gain.log_likelihood > ENOUGH + 1.0
+        and trial.trained.log_likelihood > CHOSEN
+        and gain.p_value < UNLIKELY
+        and gain.share > max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
+    )
+
+
+def _tried(problem: Problem, base: Fit, floor: Array, target: Port, form: Form, size: float) -> Trial:
+    lay_out(problem.pieces, form)
+    candidate = equation_at(target, form, size)
+    return try_fit(problem, base, Screened(candidate, term_of(problem, candidate, base), (), 1.0, [np.array([size])]), floor)
+
+
+def _left(problem: Problem, found: Found, fit: Fit, floor: Array) -> float:
+    return left_over(problem, replace(found, best=fit), floor)
+
+
+def _better_than_known(problem: Problem, found: Found, floor: Array, winner: Trial, instead: bool) -> bool:
+    """Whether an equation beats the known effects it takes the place of, or else all those that were tried and refused."""
+    if instead:
+        gain = compare(problem.pieces, "heldout", found.best.residuals, winner.fit.residuals, floor)
+        return gain.log_likelihood > ENOUGH
+    last = found.steps[-1].trials if found.steps else []
+    return all(trial.heldout.log_likelihood < NEAR * winner.heldout.log_likelihood for trial in last)

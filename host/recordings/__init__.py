@@ -1,0 +1,1 @@
+"""Recordings: write, read, repair, export, and channels that Foxglove draws."""

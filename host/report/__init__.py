@@ -1,0 +1,1 @@
+"""Reports of a run: figures, summary and HTML pages."""

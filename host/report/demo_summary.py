@@ -1,0 +1,135 @@
+"""How a demo went: the contract's JSON, from the recording, and a short table for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from host.recordings.recording import Recording
+from host.report.run_report import lateness_of, quantity, verdict_of
+from host.report.run_summary import RunSummary, summarize
+
+
+class Run(Protocol):
+    """What is known of a run beside its recording: how its scenario ended, and what the loop and the board counted."""
+
+    @property
+    def recording(self) -> Path: ...
+
+    @property
+    def outcome(self) -> Any: ...
+
+    @property
+    def counts(self) -> Mapping[str, Any]: ...
+
+    @property
+    def interrupted(self) -> str: ...
+
+
+def demo_result(recording: Recording, run: Run, report: Path) -> dict[str, Any]:
+    """The object of `seldinger demo --json`.
+
+    Forces, tip and timing come from the recording. `run.counts` adds what happened between two recorded board messages
+    (faults, crc_errors, underruns: the worse of both is given); `run.outcome` the steps, where there are pins to count.
+    """
+    summary, counts = summarize(recording), run.counts
+    ticks, board = summary.ticks, summary.board
+    result: dict[str, Any] = {
+        "target_force_N": summary.target_force_N,
+        "force_rms_error_N": summary.force_rms_error_N,
+        "force_peak_N": summary.force_peak_N,
+        "tip_rms_error_m": summary.tip_rms_error_m,
+        "contact_seconds": summary.contact_seconds,
+        "loop_hz": _whole(ticks.loop_hz),
+        "tick_us": {"p50": ticks.p50_us, "p99": ticks.p99_us, "p999": ticks.p999_us, "max": ticks.max_us},
+        "missed_ticks": max(ticks.missed, int(counts.get("missed_ticks", 0))),
+        "firmware": {
+            "faults": list(dict.fromkeys([*board.faults, *map(str, counts.get("faults", []))])),
+            "crc_errors": max(board.crc_errors, int(counts.get("crc_errors", 0))),
+            "underruns": max(board.underruns, int(counts.get("underruns", 0))),
+        },
+        "recording": str(recording.path),
+        "report": str(report),
+        "force_mean_last_10_s_N": summary.force_mean_last_10_s_N,
+        "worst_safety_action": summary.worst_action,
+        "verdict": verdict_of(summary).level,
+        "interrupted": run.interrupted,
+    }
+    steps = {name: list(map(int, getattr(run.outcome, f"steps_{name}"))) for name in ("commanded", "on_pins", "reported")}
+    if steps["on_pins"]:
+        result["steps"] = steps
+    if counts.get("digest"):
+        result["digest"] = str(counts["digest"])
+    return result
+
+
+def _whole(value: float) -> float | int:
+    return int(value) if math.isfinite(value) and value == int(value) else value
+
+
+def print_summary(result: dict[str, Any], run: Run, console: Console | None = None) -> None:
+    """Verdict, a short table, and where recording and report are, on standard error."""
+    console = console or Console(stderr=True, highlight=False)
+    summary = summarize(Recording(run.recording))
+    verdict = verdict_of(summary)
+    colour = {"good": "green", "fair": "yellow", "bad": "red"}[verdict.level]
+    console.print(f"\n[bold {colour}]{verdict.sentence}[/]", markup=True)
+    for remark in verdict.remarks:
+        console.print(f"  {remark}", markup=False)
+    for note in run.outcome.notes:
+        console.print(f"  {note}", markup=False, soft_wrap=True)
+    if run.interrupted:
+        console.print(f"  Ended early by {run.interrupted}.")
+    console.print(_table(result, summary))
+    for name in ("recording", "report"):
+        console.print(f"{name:>10}  {result[name]}", soft_wrap=True, markup=False)
+
+
+def _table(result: dict[str, Any], summary: RunSummary) -> Table:
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    firmware, ticks = result["firmware"], summary.ticks
+    rows = [
+        (
+            "mean force, last 10 s",
+            quantity(result["force_mean_last_10_s_N"], "N", 3),
+            f"wanted {quantity(result['target_force_N'], 'N', 2)}",
+        ),
+        ("RMS force error", quantity(result["force_rms_error_N"], "N", 3), "after 3 s of settling"),
+        ("peak force", quantity(result["force_peak_N"], "N", 3), f"limit {quantity(summary.force_limit_N, 'N', 2)}"),
+        ("tip off target, sideways", quantity(result["tip_rms_error_m"] * 1e3, "mm", 2), "RMS, tracker noise included"),
+        ("in touch", quantity(result["contact_seconds"], "s", 1), ""),
+        (
+            "tick",
+            quantity(ticks.p50_us, "µs", 1),
+            f"99.9 %: {quantity(ticks.p999_us, 'µs', 1)}, longest {quantity(ticks.max_us, 'µs', 0)}, {lateness_of(summary)}",
+        ),
+        (
+            "firmware",
+            ", ".join(firmware["faults"]) or "no fault",
+            f"{firmware['crc_errors']} damaged frames, {firmware['underruns']} underruns",
+        ),
+    ]
+    if "steps" in result:
+        agree = len({tuple(steps) for steps in result["steps"].values()}) == 1
+        shown = ", ".join(map(str, result["steps"]["on_pins"]))
+        rows.append(
+            (
+                "steps at the end",
+                "agree" if agree else "differ",
+                f"on the pins: {shown}"
+                if agree
+                else "; ".join(f"{name.replace('_', ' ')} {steps}" for name, steps in result["steps"].items()),
+            )
+        )
+    if ticks.longest_gap_ns:
+        rows.append(("longest gap", f"{ticks.longest_gap_ns * 1e-6:.1f} ms", ticks.longest_gap_where))
+    for row in rows:
+        table.add_row(*map(escape, row))
+    table.columns[0].style, table.columns[2].style = "dim", "dim"
+    return table

@@ -1,0 +1,252 @@
+"""The report of a run: one HTML file with everything in it, written from the recording alone."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from host.recordings.recording import Recording
+from host.report.run_figures import RunFigures
+from host.report.run_summary import RunSummary, summarize
+
+# Keeps a number and its unit on one line.
+NBSP = "\u00a0"
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+class Verdict(NamedTuple):
+    """`level` good, fair or bad; one sentence; and what else must be known, sentence by sentence."""
+
+    level: str
+    sentence: str
+    remarks: tuple[str, ...]
+
+
+class Line(NamedTuple):
+    """One line of the table of figures: what, how much, and what to hold it against."""
+
+    name: str
+    value: str
+    beside: str = ""
+
+
+def write_report(recording: Recording, target: str | Path) -> Path:
+    """Write the report of `recording` to `target` (HTML) and return its path. Raises OSError where it cannot write."""
+    target = Path(target)
+    target.write_text(render(recording), encoding="utf-8")
+    return target
+
+
+def render(recording: Recording) -> str:
+    """The report of `recording` as one self-contained HTML text."""
+    summary = summarize(recording)
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template("run_report.html.j2").render(
+        verdict=verdict_of(summary),
+        lines=lines_of(summary),
+        figures=RunFigures(recording, summary).all(),
+        firmware=firmware_of(summary),
+        safety=_safety_rows(recording, summary),
+        events=_event_rows(recording),
+        topics=_topic_rows(recording, summary),
+        run=recording.run,
+        name=recording.path.name,
+        duration=f"{summary.duration_s:.1f} s",
+        appendix=_appendix(recording),
+    )
+
+
+def quantity(value: float, unit: str, digits: int) -> str:
+    """`value` with its unit as people read it; a dash where there is none."""
+    return f"{value:.{digits}f}{NBSP}{unit}" if math.isfinite(value) else "–"
+
+
+def signed(value: float, unit: str, digits: int) -> str:
+    """As `quantity`, with its sign."""
+    return f"{value:+.{digits}f}{NBSP}{unit}".replace("-", "\u2212") if math.isfinite(value) else "–"
+
+
+def lateness_of(summary: RunSummary) -> str:
+    """How many ticks came too late; in virtual time none can, whatever they took, because the world waits."""
+    return "virtual time: the world waits" if summary.virtual else f"{summary.ticks.missed} too late"
+
+
+def verdict_of(summary: RunSummary) -> Verdict:
+    """What to say first. Good: the force was kept and nothing intervened. Bad: no contact, a stop or a board fault."""
+    remarks = _remarks(summary)
+    stopped = summary.worst_action in ("retract", "stop") or bool(summary.board.faults)
+    if summary.contact is None or summary.contact_seconds == 0:
+        sentence = f"No contact in {summary.duration_s:.0f} s."
+        return Verdict("bad" if stopped or summary.target_force_N > 0 else "fair", sentence, remarks)
+    held = f"The wall was touched for {quantity(summary.contact_seconds, 's', 1)}"
+    if not math.isfinite(summary.target_force_N):
+        return Verdict("bad" if stopped else "fair", held + "; no force was asked for.", remarks)
+    sentence = (
+        f"{quantity(summary.force_mean_last_10_s_N, 'N', 3)} held on average over the last "
+        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact, "
+        f"{quantity(summary.target_force_N, 'N', 2)} wanted; "
+        f"{quantity(summary.force_rms_error_N * 1e3, 'mN', 0)} RMS off from moment to moment."
+    )
+    if stopped:
+        return Verdict("bad", f"{held}, then the run was stopped.", remarks)
+    clean = summary.force_kept and not remarks
+    return Verdict("good" if clean else "fair", sentence, remarks)
+
+
+def _remarks(summary: RunSummary) -> tuple[str, ...]:
+    """Everything that is not as it should be."""
+    board, ticks = summary.board, summary.ticks
+    said = [
+        (summary.truncated, "The recording is incomplete: it was cut short or damaged; the rest is judged."),
+        (
+            not summary.force_kept and math.isfinite(summary.force_mean_last_10_s_N),
+            "The mean force is more than a tenth off its target.",
+        ),
+        (
+            summary.force_peak_N > summary.force_limit_N,
+            f"The force went to {summary.force_peak_N:.3f} N, above the limit of {summary.force_limit_N:.2f} N.",
+        ),
+        (bool(board.faults), "The stepper board latched: " + "; ".join(board.faults) + "."),
+        (board.crc_errors > 0, f"{board.crc_errors} damaged frames on the serial line."),
+        (board.underruns > 0, f"The board ran out of setpoints {board.underruns} times while moving."),
+        (board.rejected > 0, f"The board refused {board.rejected} setpoints."),
+        (board.resets > 0, f"The board was reset {board.resets} times."),
+        (ticks.missed > 0, f"{ticks.missed} ticks of the loop came too late."),
+        (
+            bool(summary.lost),
+            "Messages are missing from the recording: "
+            + ", ".join(f"{count} of {topic}" for topic, count in sorted(summary.lost.items()))
+            + ".",
+        ),
+    ]
+    causes = dict.fromkeys(f"Safety: {span.name}, {span.note or 'no cause given'}." for span in summary.safety)
+    return tuple([text for wrong, text in said if wrong] + list(causes))
+
+
+def lines_of(summary: RunSummary) -> list[Line]:
+    """The short table, in the units of people."""
+    ticks, estimate = summary.ticks, summary.estimate
+    limit = quantity(summary.force_limit_N, "N", 2)
+    lines = [
+        Line(
+            "Mean force, last 10 s",
+            quantity(summary.force_mean_last_10_s_N, "N", 3),
+            f"wanted {quantity(summary.target_force_N, 'N', 2)}",
+        ),
+        Line("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),
+        Line("Peak force", quantity(summary.force_peak_N, "N", 3), f"limit {limit}"),
+        Line("Tip off target, sideways", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"),
+        Line(
+            "Time in touch",
+            quantity(summary.contact_seconds, "s", 1),
+            f"of {quantity(summary.contact.seconds, 's', 1)} of contact" if summary.contact else "",
+        ),
+        Line("Tick, median", quantity(ticks.p50_us, "µs", 1), f"99.9 %: {quantity(ticks.p999_us, 'µs', 1)}"),
+        Line("Longest tick", quantity(ticks.max_us, "µs", 0), lateness_of(summary)),
+    ]
+    if estimate.count:
+        lines.insert(
+            3,
+            Line(
+                "Estimated against measured",
+                quantity(estimate.rms_error_N * 1e3, "mN", 0),
+                f"RMS; mean {signed(estimate.mean_error_N * 1e3, 'mN', 0)}, "
+                f"sd given {quantity(estimate.median_sd_N * 1e3, 'mN', 0)}",
+            ),
+        )
+    if math.isfinite(ticks.lateness_p99_us):
+        lines.append(
+            Line(
+                "Woken late, 99 %",
+                quantity(ticks.lateness_p99_us, "µs", 0),
+                f"worst {quantity(ticks.lateness_max_us, 'µs', 0)}",
+            )
+        )
+    return lines
+
+
+def firmware_of(summary: RunSummary) -> list[Line]:
+    """The board's health; empty where it was never heard."""
+    board, ticks = summary.board, summary.ticks
+    if not board.known:
+        return []
+    gap = ", ".join(str(steps) for steps in board.encoder_gap_steps)
+    where = f" ({ticks.longest_gap_where})" if ticks.longest_gap_where else ""
+    lines = [
+        Line("Faults", ", ".join(board.faults) or "none"),
+        Line("Damaged frames", str(board.crc_errors)),
+        Line("Queue underruns", str(board.underruns)),
+        Line("Setpoints refused", str(board.rejected)),
+        Line("Resets", str(board.resets)),
+        Line("Encoder against steps, largest", f"{gap} steps", "insertion, roll, knob"),
+    ]
+    if ticks.longest_gap_ns:
+        lines.append(Line("Longest gap between setpoints", f"{ticks.longest_gap_ns * 1e-6:.1f} ms{where}"))
+    return lines
+
+
+def _safety_rows(recording: Recording, summary: RunSummary) -> list[Line]:
+    start_ns = recording.span_ns[0]
+    return [Line(f"{(span.start_ns - start_ns) * 1e-9:.2f} s", span.name, span.note) for span in summary.safety[:200]]
+
+
+def _event_rows(recording: Recording, most: int = 200) -> list[Line]:
+    """Commands with their replies, and log lines, in order of time."""
+    start_ns = recording.span_ns[0]
+    replies = {reply["id"]: reply for reply in recording.messages("reply")}
+    rows: list[tuple[int, str, str]] = []
+    for command in recording.messages("command"):
+        reply = replies.get(command["id"])
+        words = [command["action"]] + ([command["target"]] if command["target"] != "none" else [])
+        words += [f"{command['force_N']:.2f} N"] if command["target"] == "contact" else []
+        answer = f"{reply['result']} {reply['text']}".strip() if reply else "no reply recorded"
+        rows.append((command["stamp_ns"], "command", f"{' '.join(words)}: {answer}"))
+    rows += [(line["stamp_ns"], line["source"], line["text"]) for line in recording.messages("log")]
+    rows.sort(key=lambda row: row[0])
+    return [Line(f"{(stamp_ns - start_ns) * 1e-9:.2f} s", source, text) for stamp_ns, source, text in rows[:most]]
+
+
+def _topic_rows(recording: Recording, summary: RunSummary) -> list[Line]:
+    duration_s = max(summary.duration_s, 1e-9)
+    rows = []
+    for topic, count in sorted(recording.topics.items()):
+        lost = f", {summary.lost[topic]} lost" if topic in summary.lost else ""
+        rows.append(Line(topic, str(count), f"{count / duration_s:.1f} /s{lost}"))
+    return rows
+
+
+def _appendix(recording: Recording) -> list[tuple[str, list[Line]]]:
+    """Run, catheter and effective configuration as flat tables."""
+    run = [Line(name, value) for name, value in recording.run.items() if value]
+    sections: list[tuple[str, list[Line]]] = [("run", run)]
+    flat_catheter = _flat(recording.catheter)
+    if flat_catheter:
+        sections.append(("catheter parameters", flat_catheter))
+    general: list[Line] = []
+    for name, value in recording.configuration.items():
+        if isinstance(value, dict):
+            sections.append((f"configuration: {name}", _flat(value)))
+        else:
+            general.append(Line(name, _shown(value)))
+    return sections[:1] + ([("configuration", general)] if general else []) + sections[1:]
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> list[Line]:
+    lines: list[Line] = []
+    for name, value in values.items():
+        if isinstance(value, dict):
+            lines += _flat(value, f"{prefix}{name}.")
+        elif value is not None:
+            lines.append(Line(prefix + name, _shown(value)))
+    return lines
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_shown(item) for item in value)
+    return f"{value:.10g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,147 @@
+"""The model process: hears the rig over zenoh, estimates the tip force, publishes it, and records everything."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+
+from host.estimation.interface import Estimator
+from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
+from host.recordings.recording import RecordingWriter, header_of
+from protocol.rig_file import load_rig
+from protocol.topics import Log
+from protocol.zenoh_session import Session
+from realtime.loop.service_notify import ServiceNotifier
+
+POLL_S = 0.002
+QUIET_S = 1.0
+
+
+class EstimatorProcess:
+    """Everything of the process between its start and its end; `run` until `stop` is set.
+
+    recording: where to write, None to record nothing. clock: `wall` is CLOCK_MONOTONIC, as in all processes of a rig;
+    `virtual` is handed out by the simulated rig, and known here as the newest stamp heard.
+    """
+
+    def __init__(
+        self, session: Session, estimator: Estimator, recording: RecordingWriter | None, clock: str = "wall"
+    ) -> None:
+        self.service = EstimationService(estimator)
+        self._recording = recording
+        self._newest_ns = 0
+        self._now_ns = time.monotonic_ns if clock == "wall" else lambda: self._newest_ns
+        self._everything = session.everything()
+        self._forces = session.publisher("force/estimate")
+        self._logs = session.publisher("log")
+        self._heard_s = self._told_s = time.monotonic()
+        self._told = ""
+        self._steps = 0
+
+    def step(self) -> bool:
+        """Take in what has come, record it, answer the newest pose. True if there was anything."""
+        self._steps += 1
+        taken = self._everything.take()
+        self._newest_ns = max([self._newest_ns, *(message.stamp_ns for _, message, _ in taken)])
+        now_ns = self._now_ns()
+        for topic, message, payload in taken:
+            self.service.hear(topic, message)
+            if self._recording is not None:
+                self._recording.write_encoded(topic, payload, message.stamp_ns, message.sequence, now_ns)
+        estimate = self.service.answer(self._now_ns())
+        if estimate is not None:
+            self._forces.put(estimate)
+        self._tell(self._everything.complaint or self.service.last_failure)
+        self._flush_when_quiet(bool(taken))
+        return bool(taken)
+
+    def _flush_when_quiet(self, heard: bool) -> None:
+        now_s = time.monotonic()
+        if not heard and self._recording is not None and now_s - self._heard_s > QUIET_S:
+            self._recording.flush()
+        if heard or now_s - self._heard_s > QUIET_S:
+            self._heard_s = now_s
+
+    def log(self, level: str, text: str) -> None:
+        """Say `text` on the log topic and on standard error."""
+        print(f"seldinger estimator: {text}", file=sys.stderr, flush=True)
+        self._logs.put(Log(stamp_ns=max(self._now_ns(), 0), level=level, source="estimator", text=text))
+
+    def _tell(self, text: str) -> None:
+        """Log `text` when it is new, at most once in QUIET_S: a flood of bad messages must not become one of logs."""
+        now_s = time.monotonic()
+        if text and text != self._told and now_s - self._told_s > QUIET_S:
+            self._told, self._told_s = text, now_s
+            self.log("warning", text)
+
+    def run(self, stop: threading.Event) -> None:
+        """Steps until `stop`, then takes in what is left. Steps feed the service manager's watchdog."""
+        manager = ServiceNotifier()
+        manager.ready("waits for poses")
+        while not stop.is_set():
+            manager.beat(self._steps)
+            if not self.step():
+                stop.wait(POLL_S)
+        self.step()
+
+
+def _stop_on_signals() -> threading.Event:
+    stop = threading.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+    return stop
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """`python -m host.run.model_process RIG.toml`. Exit status 0 after SIGTERM or SIGINT, 1 where it cannot start."""
+    parser = argparse.ArgumentParser(prog="seldinger estimator", description=__doc__)
+    parser.add_argument("rig", type=Path, help="rig file")
+    parser.add_argument("--record", type=Path, help="recording to write (a file that does not exist yet)")
+    parser.add_argument("--estimator", default=DEFAULT_ESTIMATOR, help="module:function that makes the estimator of a rig")
+    parser.add_argument("--clock", choices=("wall", "virtual"), default="wall")
+    parser.add_argument("--seed", type=int)
+    options = parser.parse_args(arguments)
+    stop = _stop_on_signals()
+    try:
+        rig = load_rig(options.rig)
+        estimator = load_estimator(options.estimator, rig)
+        session = Session(rig.name, rig.zenoh.listen, [], rig.access)
+    except (ValueError, OSError) as error:
+        print(f"seldinger estimator: {error}", file=sys.stderr)
+        return 1
+    with session:
+        recording = None
+        process: EstimatorProcess | None = None
+
+        def on_failure(text: str) -> None:
+            if process is not None:
+                process.log("error", text)
+
+        try:
+            if options.record is not None:
+                header = header_of(rig, options.clock, options.seed, {"estimator": options.estimator})
+                recording = RecordingWriter(options.record, header, on_failure)
+            process = EstimatorProcess(session, estimator, recording, options.clock)
+            print(json.dumps({"ready": True, "recording": str(options.record or "")}), flush=True)
+            process.run(stop)
+        except OSError as error:
+            print(f"seldinger estimator: {error}", file=sys.stderr)
+            return 1
+        finally:
+            if recording is not None:
+                recording.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Keys and certificates for readers and commanders on other machines."""

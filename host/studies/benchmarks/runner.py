@@ -1,0 +1,129 @@
+"""Registry and stopwatch of `seldinger bench`: every row times ours and a peer in one run, alternating, on equal inputs."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from protocol.errors import InputError
+
+Row = dict[str, Any]
+Report = Callable[[str], None]
+Benchmark = Callable[[int, Report], list[Row]]
+
+# name -> "module:function". The function takes (seed, report) and returns rows made by `row_of`; `report` is progress
+# for people. A module that cannot be imported because it is not there leaves its row out, and says so.
+BENCHMARKS: dict[str, str] = {
+    "pcar_direct": "host.studies.benchmarks.planar:direct",
+    "pcar_inverse": "host.studies.benchmarks.planar:inverse",
+    "cosserat_tip": "host.studies.benchmarks.statics:tip_frame",
+    "cosserat_global": "host.studies.benchmarks.statics:base_frame",
+    "helical_global": "host.studies.benchmarks.statics:helical",
+    "estimate_case_1": "host.studies.benchmarks.estimation:case_1",
+    "estimate_case_2": "host.studies.benchmarks.estimation:case_2",
+    "estimate_case_3": "host.studies.benchmarks.estimation:case_3",
+    "estimate_case_4": "host.studies.benchmarks.estimation:case_4",
+    "estimate_case_5": "host.studies.benchmarks.estimation:case_5",
+    "estimate_case_6": "host.studies.benchmarks.estimation:case_6",
+    "estimate_batch": "host.studies.benchmarks.estimation:batch",
+    "import_and_solve": "host.studies.benchmarks.start_up:import_and_solve",
+    "control_tick": "host.studies.benchmarks.control:control_tick",
+    "kalman_predict": "host.studies.benchmarks.control:kalman_predict",
+    "diagnose": "host.studies.benchmarks.diagnosis:diagnose",
+}
+SECONDS_PER_BLOCK = 100e-6  # a call shorter than this is repeated inside one reading of the clock
+BLOCKS = 3  # readings of each side, of which the least counts: the rest is what else ran on the machine
+PEER_BLOCKS_LONGER_THAN_s = 0.02  # ... and one reading is enough
+
+
+@dataclass
+class Timed:
+    """Seconds per call, one for each input, of ours and of the peer."""
+
+    ours_s: list[float] = field(default_factory=list)
+    peer_s: list[float] = field(default_factory=list)
+
+
+def alternate(ours: Sequence[Callable[[int], object]], peers: Sequence[Callable[[], object]]) -> Timed:
+    """Times ours[i](repeats) and peers[i]() in turn, input by input.
+
+    Arguments: ours[i] runs input i as often as it is told, inside compiled code; peers[i] runs it once.
+    """
+    timed = Timed()
+    for mine, theirs in zip(ours, peers, strict=True):
+        once = _seconds(lambda mine=mine: mine(1))  # type: ignore[misc]
+        repeats = max(1, int(SECONDS_PER_BLOCK / max(once, 1e-9)))
+        best, best_peer = np.inf, np.inf
+        for _ in range(BLOCKS):
+            best = min(best, _seconds(lambda mine=mine, n=repeats: mine(n)) / repeats)  # type: ignore[misc]
+            if not PEER_BLOCKS_LONGER_THAN_s < best_peer < np.inf:
+                best_peer = min(best_peer, _seconds(theirs))
+        timed.ours_s.append(best)
+        timed.peer_s.append(best_peer)
+    return timed
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    start = time.perf_counter_ns()
+    call()
+    return (time.perf_counter_ns() - start) * 1e-9
+
+
+def row_of(name: str, variant: str, peer: str, timed: Timed, seed: int, **accuracy: object) -> Row:
+    """One row of the result: medians and 95th percentiles in microseconds, and what both sides reached.
+
+    `accuracy`: for instance tip_error_m and peer_tip_error_m, right and peer_right of cases; what they mean is in docs.
+    """
+    ours, theirs = np.array(timed.ours_s) * 1e6, np.array(timed.peer_s) * 1e6
+    return {
+        "name": name,
+        "variant": variant,
+        "unit": "us",
+        "median": float(np.median(ours)),
+        "p95": float(np.percentile(ours, 95)),
+        "seed": seed,
+        "cases": len(ours),
+        "peer": peer,
+        "peer_median": float(np.median(theirs)),
+        "peer_p95": float(np.percentile(theirs, 95)),
+        "speedup": float(np.median(theirs) / np.median(ours)),
+        **accuracy,
+    }
+
+
+def run(only: Sequence[str], seed: int, report: Report) -> tuple[list[Row], list[str]]:
+    """Rows of the named benchmarks (all where none is named), and the names whose module is not there.
+
+    Raises: InputError for a name that is not registered.
+    """
+    for name in only:
+        if name not in BENCHMARKS:
+            raise InputError("only", name, "one of " + ", ".join(BENCHMARKS))
+    rows: list[Row] = []
+    missing: list[str] = []
+    for name in only or BENCHMARKS:
+        benchmark = find(name)
+        if benchmark is None:
+            missing.append(name)
+            report(f"{name}: not in this installation, left out")
+            continue
+        report(f"{name} ...")
+        rows += benchmark(seed, report)
+    return rows, missing
+
+
+def find(name: str) -> Benchmark | None:
+    """The registered benchmark, or None where its module does not exist. Any other failure to import is an error."""
+    module, function = BENCHMARKS[name].split(":")
+    try:
+        found: Benchmark = getattr(importlib.import_module(module), function)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        return None
+    return found

@@ -1,0 +1,297 @@
+"""The fault campaign: a plan of random faults, rigs brought to each phase once, a forked process for each run."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
+from host.recordings.recording import Recording, RecordingWriter, header_of
+from protocol.rig_file import SIMULATED_RIG, load_rig
+from protocol.topics import Message
+from realtime.control.records import PHASE_CONTACT
+from sim.fault_run import FaultyScenario, Watcher
+from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
+from sim.forked_board import ForkableBoard, forkable_board
+from sim.line_noise import LineNoise
+from sim.scenario import TARGET_M, ContactJob
+from sim.world import World, simulated_plant
+
+JOB = ContactJob(target_m=TARGET_M)
+RUNS_PER_RIG = 50
+HOLD_AFTER_S = 2.0  # of contact: what was a touch is now a force held
+DELAYS_S = {"approach": 0.5, "contact": 0.5, "hold": 1.0}
+RUN_TIMEOUT_S = 300  # of real time; a run takes a few seconds
+DISK_ROOM = 20_000  # bytes left on the full disk
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One run: which fault, in which phase of the job on which rig, how bad and how long, delay_s after the phase began."""
+
+    index: int
+    rig: int
+    fault: str
+    phase: str
+    size: float
+    seconds: float
+    delay_s: float
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What came of a run. `violations`: what the rig must not do and did, in words."""
+
+    plan: RunPlan
+    outcome: dict[str, Any]
+    recording_readable: bool
+    recording_lost_s: float
+    unhandled: str
+    violations: tuple[str, ...]
+
+
+def plan_runs(runs: int, seed: int, faults: tuple[str, ...] = ()) -> list[RunPlan]:
+    """All runs of a campaign. Faults and phases come by turns, everything else at random; the seed decides all.
+
+    faults: only these, all without. Raises ValueError for an unknown one.
+    """
+    for name in faults:
+        if name not in BY_NAME:
+            raise ValueError(f"--fault: found {name!r}, wanted one of {', '.join(BY_NAME)}")
+    pairs = [(fault, phase) for phase in PHASES for fault in (faults or tuple(BY_NAME))]
+    rigs = 2 * -(-runs // (2 * RUNS_PER_RIG))
+    plans = []
+    for index in range(runs):
+        rng = np.random.default_rng((seed, index))
+        fault, phase = pairs[index % len(pairs)]
+        size, seconds = BY_NAME[fault].draw(rng)
+        plans.append(
+            RunPlan(index, int(rng.integers(rigs)), fault, phase, size, seconds, float(rng.uniform(0.0, DELAYS_S[phase])))
+        )
+    return plans
+
+
+def run_campaign(
+    runs: int,
+    seed: int,
+    jobs: int = 1,
+    board: str = "native",
+    faults: tuple[str, ...] = (),
+    progress: Progress = lambda done, runs: None,
+) -> list[RunResult]:
+    """All runs, in the order of the plan; the same whatever `jobs` is.
+
+    Raises ValueError for an unknown fault, BoardUnavailable where the board cannot be built.
+    """
+    plans = plan_runs(runs, seed, faults)
+    of_rig = [[plan for plan in plans if plan.rig == rig] for rig in sorted({plan.rig for plan in plans})]
+    results: list[RunResult] = []
+    if jobs <= 1:
+        for group in of_rig:
+            for result in run_on_rig(group, seed, board):
+                results.append(result)
+                progress(len(results), runs)
+    else:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            for future in as_completed([pool.submit(_all_on_rig, group, seed, board) for group in of_rig]):
+                results += future.result()
+                progress(len(results), runs)
+    return sorted(results, key=lambda result: result.plan.index)
+
+
+def _all_on_rig(plans: list[RunPlan], seed: int, board: str) -> list[RunResult]:
+    return list(run_on_rig(plans, seed, board))
+
+
+def run_on_rig(plans: list[RunPlan], seed: int, board_kind: str) -> Iterator[RunResult]:
+    """Bring one rig through the phases of the job; at each, fork off the runs of `plans` that begin there."""
+    rig, number = load_rig(SIMULATED_RIG), plans[0].rig
+    rig_seed = int(np.random.default_rng((seed, 1_000_000 + number)).integers(2**31))
+    with forkable_board(board_kind) as board:
+        world = World(rig, simulated_plant(rig, rig_seed), board, rig_seed)
+        service = EstimationService(load_estimator(DEFAULT_ESTIMATOR, rig))
+        run = FaultyScenario(rig, world, _unheard, rig_seed, service)
+        for phase in PHASES:
+            _bring_to(run, phase)
+            for plan in plans:
+                if plan.phase == phase:
+                    yield _forked(run, board, plan)
+
+
+def _unheard(topic: str, message: Message) -> None:
+    """What is published on the way to the fault is of no interest."""
+
+
+def _bring_to(run: FaultyScenario, phase: str) -> None:
+    """From the phase before to the beginning of `phase`. Raises RuntimeError where the rig without a fault cannot."""
+    if phase == "approach":
+        if not run.arm():
+            raise RuntimeError(f"rig not armed, wanted it before the fault (phase {phase})")
+        run._shape(JOB)
+        run.command("target", "contact", target_m=JOB.target_m, normal=JOB.into, force_N=JOB.force_N)
+    elif phase == "contact":
+        if not run.run(10.0, lambda: run.phase == PHASE_CONTACT):
+            raise RuntimeError("no contact within 10 s, wanted it before the fault")
+    else:
+        run.run(HOLD_AFTER_S)
+
+
+def _forked(run: FaultyScenario, board: ForkableBoard, plan: RunPlan) -> RunResult:
+    """The run in a copy of this process; its end, however bad, is told through a pipe."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.close(reading)
+            signal.alarm(RUN_TIMEOUT_S)
+            board.after_fork()
+            with os.fdopen(writing, "w") as pipe:
+                json.dump(_inject(run, plan), pipe)
+            board.close()
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    _, status = os.waitpid(child, 0)
+    if status != 0 or not said:
+        said = json.dumps({"outcome": {}, "readable": False, "lost_s": 0.0, "unhandled": f"run ended with status {status}"})
+    told = json.loads(said)
+    result = RunResult(plan, told["outcome"], told["readable"], told["lost_s"], told["unhandled"], ())
+    return replace(result, violations=tuple(violations(result)))
+
+
+def _inject(run: FaultyScenario, plan: RunPlan) -> dict[str, Any]:
+    """The fault and what follows, recorded as the model process would."""
+    fault = BY_NAME[plan.fault]
+    run.noise = LineNoise(plan.index)
+    run.run(plan.delay_s)
+    unhandled = ""
+    with tempfile.TemporaryDirectory(prefix="seldinger-fault-") as folder:
+        path = Path(folder) / "run.mcap"
+        header = header_of(run.loop.rig, "virtual", plan.index, {"fault": plan.fault, "phase": plan.phase})
+        recording = RecordingWriter(path, header, lambda text: run.loop.log(run.now_ns, "error", "recorder", text))
+
+        def record(topic: str, message: Message) -> None:
+            recording.write(topic, message, run.now_ns)
+
+        run.out = record
+        watcher = Watcher(run, fault.large, fault.within_s)
+        run.watchers = [watcher]
+        if plan.fault == "disk_full":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + DISK_ROOM,) * 2)
+        try:
+            fault.inject(run, plan.size, plan.seconds)
+            run.run(plan.seconds + fault.tail_s)
+        except Exception as error:  # the very thing to be counted
+            unhandled = f"{type(error).__name__}: {error} at {traceback.extract_tb(error.__traceback__)[-1].name}"
+        end_ns = run.now_ns
+        run.watchers = []
+        recording.close()
+        readable, lost_s = _read_back(path, end_ns)
+    return {"outcome": asdict(watcher.close()), "readable": readable, "lost_s": lost_s, "unhandled": unhandled}
+
+
+def _read_back(path: Path, end_ns: int) -> tuple[bool, float]:
+    """Whether the recording can be read, and the seconds at its end that it does not have."""
+    try:
+        recording = Recording(path)
+    except ValueError:
+        return False, 0.0
+    return bool(recording.run), max((end_ns - recording.span_ns[1]) * 1e-9, 0.0) if recording.topics else end_ns * 1e-9
+
+
+def found_due_s(result: RunResult) -> float | None:
+    """Time (s, from the injection) from which the fault had to be found, None: it need not be."""
+    fault, plan = BY_NAME[result.plan.fault], result.plan
+    if fault.large is not None:
+        large_s: float | None = result.outcome.get("large_s")
+        return large_s
+    return 0.0 if fault.must_detect(plan.size, plan.seconds) else None
+
+
+def violations(result: RunResult) -> Iterator[str]:
+    """What must not be, in words, of one run."""
+    fault, outcome = BY_NAME[result.plan.fault], result.outcome
+    if result.unhandled:
+        yield f"unhandled: {result.unhandled}"
+    if not result.recording_readable:
+        yield "recording not readable"
+    if not outcome:
+        return
+    detected_s = outcome["detected_s"]
+    if fault.name == "none" and detected_s is not None:
+        yield f"false alarm: {outcome['detected_by']}"
+    due_s = found_due_s(result)
+    if due_s is not None and detected_s is None:
+        yield f"not detected within {fault.within_s} s"
+    elif due_s is not None and detected_s > due_s + fault.within_s:
+        yield f"detected only after {detected_s - due_s:.3f} s"
+    if outcome["peak_force_N"] > PEAK_N:
+        yield f"peak force {outcome['peak_force_N']:.3f} N, wanted at most {PEAK_N} N"
+    if fault.rest_s and outcome["rest_s"] > fault.rest_s:
+        yield f"still moving {outcome['rest_s'] * 1e3:.0f} ms after the link was lost, wanted {fault.rest_s * 1e3:.0f} ms"
+    if fault.stops and outcome["final_phase"] not in ("stopped", "disarmed"):
+        yield f"ended in phase {outcome['final_phase']}, wanted stopped"
+    if outcome["rearmed"]:
+        yield "moved on by itself after a stop"
+
+
+def by_fault(results: list[RunResult]) -> list[dict[str, Any]]:
+    """A row per fault and phase, as the command's contract has it, and the actions and violations beside."""
+    rows = []
+    for fault in FAULTS:
+        for phase in PHASES:
+            mine = [result for result in results if (result.plan.fault, result.plan.phase) == (fault.name, phase)]
+            if mine:
+                rows.append({"fault": fault.name, "phase": phase, **summary_of(mine)})
+    return rows
+
+
+def summary_of(results: list[RunResult]) -> dict[str, Any]:
+    """Figures over some runs."""
+    told = [result.outcome for result in results if result.outcome]
+    times_ms = [
+        1e3 * max(result.outcome["detected_s"] - (found_due_s(result) or 0.0), 0.0)
+        for result in results
+        if result.outcome.get("detected_s") is not None
+    ]
+    actions: dict[str, int] = {}
+    for outcome in told:
+        actions[outcome["action"]] = actions.get(outcome["action"], 0) + 1
+    wanted = [result for result in results if found_due_s(result) is not None]
+    stopping = [outcome["moved_after_m"] for outcome in told if outcome["action"] in ("hold", "retract", "stop")]
+    return {
+        "runs": len(results),
+        "detected": len(times_ms),
+        "must_detect": len(wanted),
+        "missed": sum(result.outcome.get("detected_s") is None for result in wanted),
+        "detection_ms_p50": float(np.median(times_ms)) if times_ms else None,
+        "detection_ms_p99": float(np.percentile(times_ms, 99)) if times_ms else None,
+        "peak_force_N": max((outcome["peak_force_N"] for outcome in told), default=0.0),
+        "moved_after_m": max(stopping, default=0.0),
+        "rest_ms_max": max((1e3 * outcome["rest_s"] for outcome in told), default=0.0),
+        "actions": actions,
+        "poses_lost": sum(outcome["poses_lost"] for outcome in told),
+        "recording_lost_s": max((result.recording_lost_s for result in results), default=0.0),
+        "recordings_unreadable": sum(not result.recording_readable for result in results),
+        "unhandled": sum(bool(result.unhandled) for result in results),
+        "violations": sum(bool(result.violations) for result in results),
+    }

@@ -1,0 +1,224 @@
+"""The proof from seed to table: generate in a child process, diagnose blindly, open the seal last, list and count."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from host.studies.proof import baselines, table, workers
+from host.studies.proof.scoring import Facts, judge, mean
+from protocol.errors import InputError
+from protocol.requests import plain
+from sim.concealed.generic import OUTPUTS
+
+MEASURED = frozenset(name for names in OUTPUTS.values() for name in names)
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run is. `folder` keeps all that is made, so that the same call takes up where the last one stopped."""
+
+    cases: int
+    seed: int
+    folder: Path
+    jobs: int = 2
+    scheduler: str | None = None
+    finder: Sequence[str] = workers.FINDER
+    limit_s: float = 900.0
+    with_baselines: bool = True
+
+
+def prove(settings: Settings, progress: Progress, announce: Callable[[str], None]) -> dict[str, Any]:
+    """The contract's object. `announce` gets the labels' sha256 before the finder runs. Raises InputError, RuntimeError."""
+    _claim(settings)
+    digest = generate(settings, progress)
+    announce(digest)
+    folders = {path.name: path for path in sorted((settings.folder / "cases").iterdir())}
+    verdicts = _diagnosed(settings, folders, progress)
+    labels = open_seal(settings.folder, digest)
+    facts = {label["id"]: judge(label, verdicts[label["id"]], _heldout(folders[label["id"]])) for label in labels}
+    compared = _baselines(settings, labels, folders, progress) if settings.with_baselines else {}
+    return {
+        "labels_sha256": digest,
+        "cases": [_row(label, verdicts[label["id"]], facts[label["id"]]) for label in labels],
+        "table": table.tabulate(list(facts.values())),
+        "baselines": compared,
+    }
+
+
+def _claim(settings: Settings) -> None:
+    """The folder belongs to one seed and one number of cases. Raises InputError for another's."""
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    note, mine = settings.folder / "suite.json", {"seed": settings.seed, "cases": settings.cases}
+    if note.exists():
+        found = json.loads(note.read_text(encoding="utf-8"))
+        if found != mine:
+            raise InputError("--dir", found, f"a folder of the suite {mine}, or an empty one")
+    note.write_text(json.dumps(mine), encoding="utf-8")
+
+
+def generate(settings: Settings, progress: Progress) -> str:
+    """Run the generator as a child process and return the sha256 of the sealed labels. Raises RuntimeError if it fails."""
+    command = [
+        sys.executable,
+        "-m",
+        "sim.concealed.suite",
+        "--seed",
+        str(settings.seed),
+        "--cases",
+        str(settings.cases),
+        "--dir",
+        str(settings.folder.resolve()),
+        "--jobs",
+        str(settings.jobs),
+    ]
+    progress("generate", 0, settings.cases)
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3]
+    ) as child:
+        assert child.stderr and child.stdout
+        said = ""
+        for line in child.stderr:
+            if line.strip().isdigit():
+                progress("generate", int(line), settings.cases)
+            else:
+                said = line.strip() or said
+        digest = child.stdout.read().strip()
+    if child.returncode != 0 or len(digest) != 64:
+        raise RuntimeError(f"generator ended with status {child.returncode}: {said}")
+    return digest
+
+
+def _diagnosed(settings: Settings, folders: dict[str, Path], progress: Progress) -> dict[str, dict[str, Any]]:
+    """Verdicts of all cases; those kept from an earlier run are not asked for again."""
+    kept = settings.folder / "verdicts"
+    kept.mkdir(exist_ok=True)
+    todo = {name: path for name, path in folders.items() if not (kept / f"{name}.json").exists()}
+    if settings.scheduler:
+        running = workers.on_cluster(todo, settings.finder, settings.limit_s, settings.scheduler)
+    else:
+        running = workers.locally(todo, settings.finder, settings.limit_s, settings.jobs)
+    done = len(folders) - len(todo)
+    progress("diagnose", done, len(folders))
+    for name, verdict in running if todo else ():
+        _keep(kept / f"{name}.json", verdict)
+        done += 1
+        progress("diagnose", done, len(folders))
+    return {name: json.loads((kept / f"{name}.json").read_text(encoding="utf-8")) for name in folders}
+
+
+def _keep(path: Path, value: Any) -> None:
+    """Write whole or not at all."""
+    path.with_suffix(".new").write_text(json.dumps(plain(value)), encoding="utf-8")
+    path.with_suffix(".new").rename(path)
+
+
+def open_seal(folder: Path, digest: str) -> list[dict[str, Any]]:
+    """The labels, after all verdicts are in. Raises RuntimeError where they are not those announced."""
+    content = (folder / "sealed" / "labels.json").read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != digest:
+        raise RuntimeError(f"sealed labels: found sha256 {found}, wanted {digest}: they were changed during the run")
+    labels = json.loads(content)["labels"]
+    assert isinstance(labels, list)
+    return labels
+
+
+def _heldout(folder: Path) -> dict[str, Any]:
+    """Columns of the held-out recording for equations: gaps bridged, what is measured smoothed over 0.15 s."""
+    columns = baselines.read_columns(next(folder.glob("c.*")))
+    time_s = columns["time_s"]
+    width = 2 * round(0.075 / float(np.median(np.diff(time_s)))) + 1
+    for name, values in columns.items():
+        known = np.isfinite(values)
+        columns[name] = np.interp(time_s, time_s[known], values[known]) if known.any() else np.zeros_like(values)
+        if name in MEASURED:
+            columns[name] = savgol_filter(columns[name], width, 3)
+    return columns
+
+
+def _row(label: dict[str, Any], verdict: dict[str, Any], facts: Facts) -> dict[str, Any]:
+    """One line of the list of cases."""
+    return {
+        "id": label["id"],
+        "truth": label["truth"],
+        "rho": label["rho"],
+        "closed_loop": label["closed_loop"],
+        "category": label["category"],
+        "kind": label["kind"],
+        "set": label["set"],
+        "form": label["form"],
+        "verdict": verdict,
+        "right": facts.right,
+    }
+
+
+def _baselines(
+    settings: Settings, labels: list[dict[str, Any]], folders: dict[str, Path], progress: Progress
+) -> dict[str, Any]:
+    """Rows of the baselines, case by case kept like the verdicts."""
+    kept = settings.folder / "baselines"
+    kept.mkdir(exist_ok=True)
+    todo = [label for label in labels if not (kept / f"{label['id']}.json").exists()]
+    done = len(labels) - len(todo)
+    progress("baselines", done, len(labels))
+    jobs = max(1, settings.jobs)
+    with ProcessPoolExecutor(max_workers=jobs) as pool:
+        made: Iterable[None] = (pool.map if jobs > 1 else map)(partial(_compare, kept, folders), todo)
+        for _ in made:
+            done += 1
+            progress("baselines", done, len(labels))
+    rows = {label["id"]: json.loads((kept / f"{label['id']}.json").read_text(encoding="utf-8")) for label in labels}
+    return {name: _summary(labels, [rows[label["id"]][name] for label in labels]) for name in baselines.NAMES}
+
+
+def _compare(kept: Path, folders: dict[str, Path], label: dict[str, Any]) -> None:
+    _keep(kept / f"{label['id']}.json", baselines.compare(label, folders[label["id"]]))
+
+
+def _summary(labels: list[dict[str, Any]], rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """A baseline's part of the table: it detects and closes gaps, it names nothing."""
+    if any("unavailable" in row for row in rows):
+        return {"unavailable": next(row["unavailable"] for row in rows if "unavailable" in row)}
+
+    def gaps(*categories: str) -> float | None:
+        found = [
+            r["gap_closed"]
+            for la, r in zip(labels, rows, strict=True)
+            if la["category"] in categories and r["gap_closed"] is not None
+        ]
+        return float(np.median(found)) if found else None
+
+    def seen(rho: float) -> float | None:
+        return mean(
+            [
+                float(r["detected"])
+                for la, r in zip(labels, rows, strict=True)
+                if la["category"] in ("single", "pair", "outside")
+                and rho / table.WIDE <= la["rho"] <= rho * table.WIDE
+                and r["detected"] is not None
+            ]
+        )
+
+    null = [r["detected"] for la, r in zip(labels, rows, strict=True) if la["category"] == "null"]
+    return {
+        "null_cases": len(null),
+        "false_alarms": None if None in null else sum(null),
+        "detected_rho_0.25": seen(0.25),
+        "detected_rho_0.5": seen(0.5),
+        "gap_closed_in_library": gaps("single", "pair"),
+        "gap_closed_outside": gaps("outside"),
+        "seconds_per_case_median": float(np.median([r["seconds"] for r in rows])) if rows else None,
+    }

@@ -1,0 +1,249 @@
+"""One verdict against one sealed label: every fact that the table counts, and whether the verdict is right."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from host.studies.proof.equation_form import right_form
+
+Array = np.ndarray
+SILENT_BELOW = 0.19  # rho under which nothing is promised: silence is no fault there
+FROM_THE_BEGIN = {"clock_drift"}
+BEHIND = "behind the gain"  # in the equation of an effect that acts on the output of its link
+_UNITS = {"m", "rad", "N", "Nm", "s", "Hz", "per", "m2", "m3", "N2", "s2", "square", "share", "kg"}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What one case contributes to the table; None where the case has no say."""
+
+    category: str
+    rho: float
+    rho_wanted: float
+    failed: bool
+    detected: bool
+    named_first: bool
+    in_set: bool
+    wrong: bool
+    subsystem: bool | None
+    window_f1: float | None
+    exact: bool
+    flagged: bool
+    form: bool
+    parameter_errors: tuple[float, ...]
+    covered: tuple[bool, ...]
+    gap_closed: float | None
+    seconds: float
+    right: bool = field(default=False)
+
+
+def judge(label: dict[str, Any], verdict: dict[str, Any], heldout: dict[str, Array] | None = None) -> Facts:
+    """Facts of one case. heldout: columns of the held-out recording, for equations; without them no form is right."""
+    kind = verdict.get("verdict")
+    effects = [e for e in verdict.get("effects") or [] if isinstance(e, dict)]
+    said = [_claim(e) for e in effects] if kind == "missing_physics" else []
+    names = [set(n) for n in label["names"]]
+    places = [t.rpartition("@")[2] for t in label["truth"]]
+    first = bool(said) and any(said[0][0] in n for n in names)
+    everything = set().union(*(claim for _, claim in said)) if said else set()
+    library = label["category"] in ("single", "pair")
+    errors, covered = parameters(label, effects) if library and said else ((), ())
+    facts = {
+        "category": label["category"],
+        "rho": label["rho"],
+        "rho_wanted": label["rho_wanted"],
+        "failed": kind not in ("missing_physics", "nothing_missing", "mismatch_not_identified"),
+        "detected": kind in ("missing_physics", "mismatch_not_identified"),
+        "named_first": first,
+        "in_set": any(everything & n for n in names),
+        "wrong": _wrong(label, kind, said, names),
+        "subsystem": _subsystem(label, verdict, effects, places),
+        "window_f1": window_f1(label, verdict),
+        "exact": _exact(said, names),
+        "flagged": kind == "mismatch_not_identified" or any("unlisted" in claim for _, claim in said),
+        "form": label["category"] == "outside" and _form(label, effects, heldout),
+        "parameter_errors": errors,
+        "covered": covered,
+        "gap_closed": gap_closed(label, verdict),
+        "seconds": float(verdict.get("wall_s", verdict.get("seconds", math.nan)) or math.nan),
+    }
+    return Facts(**facts, right=_right(label, kind, said, facts))
+
+
+def _claim(effect: dict[str, Any]) -> tuple[str, set[str]]:
+    """(id, all ids that the finder says it may be)."""
+    others = effect.get("indistinguishable_from") or []
+    name = str(effect.get("id"))
+    return name, {name, *(str(o).partition("@")[0] for o in others)}
+
+
+def _wrong(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
+    """Confident and wrong: an effect is named, and neither it nor anything it may be is true.
+
+    Outside the library: a listed effect is named first and `unlisted` is not among what it may be.
+    """
+    if kind != "missing_physics" or not said:
+        return False
+    if label["category"] == "outside":
+        return "unlisted" not in said[0][1]
+    true = [*names, set(label["set"])]
+    return any(not any(claim & n for n in true) for _, claim in said)
+
+
+def _exact(said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
+    """All effects named first by their own names, none beside them."""
+    if len(said) != len(names):
+        return False
+    left = list(names)
+    for name, _ in said:
+        hit = next((n for n in left if name in n), None)
+        if hit is None:
+            return False
+        left.remove(hit)
+    return True
+
+
+def _subsystem(
+    label: dict[str, Any], verdict: dict[str, Any], effects: list[dict[str, Any]], places: list[str]
+) -> bool | None:
+    """Whether the first place named is true; None where the nominal model has one place only, or nothing was planted."""
+    if not places or label["kind"] in ("axis", "impedance"):
+        return None
+    named = [*effects, *(x for x in verdict.get("located") or [] if isinstance(x, dict))]
+    return bool(named) and named[0].get("subsystem") in places
+
+
+def window_f1(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:
+    """F1 of the time that reported and true windows share, within the recordings that the verdict has windows in.
+
+    Windows are in the recordings' own time, which runs on through the session. None without true or reported windows.
+    """
+    told = _joined([w for x in verdict.get("located") or [] for w in x.get("windows_s") or []])
+    if not label["windows_s"] or not told:
+        return None
+    edges = [0.0, 32.0, 66.0, math.inf]  # recordings of 30 s with pauses of 4 s between them
+    spoken = [(a, b) for a, b in itertools.pairwise(edges) if any(begin < b and end > a for begin, end in told)]
+    true = [[max(a, w[0]), min(b, w[1])] for a, b in spoken for w in label["windows_s"] if w[0] < b and w[1] > a]
+    shared = sum(max(0.0, min(e, f) - max(b, c)) for b, e in told for c, f in true)
+    both = sum(e - b for b, e in told) + sum(e - b for b, e in true)
+    return 2.0 * shared / both if both > 0.0 else None
+
+
+def _joined(pieces: list[list[float]]) -> list[list[float]]:
+    out: list[list[float]] = []
+    for begin, end in sorted([float(p[0]), float(p[1])] for p in pieces):
+        if out and begin <= out[-1][1]:
+            out[-1][1] = max(out[-1][1], end)
+        else:
+            out.append([begin, end])
+    return out
+
+
+def _form(label: dict[str, Any], effects: list[dict[str, Any]], heldout: dict[str, Array] | None) -> bool:
+    """Whether one of the equations found has the form of the true one."""
+    if heldout is None:
+        return False
+    place = label["truth"][0].rpartition("@")[2]
+    own = {
+        "insertion": ["handle_insertion_m"],
+        "roll": ["handle_roll_rad", "motor_a_rad"],
+        "knob": ["handle_knob_rad", "motor_b_rad"],
+    }.get(place, [])
+    absorbed = [name for name in own if name in heldout]
+    return any(
+        right_form(str(e.get("equation", "")), label["form"], heldout, absorbed)
+        for e in effects
+        if e.get("id") == "unlisted"
+    )
+
+
+def _base(name: str) -> str:
+    """A parameter's name without its unit: width_m -> width."""
+    words = name.split("_")
+    while len(words) > 1 and words[-1] in _UNITS:
+        words.pop()
+    return "_".join(words)
+
+
+def parameters(label: dict[str, Any], effects: list[dict[str, Any]]) -> tuple[tuple[float, ...], tuple[bool, ...]]:
+    """(relative errors, whether the 95 % interval holds the truth) of all comparable parameters of truly named effects."""
+    errors, covered = [], []
+    for planted, names in zip(label["planted"], label["names"], strict=True):
+        effect = next((e for e in effects if e.get("id") in names), None) or {}
+        found = {_base(k): v for k, v in (effect.get("parameters") or {}).items()}
+        for name, true in comparable(planted, effect).items():
+            value = found.get(_base(name))
+            if not isinstance(value, dict) or true == 0.0 or not isinstance(value.get("value"), (int, float)):
+                continue
+            errors.append(abs(float(value["value"]) - true) / abs(true))
+            ends = value.get("ci95")
+            if isinstance(ends, list) and len(ends) == 2 and None not in ends:
+                covered.append(bool(ends[0] <= true <= ends[1]))
+    return tuple(errors), tuple(covered)
+
+
+def comparable(planted: dict[str, Any], effect: dict[str, Any]) -> dict[str, float]:
+    """True values that the parameters of `effect` can be held against, by name, as the label or its equivalents have them.
+
+    An amplitude that the effect counts behind the gain is turned there; a drift that began later than the recordings is
+    none whose rate counts from their begin.
+    """
+    if planted["id"] in FROM_THE_BEGIN and planted["start_s"] > 0.0:
+        return {}
+    gain = planted.get("gain", 1.0) if BEHIND in str(effect.get("equation", "")) else 1.0
+    return {name: gain * float(planted["parameters"][name]) for name in planted["compared"]} | planted.get("equivalent", {})
+
+
+def gap_closed(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:
+    """(E_nominal - E_fit) / (E_nominal - E_true), held out, on the channel that shows the mismatch most.
+
+    E_true is the noise that was in fact added there: what the true model leaves. None below rho 0.5 on held-out data.
+    """
+    if not label["planted"] or not label["channels"]:
+        return None
+    channel = label["channels"][0]
+    noise, mismatch = label["noise_rms_heldout"][channel], label["mismatch_rms_heldout"][channel]
+    rows = (verdict.get("fit") or {}).get("per_channel") or {}
+    row = rows.get(channel) or next((v for k, v in rows.items() if _base(k) == _base(channel)), None)
+    if mismatch < 0.5 * noise or not isinstance(row, dict):
+        return None
+    before, after = row.get("rmse_before"), row.get("rmse_after")
+    if not isinstance(before, (int, float)) or not isinstance(after, (int, float)) or before <= noise:
+        return None
+    return float((before - after) / (before - noise))
+
+
+def _right(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], facts: dict[str, Any]) -> bool:
+    """The verdict in one word, by the category's rule (docs/proof.md)."""
+    category = label["category"]
+    if facts["failed"]:
+        return False
+    if category == "null":
+        return bool(kind == "nothing_missing")
+    if category == "unidentifiable":
+        return _honest(label, kind, said)
+    if facts["rho"] < SILENT_BELOW and kind != "missing_physics":
+        return True
+    if category == "outside":
+        return bool(facts["flagged"] and not facts["wrong"])
+    return bool((facts["named_first"] if category == "single" else facts["exact"]) and not facts["wrong"])
+
+
+def _honest(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]]) -> bool:
+    """An undecidable case: silence where that is in the set, doubt, or a true name with another of the set beside it."""
+    allowed = set(label["set"])
+    if kind == "nothing_missing":
+        return "nothing_missing" in allowed
+    if kind == "mismatch_not_identified":
+        return "nothing_missing" not in allowed or label["rho"] >= 0.05
+    return len(said) == 1 and said[0][0] in allowed and len(said[0][1] & allowed) > 1
+
+
+def mean(values: list[float]) -> float | None:
+    """Mean, None of nothing."""
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,110 @@
+"""The proof's table: figures of all cases under the contract's names, and as rows for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from host.studies.proof.scoring import Facts, mean
+
+KEYS = (
+    "null_cases",
+    "false_alarms",
+    "detected_rho_0.25",
+    "detected_rho_0.5",
+    "named_first",
+    "truth_in_set",
+    "confident_wrong_in_library",
+    "confident_wrong_outside",
+    "subsystem_right",
+    "window_f1",
+    "pairs_exact",
+    "outside_flagged",
+    "equation_form",
+    "parameter_error_median",
+    "coverage_95",
+    "gap_closed_in_library",
+    "gap_closed_outside",
+    "seconds_per_case_median",
+)
+TARGETS = {
+    "false_alarms": "0",
+    "detected_rho_0.25": "0.90",
+    "detected_rho_0.5": "0.99",
+    "named_first": "0.90",
+    "truth_in_set": "0.97",
+    "confident_wrong_in_library": "at most 0.02",
+    "confident_wrong_outside": "at most 0.05",
+    "subsystem_right": "0.90",
+    "window_f1": "0.85",
+    "pairs_exact": "0.75",
+    "outside_flagged": "0.90",
+    "equation_form": "0.50",
+    "parameter_error_median": "at most 0.10",
+    "coverage_95": "0.92-0.98",
+    "gap_closed_in_library": "0.90",
+    "gap_closed_outside": "0.60",
+    "seconds_per_case_median": "at most 60 per 60 s",
+}
+WIDE = 1.34  # a case counts for rho where its own is within this factor
+Table = dict[str, float | int | None]
+
+
+def tabulate(facts: Sequence[Facts]) -> Table:
+    """The contract's table. A share is None where no case has a say in it."""
+
+    def share(which: Callable[[Facts], bool], of: Callable[[Facts], bool | None]) -> float | None:
+        return mean([float(bool(of(f))) for f in facts if which(f) and of(f) is not None])
+
+    def near(rho: float) -> Callable[[Facts], bool]:
+        return lambda f: f.category in ("single", "pair", "outside") and rho / WIDE <= f.rho <= rho * WIDE
+
+    def big(*categories: str) -> Callable[[Facts], bool]:
+        return lambda f: f.category in categories and f.rho_wanted >= 0.5
+
+    def middle(values: list[float]) -> float | None:
+        return float(np.median(values)) if values else None
+
+    library = [f for f in facts if f.category in ("single", "pair")]
+    return {
+        "null_cases": sum(f.category == "null" for f in facts),
+        "false_alarms": sum(f.category == "null" and f.detected for f in facts),
+        "detected_rho_0.25": share(near(0.25), lambda f: f.detected),
+        "detected_rho_0.5": share(near(0.5), lambda f: f.detected),
+        "named_first": share(big("single"), lambda f: f.named_first),
+        "truth_in_set": share(big("single"), lambda f: f.in_set),
+        "confident_wrong_in_library": share(lambda f: f.category in ("single", "pair"), lambda f: f.wrong),
+        "confident_wrong_outside": share(lambda f: f.category == "outside", lambda f: f.wrong),
+        "subsystem_right": share(big("single", "outside"), lambda f: f.subsystem),
+        "window_f1": mean([f.window_f1 or 0.0 for f in facts if big("single", "pair", "outside")(f) and f.detected]),
+        "pairs_exact": share(big("pair"), lambda f: f.exact),
+        "outside_flagged": share(lambda f: f.category == "outside", lambda f: f.flagged),
+        "equation_form": share(big("outside"), lambda f: f.form),
+        "parameter_error_median": middle([e for f in library for e in f.parameter_errors]),
+        "coverage_95": mean([float(c) for f in library for c in f.covered]),
+        "gap_closed_in_library": middle([f.gap_closed for f in library if f.gap_closed is not None]),
+        "gap_closed_outside": middle([f.gap_closed for f in facts if f.category == "outside" and f.gap_closed is not None]),
+        "seconds_per_case_median": middle([f.seconds for f in facts if np.isfinite(f.seconds)]),
+    }
+
+
+def markdown(table: Table, baselines: dict[str, dict[str, Any]]) -> str:
+    """The table beside its targets and the baselines, as markdown."""
+    names = list(baselines)
+    lines = [
+        f"| figure | to reach | diagnose | {' | '.join(n.replace('_', ' ') for n in names)} |",
+        "|---|---|---|" + "---|" * len(names),
+    ]
+    for key in KEYS:
+        cells = [_text(baselines[n].get(key), n if "unavailable" in baselines[n] else "") for n in names]
+        lines.append(f"| {key.replace('_', ' ')} | {TARGETS.get(key, '')} | {_text(table.get(key))} | {' | '.join(cells)} |")
+    lines += [f"\n{n.replace('_', ' ')}: {row['unavailable']}" for n, row in baselines.items() if "unavailable" in row]
+    return "\n".join(lines)
+
+
+def _text(value: Any, unavailable: str = "") -> str:
+    if unavailable:
+        return "n/a"
+    return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,37 @@
+"""The control part of the thesis again: chapters 6 and 7, one section a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from host.report.figure_page import HOLDS, Section, write_reproduction
+from host.studies.reproduction import control_hybrid, control_kinematics, control_position, control_rig, control_transmission
+
+
+def run(
+    directory: Path, quick: bool = False, progress: Callable[[str], None] = lambda text: None, board: str = "native"
+) -> tuple[list[Section], Path]:
+    """All sections, and the page's path in `directory`. `quick`: shorter sweeps and runs. `board`: what runs the firmware.
+
+    Raises BoardUnavailable where the board cannot be built.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    sections, _ = control_transmission.sections(directory, quick, board)
+    progress("chapter 6: transmission done")
+    sections += control_position.sections(quick)
+    progress("chapter 6: position control done")
+    sections += control_kinematics.sections()
+    sections += control_hybrid.sections(quick)
+    progress("chapter 7: simulations done")
+    sections += control_rig.sections(quick, board, progress)
+    held = sum(section.verdict == HOLDS for section in sections)
+    lead = (
+        "Chapters 6 and 7. The experiments run on the simulated rig, its firmware and protocols included; the "
+        "simulations "
+        "as the thesis did them. Where the thesis leaves a number out, ours says what was taken."
+    )
+    page = write_reproduction(
+        directory / "reproduction-control.html", f"Control: {held} of {len(sections)} statements hold", lead, sections
+    )
+    return sections, page

@@ -1,0 +1,36 @@
+"""Bad input in one line: which key, what was found, what is accepted."""
+
+from __future__ import annotations
+
+import json
+
+
+class InputError(ValueError):
+    """Input that must not reach a kernel or a motor.
+
+    The command line prints it as one line and exits with status 2. Any other exception is a programming error: it keeps
+    its traceback and exits with status 1.
+
+    key: the name of the offending input (key, file or option). found: its value. wanted: what is accepted.
+    """
+
+    def __init__(self, key: str, found: object, wanted: str) -> None:
+        self.key, self.found, self.wanted = key, found, wanted
+        super().__init__(f"{key}: found {_short(found)}, wanted {wanted}")
+
+    @classmethod
+    def from_sentence(cls, sentence: str) -> InputError:
+        """The error that a sentence "KEY: found FOUND, wanted WANTED" describes (validators can only raise sentences)."""
+        error = cls.__new__(cls)
+        error.key, _, rest = sentence.partition(": found ")
+        error.found, _, error.wanted = rest.partition(", wanted ")
+        ValueError.__init__(error, sentence)
+        return error
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return InputError.from_sentence, (str(self),)
+
+
+def _short(value: object, limit: int = 80) -> str:
+    text = json.dumps(value) if isinstance(value, (dict, list, str, int, float, bool, type(None))) else str(value)
+    return text if len(text) <= limit else text[: limit - 3] + "..."

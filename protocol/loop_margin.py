@@ -1,0 +1,51 @@
+"""Phase margins of the thesis' two loops (Figs. 6.12, 7.1), linear: gains, delays and the stiffness that is assumed.
+
+Both integrate (the actuators are moved by differences), so L(s) = (K_p + K_i/s) / s e^(-sT) for the position and
+(K_p + K_i/s) / s (K_f + K_if/s) k e^(-sT) for the force. Play and noise ask for more than a margin above zero:
+`seldinger tune` finds by simulation what rings.
+"""
+
+from __future__ import annotations
+
+import math
+
+# A loop with less is taken for unstable.
+LEAST_MARGIN_deg = 20.0
+
+
+def _margin_deg(gain: float, corners: tuple[float, ...], delay_s: float) -> float:
+    """Phase margin (degrees) of gain / s prod(1 + corner / s) e^(-s delay), corners in rad/s."""
+    if gain <= 0.0 or not all(math.isfinite(corner) for corner in corners):
+        return 90.0 if gain <= 0.0 and not any(corners) else -90.0
+    low, high = 1e-6, 1e6
+    for _ in range(100):
+        omega = math.sqrt(low * high)
+        size = gain / omega * math.prod(math.hypot(1.0, corner / omega) for corner in corners)
+        low, high = (omega, high) if size > 1.0 else (low, omega)
+    lag = sum(math.atan2(corner, omega) for corner in corners) + omega * delay_s
+    return 90.0 - math.degrees(lag)
+
+
+def position_margin_deg(gain_per_s: float, integral_per_s2: float, delay_s: float) -> float:
+    """Of the position loop. delay_s: from the sampling of a pose to the stage. Without gain but with integral: -90."""
+    return _margin_deg(gain_per_s, (_corner(integral_per_s2, gain_per_s),), delay_s)
+
+
+def force_margin_deg(
+    gain_per_s: float,
+    integral_per_s2: float,
+    force_gain_m_per_N: float,
+    force_integral_m_per_N_s: float,
+    stiffness_N_per_m: float,
+    delay_s: float,
+) -> float:
+    """Of the force loop around it, by a force sensor. delay_s: from the force to the stage."""
+    corners = (_corner(integral_per_s2, gain_per_s), _corner(force_integral_m_per_N_s, force_gain_m_per_N))
+    return _margin_deg(gain_per_s * force_gain_m_per_N * stiffness_N_per_m, corners, delay_s)
+
+
+def _corner(integral: float, gain: float) -> float:
+    """Where the integral part takes over (rad/s)."""
+    if integral <= 0.0:
+        return 0.0
+    return integral / gain if gain > 0.0 else math.inf

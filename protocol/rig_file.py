@@ -1,0 +1,380 @@
+"""The one rig file: what the rig is, its limits and gains. Unknown keys and values out of bounds are refused."""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from protocol import board_pins, loop_margin
+from protocol.errors import InputError
+from protocol.topics import check_name
+from protocol.zenoh_access import Network, check_network_endpoint
+
+AXES = ("insertion", "roll", "knob")
+SIMULATED_RIG = Path(__file__).parent / "rigs" / "simulated.toml"
+
+# Bounds that no rig file can widen (a safety limit cannot be configured away).
+HARD_MAX_FORCE_N = 0.5
+HARD_STOP_AFTER_S = 0.150
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=False, allow_inf_nan=False, frozen=True)
+
+
+Positive = Annotated[float, Field(gt=0)]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Stage(_Section):
+    """One stepper axis. `unit` is m for insertion and rad for roll and knob."""
+
+    steps_per_unit: Annotated[float, Field(gt=0, le=1e7)]
+    encoder_counts_per_step: Positive = 1.0
+    max_speed_unit_per_s: Positive
+    max_accel_unit_per_s2: Positive
+    min_unit: float
+    max_unit: float
+    home_end: Literal["", "min", "max"] = ""
+    home_unit: float = 0.0
+    home_speed_unit_per_s: Annotated[float, Field(ge=0)] = 0.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Stage:
+        if self.min_unit >= self.max_unit:
+            raise ValueError("min_unit below max_unit")
+        if self.max_speed_unit_per_s * self.steps_per_unit > 20_000:
+            raise ValueError("at most 20000 steps/s (max_speed_unit_per_s * steps_per_unit), the board's step timer")
+        if self.max_speed_unit_per_s / self.max_accel_unit_per_s2 > 0.045:
+            raise ValueError("a stop from full speed within 0.045 s (max_speed_unit_per_s / max_accel_unit_per_s2)")
+        if self.home_end and not 0 < self.home_speed_unit_per_s <= 0.2 * self.max_speed_unit_per_s:
+            raise ValueError("home_speed_unit_per_s above 0 and at most a fifth of max_speed_unit_per_s, for home_end")
+        return self
+
+
+class Stages(_Section):
+    insertion: Stage
+    roll: Stage
+    knob: Stage
+
+
+class Catheter(_Section):
+    name: str
+    distal_length_m: Annotated[float, Field(gt=0.01, le=0.3)]
+    max_curvature_per_m: Annotated[float, Field(gt=0, le=100)]
+
+
+class Transmission(_Section):
+    """Handle to distal end, as characterized on this rig (thesis 6.2)."""
+
+    catheter: str
+    insertion_at_home_m: float
+    insertion_backlash_m: Annotated[float, Field(ge=0, le=0.02)]
+    insertion_slope: Annotated[float, Field(gt=0.2, le=2)]
+    roll_slope: Annotated[float, Field(gt=0.05, le=2)]
+    knob_rad: list[float]
+    curvature_per_m: list[float]
+
+    @model_validator(mode="after")
+    def _monotone_curve(self) -> Transmission:
+        if len(self.knob_rad) != len(self.curvature_per_m) or len(self.knob_rad) < 3:
+            raise ValueError("knob_rad and curvature_per_m of one length, at least 3")
+        if any(b <= a for a, b in zip(self.knob_rad, self.knob_rad[1:], strict=False)):
+            raise ValueError("knob_rad strictly increasing")
+        if any(b < a for a, b in zip(self.curvature_per_m, self.curvature_per_m[1:], strict=False)):
+            raise ValueError("curvature_per_m never decreasing along knob_rad")
+        return self
+
+
+class Tracker(_Section):
+    """NDI Aurora. `base_from_tracker_*` registers the tracker's frame to the base frame at the sheath's exit."""
+
+    port: str
+    rate_hz: Annotated[float, Field(gt=1, le=200)]
+    latency_s: Annotated[float, Field(ge=0, le=0.2)]
+    tip_handle: str = "0A"
+    shaft_handle: str = "0B"
+    shaft_sensor_offset_m: Annotated[float, Field(gt=0, le=0.2)]
+    position_noise_m: Positive
+    orientation_noise_rad: Positive
+    base_from_tracker_m: Vector3
+    base_from_tracker_wxyz: Quaternion
+
+    @model_validator(mode="after")
+    def _unit(self) -> Tracker:
+        if abs(math.hypot(*self.base_from_tracker_wxyz) - 1) > 1e-3:
+            raise ValueError("base_from_tracker_wxyz of unit length")
+        return self
+
+
+class ForceSensor(_Section):
+    """ATI Nano17 behind a Net F/T box; `base_from_sensor_wxyz` turns its reading into the force on the tissue."""
+
+    address: str
+    counts_per_newton: Positive
+    counts_per_newton_metre: Positive
+    rate_hz: Annotated[float, Field(gt=1, le=7000)]
+    noise_N: Positive
+    range_N: Positive
+    base_from_sensor_wxyz: Quaternion
+
+    @model_validator(mode="after")
+    def _unit(self) -> ForceSensor:
+        if abs(math.hypot(*self.base_from_sensor_wxyz) - 1) > 1e-3:
+            raise ValueError("base_from_sensor_wxyz of unit length")
+        return self
+
+
+class Pins(_Section):
+    """A port each of the board's processor for outputs, encoders and switches (protocol/board_pins.py)."""
+
+    mcu: Literal["atmega2560", "atmega328p"] = "atmega2560"
+    outputs: str
+    output_shift: Annotated[int, Field(ge=0, le=7)]
+    encoders: str
+    switches: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual(cls, data: Any) -> Any:
+        chip = board_pins.PROCESSORS.get(data.get("mcu", "atmega2560")) if isinstance(data, dict) else None
+        return {**chip.usual, **data} if chip else data
+
+    @model_validator(mode="after")
+    def _free(self) -> Pins:
+        problem = board_pins.problem_of(**self.model_dump())
+        if problem:
+            raise ValueError(problem)
+        return self
+
+
+class Board(_Section):
+    port: str
+    baud: Annotated[int, Field(gt=9600, le=1_000_000)]
+    setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
+    setpoint_expiry_s: Annotated[float, Field(ge=0.001, le=0.02)]
+    pins: Pins = Pins.model_validate({})
+
+
+class Control(_Section):
+    """Gains in physical units per second: they hold at any loop rate."""
+
+    loop_hz: Annotated[int, Field(ge=100, le=4000)]
+    position_gain_per_s: Annotated[float, Field(ge=0, le=50)]
+    position_integral_per_s2: Annotated[float, Field(ge=0, le=200)]
+    force_gain_m_per_N: Annotated[float, Field(ge=0, le=0.1)]
+    force_integral_m_per_N_s: Annotated[float, Field(ge=0, le=0.5)]
+    approach_speed_m_per_s: Annotated[float, Field(gt=0, le=0.02)]
+    contact_force_N: Annotated[float, Field(gt=0.005, le=0.1)]
+    reversal_threshold_m: Annotated[float, Field(ge=0, le=0.002)]
+    acceleration_noise_m_per_s2: Positive
+    law: Literal["thesis", "predictive"] = "predictive"
+    force_frame: Literal["base", "tip"] = "base"
+    move_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)] = 0.03
+    move_accel_m_per_s2: Annotated[float, Field(gt=0, le=2)] = 0.2
+    slide_speed_m_per_s: Annotated[float, Field(gt=0, le=0.02)] = 0.005
+    offset_memory_s: Annotated[float, Field(ge=0.05, le=10)] = 0.4
+    contact_memory_s: Annotated[float, Field(ge=0.05, le=30)] = 1.0
+    force_slew_N_per_s: Annotated[float, Field(gt=0, le=2)] = 0.3
+    force_margin_N: Annotated[float, Field(ge=0, le=0.1)] = 0.04
+    tip_compliance_m_per_N: Annotated[float, Field(gt=1e-4, le=0.1)] = 0.01
+    stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    reversal_share: Annotated[float, Field(ge=0, le=2)] = 0.75
+    reversal_depth_m: Annotated[float, Field(ge=0, le=0.002)] = 0.0001
+    play_noise_m: Positive = 0.00003
+    blind_approach_share: Annotated[float, Field(gt=0, le=1)] = 0.5
+    play_caution_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
+    play_sd_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
+
+    @model_validator(mode="after")
+    def _stable(self) -> Control:
+        if self.position_gain_per_s / self.loop_hz > 0.5:
+            raise ValueError("position_gain_per_s at most half of loop_hz, beyond it the loop is unstable")
+        return self
+
+
+class Safety(_Section):
+    over_force_N: Annotated[float, Field(gt=0, le=HARD_MAX_FORCE_N)]
+    hold_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    stop_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    force_timeout_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
+    retract_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)]
+    retract_distance_m: Annotated[float, Field(gt=0, le=0.05)]
+    max_tip_speed_m_per_s: Annotated[float, Field(gt=0, le=1)]
+    workspace_min_m: Vector3
+    workspace_max_m: Vector3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Safety:
+        if self.hold_after_s > self.stop_after_s:
+            raise ValueError("hold_after_s at most stop_after_s")
+        if any(a >= b for a, b in zip(self.workspace_min_m, self.workspace_max_m, strict=True)):
+            raise ValueError("workspace_min_m below workspace_max_m")
+        return self
+
+
+class Zenoh(_Section):
+    listen: list[str]
+    connect: list[str]
+
+
+class NetworkAccess(_Section):
+    """Other machines: where they reach the rig, with whose keys, who may read and who command. Nothing: nobody."""
+
+    listen: list[str] = []
+    keys: str = ""
+    peers: list[str] = []
+    readers: list[str] = []
+    commanders: list[str] = []
+
+    @model_validator(mode="after")
+    def _sound(self) -> NetworkAccess:
+        for endpoint in self.listen:
+            check_network_endpoint(endpoint)
+        for name in self.readers + self.commanders:
+            check_name(name)
+        for peer in self.peers:
+            ipaddress.ip_network(peer)
+        if len({*self.readers, *self.commanders}) < len(self.readers + self.commanders):
+            raise ValueError("every name once in readers and commanders (a commander reads too)")
+        if self.listen and not Path(self.keys).is_absolute():
+            raise ValueError("keys: an absolute path, of the folder that `seldinger keys issue RIG --role rig` made")
+        return self
+
+
+class Rig(_Section):
+    """All of it. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    catheter: Catheter
+    stages: Stages
+    transmission: Transmission
+    tracker: Tracker
+    force_sensor: ForceSensor
+    board: Board
+    control: Control
+    safety: Safety
+    zenoh: Zenoh
+    network: NetworkAccess = NetworkAccess()
+
+    @model_validator(mode="after")
+    def _calibration_fits(self) -> Rig:
+        if self.transmission.catheter != self.catheter.name:
+            raise ValueError(
+                f"transmission.catheter: found {self.transmission.catheter}, wanted {self.catheter.name}, as "
+                "catheter.name: it was calibrated with another catheter"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _gains_hold(self) -> Rig:
+        c, turns_s = self.control, 1.5 / self.control.loop_hz + self.board.setpoint_lead_s
+        if c.law != "thesis":
+            return self
+        gains = (c.position_gain_per_s, c.position_integral_per_s2)
+        late_s = self.tracker.latency_s + 0.5 / self.tracker.rate_hz + turns_s
+        margins = {
+            "position": (loop_margin.position_margin_deg(*gains, late_s), late_s),
+            "force": (
+                loop_margin.force_margin_deg(
+                    *gains, c.force_gain_m_per_N, c.force_integral_m_per_N_s, 1.0 / c.tip_compliance_m_per_N, turns_s
+                ),
+                turns_s,
+            ),
+        }
+        for loop, (margin_deg, delay_s) in margins.items():
+            if not margin_deg >= loop_margin.LEAST_MARGIN_deg:
+                raise ValueError(
+                    f"control: found gains with a phase margin of {margin_deg:.0f} degrees in the {loop} loop "
+                    f"(at {c.loop_hz} Hz, {delay_s * 1e3:.0f} ms late), wanted at least "
+                    f"{loop_margin.LEAST_MARGIN_deg:.0f}: less gain, or less integral"
+                )
+        return self
+
+    def stage(self, axis: int) -> Stage:
+        """The stage of axis 0 insertion, 1 roll or 2 knob."""
+        return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
+
+    @property
+    def access(self) -> Network | None:
+        """What other machines may do here; None where nothing leaves this one."""
+        n = self.network
+        return Network(self.name, tuple(n.listen), Path(n.keys), tuple(n.readers), tuple(n.commanders)) if n.listen else None
+
+    def effective(self) -> dict[str, Any]:
+        """The whole effective configuration, for the recording's header."""
+        return self.model_dump(mode="json")
+
+
+def _bounds(error: Any) -> str:
+    context = error.get("ctx") or {}
+    limits = [
+        f"{word} {context[key]}"
+        for key, word in (("gt", "above"), ("ge", "at least"), ("lt", "below"), ("le", "at most"))
+        if key in context
+    ]
+    return " and ".join(limits) or error["msg"].removeprefix("Value error, ")
+
+
+def _known_keys(path: tuple[Any, ...]) -> list[str]:
+    """The keys of the section that `path` (keys from the top) lies in."""
+    section: Any = Rig
+    for part in path[:-1]:
+        field = section.model_fields.get(str(part)) if hasattr(section, "model_fields") else None
+        if field is None:
+            return []
+        section = field.annotation
+    return list(section.model_fields) if hasattr(section, "model_fields") else []
+
+
+def _in_words(error: Any) -> str:
+    """One of pydantic's errors as key, what was found, what is wanted."""
+    key = ".".join(str(part) for part in error["loc"]) or "rig"
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(error["loc"])
+        near = difflib.get_close_matches(str(error["loc"][-1]), known, 1)
+        hint = f"; did you mean {near[0]}?" if near else f": {', '.join(known)}" if known else ""
+        return f"{key}: found an unknown key, wanted one that the rig file knows{hint}"
+    if error["type"] == "missing":
+        return f"{key}: found nothing, wanted a value (see protocol/rigs/simulated.toml for what it means)"
+    said = error["msg"].removeprefix("Value error, ")
+    if ": found " in said:
+        return said if not error["loc"] or said.startswith(f"{error['loc'][0]}") else f"{key}: {said}"
+    return f"{key}: found {repr(error['input'])[:80]}, wanted {_bounds(error)}"
+
+
+def problems_of(data: dict[str, Any]) -> list[str]:
+    """All that is wrong with `data`, one line each; empty for a good rig file."""
+    try:
+        Rig.model_validate(data)
+    except ValidationError as problem:
+        return [_in_words(error) for error in problem.errors()]
+    return []
+
+
+def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
+    """`data` as a checked `Rig`. Raises InputError with the first offending key."""
+    try:
+        return Rig.model_validate(data)
+    except ValidationError as problem:
+        raise InputError.from_sentence(f"{name}: {_in_words(problem.errors()[0])}") from None
+
+
+def read_rig_data(path: str | Path) -> dict[str, Any]:
+    """The TOML file `path`, unchecked. Raises InputError where it cannot be read."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError.from_sentence(f"{path}: found {error}, wanted a readable TOML file") from None
+
+
+def load_rig(path: str | Path) -> Rig:
+    """The rig in TOML file `path`. Raises InputError (unreadable file, unknown key, value out of its bounds)."""
+    return parse_rig(read_rig_data(path), str(path))

@@ -1,0 +1,144 @@
+"""From the rig file to the tick's parameter record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from protocol.rig_file import Rig
+from realtime.control.inverse_kinematics import fitted_knob_curve
+from realtime.control.records import LAW_PREDICTIVE, LAW_THESIS, PARAMS, new
+from realtime.control.stage_limiter import crossing_time_s
+from realtime.control.tick import FORCE_FROM_ESTIMATE, FORCE_FROM_SENSOR
+
+# The board answers at 200 Hz; three missed answers and a margin.
+BOARD_TIMEOUT_S = 0.030
+# Offsets from the axis below this multiple of the tracker noise say nothing about the roll.
+AXIS_RADIUS_SIGMA = 4.0
+# Forecasts of the wall are judged this far ahead; samples further off than this many sigma are wild.
+HORIZON_S = 0.040
+# Squared acceleration (m2/s3) of the local model: follows a heart of 1 mm at 2 Hz without knowing it; or stands in its
+# middle, which is better than following where samples are few, noisy and late.
+FOLLOWING2, STANDING2 = 1e-3, 1e-7
+GATE_SIGMA = 5.0
+
+
+def _fill(record: np.record, **fields: Any) -> None:
+    for name, value in fields.items():
+        record[name] = value
+
+
+def _fill_predictive(p: np.record, rig: Rig) -> None:
+    """Parameters of the predictive law and of the two predictors of the wall."""
+    control, insertion = rig.control, rig.stages.insertion
+    crossing_s = crossing_time_s(
+        rig.transmission.insertion_backlash_m, insertion.max_speed_unit_per_s, insertion.max_accel_unit_per_s2
+    )
+    p.law = LAW_PREDICTIVE if control.law == "predictive" else LAW_THESIS
+    _fill(
+        p.predictive,
+        move_speed_m_per_s=control.move_speed_m_per_s,
+        move_accel_m_per_s2=control.move_accel_m_per_s2,
+        slide_speed_m_per_s=control.slide_speed_m_per_s,
+        force_slew_N_per_s=control.force_slew_N_per_s,
+        force_margin_N=control.force_margin_N,
+        offset_memory_s=control.offset_memory_s,
+        contact_memory_s=control.contact_memory_s,
+        crossing_s=crossing_s,
+        reversal_share=control.reversal_share,
+        reversal_depth_m=control.reversal_depth_m,
+        force_noise_N=rig.force_sensor.noise_N,
+        play_noise_m=control.play_noise_m,
+        position_noise_m=rig.tracker.position_noise_m,
+        compliance_m_per_N=control.tip_compliance_m_per_N,
+        blind_share=control.blind_approach_share,
+    )
+    p.estimate_wall.by_phase = p.tip_wall.by_phase = 1
+    for record, stiffness_sd, play_sd_m, acceleration, local2, memory_s in (
+        (p.wall, control.stiffness_sd, control.play_sd_m, 1e-4, FOLLOWING2, 1.0),
+        (p.estimate_wall, 0.0, 0.0, 2e-5, STANDING2, 3.0),
+        (p.tip_wall, 0.0, 0.0, 1e-5, FOLLOWING2, 3.0),
+    ):
+        _fill(
+            record,
+            horizon_s=HORIZON_S,
+            gate_sigma=GATE_SIGMA,
+            stiffness_sd=stiffness_sd,
+            play_sd_m=play_sd_m,
+            level_acceleration_m_per_s2=acceleration,
+            local_acceleration2=local2,
+            score_memory_s=memory_s,
+            heart_min_Hz=40 / 60 * 0.9,
+            heart_max_Hz=180 / 60 * 1.1,
+            breath_min_Hz=0.1,
+            breath_max_Hz=0.6,
+        )
+
+
+def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
+    """The PARAMS record of `rig`; `force_source` is `sensor` or `estimate`. Raises ValueError otherwise."""
+    if force_source not in ("sensor", "estimate"):
+        raise ValueError(f"force_source: found {force_source!r}, wanted sensor or estimate")
+    params = new(PARAMS)
+    p, control, limits = params[0], rig.control, rig.safety
+    p.period_s = 1.0 / control.loop_hz
+    p.setpoint_lead_ns = round(rig.board.setpoint_lead_s * 1e9)
+    p.setpoint_expiry_us = round(rig.board.setpoint_expiry_s * 1e6)
+    p.sensor_on_tip = 1 if control.force_frame == "tip" else 0
+    p.force_source = FORCE_FROM_SENSOR if force_source == "sensor" else FORCE_FROM_ESTIMATE
+    for axis in range(3):
+        stage = rig.stage(axis)
+        p.stage.steps_per_unit[axis] = stage.steps_per_unit
+        p.stage.max_speed[axis] = stage.max_speed_unit_per_s
+        p.stage.max_accel[axis] = stage.max_accel_unit_per_s2
+        p.stage.min_unit[axis], p.stage.max_unit[axis] = stage.min_unit, stage.max_unit
+    _fill(
+        p.backlash,
+        width_m=rig.transmission.insertion_backlash_m,
+        slope=rig.transmission.insertion_slope,
+        caution_m=control.play_caution_m if control.law == "predictive" else 0.0,
+        threshold_m=control.reversal_threshold_m,
+        roll_slope=rig.transmission.roll_slope,
+    )
+    _fill(
+        p.kinematics,
+        distal_length_m=rig.catheter.distal_length_m,
+        insertion_at_home_m=rig.transmission.insertion_at_home_m,
+        max_curvature_per_m=rig.catheter.max_curvature_per_m,
+        axis_radius_m=AXIS_RADIUS_SIGMA * rig.tracker.position_noise_m,
+    )
+    p.kinematics.knob_of_curvature_rad[:] = fitted_knob_curve(
+        rig.transmission.knob_rad, rig.transmission.curvature_per_m, rig.catheter.max_curvature_per_m
+    )
+    _fill(
+        p.hybrid,
+        position_gain_per_s=control.position_gain_per_s,
+        position_integral_per_s2=control.position_integral_per_s2,
+        force_gain_m_per_N=control.force_gain_m_per_N,
+        force_integral_m_per_N_s=control.force_integral_m_per_N_s,
+        approach_speed_m_per_s=control.approach_speed_m_per_s,
+        contact_force_N=control.contact_force_N,
+    )
+    _fill(
+        p.predictor,
+        acceleration_noise_m_per_s2=control.acceleration_noise_m_per_s2,
+        position_noise_m=rig.tracker.position_noise_m,
+        max_speed_m_per_s=limits.max_tip_speed_m_per_s,
+        gate_sigma=5.0,
+        workspace_min_m=limits.workspace_min_m,
+        workspace_max_m=limits.workspace_max_m,
+    )
+    _fill_predictive(p, rig)
+    force_timeout_s = limits.force_timeout_s if force_source == "sensor" else limits.hold_after_s
+    _fill(
+        p.safety,
+        over_force_N=limits.over_force_N,
+        hold_after_ns=round(limits.hold_after_s * 1e9),
+        stop_after_ns=round(limits.stop_after_s * 1e9),
+        force_timeout_ns=round(force_timeout_s * 1e9),
+        board_timeout_ns=round(BOARD_TIMEOUT_S * 1e9),
+        retract_speed_m_per_s=limits.retract_speed_m_per_s,
+        retract_distance_m=limits.retract_distance_m,
+    )
+    return params

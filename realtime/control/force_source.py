@@ -1,0 +1,176 @@
+"""Which force closes the loop: the sensor's or the model's estimate; handed over when the sensor falls silent or parts."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from realtime.control.constraint_frame import to_base
+from realtime.control.records import FORCE_RING, FORCE_SOURCE_STATE
+
+State = FORCE_SOURCE_STATE
+
+SENSOR, ESTIMATE = 0, 1
+
+# A reading above this is no contact force, whatever the sensor says.
+_RANGE_N = 20.0
+# The sensor is taken for frozen after so many equal readings in a row: its noise is many counts.
+_FROZEN = 25
+# Estimates are used no older than this on arrival, and for this long after (two frames of the tracker and a margin).
+_ESTIMATE_AGE_NS, _ESTIMATE_LIFE_NS = 150_000_000, 75_000_000
+# Sensor and estimate are compared over _APART of the estimates; they have parted where their mean square difference is
+# more than _PARTED times what it was in good times, learned over _LEARN estimates, and more than _LEAST_N.
+_APART, _LEARN, _LEARNED, _PARTED, _LEAST_N = 10.0, 200.0, 30, 6.0, 0.03
+# Back to the sensor when it has been good for this long.
+_BACK_S = 0.5
+# Smoothing of estimates where a touch is looked for.
+_SMOOTH_S = 0.08
+
+
+@njit(cache=True)
+def start(params, state) -> None:  # type: ignore[no-untyped-def]
+    """As at arming: the source of the parameters, nothing known of how sensor and estimate agree."""
+    state.source = params.force_source
+    state.pairs, state.bias_N, state.apart_N2, state.usual_N2, state.good_s, state.smooth_N = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+
+
+@njit(cache=True)
+def _plausible(force) -> bool:  # type: ignore[no-untyped-def]
+    square = force.force_N[0] ** 2 + force.force_N[1] ** 2 + force.force_N[2] ** 2
+    return square < _RANGE_N**2
+
+
+@njit(cache=True)
+def compression(force_N, normal) -> float:  # type: ignore[no-untyped-def]
+    """Compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
+    return -(force_N[0] * normal[0] + force_N[1] * normal[1] + force_N[2] * normal[2])
+
+
+@njit(cache=True)
+def _take_sensor(state, sensor, normal) -> bool:  # type: ignore[no-untyped-def]
+    """A new reading of the sensor; False where it is not one."""
+    if not _plausible(sensor):
+        return False
+    normal_N = compression(state.reading_N, normal)
+    equal = normal_N == state.normal_N[SENSOR]
+    state.equal = state.equal + 1 if equal else 0
+    state.arrival_ns[SENSOR], state.normal_N[SENSOR] = sensor.arrival_ns, normal_N
+    state.head = (state.head + 1) % FORCE_RING
+    state.ring_ns[state.head], state.ring_N[state.head] = sensor.stamp_ns, normal_N
+    return True
+
+
+@njit(cache=True)
+def _sensor_at(state, stamp_ns: int) -> int:  # type: ignore[no-untyped-def]
+    """Place in the ring of the sensor's reading at `stamp_ns` (within 2 ms), or -1."""
+    for k in range(FORCE_RING):
+        place = (state.head - k) % FORCE_RING
+        if abs(state.ring_ns[place] - stamp_ns) <= 2_000_000:
+            return place
+        if state.ring_ns[place] < stamp_ns:
+            return -1
+    return -1
+
+
+@njit(cache=True)
+def _take_estimate(state, estimate, normal, now_ns: int, touching: bool) -> bool:  # type: ignore[no-untyped-def]
+    """A new estimate; False where it is not one. In contact it is compared with the sensor at its time."""
+    noise_N2 = 0.0
+    for i in range(3):
+        for j in range(3):
+            noise_N2 += normal[i] * estimate.covariance_N2[i, j] * normal[j]
+    if not (_plausible(estimate) and 0.0 <= noise_N2 < 1e3) or now_ns - estimate.stamp_ns > _ESTIMATE_AGE_NS:
+        return False
+    normal_N = compression(estimate.force_N, normal)
+    state.arrival_ns[ESTIMATE], state.normal_N[ESTIMATE] = estimate.arrival_ns, normal_N
+    state.noise_N2 = max(noise_N2, 1e-6)
+    place = _sensor_at(state, estimate.stamp_ns) if touching else -1
+    if place >= 0:
+        _compare(state, normal_N - state.ring_N[place])
+    return True
+
+
+@njit(cache=True)
+def _compare(state, apart_N: float) -> None:  # type: ignore[no-untyped-def]
+    off_N = apart_N - state.bias_N if state.pairs > 0 else 0.0
+    state.apart_N2 += (off_N * off_N - state.apart_N2) / _APART
+    if parted(state):
+        return
+    state.pairs += 1
+    state.bias_N += (apart_N - state.bias_N) / min(state.pairs, _LEARN)
+    state.usual_N2 += (off_N * off_N - state.usual_N2) / min(max(state.pairs - 1, 1), _LEARN)
+
+
+@njit(cache=True)
+def parted(state) -> bool:  # type: ignore[no-untyped-def]
+    """Whether sensor and estimate differ by more than they use to."""
+    return state.pairs > _LEARNED and state.apart_N2 > max(_PARTED * state.usual_N2, _LEAST_N**2)
+
+
+@njit(cache=True)
+def _choose(params, state, now_ns: int, touching: bool) -> bool:  # type: ignore[no-untyped-def]
+    """Hand over where needed; returns whether the source has changed."""
+    if params.force_source == ESTIMATE or not touching:
+        changed = state.source != params.force_source
+        state.source = params.force_source
+        return changed
+    silent = now_ns - state.arrival_ns[SENSOR] > params.safety.force_timeout_ns // 2
+    bad = silent or state.equal >= _FROZEN or parted(state)
+    state.good_s = 0.0 if bad else state.good_s + params.period_s
+    other = now_ns - state.arrival_ns[ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
+    if state.source == SENSOR and bad and other:
+        state.source = ESTIMATE
+        return True
+    if state.source == ESTIMATE and (not other or state.good_s > _BACK_S):
+        state.source = SENSOR
+        return True
+    return False
+
+
+@njit(cache=True)
+def apply(params, state, inputs, frame_wxyz, normal, touching: bool) -> int:  # type: ignore[no-untyped-def]
+    """Take in what has come of both. Returns how many readings of either were refused.
+
+    frame_wxyz: the tip's measured orientation, used where the sensor sits on the tip; normal: outward, unit.
+
+    Afterwards: `fresh` is 1 where the chosen source has a new reading: `stamp_ns`, `value_N` (compression), `spread_N2`;
+    `force_N` (3,) and `age_from_ns` belong to the chosen source; `changed` is 1 in the tick of a handover.
+    """
+    refused, new = 0, -1
+    if inputs.sensor.count != state.seen[SENSOR]:
+        state.seen[SENSOR] = inputs.sensor.count
+        for i in range(3):
+            state.reading_N[i] = inputs.sensor.force_N[i]
+        if params.sensor_on_tip != 0:
+            to_base(frame_wxyz, inputs.sensor.force_N, state.reading_N)
+        if _take_sensor(state, inputs.sensor, normal):
+            new = SENSOR
+        else:
+            refused += 1
+    estimated = False
+    if inputs.estimate.count != state.seen[ESTIMATE]:
+        state.seen[ESTIMATE] = inputs.estimate.count
+        estimated = _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching)
+        if not estimated and params.force_source == ESTIMATE:
+            refused += 1
+    state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0
+    state.fresh = 0
+    if state.source == SENSOR and new == SENSOR:
+        _set(state, inputs.sensor, state.reading_N, state.normal_N[SENSOR], params.predictive.force_noise_N**2)
+        state.smooth_N = state.value_N
+    elif state.source == ESTIMATE and estimated:
+        before_ns = state.stamp_ns
+        bias_N = 0.0 if params.force_source == ESTIMATE else state.bias_N
+        _set(state, inputs.estimate, inputs.estimate.force_N, state.normal_N[ESTIMATE] - bias_N, state.noise_N2)
+        dt_s = min(max((state.stamp_ns - before_ns) * 1e-9, 0.0), _SMOOTH_S)
+        state.smooth_N += dt_s / (dt_s + _SMOOTH_S) * (state.value_N - state.smooth_N)
+    return refused
+
+
+@njit(cache=True)
+def _set(state, force, vector_N, value_N: float, spread_N2: float) -> None:  # type: ignore[no-untyped-def]
+    stamped = 0 <= force.arrival_ns - force.stamp_ns <= _ESTIMATE_AGE_NS
+    state.stamp_ns = force.stamp_ns if stamped else force.arrival_ns
+    state.fresh, state.value_N, state.spread_N2 = 1, value_N, spread_N2
+    state.age_from_ns = force.arrival_ns
+    for i in range(3):
+        state.force_N[i] = vector_N[i]

@@ -1,0 +1,105 @@
+"""Where in frequency a signal moves: leaky Fourier sums on a geometric grid, for finding a heart or breath rate."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from realtime.control.records import BANK, BANK_POINTS
+
+Bank = BANK
+# The grid is wide enough for 40-180 heart beats and 6-36 breaths a minute.
+POINTS = BANK_POINTS
+# Samples come in at about this rate; faster streams are averaged first.
+STEP_S = 0.020
+
+
+@njit(cache=True)
+def start(bank, low_Hz: float, high_Hz: float, memory_s: float, level: float) -> None:  # type: ignore[no-untyped-def]
+    """Forget everything; look between `low_Hz` and `high_Hz` over the last two `memory_s` or so. `level`: first guess
+    of the mean (unit of the signal)."""
+    bank.low_Hz, bank.high_Hz, bank.memory_s, bank.since_s, bank.level = low_Hz, high_Hz, memory_s, 0.0, level
+    for k in range(POINTS):
+        bank.phase_rad[k] = 0.0
+        for part in range(2):
+            bank.first[k, part] = 0.0
+            bank.second[k, part] = 0.0
+
+
+@njit(cache=True)
+def frequency_Hz(bank, place: float) -> float:  # type: ignore[no-untyped-def]
+    """Frequency (Hz) at a place on the grid, 0 to POINTS - 1, fractions allowed."""
+    return bank.low_Hz * (bank.high_Hz / bank.low_Hz) ** (place / (POINTS - 1))
+
+
+@njit(cache=True)
+def amplitude(bank, point: int) -> float:  # type: ignore[no-untyped-def]
+    """Amplitude (unit of the signal) near grid point number `point`."""
+    return 2.0 * math.hypot(bank.second[point, 0], bank.second[point, 1])
+
+
+@njit(cache=True)
+def apply(bank, value: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+    """Take in the signal's mean `value` over the last `dt_s` seconds.
+
+    Two leaky sums in cascade (window t exp(-t/memory)): side lobes fall with the square of the distance, so that breath
+    and mean do not show up as heart.
+    """
+    bank.since_s += dt_s
+    leak = min(dt_s / bank.memory_s, 1.0)
+    bank.level += leak * (value - bank.level)
+    moving = value - bank.level
+    ratio = (bank.high_Hz / bank.low_Hz) ** (1.0 / (POINTS - 1))
+    turn = 2.0 * math.pi * bank.low_Hz * dt_s
+    for k in range(POINTS):
+        phase = bank.phase_rad[k] + turn
+        phase -= 2.0 * math.pi * math.floor(phase / (2.0 * math.pi))
+        bank.phase_rad[k] = phase
+        bank.first[k, 0] += leak * (moving * math.cos(phase) - bank.first[k, 0])
+        bank.first[k, 1] += leak * (-moving * math.sin(phase) - bank.first[k, 1])
+        for part in range(2):
+            bank.second[k, part] += leak * (bank.first[k, part] - bank.second[k, part])
+        turn *= ratio
+
+
+@njit(cache=True)
+def peak(bank) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    """(frequency in Hz, amplitude) of the strongest motion inside the grid; (0, 0) where there is none but at its edge.
+
+    Where half the frequency also moves by a third as much, that is taken: the strongest may be a second harmonic. Asked
+    only after several periods of it, when leakage from the strongest has died out.
+    """
+    best = 0
+    for k in range(1, POINTS - 1):
+        if _is_top(bank, k) and (best == 0 or amplitude(bank, k) > amplitude(bank, best)):
+            best = k
+    if best == 0:
+        return 0.0, 0.0
+    octave = (POINTS - 1) * math.log(2.0) / math.log(bank.high_Hz / bank.low_Hz)
+    half = best - round(octave)
+    long_enough = bank.since_s * frequency_Hz(bank, half) > 4.0
+    if 1 <= half and long_enough and _is_top(bank, half) and amplitude(bank, half) > 0.33 * amplitude(bank, best):
+        best = half
+    left, middle, right = amplitude(bank, best - 1), amplitude(bank, best), amplitude(bank, best + 1)
+    bend = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    return frequency_Hz(bank, best + min(max(shift, -0.5), 0.5)), middle
+
+
+@njit(cache=True)
+def pair(bank, heard_Hz: float) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    """(cosine, sine) part now of the motion at `heard_Hz`, from the nearest grid point: value = cosine part, turning."""
+    place = (POINTS - 1) * math.log(heard_Hz / bank.low_Hz) / math.log(bank.high_Hz / bank.low_Hz)
+    k = min(max(round(place), 0), POINTS - 1)
+    c, s = math.cos(bank.phase_rad[k]), math.sin(bank.phase_rad[k])
+    re, im = 2.0 * bank.second[k, 0], 2.0 * bank.second[k, 1]
+    lag = 2.0 * math.atan(2.0 * math.pi * (heard_Hz - frequency_Hz(bank, k)) * bank.memory_s)
+    re, im = re * math.cos(lag) - im * math.sin(lag), re * math.sin(lag) + im * math.cos(lag)
+    return re * c - im * s, re * s + im * c
+
+
+@njit(cache=True)
+def _is_top(bank, point: int) -> bool:  # type: ignore[no-untyped-def]
+    here = amplitude(bank, point)
+    return here >= amplitude(bank, point - 1) and here >= amplitude(bank, point + 1)

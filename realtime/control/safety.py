@@ -1,0 +1,93 @@
+"""The failsafe decision: one pure function from what is wrong to what is done about it."""
+
+from __future__ import annotations
+
+from numba import njit
+
+# Actions, ordered: a later one is never weakened by an earlier one.
+NONE, WARN, HOLD, RETRACT, STOP = range(5)
+ACTION_NAMES = ("none", "warn", "hold", "retract", "stop")
+
+# (bit, action, latches until the operator clears it, what to tell the operator)
+CAUSES: tuple[tuple[str, int, bool, str], ...] = (
+    ("pose_rejected", WARN, False, "a pose was not finite, out of the workspace or too fast; it was not used"),
+    ("force_rejected", WARN, False, "a force reading was not finite or out of the sensor's range; it was not used"),
+    ("pose_stale", HOLD, False, "no fresh pose from the tracker: holding"),
+    ("poses_wild", HOLD, False, "three poses in a row rejected: holding; check the tracker"),
+    ("force_stale", HOLD, False, "no fresh force while in contact: holding; check the force sensor"),
+    ("over_force", RETRACT, True, "contact force above the limit: retracting"),
+    ("pose_lost", STOP, True, "no pose for longer than the limit: stopped; check the tracker, then clear"),
+    ("force_lost", RETRACT, True, "no force for longer than the limit while in contact: retracting"),
+    ("board_silent", STOP, True, "no status from the stepper board: stopped; check cable and power, then clear"),
+    ("board_fault", STOP, True, "the stepper board latched a fault: stopped; see its fault code, then clear"),
+    ("operator_stop", STOP, True, "stopped by the operator"),
+    (
+        "steps_lost",
+        RETRACT,
+        True,
+        "encoder and steps have parted: retracting; look for a jam or a loose encoder plug, clear, and home the axes",
+    ),
+    ("force_disagrees", RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
+    ("force_handover", WARN, False, "the force sensor is silent, frozen or off: the model's estimate closes the loop"),
+)
+CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
+(
+    POSE_REJECTED,
+    FORCE_REJECTED,
+    POSE_STALE,
+    POSES_WILD,
+    FORCE_STALE,
+    OVER_FORCE,
+    POSE_LOST,
+    FORCE_LOST,
+    BOARD_SILENT,
+    BOARD_FAULT,
+    OPERATOR_STOP,
+    STEPS_LOST,
+    FORCE_DISAGREES,
+    FORCE_HANDOVER,
+) = (1 << index for index in range(len(CAUSES)))
+LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
+
+_HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE
+_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST
+_STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
+
+
+@njit(cache=True)
+def action_of(flags: int) -> int:
+    """The strongest action that any cause in the bit set `flags` asks for."""
+    if flags & _STOP_BITS:
+        return STOP
+    if flags & _RETRACT_BITS:
+        return RETRACT
+    if flags & _HOLD_BITS:
+        return HOLD
+    if flags != 0:
+        return WARN
+    return NONE
+
+
+@njit(cache=True)
+def decide(flags: int, latched: int, clear: bool) -> tuple[int, int]:
+    """What to do now.
+
+    flags: causes that stand at this tick (bit set of CAUSES); latched: those kept from earlier ticks;
+    clear: the operator clears. Returns (action, latched). A cause that still stands is never cleared,
+    so an action never weakens while its cause stands.
+    """
+    if clear:
+        latched = 0
+    latched |= flags & LATCHING
+    return action_of(flags | latched), latched
+
+
+def in_words(flags: int) -> list[str]:
+    """The sentences of all causes in the bit set `flags`, strongest first."""
+    standing = [cause for index, cause in enumerate(CAUSES) if flags & (1 << index)]
+    return [cause[3] for cause in sorted(standing, key=lambda cause: -cause[1])]
+
+
+def names(flags: int) -> list[str]:
+    """The names of all causes in the bit set `flags`."""
+    return [cause[0] for index, cause in enumerate(CAUSES) if flags & (1 << index)]

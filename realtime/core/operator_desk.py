@@ -1,0 +1,175 @@
+"""Commands in, replies out: arms the board and the loop, sets targets, stops, clears. Nothing arms by itself.
+
+Who may command, and whether a command is fresh, has been judged before (`realtime.core.command_gate`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from protocol.messages import Vector
+from protocol.rig_file import Rig
+from protocol.serial_frames import Fault
+from protocol.topics import Command, Reply
+from realtime.control import inverse_kinematics
+from realtime.control.configure import tick_parameters
+from realtime.control.force_source import ESTIMATE
+from realtime.control.records import (
+    COMMAND_CONTACT,
+    COMMAND_HOLD,
+    COMMAND_POSITION,
+    COMMAND_RETRACT,
+    COMMAND_STOP,
+    PHASE_CONTACT,
+)
+from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
+
+# A target may be out of reach by no more than this: the calibration is not better known.
+REACH_m = 0.001
+FORCE_BOX = "net_ft"  # as the driver names it in its events
+_KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND_CONTACT, "retract": COMMAND_RETRACT}
+
+
+class OperatorDesk:
+    """Turns commands into the tick's COMMAND record and into frames for the board (`take_frames`)."""
+
+    def __init__(self, rig: Rig, record: np.record, link: StepperBoardLink, missing: Callable[[], str] = lambda: "") -> None:
+        """missing: names the devices that are not there yet, empty when all are; asked before arming."""
+        self._rig, self._record, self._link, self._missing = rig, record, link, missing
+        self._frames: list[bytes] = []
+        self._kinematics = tick_parameters(rig)[0].kinematics
+        record.normal[:] = (0.0, 0.0, -1.0)
+
+    def take_frames(self) -> list[bytes]:
+        """Frames to send to the board, in order."""
+        frames, self._frames = self._frames, []
+        return frames
+
+    def watch(self, flags: int) -> None:
+        """Set the causes that the supervision has found: a bit set of `realtime.control.safety`, 0 for none."""
+        self._record.watch = flags
+
+    def obey(self, command: Command, now_ns: int) -> Reply:
+        """Carry out `command` at `now_ns` or refuse it; a refused command changes nothing."""
+        actions = {
+            "arm": self._arm,
+            "disarm": self._disarm,
+            "stop": self._stop,
+            "clear_fault": self._clear_fault,
+            "target": self._target,
+            "hold": self._hold,
+            "force": self._force,
+        }
+        problem = actions[command.action](command)
+        return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
+
+    def _set(self, kind: int) -> None:
+        self._record.kind = kind
+        self._record.count += 1
+
+    def _arm(self, command: Command) -> str:
+        if self._link.phase is not LinkPhase.READY:
+            return f"arm: found the board link in phase {self._link.phase.value}, wanted ready"
+        if self._link.status is not None and self._link.status.fault != Fault.NONE:
+            return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
+        if self._record.armed:
+            return "arm: found the rig armed, wanted disarmed"
+        missing = self._missing()
+        if missing:
+            return f"arm: found nothing from {missing}, wanted fresh readings"
+        self._frames.append(self._link.arm())
+        self._record.armed = 1
+        self._set(COMMAND_HOLD)
+        return ""
+
+    def _disarm(self, command: Command) -> str:
+        self._rest()
+        return ""
+
+    def back(self, device: str, force_source: int, phase: int) -> str:
+        """`device` was gone and is there again: what was armed is disarmed. Returns words for the log, empty for none.
+
+        Not so for a force sensor whose place the estimate has taken in contact: the loop never lost the force, and lets the
+        sensor in again when both agree (`force_source.py`). force_source, phase: of the loop's last outputs.
+        """
+        if not self._record.armed or (device == FORCE_BOX and force_source == ESTIMATE and phase == PHASE_CONTACT):
+            return ""
+        self._rest()
+        return f"{device} is back: disarmed, to be armed again"
+
+    def _rest(self) -> None:
+        self._record.armed = 0
+        self._set(COMMAND_HOLD)
+        self._frames.append(self._link.disarm())
+
+    def _stop(self, command: Command) -> str:
+        self._set(COMMAND_STOP)
+        return ""
+
+    def _clear_fault(self, command: Command) -> str:
+        """Clears the loop's latched causes and the board's fault, and leaves both disarmed."""
+        self._disarm(command)
+        self._record.clear += 1
+        if self._link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH):
+            self._link.restart()
+        elif self._link.status is not None and self._link.status.fault != Fault.NONE:
+            self._frames.append(self._link.clear_fault(command.fault or self._link.status.fault))
+        return ""
+
+    def _hold(self, command: Command) -> str:
+        if not self._record.armed:
+            return "hold: found the rig disarmed, wanted armed"
+        self._set(COMMAND_HOLD)
+        return ""
+
+    def _force(self, command: Command) -> str:
+        """Another force on the target that there is; nothing else changes."""
+        if not self._record.armed or self._record.kind != COMMAND_CONTACT:
+            return "force: found no contact asked for, wanted target contact before"
+        problem = self._too_much(command)
+        if not problem and command.force_N is not None:
+            self._record.force_N = command.force_N
+        return problem
+
+    def _target(self, command: Command) -> str:
+        if not self._record.armed:
+            return "target: found the rig disarmed, wanted armed"
+        problem = self._too_much(command) or ("" if command.target_m is None else self._outside(command.target_m))
+        if problem:
+            return problem
+        if command.target_m is not None:
+            self._record.target_m[:] = command.target_m
+        if command.normal is not None:
+            self._record.normal[:] = -np.asarray(command.normal)
+        if command.force_N is not None:
+            self._record.force_N = command.force_N
+        self._set(_KINDS[command.target])
+        return ""
+
+    def _too_much(self, command: Command) -> str:
+        limit_N = self._rig.safety.over_force_N
+        if command.force_N is not None and command.force_N >= limit_N:
+            return f"force_N: found {command.force_N}, wanted below safety.over_force_N {limit_N}"
+        return ""
+
+    def _outside(self, target_m: Vector) -> str:
+        low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
+        for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
+            if not least <= value <= most:
+                return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
+        insertion, t = self._rig.stages.insertion, self._rig.transmission
+        least_m, most_m = (
+            t.insertion_at_home_m + t.insertion_slope * unit + 0.5 * side * t.insertion_backlash_m
+            for unit, side in ((insertion.min_unit, -1.0), (insertion.max_unit, 1.0))
+        )
+        off_m = inverse_kinematics.out_of_reach_m(
+            self._kinematics, np.asarray(target_m, float), least_m, most_m, self._rig.stages.knob.max_unit
+        )
+        if not off_m <= REACH_m:
+            return (
+                f"target_m: found {tuple(target_m)}, wanted a point that the unloaded tip can reach: it comes no nearer "
+                f"than {off_m * 1e3:.1f} mm"
+            )
+        return ""

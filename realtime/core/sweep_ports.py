@@ -1,0 +1,172 @@
+"""The sweeps on a rig's own ports: `SweepLoop` fed from serial lines and UDP, in turn, at the loop's rate.
+
+Whoever holds the board's port commands the rig: the port is opened for this process alone, so that nothing moves while
+a realtime process (or another sweep) has it, and neither gets at the board as long as the sweeps run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import socket
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from protocol.rig_file import Rig
+from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.sweep import SweepLoop
+from realtime.drivers.net_ft import RDT_PORT
+from realtime.drivers.sensor_threads import apply_line_action
+from realtime.drivers.transport import Transport, open_serial
+from realtime.loop.clock import Clock
+from realtime.loop.scheduling import RealtimeSettings, realtime_thread
+
+# The tracker answers at this speed until its driver asks for another.
+TRACKER_BAUD = 9600
+# A period that comes later than this many is left out, not made up for.
+LATE_PERIODS = 3
+_DATAGRAM = 2048
+
+
+class Ports(Protocol):
+    """The lines of a rig, as bytes."""
+
+    def receive(self) -> Arriving:
+        """What has come since the last call. Raises OSError when the board's line is gone."""
+
+    def send(self, leaving: Leaving) -> None:
+        """Hand over what is to be sent. Raises OSError when the board's line is gone."""
+
+
+class RigPorts:
+    """Board and tracker on serial ports, the force box by UDP; addresses of the rig file, or given here.
+
+    Raises OSError, naming the key, where one does not open or another process has it. Use as a context.
+    """
+
+    def __init__(
+        self, rig: Rig, board_port: str | None = None, tracker_port: str | None = None, force_port: int = RDT_PORT
+    ) -> None:
+        self._opened: list[Transport] = []
+        self.failures: dict[str, str] = {}
+        try:
+            self._board = self._open("board.port", board_port or rig.board.port, rig.board.baud)
+            self._tracker = self._open("tracker.port", tracker_port or rig.tracker.port, TRACKER_BAUD)
+            self._force = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._force.setblocking(False)
+            self._force.connect((rig.force_sensor.address, force_port))
+        except OSError:
+            self.close()
+            raise
+
+    def _open(self, key: str, path: str, baud: int) -> Transport:
+        try:
+            line = open_serial(path, baud)
+        except OSError as error:
+            cause = error.__cause__ or error
+            raise OSError(
+                f"{key}: found {path} that does not open ({cause}), wanted a device that no other process holds "
+                "(a realtime process must be stopped first)"
+            ) from None
+        self._opened.append(line)
+        return line
+
+    def receive(self) -> Arriving:
+        """What the devices have sent. A tracker or force box that is gone is silent, and the sweeps end by that."""
+        arriving = Arriving(board=self._board.read())
+        try:
+            arriving.tracker = self._tracker.read()
+        except OSError as gone:
+            self.failures["tracker"] = str(gone)
+        try:
+            while True:
+                arriving.force.append(self._force.recv(_DATAGRAM))
+        except BlockingIOError:
+            pass
+        except OSError as gone:
+            self.failures["force sensor"] = str(gone)
+        return arriving
+
+    def send(self, leaving: Leaving) -> None:
+        """The board first: its set-points have a time."""
+        if leaving.board:
+            self._board.write(leaving.board)
+        try:
+            for action in leaving.tracker_line:
+                apply_line_action(self._tracker, action)
+            if leaving.tracker:
+                self._tracker.write(leaving.tracker)
+        except OSError as gone:
+            self.failures["tracker"] = str(gone)
+        try:
+            for datagram in leaving.force:
+                self._force.send(datagram)
+        except OSError as gone:
+            self.failures["force sensor"] = str(gone)
+
+    def close(self) -> None:
+        """Give the lines back."""
+        for line in self._opened:
+            line.close()
+        force = getattr(self, "_force", None)
+        if force is not None:
+            force.close()
+
+    def __enter__(self) -> RigPorts:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without Python's garbage collector: it may stand still for longer than the board waits for a set-point."""
+    was = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
+class Pace(Protocol):
+    """A clock to keep to: `realtime.loop.clock.Clock`, or a world that hands out its own time."""
+
+    def now_ns(self) -> int:
+        """The time."""
+
+    def sleep_until(self, deadline_ns: int) -> bool:
+        """Return when it is `deadline_ns`."""
+
+
+def run_sweeps(
+    loop: SweepLoop,
+    ports: Ports,
+    clock: Pace | None = None,
+    each: Callable[[], None] = lambda: None,
+    stop: Callable[[], bool] = lambda: False,
+    settings: RealtimeSettings | None = None,
+) -> None:
+    """Turn after turn until the sweeps are done and the stages stand, or `stop` says to break off (they are braked).
+
+    clock: CLOCK_MONOTONIC unless another is given; `loop` keeps its stamps. each: called once a turn. When it returns,
+    `loop.finished` or `loop.problem` say how it ended. Raises OSError when the board's line is gone: then the board, which
+    hears nothing more, stops the stages by itself.
+    """
+    clock = clock or Clock.monotonic()
+    with realtime_thread(settings), _no_collection():
+        due_ns = clock.now_ns()
+        ports.send(loop.step(due_ns, Arriving()))
+        while not loop.done:
+            due_ns += loop.period_ns
+            clock.sleep_until(due_ns)
+            now_ns = clock.now_ns()
+            if now_ns - due_ns > LATE_PERIODS * loop.period_ns:
+                due_ns = now_ns
+            if stop():
+                loop.break_off("operator: found a wish to stop, wanted the sweeps to their end")
+            ports.send(loop.step(now_ns, ports.receive()))
+            each()

@@ -1,0 +1,118 @@
+"""What the loop tells the others: tick records turned into the messages of `protocol.topics`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocol.topics import (
+    HISTOGRAM_BUCKETS,
+    MODES,
+    SAFETY_ACTIONS,
+    BoardCounters,
+    ForceSensor,
+    LoopTiming,
+    Message,
+    Pose,
+    RigState,
+    Stage,
+    histogram_bucket,
+)
+from realtime.control import safety
+from realtime.control.inverse_kinematics import curvature_of_knob
+from realtime.control.records import PHASE_CONTACT
+from realtime.loop.latency import percentiles_us
+from realtime.loop.native_loop import WORK_BIN_NS
+
+# Ticks (of 1 ms) between two messages of a topic.
+STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY, LOOP_EVERY = 4, 2, 10, 50, 500
+
+
+def stage_message(params: np.record, inputs: np.record, outputs: np.record) -> Stage:
+    """Handle commands and encoders, and the catheter's joints as the controller has them."""
+    steps = params.stage.steps_per_unit
+    encoder = np.asarray(inputs.board.encoder_counts) / steps
+    known = inputs.board.count > 0
+    return Stage(
+        stamp_ns=int(outputs.now_ns),
+        command_insertion_m=float(outputs.stage_unit[0]),
+        command_roll_rad=float(outputs.stage_unit[1]),
+        command_knob_rad=float(outputs.stage_unit[2]),
+        encoder_insertion_m=float(encoder[0]) if known else None,
+        encoder_roll_rad=float(encoder[1]) if known else None,
+        encoder_knob_rad=float(encoder[2]) if known else None,
+        joint_insertion_m=float(outputs.joint[0]),
+        joint_roll_rad=float(outputs.joint[1]),
+        joint_curvature_per_m=curvature_of_knob(params.kinematics, float(outputs.joint[2])),
+    )
+
+
+def pose_message(record: np.record, frame: int = 0, quality_m: float | None = None) -> Pose:
+    """A POSE record (base frame) as it entered the loop."""
+    return Pose(
+        stamp_ns=int(record.stamp_ns),
+        arrival_ns=int(record.arrival_ns),
+        frame=frame,
+        missing=False,
+        position_m=tuple(map(float, record.position_m)),
+        quaternion_wxyz=tuple(map(float, record.quaternion_wxyz)),
+        quality_m=quality_m,
+    )
+
+
+def force_message(record: np.record, status: int = 0) -> ForceSensor:
+    """A FORCE record of the sensor (base frame, on the tissue)."""
+    return ForceSensor(
+        stamp_ns=int(record.stamp_ns),
+        arrival_ns=int(record.arrival_ns),
+        force_N=tuple(map(float, record.force_N)),
+        status=status,
+    )
+
+
+def state_message(inputs: np.record, outputs: np.record) -> RigState:
+    """Phase, failsafe action and its cause in words, target and tip."""
+    command = inputs.command
+    pressing = float(command.force_N) if outputs.phase == PHASE_CONTACT else None
+    return RigState(
+        stamp_ns=int(outputs.now_ns),
+        mode=MODES[int(outputs.phase)],
+        safety_action=SAFETY_ACTIONS[int(outputs.action)],
+        cause="; ".join(safety.in_words(int(outputs.cause)))[:500],
+        target_m=tuple(map(float, command.target_m)),
+        tip_m=tuple(map(float, outputs.tip_m)),
+        tip_velocity_m_per_s=tuple(map(float, outputs.tip_velocity_m_per_s)),
+        force_direction=tuple(-float(x) for x in command.normal),
+        target_force_N=pressing,
+        force_N=float(outputs.normal_force_N),
+        pose_age_ns=max(int(outputs.pose_age_ns), 0),
+        poses_rejected=int(outputs.poses_rejected),
+        forces_rejected=int(outputs.forces_rejected),
+    )
+
+
+def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
+    """The message's histogram of tick times, from the loop's (n + 2,) one with bins of WORK_BIN_NS."""
+    work = work.copy()  # the loop's thread counts on meanwhile, which np.flatnonzero would not bear
+    buckets = [0] * HISTOGRAM_BUCKETS
+    for index in np.flatnonzero(work[:-2]):
+        buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(work[index])
+    return tuple(buckets)
+
+
+def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -> LoopTiming:
+    """Histogram (n + 2,) of tick times so far, as the compiled loop keeps it; virtual time knows no lateness."""
+    times = percentiles_us(work, WORK_BIN_NS)
+    return LoopTiming(
+        stamp_ns=stamp_ns,
+        loop_hz=loop_hz,
+        ticks=int(work[:-1].sum()),
+        missed_ticks=missed,
+        tick_p50_us=times["p50"],
+        tick_p99_us=times["p99"],
+        tick_p999_us=times["p999"],
+        tick_max_us=times["max"],
+        tick_histogram=tick_buckets(work),
+    )
+
+
+__all__ = ["BoardCounters", "Message", "force_message", "loop_message", "pose_message", "stage_message", "state_message"]

@@ -1,0 +1,1 @@
+"""Generator of the proof: recordings with concealed physics, labels kept apart. Written apart from the finder."""
