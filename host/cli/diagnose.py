@@ -1,16 +1,16 @@
-"""`seldinger diagnose`: recordings and a nominal model in, verdict out, as JSON and as a report page."""
+"""`seldinger diagnose`: recordings and a nominal model in; verdict out, as text, as JSON and as a report page."""
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from host.cli.contract_io import write_json
+from protocol.errors import InputError
 
 
 class Progress:
@@ -44,15 +44,14 @@ def diagnose(
         list[str] | None, typer.Argument(help="tables or folders; without any, those the nominal TOML names")
     ] = None,
     nominal: Annotated[str, typer.Option(help="nominal model, a TOML file or the name of one that ships")] = "",
-    json: Annotated[str | None, typer.Option(help="where the verdict goes; - for standard output")] = None,
-    report: Annotated[str | None, typer.Option(help="where the report page goes (one HTML file)")] = None,
+    json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
     out: Annotated[
         Path | None, typer.Option(help="folder for verdict.json, report.html, and the scripts of experiments to tell apart")
     ] = None,
     data: Annotated[
         str | None, typer.Option(help="folder of the recordings that the nominal TOML names (else SELDINGER_DATA)")
     ] = None,
-    without: Annotated[list[str] | None, typer.Option(help="effect id the finder is not to know")] = None,
+    without: Annotated[list[str] | None, typer.Option(help="effect id that is not to be considered")] = None,
     quiet: Annotated[bool, typer.Option(help="no progress on standard error")] = False,
     live: Annotated[bool, typer.Option("--live", help="watch a running rig against its twin, and raise alarms")] = False,
     rig: Annotated[str | None, typer.Option(help="with --live: the rig's file (default: the simulated rig)")] = None,
@@ -61,52 +60,42 @@ def diagnose(
         typer.Option(help="effect that is known to be there: id@subsystem:key=value,... as the report gives it"),
     ] = None,
 ) -> None:
-    """Where simulation and recording part, what physics was left out, its model, and the proof."""
+    """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""
     if live:
         from host.cli.diagnose_live import watch_rig
 
         watch_rig(rig, json)
         return
-    from host.diagnosis.model.dataset import find_files
-    from host.diagnosis.model.effect import library
-    from host.diagnosis.model.nominal import effect_of, read_nominal
-    from host.diagnosis.pipeline import diagnose as run
-    from host.diagnosis.report.verdict import as_json
-    from protocol.errors import InputError
+    from host.diagnosis import diagnose as run
 
-    began = time.monotonic()
-    known = {effect.id for effect in library()}
-    for effect_id in without or []:
-        if effect_id not in known:
-            raise InputError("--without", effect_id, "one of " + ", ".join(sorted(known)))
     if not nominal:
         raise InputError("--nominal", "nothing", "a TOML file")
-    spec = read_nominal(nominal_path(nominal))
-    spec.effect += [effect_of(text) for text in effect or []]
-    files = find_files(spec, recordings or [], data or os.environ.get("SELDINGER_DATA"))
     progress = Progress(quiet)
-    result = run(spec, files, progress, frozenset(without or []))
+    verdict = run(recordings or [], nominal, without=without or [], known=effect or [], data_folder=data, progress=progress)
     progress.close()
-    verdict = as_json(result, time.monotonic() - began)
     if out is not None:
-        from host.diagnosis.design.scripts import write_scripts
-
-        out.mkdir(parents=True, exist_ok=True)
-        verdict["scripts"] = [str(path) for path in write_scripts(result, out)]
-        report = report or str(out / "report.html")
-        write_json(verdict, str(out / "verdict.json"))
-        for path in verdict["scripts"]:
-            print(f"script: {path}", file=sys.stderr)
-    if report:
-        from host.diagnosis.report.page import write_report
-
-        write_report(result, verdict, Path(report))
-    if json or not report:
-        write_json(verdict, json)
+        report = verdict.write(out)
+        print(f"report: {report}", file=sys.stderr)
+        for script in verdict.as_dict()["scripts"]:
+            print(f"script: {script}", file=sys.stderr)
+    if json:
+        write_json(verdict.as_dict())
+    else:
+        print("\n".join(summary(verdict.as_dict())))
 
 
-def nominal_path(name: str) -> Path:
-    """The file `name`, or the shipped nominal of that name."""
-    path = Path(name)
-    shipped = Path(__file__).parents[1] / "diagnosis" / "nominals" / f"{name}.toml"
-    return shipped if not path.exists() and shipped.exists() else path
+def summary(verdict: dict[str, Any]) -> list[str]:
+    """The verdict as lines for people."""
+    fit = verdict["fit"]
+    lines = [verdict["verdict"].replace("_", " ")]
+    for effect in verdict["effects"]:
+        lines.append(f"{effect['id']} ({effect['subsystem']}): {effect['says']}")
+        for key, p in effect["parameters"].items():
+            lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g})")
+        if effect["indistinguishable_from"]:
+            lines.append("  indistinguishable from " + ", ".join(effect["indistinguishable_from"]))
+    lines.append(
+        f"held-out RMS error {fit['rmse_before']:.4g} {fit['unit']}, with the effects {fit['rmse_after']:.4g} "
+        f"{fit['unit']}; noise {fit['noise_floor']:.4g} {fit['unit']}"
+    )
+    return lines

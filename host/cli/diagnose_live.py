@@ -18,8 +18,8 @@ from protocol.zenoh_session import Session
 SAYS = {"waiting": "waiting for an armed rig", "learning": "learning how rig and twin agree", "watching": "watching"}
 
 
-def watch_rig(rig_file: str | None, json: str | None) -> None:
-    """Watch the rig of `rig_file` until SIGINT or SIGTERM. With json `-`, one JSON object a line for each alarm.
+def watch_rig(rig_file: str | None, json: bool) -> None:
+    """Watch the rig of `rig_file` until SIGINT or SIGTERM. With `json`, one JSON object a line for each alarm.
 
     Raises InputError for a bad rig file.
     """

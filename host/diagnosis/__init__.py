@@ -1,1 +1,115 @@
-"""The mismatch finder: where simulation and recording part, what physics was left out, its model and the proof."""
+"""The mismatch finder: where simulation and recordings disagree, which physics is missing, its model and the evidence."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from protocol.errors import InputError
+
+if TYPE_CHECKING:
+    from host.diagnosis.model.tables import Table
+    from host.diagnosis.pipeline import Diagnosis
+
+__all__ = ["Verdict", "diagnose"]
+
+
+class Verdict:
+    """What a diagnosis found. `as_dict` has all of it, as `seldinger diagnose --json` prints it."""
+
+    def __init__(self, diagnosis: Diagnosis, seconds: float) -> None:
+        from host.diagnosis.report.verdict import as_json
+
+        self.diagnosis = diagnosis
+        self._content = as_json(diagnosis, seconds)
+
+    @property
+    def verdict(self) -> str:
+        """`missing_physics`, `nothing_missing` or `mismatch_not_identified`."""
+        return str(self._content["verdict"])
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """Effects that are missing from the nominal model, most probable first, each as in the JSON."""
+        return list(self._content["effects"])
+
+    def as_dict(self) -> dict[str, Any]:
+        """The whole verdict as JSON's own types; NaN is None."""
+        from protocol.requests import plain
+
+        return dict(plain(self._content))
+
+    def write(self, folder: Path | str) -> Path:
+        """Write verdict.json, report.html and the scripts of proposed experiments to `folder`. Returns the report.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        import json
+
+        from host.diagnosis.design.scripts import write_scripts
+        from host.diagnosis.report.page import write_report
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        scripts = write_scripts(self.diagnosis, folder)
+        self._content["scripts"] = [str(path) for path in scripts]
+        (folder / "verdict.json").write_text(json.dumps(self.as_dict(), allow_nan=False) + "\n", encoding="utf-8")
+        return write_report(self.diagnosis, self._content, folder / "report.html")
+
+
+def diagnose(
+    recordings: Sequence[Any],
+    nominal: Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    without: Sequence[str] = (),
+    known: Sequence[str] = (),
+    data_folder: str | None = None,
+    progress: Callable[[str, float], None] = lambda what, part: None,
+) -> Verdict:
+    """Compare recordings with a nominal model and name the physics that it lacks.
+
+    Parameters:
+        recordings: each a dictionary of arrays (n,), a DataFrame, or a path (a folder stands for the tables in it).
+            Empty: the files that the nominal model names, in `data_folder`.
+        nominal: a TOML file, the name of one that ships, or the content of such a file as a dictionary.
+        without: ids of effects that are not to be considered.
+        known: effects to take for granted, `id@subsystem:key=value,...`.
+        data_folder: where files that the nominal model names lie (default: SELDINGER_DATA).
+        progress: called with what is being done and the part of it that is done (0 to 1).
+
+    Returns:
+        The verdict: `.verdict`, `.effects`, `.as_dict()`, `.write(folder)`.
+
+    Raises:
+        InputError: recordings or nominal model cannot be used; names the key.
+
+    Examples:
+        >>> verdict = diagnose([{"t": t, "f": f, "x": x}], "stage.toml")  # doctest: +SKIP
+        >>> verdict.effects[0]["id"]  # doctest: +SKIP
+        'coulomb_friction'
+    """
+    from host.diagnosis.model.dataset import find_files
+    from host.diagnosis.model.effect import library
+    from host.diagnosis.model.nominal import effect_of, nominal_of, nominal_path, read_nominal
+    from host.diagnosis.model.tables import table_of
+    from host.diagnosis.pipeline import diagnose as run
+
+    began = time.monotonic()
+    ids = {effect.id for effect in library()}
+    for effect_id in without:
+        if effect_id not in ids:
+            raise InputError("without", effect_id, "one of " + ", ".join(sorted(ids)))
+    spec = nominal_of(dict(nominal)) if isinstance(nominal, Mapping) else read_nominal(nominal_path(os.fspath(nominal)))
+    spec.effect += [effect_of(text) for text in known]
+    if isinstance(recordings, Mapping | str | os.PathLike) or hasattr(recordings, "columns"):
+        recordings = [recordings]
+    sources: list[Path | Table] = []
+    for number, recording in enumerate(recordings):
+        source = table_of(recording, number)
+        sources += find_files(spec, [str(source)], None) if isinstance(source, Path) else [source]
+    sources = sources or find_files(spec, [], data_folder)
+    return Verdict(run(spec, sources, progress, frozenset(without)), time.monotonic() - began)

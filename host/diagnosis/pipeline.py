@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -17,16 +17,18 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.uncertainty import intervals
-from host.diagnosis.model.dataset import Recording, load, thin
+from host.diagnosis.model.dataset import Recording, load, read_tables, thin
 from host.diagnosis.model.effect import candidates
 from host.diagnosis.model.model import Model, Piece
 from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.dictionary import lay_out
 from host.diagnosis.selection.equivalence import Standing, beside_unlisted, standings
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.search import Found, search
 from host.diagnosis.symbolic.unlisted import Rest, explain_rest
+from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
@@ -77,10 +79,13 @@ class Diagnosis:
     designs: list[Design] = field(default_factory=list)
 
 
-def prepare(spec: NominalSpec, files: list[Path]) -> tuple[Model, Problem, Problem]:
+def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
-    spec._files = files
-    recordings = load(spec, files, *channels_of(spec))
+    if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
+        raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
+    tables = read_tables(spec, sources)
+    spec._files = [table.path for table in tables if table.path is not None]
+    recordings = load(spec, tables, *channels_of(spec))
     model = build(spec)
     if spec.effect:
         model = cast(Model, Known(model, spec.effect, recordings))
@@ -116,10 +121,12 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
     return Problem(model, pieces, noises, np.ones(len(model.outputs)), columns)
 
 
-def diagnose(spec: NominalSpec, files: list[Path], tell: Tell, left_out: frozenset[str] = frozenset()) -> Diagnosis:
+def diagnose(
+    spec: NominalSpec, sources: Sequence[Path | Table], tell: Tell, left_out: frozenset[str] = frozenset()
+) -> Diagnosis:
     """The whole diagnosis. `left_out`: effect ids the finder is not to know (leave-one-out proof)."""
     tell("reading recordings", 0.0)
-    model, problem, full = prepare(spec, files)
+    model, problem, full = prepare(spec, sources)
     pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
     pool = [c for c in pool if c.effect.id not in left_out]
     found = search(problem, pool, tell)

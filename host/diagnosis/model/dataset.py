@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.model.rig_recording import rig_rows
-from host.diagnosis.model.tables import is_table, read_table
+from host.diagnosis.model.tables import Table, is_table, read_table
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -66,17 +67,22 @@ def find_files(spec: NominalSpec, named: list[str], data_folder: str | None) -> 
     return found
 
 
-def load(spec: NominalSpec, files: list[Path], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
-    """Recordings of `files`; `needed`: the channels of the model; those in `optional` may be absent. Raises InputError."""
-    pieces: list[Recording] = []
+def read_tables(spec: NominalSpec, sources: Sequence[Path | Table]) -> list[Table]:
+    """Read those of `sources` that are files. Raises InputError."""
     read = rig_rows if spec.recorded_rig else read_table
-    wholes = [_one(spec, path.name, read(path), needed, optional) for path in files]
+    return [source if isinstance(source, Table) else Table(source.name, read(source), source) for source in sources]
+
+
+def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
+    """Recordings of `tables`; `needed`: the channels of the model; those in `optional` may be absent. Raises InputError."""
+    pieces: list[Recording] = []
+    wholes = [_one(spec, table.name, table.columns, needed, optional) for table in tables]
     shared = one_clock(wholes)
     first = min(whole.time_s[0] for whole in wholes)
-    for path, whole in zip(files, wholes, strict=True):
+    for whole in wholes:
         begin = float(first if shared else whole.time_s[0])
         whole = replace(whole, time_s=whole.time_s - begin, begin_s=begin)
-        cuts = [piece for piece in spec.data.pieces if fnmatch(path.name, piece.file)]
+        cuts = [piece for piece in spec.data.pieces if fnmatch(whole.name, piece.file)]
         pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [
             whole
         ]

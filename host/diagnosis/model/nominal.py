@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -202,6 +202,18 @@ def read_nominal(path: Path | str) -> NominalSpec:
         raise InputError("nominal", f"{path}: {error}", "a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError("nominal", f"{path}: {error}", "valid TOML") from None
+    return nominal_of(content, path.parent)
+
+
+def nominal_of(content: dict[str, Any], folder: Path | str = ".") -> NominalSpec:
+    """The nominal model with the content of a TOML; a callable's module is looked for in `folder`. Raises InputError."""
     spec = validate(NominalSpec, content)
-    spec._folder = str(path.parent)
+    spec._folder = str(folder)
     return spec
+
+
+def nominal_path(name: Path | str) -> Path:
+    """The file `name`, or the nominal model of that name that ships."""
+    path = Path(name)
+    shipped = Path(__file__).parents[1] / "nominals" / f"{name}.toml"
+    return shipped if not path.exists() and shipped.exists() else path

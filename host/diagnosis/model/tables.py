@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import os
 import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,43 @@ from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
+
+
+@dataclass(frozen=True)
+class Table:
+    """One recording as it was given: columns by name, each (n,), and the file that it was read from, if any."""
+
+    name: str
+    columns: dict[str, Array]
+    path: Path | None = None
+
+
+def table_of(source: Any, number: int) -> Table | Path:
+    """A recording from Python: a path, a dictionary of arrays or a DataFrame. `number`: its place, for its name.
+
+    Raises:
+        InputError: anything else, no numeric column, or a column that is not one-dimensional.
+    """
+    if isinstance(source, str | os.PathLike):
+        return Path(source)
+    name = f"recording {number + 1}"
+    if not isinstance(source, Mapping) and not (hasattr(source, "columns") and hasattr(source, "__getitem__")):
+        raise InputError("recordings", type(source).__name__, "paths, dictionaries of arrays or DataFrames")
+    columns: dict[str, Array] = {}
+    for key in source if isinstance(source, Mapping) else source.columns:
+        try:
+            array = np.asarray(source[key])
+            values = np.array(array, dtype=np.float64) if array.dtype.kind in "fiubO" else None
+        except (TypeError, ValueError):
+            values = None
+        if values is None:  # words, dates: not a signal
+            continue
+        if values.ndim != 1:
+            raise InputError(f"{name}, {key}", f"shape {values.shape}", "one-dimensional arrays (n,)")
+        columns[str(key)] = values
+    if not columns:
+        raise InputError(name, "no numeric column", "at least one numeric column")
+    return Table(name, columns)
 
 
 def is_table(path: Path) -> bool:

@@ -29,7 +29,7 @@ def run_case(files: dict[str, bytes], finder: Sequence[str], limit_s: float) -> 
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
         recordings = sorted(name for name in files if name != "nominal.toml")
-        command = [*finder, *recordings, "--nominal", "nominal.toml", "--json", "verdict.json"]
+        command = [*finder, *recordings, "--nominal", "nominal.toml", "--json"]
         began = time.monotonic()
         try:
             done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, timeout=limit_s)
@@ -39,8 +39,8 @@ def run_case(files: dict[str, bytes], finder: Sequence[str], limit_s: float) -> 
         if done.returncode < 0:
             raise ChildProcessError(f"finder ended by signal {-done.returncode}")
         try:
-            verdict = json.loads(Path(folder, "verdict.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            verdict = json.loads(done.stdout)
+        except ValueError:
             last = (done.stderr.strip().splitlines() or ["no message"])[-1]
             return {"verdict": "failed", "error": f"exit status {done.returncode}: {last[:200]}", "wall_s": took}
     return (

@@ -14,7 +14,7 @@ from host.cli.diagnose import diagnose
 from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
-KEYS = {"verdict", "located", "effects", "fit", "seconds"}
+KEYS = {"verdict", "located", "effects", "fit", "seconds", "scripts"}
 FIT = {
     "heldout",
     "rmse_before",
@@ -42,8 +42,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
     """JSON and report of a planted case."""
     folder = tmp_path_factory.mktemp("case")
     nominal, files = planted.transmission(folder, "backlash", 1)
-    diagnose([str(f) for f in files], str(nominal), str(folder / "o.json"), str(folder / "o.html"), quiet=True)
-    return json.loads((folder / "o.json").read_text()), (folder / "o.html").read_text()
+    diagnose([str(f) for f in files], str(nominal), out=folder / "out", quiet=True)
+    return json.loads((folder / "out" / "verdict.json").read_text()), (folder / "out" / "report.html").read_text()
 
 
 def test_json_is_what_the_contract_says(made: tuple[dict, str]) -> None:
@@ -67,7 +67,7 @@ def test_misuse_is_bad_input(tmp_path: Path) -> None:
     nominal, files = planted.transmission(tmp_path, "none", 0)
     with pytest.raises(InputError, match="--nominal"):
         diagnose([str(files[0])])
-    with pytest.raises(InputError, match="--without"):
+    with pytest.raises(InputError, match="without"):
         diagnose([str(files[0])], str(nominal), without=["backlsh"])
     with pytest.raises(InputError, match="recording"):
         diagnose([str(tmp_path / "none.csv")], str(nominal), quiet=True)
@@ -79,14 +79,14 @@ def test_help_names_every_option() -> None:
     app = typer.Typer()
     app.command()(diagnose)
     text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
-    for word in ("--nominal", "--json", "--report", "--data", "--without"):
+    for word in ("--nominal", "--json", "--out", "--data", "--without"):
         assert word in text
 
 
 def test_progress_goes_to_standard_error(tmp_path: Path) -> None:
     nominal, files = planted.transmission(tmp_path, "none", 0)
     code = (
-        f"import sys; from host.cli.diagnose import diagnose; diagnose({[str(f) for f in files]!r}, {str(nominal)!r}, '-')"
+        f"import sys; from host.cli.diagnose import diagnose; diagnose({[str(f) for f in files]!r}, {str(nominal)!r}, True)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["verdict"] == "nothing_missing"

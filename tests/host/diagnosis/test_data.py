@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.diagnosis.model.dataset import Recording, find_files, load, thin
+from host.diagnosis.model.dataset import Recording, find_files, load, read_tables, thin
 from host.diagnosis.model.nominal import NominalSpec, read_nominal
 from host.diagnosis.model.tables import read_table
 from host.diagnosis.models import channels_of
@@ -46,7 +46,7 @@ def table(path: Path, start: float = 0.0, n: int = 100) -> Path:
 
 def read(folder: Path, files: list[Path], text: str = TOML) -> list[Recording]:
     nominal = spec(folder, text)
-    return load(nominal, files, *channels_of(nominal))
+    return load(nominal, read_tables(nominal, files), *channels_of(nominal))
 
 
 def test_every_kind_of_file_gives_the_same_columns(tmp_path: Path) -> None:

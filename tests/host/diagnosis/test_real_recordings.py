@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli.diagnose import nominal_path
 from host.diagnosis.model.dataset import find_files
-from host.diagnosis.model.nominal import read_nominal
+from host.diagnosis.model.nominal import nominal_path, read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from host.diagnosis.report.verdict import as_json
 
