@@ -1,4 +1,9 @@
-"""Where compiled kernels are kept: a folder for each state of the sources, since numba does not see a callee's edits."""
+"""Where compiled kernels are kept. Numba sees an edit of a kernel's own file only; this cache sees edits of its callees too.
+
+Each module with kernels has a folder named by a hash of its source and of all project sources that it imports. An edit
+makes new folders for the modules that depend on it, and for no others. The hash holds no path, so that two checkouts of the
+same sources share their kernels.
+"""
 
 from __future__ import annotations
 
@@ -8,61 +13,99 @@ import re
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
-_ROOMS = ("protocol", "realtime", "sim", "host")
-_KEPT_STATES = 12
+PACKAGES = ("protocol", "realtime", "sim", "host", "seldinger")
+ROOT = Path(__file__).resolve().parent.parent
+# Folders that no process has used for this long are removed when a new one is made.
+KEPT_S = 14 * 86400.0
+# Numba tries these in order; the first serves the files of this project, the others everything else.
+_LOCATORS = (
+    "protocol.kernel_locator.KernelLocator",
+    "UserProvidedCacheLocator",
+    "InTreeCacheLocator",
+    "UserWideCacheLocator",
+    "IPythonCacheLocator",
+    "ZipCacheLocator",
+)
 _IMPORT = re.compile(r"^\s*(?:from\s+([\w.]+)\s+import\s+(\([^)]*\)|[\w, ]*)|import\s+([\w.]+))", re.MULTILINE)
 
 
-def sources_state(root: Path) -> str:
-    """A short hash of the sources below `root` that a kernel can depend on: files with kernels, and all that they import."""
-    texts = {path: path.read_bytes() for room in _ROOMS for path in (root / room).rglob("*.py")}
-    wanted = {path for path, text in texts.items() if b"njit" in text}
-    new = set(wanted)
-    while new:
-        new = {found for path in new for found in _imported(root, texts[path].decode()) if found in texts} - wanted
-        wanted |= new
-    digest = hashlib.sha256(str(root).encode())
-    for path in sorted(wanted):
+def sources_state(module: Path, root: Path = ROOT) -> str:
+    """Hash `module` (a file below `root`) together with all sources below `root` that it imports, directly or not.
+
+    Returns 16 hexadecimal digits.
+    """
+    texts: dict[Path, bytes] = {}
+    waiting = [module]
+    while waiting:
+        path = waiting.pop()
+        if path not in texts:
+            texts[path] = path.read_bytes()
+            waiting += _imported(root, texts[path].decode())
+    digest = hashlib.sha256()
+    for path in sorted(texts):
         digest.update(f"{path.relative_to(root)} {len(texts[path])}\n".encode() + texts[path])
     return digest.hexdigest()[:16]
 
 
 def _imported(root: Path, text: str) -> Iterator[Path]:
-    """Files that the imports of a source could mean."""
+    """Files of the project that the imports of a source load, packages without code of their own left out."""
     for match in _IMPORT.finditer(text):
         module, names, plain = match.groups()
-        folder = root.joinpath(*(module or plain).split("."))
-        yield folder.with_suffix(".py")
+        parts = (module or plain).split(".")
+        if parts[0] not in PACKAGES:
+            continue
+        folder = root.joinpath(*parts)
+        if folder.with_suffix(".py").is_file():
+            yield folder.with_suffix(".py")
+            continue
         for name in re.findall(r"\w+", names or ""):
-            yield folder / f"{name}.py"
+            inside = folder / f"{name}.py"
+            if inside.is_file():
+                yield inside
+            elif not (folder / name).is_dir() and (folder / "__init__.py").is_file():
+                yield folder / "__init__.py"
 
 
-def _base() -> Path:
+def base() -> Path:
+    """The folder of all kernels: below $XDG_CACHE_HOME, ~/.cache, or where neither can be written, the temporary folder."""
     chosen = os.environ.get("XDG_CACHE_HOME")
-    base = Path(chosen) if chosen else Path(os.path.expanduser("~")) / ".cache"
+    parent = Path(chosen) if chosen else Path(os.path.expanduser("~")) / ".cache"
     try:
-        (base / "seldinger").mkdir(parents=True, exist_ok=True)
+        (parent / "seldinger").mkdir(parents=True, exist_ok=True)
     except OSError:
-        base = Path(tempfile.gettempdir()) / f"seldinger-cache-{os.getuid()}"
-    return base / "seldinger" / "kernels"
+        parent = Path(tempfile.gettempdir()) / f"seldinger-cache-{os.getuid()}"
+    return parent / "seldinger" / "kernels"
+
+
+@cache
+def folder_of(module: Path) -> Path:
+    """The folder of the kernels of `module`, a file of this project; made if needed. Raises OSError."""
+    name = ".".join(module.relative_to(ROOT).with_suffix("").parts)
+    folder = base() / f"{name}-{sources_state(module)}"
+    if folder.is_dir():
+        os.utime(folder)
+    else:
+        _remove_unused(folder.parent)
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _remove_unused(kernels: Path) -> None:
+    oldest_s = time.time() - KEPT_S
+    for folder in kernels.iterdir() if kernels.is_dir() else ():
+        if folder.stat().st_mtime < oldest_s:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def choose() -> None:
-    """Point numba at the folder of the present sources, unless NUMBA_CACHE_DIR is set. Drops the oldest folders."""
-    if "NUMBA_CACHE_DIR" in os.environ:
+    """Make numba keep this project's kernels here. Does nothing where NUMBA_CACHE_DIR is set: the user has chosen."""
+    if "NUMBA_CACHE_DIR" in os.environ or "NUMBA_CACHE_LOCATOR_CLASSES" in os.environ:
         return
-    base = _base()
-    folder = base / sources_state(Path(__file__).resolve().parent.parent)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
-        for old in sorted(base.iterdir(), key=lambda path: path.stat().st_mtime)[:-_KEPT_STATES]:
-            shutil.rmtree(old, ignore_errors=True)
-    except OSError:
-        return
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = ",".join(_LOCATORS)
     if "numba" in sys.modules:
-        sys.modules["numba"].config.CACHE_DIR = str(folder)
+        sys.modules["numba"].config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"]
