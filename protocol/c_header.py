@@ -48,9 +48,9 @@ def _struct(frame: declared.Frame) -> list[str]:
 
 def _enums() -> list[str]:
     lines = []
-    for enum in declared.ENUMS:
+    for name, enum in declared.ENUMS.items():
         lines.append("enum {" + f"  /* {(enum.__doc__ or '').splitlines()[0]} */")
-        lines += [f"    {_screaming(enum.__name__)}_{member.name} = {member.value}," for member in enum]
+        lines += [f"    {_screaming(name)}_{member.name} = {member.value}," for member in enum]
         lines += ["};", ""]
     return lines
 

@@ -4,6 +4,8 @@ import enum
 import zlib
 from dataclasses import dataclass
 
+from protocol.enums import BoardState
+
 AXES = ("insertion", "roll", "knob")
 AXIS_COUNT = len(AXES)
 BAUD = 500_000
@@ -14,16 +16,6 @@ HORIZON_US = 12_000  # a set-point further ahead is refused: with the speed limi
 DEADMAN_US = 30_000  # no valid set-point for this long stops the axes and latches a fault
 STOP_US = 50_000  # from full speed every axis must be able to come to rest in this time
 FIRMWARE_VERSION = (1, 0)  # major changes break the link, minor ones do not
-
-
-class State(enum.IntEnum):
-    """What the board is doing."""
-
-    DISARMED = 0  # holds; set-points are refused; the only state that takes a configuration
-    ARMED = 1  # holds and waits for the first set-point
-    RUNNING = 2  # follows set-points; the deadman runs
-    STOPPING = 3  # decelerates to rest, then FAULT or DISARMED
-    FAULT = 4  # holds until CLEAR_FAULT names the fault
 
 
 class Fault(enum.IntEnum):
@@ -93,7 +85,16 @@ class InputBit(enum.IntEnum):
     ESTOP = 6
 
 
-ENUMS: tuple[type[enum.IntEnum], ...] = (State, Fault, Result, Reject, Mcu, ResetCause, InputBit)
+# By the name that the C header and the protocol's hash know.
+ENUMS: dict[str, type[enum.IntEnum]] = {
+    "State": BoardState,
+    "Fault": Fault,
+    "Result": Result,
+    "Reject": Reject,
+    "Mcu": Mcu,
+    "ResetCause": ResetCause,
+    "InputBit": InputBit,
+}
 WIRE_BYTES = {"u8": 1, "u16": 2, "u32": 4, "i32": 4}
 
 
@@ -276,7 +277,7 @@ def _protocol_hash() -> int:
     lines = [
         f"{f.name} {f.id} {f.to} " + ",".join(f"{x.name}:{x.wire}:{x.unit}:{x.count}" for x in f.fields) for f in FRAMES
     ]
-    lines += [f"{e.__name__} " + ",".join(f"{m.name}={m.value}" for m in e) for e in ENUMS]
+    lines += [f"{name} " + ",".join(f"{m.name}={m.value}" for m in e) for name, e in ENUMS.items()]
     lines.append(f"baud {BAUD} timer {TIMER_HZ} deadman {DEADMAN_US} horizon {HORIZON_US} stop {STOP_US}")
     return zlib.crc32("\n".join(lines).encode("ascii"))
 

@@ -6,6 +6,7 @@ import math
 import re
 from typing import NamedTuple
 
+from protocol.enums import CommandKind, Phase, SafetyAction
 from protocol.messages import (
     MAX_PAYLOAD_BYTES,
     SCHEMA_VERSION,
@@ -56,12 +57,10 @@ __all__ = [
     "topic_of",
 ]
 
-MODES = ("disarmed", "hold", "position", "approach", "contact", "retract", "stopped")
-SAFETY_ACTIONS = ("none", "warn", "hold", "retract", "stop")
 FRAMES = ("base", "tip")
 LOG_LEVELS = ("info", "warning", "error")
 ACTIONS = ("clock", "take", "release", "arm", "disarm", "target", "force", "hold", "stop", "clear_fault")
-TARGETS = ("none", "hold", "position", "contact", "retract")
+TARGETS = tuple(kind.label for kind in CommandKind if kind is not CommandKind.STOP)
 RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
 _XYZ_m = ("x_m", "y_m", "z_m")
@@ -164,8 +163,8 @@ class ForceEstimate(Message):
 class RigState(Message):
     """What the loop does and why: mode, safety action and its cause in words, target, and what it steers by."""
 
-    mode: str = choice("phase of the control loop", MODES)
-    safety_action: str = choice("what safety asks for, weakest first", SAFETY_ACTIONS)
+    mode: str = choice("phase of the control loop", Phase.labels())
+    safety_action: str = choice("what safety asks for, weakest first", SafetyAction.labels())
     cause: str = text("why, in words; empty when nothing is wrong", default="")
     target_m: Vector | None = vector("m", "tip wanted, base frame", _triple("target", "m"), default=None)
     tip_m: Vector | None = vector("m", "tip predicted for now, base frame", _triple("tip", "m"), default=None)
@@ -245,7 +244,10 @@ class Command(Message):
     lease: str = text("the lease under which it is given; clock, take, hold and stop need none", default="")
     expires_ns: int = integer("ns", "not to be executed after this time, on the rig's clock")
     action: str = choice("what to do", ACTIONS)
-    target: str = choice("kind of the target; none unless action is target", TARGETS)
+    target: str = choice(
+        "kind of the target; none unless action is target",
+        TARGETS,
+    )
     target_m: Vector | None = vector("m", "tip position, base frame", _triple("target", "m"), default=None)
     normal: Vector | None = vector(
         "", "unit vector into the tissue, base frame, along which to press", _triple("normal"), default=None

@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from protocol.enums import BoardState, Phase, SafetyAction
 from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Log, Message
 from realtime.control import safety
-from realtime.control.records import PHASE_DISARMED, PHASE_NAMES, PHASE_STOPPED
 from realtime.core.lockstep import Arriving, Leaving, Publish
 from sim.line_noise import LineNoise
 from sim.scenario import Estimator, Scenario
 from sim.world import World
 
 MS = 1_000_000
-# The board's state after it stopped by itself, and the counts of the drivers that say that something is wrong.
-BOARD_FAULT = 4
+# The counts of the drivers that say that something is wrong.
 # The computer has been up for so long when the rig is switched on, so that its clock can be set back.
 CLOCK_START_NS = 20_000_000_000
 _BAD_STATUS = (
@@ -135,7 +134,7 @@ class Watcher:
         self._begin_ns = run.world.now_ns
         self._causes = int(run.loop.outputs[0].cause)
         self._counts = _bad_counts(run)
-        self._worst = safety.NONE
+        self._worst = int(SafetyAction.NONE)
         self._edges = int(run.world.edges.sum())
         self._from_m: float | None = None
         self._stopped = False
@@ -196,18 +195,18 @@ class Watcher:
             if grown:
                 self._detected("count: " + ", ".join(grown))
         self._worst = max(self._worst, int(outputs.action))
-        if status is not None and status.state == BOARD_FAULT:
+        if status is not None and status.state == BoardState.FAULT:
             self.outcome.board_fault = str(status.fault)
         phase = int(outputs.phase)
-        if self._stopped and phase not in (PHASE_STOPPED, PHASE_DISARMED):
+        if self._stopped and phase not in (Phase.STOPPED, Phase.DISARMED):
             self.outcome.rearmed = True
-        self._stopped = self._stopped or (phase == PHASE_STOPPED and int(outputs.action) == safety.STOP)
+        self._stopped = self._stopped or (phase == Phase.STOPPED and int(outputs.action) == SafetyAction.STOP)
 
     def close(self) -> FaultOutcome:
         """The outcome of the run so far."""
         outcome, run = self.outcome, self.run
-        outcome.action = safety.ACTION_NAMES[self._worst]
-        outcome.final_phase = PHASE_NAMES[run.phase]
+        outcome.action = SafetyAction(self._worst).label
+        outcome.final_phase = Phase(run.phase).label
         expected = int(self.now_s * run.loop.rig.tracker.rate_hz)
         outcome.poses_lost = max(expected - self._poses - 1, 0)
         outcome.counts = {

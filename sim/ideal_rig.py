@@ -14,18 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.enums import CommandKind, Phase
 from protocol.rig_file import Rig
 from realtime.control.configure import tick_parameters
-from realtime.control.records import (
-    COMMAND_CONTACT,
-    COMMAND_HOLD,
-    COMMAND_POSITION,
-    INPUTS,
-    OUTPUTS,
-    PHASE_CONTACT,
-    STATE,
-    new,
-)
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from sim.plant import Plant, PlantConfig
 
@@ -48,7 +40,7 @@ class Trace(NamedTuple):
 
     def since_contact(self) -> Trace:
         """From the first tick in contact on, its time zero; empty where there was none."""
-        touched = np.flatnonzero(self.phase == PHASE_CONTACT)
+        touched = np.flatnonzero(self.phase == Phase.CONTACT)
         first = touched[0] if touched.size else self.time_s.size
         late = self.rows(slice(first, None))
         return late._replace(time_s=late.time_s - (late.time_s[0] if late.time_s.size else 0.0))
@@ -96,7 +88,7 @@ class IdealRig:
         self._per_unit = np.array([rig.stage(axis).steps_per_unit for axis in range(3)])
         u.board.position_steps[:] = np.round(np.array(config.start_stage) * self._per_unit)
         self.run(_LISTEN_S)
-        self._command(COMMAND_HOLD)
+        self._command(CommandKind.HOLD)
         self.run(0.02)
 
     def _command(self, kind: int, target_m: Array | None = None, force_N: float = 0.0) -> None:
@@ -108,12 +100,12 @@ class IdealRig:
 
     def press(self, force_N: float, target_m: Array, seconds: float) -> Trace:
         """Approach the wall towards `target_m` (3,), hold `force_N` (N); all of it for `seconds`."""
-        self._command(COMMAND_CONTACT, np.asarray(target_m, float), force_N)
+        self._command(CommandKind.CONTACT, np.asarray(target_m, float), force_N)
         return self.run(seconds)
 
     def go(self, target_m: Array, seconds: float) -> Trace:
         """Position control towards `target_m` (3,) for `seconds`."""
-        self._command(COMMAND_POSITION, np.asarray(target_m, float))
+        self._command(CommandKind.POSITION, np.asarray(target_m, float))
         return self.run(seconds)
 
     def run(self, seconds: float) -> Trace:

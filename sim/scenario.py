@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from protocol.commander import Acknowledgement, Commander
+from protocol.enums import Phase
 from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Message, Reply, SimulatedTruth, encode
-from realtime.control.records import PHASE_CONTACT, PHASE_STOPPED
 from realtime.core.lockstep import Arriving, LockstepLoop, Publish
 from realtime.drivers.stepper_board import LinkPhase
 from sim.world import World
@@ -171,21 +171,21 @@ class Scenario:
             def watch() -> bool:
                 if self.loop.state[0].ticks % 100 == 0:
                     progress(phase, (self.world.now_ns - begin_ns) / (seconds * 1e9))
-                return done() or self.phase == PHASE_STOPPED
+                return done() or self.phase == Phase.STOPPED
 
             return self.run(seconds, watch) and done()
 
-        outcome.contact = reporting("approach", job.approach_s, lambda: self.phase == PHASE_CONTACT)
+        outcome.contact = reporting("approach", job.approach_s, lambda: self.phase == Phase.CONTACT)
         if outcome.contact:
             reporting("hold", job.hold_s, lambda: False)
         else:
             outcome.notes.append(f"no contact within {(self.world.now_ns - start_ns) * 1e-9:.1f} s")
-        outcome.stopped = self.phase == PHASE_STOPPED
+        outcome.stopped = self.phase == Phase.STOPPED
         if self._stop:
             self.command("target", "hold")
         else:
             self.command("target", "retract")
-            reporting("retract", 2.0, lambda: self.phase == PHASE_STOPPED)
+            reporting("retract", 2.0, lambda: self.phase == Phase.STOPPED)
         return self._closed(outcome)
 
     def _shape(self, job: ContactJob) -> bool:

@@ -178,7 +178,7 @@ class Desk(Protocol):
         ...
 
     def mode(self) -> str:
-        """What the loop does: one of `protocol.topics.MODES`."""
+        """What the loop does: the label of a `protocol.enums.Phase`."""
         ...
 
     def tip_m(self) -> Sequence[float] | None:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution, minimize
 
+from protocol.enums import Phase
 from protocol.rig_file import Rig, parse_rig
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
-from realtime.control.records import PHASE_CONTACT
 from sim.heart import HeartConfig
 from sim.ideal_rig import IdealRig, Trace
 from sim.plant import PlantConfig
@@ -96,7 +96,7 @@ def response(
 
 def cost_of(trace: Trace, force_N: float, seconds: float) -> float:
     """Mean absolute force error (N) of one response; the part it spent out of contact counts as FAILED_N."""
-    held = trace.phase == PHASE_CONTACT
+    held = trace.phase == Phase.CONTACT
     wanted = max(1, round(seconds / max(_period_s(trace), 1e-9)))
     error = np.abs(trace.force_N - force_N)[held]
     missing = max(0.0, 1.0 - error.size / wanted)
@@ -121,7 +121,7 @@ def criterion(
 
 
 def _rings(trace: Trace, force_N: float) -> bool:
-    if trace.time_s.size < 1000 or np.any(trace.phase != PHASE_CONTACT):
+    if trace.time_s.size < 1000 or np.any(trace.phase != Phase.CONTACT):
         return True
     late = trace.force_N[trace.time_s > trace.time_s[-1] - 1.0]
     trend = np.polyval(np.polyfit(np.arange(late.size), late, 1), np.arange(late.size))

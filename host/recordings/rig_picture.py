@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from protocol.enums import BoardState
+
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
 LOG_LINES = 6
@@ -18,7 +20,6 @@ KEPT, KEEP_EVERY = 1000, 3
 ESTIMATE_LASTS_NS = 200_000_000
 # A pose this old is not drawn as where the sensor is.
 POSE_LASTS_NS = 500_000_000
-BOARD_STATES = ("disarmed", "armed", "running", "stopping", "fault")
 Body = Mapping[str, Any]
 
 
@@ -208,8 +209,7 @@ class Picture:
             "position_steps",
             "encoder_counts",
         )
-        code = board.get("state", 0)
-        state = BOARD_STATES[code] if code < len(BOARD_STATES) else f"state {code}"
+        state = BoardState.label_of(board.get("state", 0))
         age_ms = max(self.now_ns - board["stamp_ns"], 0) * 1e-6
         return {**{name: board.get(name) for name in names}, "state": state, "age_ms": _rounded(age_ms, 0)}
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from host.recordings.recording import Recording
-from protocol.topics import HISTOGRAM_BUCKETS, SAFETY_ACTIONS
+from protocol.enums import SafetyAction
+from protocol.topics import HISTOGRAM_BUCKETS
 
 Array = np.ndarray
 # A measured force above this is contact; below it is the sensor's noise.
@@ -102,7 +103,7 @@ class RunSummary:
     @property
     def worst_action(self) -> str:
         """The strongest safety action of the run."""
-        return max((span.name for span in self.safety), key=SAFETY_ACTIONS.index, default="none")
+        return max((span.name for span in self.safety), key=SafetyAction.labels().index, default="none")
 
     @property
     def force_kept(self) -> bool:

@@ -11,9 +11,10 @@ from host.commissioning.experiment_script import Script, perform
 from host.recordings.recording import RecordingWriter, header_of, new_recording_path
 from host.run.commander import Commander
 from protocol.commander import Acknowledgement
+from protocol.enums import Phase
 from protocol.errors import InputError
 from protocol.rig_file import Rig
-from protocol.topics import MODES, Message, RigState
+from protocol.topics import Message, RigState
 from protocol.zenoh_session import Session
 from sim.board import Board
 from sim.effects import parse
@@ -45,7 +46,7 @@ class VirtualDesk:
 
     def mode(self) -> str:
         """The loop's phase."""
-        return MODES[self._scenario.phase]
+        return Phase(self._scenario.phase).label
 
     def tip_m(self) -> Sequence[float]:
         """The tip as the loop predicts it."""

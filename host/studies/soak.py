@@ -15,9 +15,9 @@ import numpy as np
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.index import is_whole
 from host.recordings.recording import RecordingWriter, header_of
+from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message
-from realtime.control.records import PHASE_CONTACT
 from sim.board import STEP_TIMER_CYCLES, Board, resolve_kind
 from sim.forked_board import LibraryBoard
 from sim.scenario import TARGET_M, ContactJob, Scenario
@@ -94,7 +94,7 @@ def soak(
                 return result
             run._shape(JOB)
             run.command("target", "contact", target_m=JOB.target_m, normal=JOB.into, force_N=JOB.force_N)
-            if not run.run(10.0, lambda: run.phase == PHASE_CONTACT):
+            if not run.run(10.0, lambda: run.phase == Phase.CONTACT):
                 result.problems.append("no contact")
                 return result
             _minutes(run, minutes, result, progress)
@@ -108,7 +108,7 @@ def _minutes(run: Scenario, minutes: float, result: SoakResult, progress: Callab
     world, loop, begin_ns = run.world, run.loop, run.now_ns
     offset_ns = loop.link.mcu_offset_ns(begin_ns)
     every_s = min(60.0, minutes * 60.0 / 20)
-    while run.now_ns - begin_ns < minutes * 60e9 and run.phase == PHASE_CONTACT:
+    while run.now_ns - begin_ns < minutes * 60e9 and run.phase == Phase.CONTACT:
         run.run(every_s)
         status = loop.link.status
         assert status is not None
@@ -117,7 +117,7 @@ def _minutes(run: Scenario, minutes: float, result: SoakResult, progress: Callab
         drifted_ns = abs(loop.link.mcu_offset_ns(run.now_ns) - offset_ns)
         result.clock_error_s = max(result.clock_error_s, drifted_ns * 1e-9)
         progress((run.now_ns - begin_ns) / (minutes * 60e9))
-    if run.phase != PHASE_CONTACT:
+    if run.phase != Phase.CONTACT:
         result.problems.append(f"contact ended after {(run.now_ns - begin_ns) * 1e-9:.0f} s")
     run.command("target", "hold")
     run.run(0.3)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from protocol.enums import ControlLaw, ForceSource
 from protocol.rig_file import Rig
 from realtime.control.inverse_kinematics import fitted_knob_curve
-from realtime.control.records import LAW_PREDICTIVE, LAW_THESIS, PARAMS, new
+from realtime.control.records import PARAMS, new
 from realtime.control.stage_limiter import crossing_time_s
-from realtime.control.tick import FORCE_FROM_ESTIMATE, FORCE_FROM_SENSOR
 
 # The board answers at 200 Hz; three missed answers and a margin.
 BOARD_TIMEOUT_S = 0.030
@@ -35,7 +35,7 @@ def _fill_predictive(p: np.record, rig: Rig) -> None:
     crossing_s = crossing_time_s(
         rig.transmission.insertion_backlash_m, insertion.max_speed_unit_per_s, insertion.max_accel_unit_per_s2
     )
-    p.law = LAW_PREDICTIVE if control.law == "predictive" else LAW_THESIS
+    p.law = ControlLaw[control.law.upper()]
     _fill(
         p.predictive,
         move_speed_m_per_s=control.move_speed_m_per_s,
@@ -78,15 +78,15 @@ def _fill_predictive(p: np.record, rig: Rig) -> None:
 
 def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
     """The PARAMS record of `rig`; `force_source` is `sensor` or `estimate`. Raises ValueError otherwise."""
-    if force_source not in ("sensor", "estimate"):
-        raise ValueError(f"force_source: found {force_source!r}, wanted sensor or estimate")
+    if force_source not in ForceSource.labels():
+        raise ValueError(f"force_source: found {force_source!r}, wanted {' or '.join(ForceSource.labels())}")
     params = new(PARAMS)
     p, control, limits = params[0], rig.control, rig.safety
     p.period_s = 1.0 / control.loop_hz
     p.setpoint_lead_ns = round(rig.board.setpoint_lead_s * 1e9)
     p.setpoint_expiry_us = round(rig.board.setpoint_expiry_s * 1e6)
     p.sensor_on_tip = 1 if control.force_frame == "tip" else 0
-    p.force_source = FORCE_FROM_SENSOR if force_source == "sensor" else FORCE_FROM_ESTIMATE
+    p.force_source = ForceSource[force_source.upper()]
     for axis in range(3):
         stage = rig.stage(axis)
         p.stage.steps_per_unit[axis] = stage.steps_per_unit

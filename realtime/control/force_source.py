@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from numba import njit
 
+from realtime.control.codes import SOURCE_ESTIMATE, SOURCE_SENSOR
 from realtime.control.constraint_frame import to_base
 from realtime.control.records import FORCE_RING, FORCE_SOURCE_STATE
 
 State = FORCE_SOURCE_STATE
-
-SENSOR, ESTIMATE = 0, 1
 
 # A reading above this is no contact force, whatever the sensor says.
 _RANGE_N = 20.0
@@ -51,9 +50,9 @@ def _take_sensor(state, sensor, normal) -> bool:  # type: ignore[no-untyped-def]
     if not _plausible(sensor):
         return False
     normal_N = compression(state.reading_N, normal)
-    equal = normal_N == state.normal_N[SENSOR]
+    equal = normal_N == state.normal_N[SOURCE_SENSOR]
     state.equal = state.equal + 1 if equal else 0
-    state.arrival_ns[SENSOR], state.normal_N[SENSOR] = sensor.arrival_ns, normal_N
+    state.arrival_ns[SOURCE_SENSOR], state.normal_N[SOURCE_SENSOR] = sensor.arrival_ns, normal_N
     state.head = (state.head + 1) % FORCE_RING
     state.ring_ns[state.head], state.ring_N[state.head] = sensor.stamp_ns, normal_N
     return True
@@ -81,7 +80,7 @@ def _take_estimate(state, estimate, normal, now_ns: int, touching: bool) -> bool
     if not (_plausible(estimate) and 0.0 <= noise_N2 < 1e3) or now_ns - estimate.stamp_ns > _ESTIMATE_AGE_NS:
         return False
     normal_N = compression(estimate.force_N, normal)
-    state.arrival_ns[ESTIMATE], state.normal_N[ESTIMATE] = estimate.arrival_ns, normal_N
+    state.arrival_ns[SOURCE_ESTIMATE], state.normal_N[SOURCE_ESTIMATE] = estimate.arrival_ns, normal_N
     state.noise_N2 = max(noise_N2, 1e-6)
     place = _sensor_at(state, estimate.stamp_ns) if touching else -1
     if place >= 0:
@@ -109,19 +108,19 @@ def parted(state) -> bool:  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _choose(params, state, now_ns: int, touching: bool) -> bool:  # type: ignore[no-untyped-def]
     """Hand over where needed; returns whether the source has changed."""
-    if params.force_source == ESTIMATE or not touching:
+    if params.force_source == SOURCE_ESTIMATE or not touching:
         changed = state.source != params.force_source
         state.source = params.force_source
         return changed
-    silent = now_ns - state.arrival_ns[SENSOR] > params.safety.force_timeout_ns // 2
+    silent = now_ns - state.arrival_ns[SOURCE_SENSOR] > params.safety.force_timeout_ns // 2
     bad = silent or state.equal >= _FROZEN or parted(state)
     state.good_s = 0.0 if bad else state.good_s + params.period_s
-    other = now_ns - state.arrival_ns[ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
-    if state.source == SENSOR and bad and other:
-        state.source = ESTIMATE
+    other = now_ns - state.arrival_ns[SOURCE_ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
+    if state.source == SOURCE_SENSOR and bad and other:
+        state.source = SOURCE_ESTIMATE
         return True
-    if state.source == ESTIMATE and (not other or state.good_s > _BACK_S):
-        state.source = SENSOR
+    if state.source == SOURCE_ESTIMATE and (not other or state.good_s > _BACK_S):
+        state.source = SOURCE_SENSOR
         return True
     return False
 
@@ -136,31 +135,31 @@ def apply(params, state, inputs, frame_wxyz, normal, touching: bool) -> int:  # 
     `force_N` (3,) and `age_from_ns` belong to the chosen source; `changed` is 1 in the tick of a handover.
     """
     refused, new = 0, -1
-    if inputs.sensor.count != state.seen[SENSOR]:
-        state.seen[SENSOR] = inputs.sensor.count
+    if inputs.sensor.count != state.seen[SOURCE_SENSOR]:
+        state.seen[SOURCE_SENSOR] = inputs.sensor.count
         for i in range(3):
             state.reading_N[i] = inputs.sensor.force_N[i]
         if params.sensor_on_tip != 0:
             to_base(frame_wxyz, inputs.sensor.force_N, state.reading_N)
         if _take_sensor(state, inputs.sensor, normal):
-            new = SENSOR
+            new = SOURCE_SENSOR
         else:
             refused += 1
     estimated = False
-    if inputs.estimate.count != state.seen[ESTIMATE]:
-        state.seen[ESTIMATE] = inputs.estimate.count
+    if inputs.estimate.count != state.seen[SOURCE_ESTIMATE]:
+        state.seen[SOURCE_ESTIMATE] = inputs.estimate.count
         estimated = _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching)
-        if not estimated and params.force_source == ESTIMATE:
+        if not estimated and params.force_source == SOURCE_ESTIMATE:
             refused += 1
     state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0
     state.fresh = 0
-    if state.source == SENSOR and new == SENSOR:
-        _set(state, inputs.sensor, state.reading_N, state.normal_N[SENSOR], params.predictive.force_noise_N**2)
+    if state.source == SOURCE_SENSOR and new == SOURCE_SENSOR:
+        _set(state, inputs.sensor, state.reading_N, state.normal_N[SOURCE_SENSOR], params.predictive.force_noise_N**2)
         state.smooth_N = state.value_N
-    elif state.source == ESTIMATE and estimated:
+    elif state.source == SOURCE_ESTIMATE and estimated:
         before_ns = state.stamp_ns
-        bias_N = 0.0 if params.force_source == ESTIMATE else state.bias_N
-        _set(state, inputs.estimate, inputs.estimate.force_N, state.normal_N[ESTIMATE] - bias_N, state.noise_N2)
+        bias_N = 0.0 if params.force_source == SOURCE_ESTIMATE else state.bias_N
+        _set(state, inputs.estimate, inputs.estimate.force_N, state.normal_N[SOURCE_ESTIMATE] - bias_N, state.noise_N2)
         dt_s = min(max((state.stamp_ns - before_ns) * 1e-9, 0.0), _SMOOTH_S)
         state.smooth_N += dt_s / (dt_s + _SMOOTH_S) * (state.value_N - state.smooth_N)
     return refused

@@ -13,9 +13,10 @@ import math
 
 from numba import njit
 
-from realtime.control import backlash, force_source, free_tip, inverse_kinematics, target_predictor
+from realtime.control import backlash, free_tip, inverse_kinematics, target_predictor
+from realtime.control.codes import PHASE_APPROACH, PHASE_HOLD, PHASE_POSITION, SOURCE_ESTIMATE
 from realtime.control.constraint_frame import dot
-from realtime.control.records import N_AXES, PHASE_APPROACH, PHASE_HOLD, PHASE_POSITION, PREDICTIVE_PARAMS, PREDICTIVE_STATE
+from realtime.control.records import N_AXES, PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
 Config, State = PREDICTIVE_PARAMS, PREDICTIVE_STATE
 
@@ -262,7 +263,7 @@ def _wanted(params, state, wanted_N: float) -> float:  # type: ignore[no-untyped
     law, own, wall = params.predictive, state.predictive, state.wall
     sure_m2 = max(target_predictor.variance_ahead(wall) - wall.noise_m2, 0.0)
     sure_N = math.sqrt(sure_m2) / law.compliance_m_per_N
-    gentle = _GENTLE_BLIND_SHARE if params.force_source == force_source.ESTIMATE else _GENTLE_SHARE
+    gentle = _GENTLE_BLIND_SHARE if params.force_source == SOURCE_ESTIMATE else _GENTLE_SHARE
     goal_N = min(wanted_N, max(gentle * wanted_N, wanted_N + law.force_margin_N - _SURE_SIGMA * sure_N))
     step_N = law.force_slew_N_per_s * params.period_s
     own.wanted_N += min(max(goal_N - own.wanted_N, -step_N), step_N)

@@ -7,12 +7,6 @@ import numpy as np
 N_AXES = 3
 CURVE_POINTS = 129
 
-# What the operator wants of the loop.
-COMMAND_NONE, COMMAND_HOLD, COMMAND_POSITION, COMMAND_CONTACT, COMMAND_RETRACT, COMMAND_STOP = range(6)
-# Where the loop is.
-PHASE_DISARMED, PHASE_HOLD, PHASE_POSITION, PHASE_APPROACH, PHASE_CONTACT, PHASE_RETRACT, PHASE_STOPPED = range(7)
-PHASE_NAMES = ("disarmed", "hold", "position", "approach", "contact", "retract", "stopped")
-
 POSE = np.dtype(
     [
         ("count", "i8"),
@@ -251,7 +245,6 @@ HYBRID_STATE = np.dtype(
     align=True,
 )
 
-LAW_THESIS, LAW_PREDICTIVE = 0, 1
 PREDICTIVE_PARAMS = np.dtype(
     [
         ("move_speed_m_per_s", "f8"),

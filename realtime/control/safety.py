@@ -4,31 +4,34 @@ from __future__ import annotations
 
 from numba import njit
 
-# Actions, ordered: a later one is never weakened by an earlier one.
-NONE, WARN, HOLD, RETRACT, STOP = range(5)
-ACTION_NAMES = ("none", "warn", "hold", "retract", "stop")
+from realtime.control.codes import ACTION_HOLD, ACTION_NONE, ACTION_RETRACT, ACTION_STOP, ACTION_WARN
 
 # (bit, action, latches until the operator clears it, what to tell the operator)
 CAUSES: tuple[tuple[str, int, bool, str], ...] = (
-    ("pose_rejected", WARN, False, "a pose was not finite, out of the workspace or too fast; it was not used"),
-    ("force_rejected", WARN, False, "a force reading was not finite or out of the sensor's range; it was not used"),
-    ("pose_stale", HOLD, False, "no fresh pose from the tracker: holding"),
-    ("poses_wild", HOLD, False, "three poses in a row rejected: holding; check the tracker"),
-    ("force_stale", HOLD, False, "no fresh force while in contact: holding; check the force sensor"),
-    ("over_force", RETRACT, True, "contact force above the limit: retracting"),
-    ("pose_lost", STOP, True, "no pose for longer than the limit: stopped; check the tracker, then clear"),
-    ("force_lost", RETRACT, True, "no force for longer than the limit while in contact: retracting"),
-    ("board_silent", STOP, True, "no status from the stepper board: stopped; check cable and power, then clear"),
-    ("board_fault", STOP, True, "the stepper board latched a fault: stopped; see its fault code, then clear"),
-    ("operator_stop", STOP, True, "stopped by the operator"),
+    ("pose_rejected", ACTION_WARN, False, "a pose was not finite, out of the workspace or too fast; it was not used"),
+    ("force_rejected", ACTION_WARN, False, "a force reading was not finite or out of the sensor's range; it was not used"),
+    ("pose_stale", ACTION_HOLD, False, "no fresh pose from the tracker: holding"),
+    ("poses_wild", ACTION_HOLD, False, "three poses in a row rejected: holding; check the tracker"),
+    ("force_stale", ACTION_HOLD, False, "no fresh force while in contact: holding; check the force sensor"),
+    ("over_force", ACTION_RETRACT, True, "contact force above the limit: retracting"),
+    ("pose_lost", ACTION_STOP, True, "no pose for longer than the limit: stopped; check the tracker, then clear"),
+    ("force_lost", ACTION_RETRACT, True, "no force for longer than the limit while in contact: retracting"),
+    ("board_silent", ACTION_STOP, True, "no status from the stepper board: stopped; check cable and power, then clear"),
+    ("board_fault", ACTION_STOP, True, "the stepper board latched a fault: stopped; see its fault code, then clear"),
+    ("operator_stop", ACTION_STOP, True, "stopped by the operator"),
     (
         "steps_lost",
-        RETRACT,
+        ACTION_RETRACT,
         True,
         "encoder and steps have parted: retracting; look for a jam or a loose encoder plug, clear, and home the axes",
     ),
-    ("force_disagrees", RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
-    ("force_handover", WARN, False, "the force sensor is silent, frozen or off: the model's estimate closes the loop"),
+    ("force_disagrees", ACTION_RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
+    (
+        "force_handover",
+        ACTION_WARN,
+        False,
+        "the force sensor is silent, frozen or off: the model's estimate closes the loop",
+    ),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 (
@@ -58,14 +61,14 @@ _STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
 def action_of(flags: int) -> int:
     """The strongest action that any cause in the bit set `flags` asks for."""
     if flags & _STOP_BITS:
-        return STOP
+        return ACTION_STOP
     if flags & _RETRACT_BITS:
-        return RETRACT
+        return ACTION_RETRACT
     if flags & _HOLD_BITS:
-        return HOLD
+        return ACTION_HOLD
     if flags != 0:
-        return WARN
-    return NONE
+        return ACTION_WARN
+    return ACTION_NONE
 
 
 @njit(cache=True)

@@ -19,14 +19,17 @@ from realtime.control import (
     stage_limiter,
     target_predictor,
 )
-from realtime.control.records import (
+from realtime.control.codes import (
+    ACTION_HOLD,
+    ACTION_RETRACT,
+    ACTION_STOP,
+    BOARD_FAULT,
     COMMAND_CONTACT,
     COMMAND_HOLD,
     COMMAND_POSITION,
     COMMAND_RETRACT,
     COMMAND_STOP,
     LAW_PREDICTIVE,
-    N_AXES,
     PHASE_APPROACH,
     PHASE_CONTACT,
     PHASE_DISARMED,
@@ -34,11 +37,10 @@ from realtime.control.records import (
     PHASE_POSITION,
     PHASE_RETRACT,
     PHASE_STOPPED,
+    SOURCE_ESTIMATE,
+    SOURCE_SENSOR,
 )
-
-# The board's states and readiness as they appear in the input record.
-BOARD_FAULT_STATE = 4
-FORCE_FROM_SENSOR, FORCE_FROM_ESTIMATE = force_source.SENSOR, force_source.ESTIMATE
+from realtime.control.records import N_AXES
 
 # Contact is believed after this long above the threshold, and lost after this long below half of it.
 _CONTACT_NS = 3_000_000
@@ -61,13 +63,11 @@ def _take_force(params, state, inputs) -> None:  # type: ignore[no-untyped-def]
     state.force_seen = force.seen[force.source]
     if force.fresh == 0 or state.phase != PHASE_CONTACT or params.law != LAW_PREDICTIVE:
         return
-    if force.source == force_source.SENSOR and force.value_N > params.hybrid.contact_force_N:
+    if force.source == SOURCE_SENSOR and force.value_N > params.hybrid.contact_force_N:
         constraint_frame.follow_force(
             state.predictive.normal, inputs.command.normal, force.force_N, params.period_s / _NORMAL_S
         )
-    result = predictive.feel(
-        params, state, force.source == force_source.ESTIMATE, force.stamp_ns, force.value_N, force.spread_N2
-    )
+    result = predictive.feel(params, state, force.source == SOURCE_ESTIMATE, force.stamp_ns, force.value_N, force.spread_N2)
     if result == target_predictor.REJECTED:
         state.force_rejected += 1
 
@@ -86,9 +86,9 @@ def _flags(params, state, inputs, pose_result: int, forces_rejected: int) -> int
     pose_age_ns = now_ns - state.predictor.accepted_ns
     force, force_age_ns = state.force.force_N, now_ns - state.force.age_from_ns
     force_timeout_ns = limits.force_timeout_ns
-    if state.force.source == force_source.ESTIMATE:
+    if state.force.source == SOURCE_ESTIMATE:
         force_timeout_ns = limits.hold_after_ns
-        if params.force_source == force_source.SENSOR:
+        if params.force_source == SOURCE_SENSOR:
             flags |= safety.FORCE_HANDOVER
     if armed and pose_age_ns > limits.hold_after_ns:
         flags |= safety.POSE_STALE
@@ -107,7 +107,7 @@ def _flags(params, state, inputs, pose_result: int, forces_rejected: int) -> int
             flags |= safety.FORCE_LOST
     if armed and inputs.command.kind == COMMAND_STOP:
         flags |= safety.OPERATOR_STOP
-    if armed and inputs.board.state == BOARD_FAULT_STATE:
+    if armed and inputs.board.state == BOARD_FAULT:
         flags |= safety.BOARD_FAULT
     if armed and now_ns - inputs.board.arrival_ns > limits.board_timeout_ns:
         flags |= safety.BOARD_SILENT
@@ -189,11 +189,11 @@ def _obey(params, state, inputs, action: int, tip_m) -> None:  # type: ignore[no
     if command.armed == 0:
         state.phase = PHASE_DISARMED
         return
-    if action == safety.STOP:
+    if action == ACTION_STOP:
         if state.phase != PHASE_DISARMED:
             _enter(params, state, PHASE_STOPPED, tip_m, inputs.now_ns)
         return
-    if action == safety.RETRACT:
+    if action == ACTION_RETRACT:
         if state.phase != PHASE_DISARMED and state.phase != PHASE_STOPPED:
             _enter(params, state, PHASE_RETRACT, tip_m, inputs.now_ns)
         return
@@ -226,7 +226,7 @@ def _watch_contact(params, state, inputs, force_N: float, tip_m) -> None:  # typ
     config, hy, now_ns = params.hybrid, state.hybrid, inputs.now_ns
     approaching = state.phase == PHASE_APPROACH
     threshold_N = config.contact_force_N
-    if state.force.source == force_source.ESTIMATE:
+    if state.force.source == SOURCE_ESTIMATE:
         threshold_N *= _NOISY_FACTOR
     turned = force_N > threshold_N if approaching else force_N < 0.5 * threshold_N
     if not turned:
@@ -292,7 +292,7 @@ def _control_predictive(params, state, inputs, force_N: float) -> None:  # type:
         predictive.go(params, state, command.target_m, law.move_speed_m_per_s)
     elif state.phase == PHASE_APPROACH:
         _approach_target(command, state.work[3])
-        slow = law.blind_share if state.force.source == force_source.ESTIMATE else 1.0
+        slow = law.blind_share if state.force.source == SOURCE_ESTIMATE else 1.0
         predictive.go(params, state, state.work[3], slow * params.hybrid.approach_speed_m_per_s)
     elif state.phase == PHASE_CONTACT:
         predictive.press(params, state, inputs.now_ns, command.target_m, command.force_N, force_N)
@@ -389,7 +389,7 @@ def tick(params, state, inputs, outputs) -> None:  # type: ignore[no-untyped-def
     if ours and s.phase != PHASE_DISARMED and s.predictive.offset_s > 0.0:
         predictive.tip_now(p, s, u.now_ns, touching, tip_m)
     force_N = s.force.value_N
-    if s.force.source == force_source.ESTIMATE:
+    if s.force.source == SOURCE_ESTIMATE:
         force_N = predictive.force_now(p, s, u.now_ns) if ours and touching else s.force.smooth_N
     if not math.isfinite(force_N):
         force_N = 0.0
@@ -401,7 +401,7 @@ def tick(params, state, inputs, outputs) -> None:  # type: ignore[no-untyped-def
     _obey(p, s, u, action, tip_m)
     if s.phase == PHASE_DISARMED and s.predictor.started != 0:
         _locate(p, s, u, tip_m)
-    if action < safety.HOLD or s.phase == PHASE_RETRACT:
+    if action < ACTION_HOLD or s.phase == PHASE_RETRACT:
         _control(p, s, u, tip_m, force_N)
     elif ours:
         predictive.stay(s)

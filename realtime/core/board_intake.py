@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from protocol.enums import BoardState
 from protocol.rig_file import Rig
-from protocol.serial_frames import Fault, Reject, State
+from protocol.serial_frames import Fault, Reject
 from protocol.topics import BoardCounters
 from realtime.drivers.stepper_board import AxisLimits, LinkPhase, StepperBoardLink
 
@@ -46,7 +47,7 @@ def take_status(record: np.record, link: StepperBoardLink, now_ns: int) -> None:
     record.encoder_counts[:] = status.encoder_counts
     # A board that was reset, or is another one, is no longer where the loop believes it: as bad as a fault of its own.
     strange = link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH)
-    record.state, record.fault = (State.FAULT if strange else status.state), status.fault
+    record.state, record.fault = (BoardState.FAULT if strange else status.state), status.fault
     record.ready = 1 if link.armed and not strange else 0
 
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from protocol.enums import Phase
 from protocol.rig_file import Rig
 from protocol.setpoint_encoder import BUFFER_BYTES, encode_setpoint
 from protocol.topics import Command, ForceEstimate, Log, Message, Reply
 from realtime.control.configure import tick_parameters
-from realtime.control.records import INPUTS, OUTPUTS, PHASE_CONTACT, PHASE_DISARMED, STATE, new
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
@@ -181,7 +182,7 @@ class LockstepLoop:
 
     def _check_steps(self, now_ns: int) -> None:
         board = self.inputs[0].board
-        if self.outputs[0].phase != PHASE_DISARMED and board.ready:
+        if self.outputs[0].phase != Phase.DISARMED and board.ready:
             self._supervised(self.supervision.status(board.position_steps, board.encoder_counts, now_ns), now_ns)
 
     def _supervised(self, words: str, now_ns: int, restart: bool = False) -> None:
@@ -227,7 +228,7 @@ class LockstepLoop:
                     np.array(estimate.force_N),
                     np.array(estimate.covariance_N2).reshape(3, 3),
                 )
-                if self.outputs[0].phase == PHASE_CONTACT:
+                if self.outputs[0].phase == Phase.CONTACT:
                     sensor_N, estimate_N = self.inputs[0].sensor.force_N, self.inputs[0].estimate.force_N
                     self._supervised(self.supervision.estimate(sensor_N, estimate_N, now_ns), now_ns)
         words = self.supervision.host.silent(now_ns)

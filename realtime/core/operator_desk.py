@@ -9,27 +9,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from protocol.enums import CommandKind, ForceSource, Phase
 from protocol.messages import Vector
 from protocol.rig_file import Rig
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
-from realtime.control.force_source import ESTIMATE
-from realtime.control.records import (
-    COMMAND_CONTACT,
-    COMMAND_HOLD,
-    COMMAND_POSITION,
-    COMMAND_RETRACT,
-    COMMAND_STOP,
-    PHASE_CONTACT,
-)
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
 # A target may be out of reach by no more than this: the calibration is not better known.
 REACH_m = 0.001
 FORCE_BOX = "net_ft"  # as the driver names it in its events
-_KINDS = {"hold": COMMAND_HOLD, "position": COMMAND_POSITION, "contact": COMMAND_CONTACT, "retract": COMMAND_RETRACT}
+_KINDS = {kind.label: kind for kind in CommandKind}
 
 
 class OperatorDesk:
@@ -81,7 +73,7 @@ class OperatorDesk:
             return f"arm: found nothing from {missing}, wanted fresh readings"
         self._frames.append(self._link.arm())
         self._record.armed = 1
-        self._set(COMMAND_HOLD)
+        self._set(CommandKind.HOLD)
         return ""
 
     def _disarm(self, command: Command) -> str:
@@ -94,18 +86,19 @@ class OperatorDesk:
         Not so for a force sensor whose place the estimate has taken in contact: the loop never lost the force, and lets the
         sensor in again when both agree (`force_source.py`). force_source, phase: of the loop's last outputs.
         """
-        if not self._record.armed or (device == FORCE_BOX and force_source == ESTIMATE and phase == PHASE_CONTACT):
+        replaced = device == FORCE_BOX and force_source == ForceSource.ESTIMATE and phase == Phase.CONTACT
+        if not self._record.armed or replaced:
             return ""
         self._rest()
         return f"{device} is back: disarmed, to be armed again"
 
     def _rest(self) -> None:
         self._record.armed = 0
-        self._set(COMMAND_HOLD)
+        self._set(CommandKind.HOLD)
         self._frames.append(self._link.disarm())
 
     def _stop(self, command: Command) -> str:
-        self._set(COMMAND_STOP)
+        self._set(CommandKind.STOP)
         return ""
 
     def _clear_fault(self, command: Command) -> str:
@@ -121,12 +114,12 @@ class OperatorDesk:
     def _hold(self, command: Command) -> str:
         if not self._record.armed:
             return "hold: found the rig disarmed, wanted armed"
-        self._set(COMMAND_HOLD)
+        self._set(CommandKind.HOLD)
         return ""
 
     def _force(self, command: Command) -> str:
         """Another force on the target that there is; nothing else changes."""
-        if not self._record.armed or self._record.kind != COMMAND_CONTACT:
+        if not self._record.armed or self._record.kind != CommandKind.CONTACT:
             return "force: found no contact asked for, wanted target contact before"
         problem = self._too_much(command)
         if not problem and command.force_N is not None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from protocol.enums import ForceSource, Phase
 from protocol.rig_file import Rig
 from protocol.topics import Command, CommandCounts, Log, LoopTiming, Message, Reply
 from protocol.zenoh_session import Session
 from realtime.control.configure import tick_parameters
-from realtime.control.force_source import SENSOR
-from realtime.control.records import INPUTS, OUTPUTS, PHASE_CONTACT, PHASE_DISARMED, STATE, new
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
@@ -69,7 +69,7 @@ class RealtimeProcess:
         self._desk = OperatorDesk(rig, self._mailboxes["command"].record[0], self._link, self._missing)
         self._gate = CommandGate(self.clock.now_ns, self._obey, roles=rig.access.roles if rig.access else {})
         self._supervision = Supervision(tuple(rig.stage(axis).encoder_counts_per_step for axis in range(3)))  # type: ignore[arg-type]
-        self._phase, self._force_source = PHASE_DISARMED, SENSOR
+        self._phase, self._force_source = int(Phase.DISARMED), int(ForceSource.SENSOR)
         self._params = tick_parameters(rig, force_source)
         self._told_board_ns = 0
         self._port = _opened(board_port or rig.board.port, rig.board.baud, open_timeout_s)
@@ -263,7 +263,7 @@ class RealtimeProcess:
 
     def _check_steps(self, now_ns: int) -> None:
         board = self._mailboxes["board"].record[0]
-        if self._phase != PHASE_DISARMED and board.ready:
+        if self._phase != Phase.DISARMED and board.ready:
             self._supervised(self._supervision.status(board.position_steps, board.encoder_counts, now_ns))
 
     def _supervised(self, words: str) -> None:
@@ -298,7 +298,7 @@ class RealtimeProcess:
             np.array(estimate.covariance_N2).reshape(3, 3),
         )
         box.publish()
-        if self._phase == PHASE_CONTACT:
+        if self._phase == Phase.CONTACT:
             sensor_N = self._mailboxes["sensor"].record[0].force_N
             with self._link_lock:
                 self._supervised(self._supervision.estimate(sensor_N, box.record[0].force_N, now_ns))

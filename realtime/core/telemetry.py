@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from protocol.enums import Phase, SafetyAction
 from protocol.topics import (
     HISTOGRAM_BUCKETS,
-    MODES,
-    SAFETY_ACTIONS,
     BoardCounters,
     ForceSensor,
     LoopTiming,
@@ -19,7 +18,6 @@ from protocol.topics import (
 )
 from realtime.control import safety
 from realtime.control.inverse_kinematics import curvature_of_knob
-from realtime.control.records import PHASE_CONTACT
 from realtime.loop.latency import percentiles_us
 from realtime.loop.native_loop import WORK_BIN_NS
 
@@ -72,11 +70,11 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
 def state_message(inputs: np.record, outputs: np.record) -> RigState:
     """Phase, failsafe action and its cause in words, target and tip."""
     command = inputs.command
-    pressing = float(command.force_N) if outputs.phase == PHASE_CONTACT else None
+    pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
     return RigState(
         stamp_ns=int(outputs.now_ns),
-        mode=MODES[int(outputs.phase)],
-        safety_action=SAFETY_ACTIONS[int(outputs.action)],
+        mode=Phase(int(outputs.phase)).label,
+        safety_action=SafetyAction(int(outputs.action)).label,
         cause="; ".join(safety.in_words(int(outputs.cause)))[:500],
         target_m=tuple(map(float, command.target_m)),
         tip_m=tuple(map(float, outputs.tip_m)),

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from protocol.serial_frames import AXES, Fault, State
+from protocol.enums import BoardState
+from protocol.serial_frames import AXES, Fault
 from realtime.drivers.stepper_board import FAULT_ADVICE, AxisLimits, LinkPhase, StepperBoardLink
 
 # The second touch is slow: what the switch's 2 ms of settling and the braking add is less than a step.
@@ -87,14 +88,14 @@ class Homing:
 
     def _touch(self, speed: float) -> Iterator[bytes]:
         """Towards the switch until the board has stopped at it; its fault, which is what was wanted, is cleared."""
-        yield from self._move(self._home.end * speed, lambda: self._state() in (State.STOPPING, State.FAULT))
-        yield from self._until(lambda: self._state() is State.FAULT, _ANSWER_S, "the board at rest")
+        yield from self._move(self._home.end * speed, lambda: self._state() in (BoardState.STOPPING, BoardState.FAULT))
+        yield from self._until(lambda: self._state() is BoardState.FAULT, _ANSWER_S, "the board at rest")
         fault = Fault(self._link.status.fault) if self._link.status else Fault.NONE
         if fault is not Fault.LIMIT:
             raise HomingFailed(f"{self._name}: found {fault.name}, wanted its switch: {FAULT_ADVICE[fault]}")
         touched = self._touched()
         yield self._link.clear_fault(fault)
-        yield from self._until(lambda: self._state() is State.DISARMED, _ANSWER_S, "the fault cleared")
+        yield from self._until(lambda: self._state() is BoardState.DISARMED, _ANSWER_S, "the fault cleared")
         if not touched:
             raise HomingFailed(
                 f"{self._name}: found another switch than the {self._end()} one, wanted that: wiring or direction?"
@@ -111,7 +112,7 @@ class Homing:
 
         yield from self._move(-self._home.end * speed, clear)
         yield self._link.disarm()
-        yield from self._until(lambda: self._state() is State.DISARMED, _ANSWER_S, "rest")
+        yield from self._until(lambda: self._state() is BoardState.DISARMED, _ANSWER_S, "rest")
 
     def _move(self, speed: float, reached: Callable[[], bool]) -> Iterator[bytes]:
         """Arm, and move at `speed` (steps/s, signed) until `reached`. Raises HomingFailed beyond the travel."""
@@ -120,7 +121,7 @@ class Homing:
         assert self._link.status is not None
         start, begin_ns, sent_ns = list(self._link.status.position_steps), self._now_ns, -_EVERY_NS
         while not reached():
-            if self._state() not in (State.ARMED, State.RUNNING, State.STOPPING):
+            if self._state() not in (BoardState.ARMED, BoardState.RUNNING, BoardState.STOPPING):
                 raise HomingFailed(f"{self._name}: found the board {self._said()}, wanted it to move")
             gone_s = (self._now_ns - begin_ns) * 1e-9
             gone = speed * (0.5 * gone_s**2 / RAMP_S if gone_s < RAMP_S else gone_s - 0.5 * RAMP_S)
@@ -161,12 +162,12 @@ class Homing:
     def _steps(self) -> int:
         return 0 if self._link.status is None else int(self._link.status.position_steps[self._home.axis])
 
-    def _state(self) -> State | None:
-        return None if self._link.status is None else State(self._link.status.state)
+    def _state(self) -> BoardState | None:
+        return None if self._link.status is None else BoardState(self._link.status.state)
 
     def _said(self) -> str:
         status = self._link.status
-        return "silent" if status is None else f"{State(status.state).name}, fault {Fault(status.fault).name}"
+        return "silent" if status is None else f"{BoardState(status.state).name}, fault {Fault(status.fault).name}"
 
     def _end(self) -> str:
         return "upper" if self._home.end > 0 else "lower"

@@ -4,6 +4,7 @@ import enum
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from protocol.enums import BoardState
 from protocol.serial_codec import Message, StreamDecoder, encode
 from protocol.serial_frames import (
     AXES,
@@ -17,7 +18,6 @@ from protocol.serial_frames import (
     Mcu,
     ResetCause,
     Result,
-    State,
     wire_bytes,
 )
 from realtime.drivers.mcu_clock import McuClock
@@ -155,7 +155,7 @@ class StepperBoardLink:
         """
         if self.phase not in (LinkPhase.HELLO, LinkPhase.CONFIGURE):
             return b""
-        if self.phase is LinkPhase.CONFIGURE and self.status is not None and self.status.state != State.DISARMED:
+        if self.phase is LinkPhase.CONFIGURE and self.status is not None and self.status.state != BoardState.DISARMED:
             return b""
         if self._sent_ns is not None and now_ns - self._sent_ns < RETRY_NS:
             return b""
@@ -253,7 +253,7 @@ class StepperBoardLink:
     @property
     def armed(self) -> bool:
         """Whether the board takes set-points, by its last STATUS."""
-        return self.status is not None and self.status.state in (State.ARMED, State.RUNNING)
+        return self.status is not None and self.status.state in (BoardState.ARMED, BoardState.RUNNING)
 
     def _on_identity(self, message: Message, now_ns: int) -> list[LinkEvent]:
         identity = BoardIdentity(**message.fields)
@@ -324,7 +324,7 @@ class StepperBoardLink:
         if result != Result.OK:
             message_text = f"board refused {frame.name}: {result.name}"
             if self.status is not None:
-                message_text += f" (it is {State(self.status.state).name}, fault {Fault(self.status.fault).name})"
+                message_text += f" (it is {BoardState(self.status.state).name}, fault {Fault(self.status.fault).name})"
             return [LinkEvent(EventKind.REFUSED, now_ns, message_text, frame.name)]
         events = [LinkEvent(EventKind.ACK, now_ns, f"board accepted {frame.name}", frame.name)]
         if frame.name == "CONFIGURE":

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from realtime.control.records import COMMAND_CONTACT, COMMAND_HOLD, INPUTS, OUTPUTS, STATE, new
+from protocol.enums import CommandKind
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.loop.clock import Clock
 from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.mailbox import Mailbox
@@ -126,7 +127,7 @@ class _Feeder(threading.Thread):
             )
         if turn in (20, 40):
             self._boxes["command"].publish(
-                kind=COMMAND_HOLD if turn == 20 else COMMAND_CONTACT,
+                kind=CommandKind.HOLD if turn == 20 else CommandKind.CONTACT,
                 armed=1,
                 target_m=(0.0, -0.006, 0.034),
                 normal=(0.0, 0.0, -1.0),

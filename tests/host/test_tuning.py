@@ -14,9 +14,9 @@ from host.commissioning.tuning import (
     tune,
     with_gains,
 )
+from protocol.enums import Phase
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
-from realtime.control.records import PHASE_APPROACH, PHASE_CONTACT
 from sim.ideal_rig import IdealRig, Trace
 
 
@@ -36,14 +36,14 @@ def flat(force_N: float, phase: int, n: int = 1000) -> Trace:
 
 
 def test_the_cost_is_the_mean_absolute_error_and_lost_contact_is_dear() -> None:
-    assert cost_of(flat(0.15, PHASE_CONTACT), 0.2, 1.0) == pytest.approx(0.05)
-    assert cost_of(flat(0.15, PHASE_CONTACT, 500), 0.2, 1.0) == pytest.approx(0.025 + 0.5 * FAILED_N, abs=2e-3)
-    assert cost_of(flat(0.15, PHASE_APPROACH), 0.2, 1.0) == pytest.approx(FAILED_N)
+    assert cost_of(flat(0.15, Phase.CONTACT), 0.2, 1.0) == pytest.approx(0.05)
+    assert cost_of(flat(0.15, Phase.CONTACT, 500), 0.2, 1.0) == pytest.approx(0.025 + 0.5 * FAILED_N, abs=2e-3)
+    assert cost_of(flat(0.15, Phase.APPROACH), 0.2, 1.0) == pytest.approx(FAILED_N)
 
 
 def test_the_ideal_rig_touches_and_holds_and_repeats_itself(rig: Rig) -> None:
     first, again = (response(rig, 0.2, 1.0, seed=3) for _ in range(2))
-    assert first.time_s.size == 1000 and np.all(first.phase == PHASE_CONTACT)
+    assert first.time_s.size == 1000 and np.all(first.phase == Phase.CONTACT)
     assert np.array_equal(first.force_N, again.force_N)
     assert 0.02 < first.force_N[-1] < 0.35
     assert not np.array_equal(first.force_N, response(rig, 0.2, 1.0, seed=4).force_N)

@@ -16,10 +16,9 @@ import pytest
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet
 from protocol.commander import Commander
+from protocol.enums import Phase, SafetyAction
 from protocol.rig_file import load_rig
 from protocol.topics import Command, Log, Message, Reply, encode
-from realtime.control.records import PHASE_CONTACT, PHASE_DISARMED, PHASE_HOLD, PHASE_STOPPED
-from realtime.control.safety import HOLD
 from realtime.core.process import RealtimeProcess
 from realtime.drivers.stepper_board import LinkPhase
 from sim.forked_board import LibraryBoard
@@ -48,22 +47,22 @@ def test_a_sensor_unplugged_in_contact_and_back_leaves_the_rig_disarmed(device: 
         run.command("target", "position", target_m=(TARGET_M[0], TARGET_M[1], TARGET_M[2] - 0.004))
         run.run(4.0)
         run.command("target", "contact", target_m=TARGET_M, normal=(0.0, 0.0, 1.0), force_N=0.2)
-        assert run.run(10.0, lambda: run.phase == PHASE_CONTACT)
+        assert run.run(10.0, lambda: run.phase == Phase.CONTACT)
         run.run(0.5)
         begin_ns = run.now_ns
         getattr(run.world, device).faults.append(Fault("silent", begin_ns, begin_ns + 1_500_000_000))
-        assert run.run(0.2, lambda: run.loop.outputs[0].action >= HOLD)
+        assert run.run(0.2, lambda: run.loop.outputs[0].action >= SafetyAction.HOLD)
         run.run(1.0)
         at_rest = run.world.edges.copy()
-        run.run(6.0, lambda: run.phase == PHASE_DISARMED)
-        assert run.phase == PHASE_DISARMED and any("is back: disarmed" in text for text in logs)
+        run.run(6.0, lambda: run.phase == Phase.DISARMED)
+        assert run.phase == Phase.DISARMED and any("is back: disarmed" in text for text in logs)
         run.run(1.0)
-        assert (run.world.edges == at_rest).all() and run.phase == PHASE_DISARMED
+        assert (run.world.edges == at_rest).all() and run.phase == Phase.DISARMED
         assert not run.command("target", "position", target_m=TARGET_M).accepted
         assert run.world.peak_force_N < 0.55
         assert run.command("clear_fault").accepted
         run.run(0.5)
-        assert run.command("arm").accepted and run.run(1.0, lambda: run.phase == PHASE_HOLD)
+        assert run.command("arm").accepted and run.run(1.0, lambda: run.phase == Phase.HOLD)
 
 
 class Cable:
@@ -151,19 +150,19 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
             commander.clear_fault()
             time.sleep(0.5)
             return False
-        return until(lambda: process._phase == PHASE_HOLD, patience_s=5.0)
+        return until(lambda: process._phase == Phase.HOLD, patience_s=5.0)
 
     until(armed_and_holding, "the rig to be armed")
     cable.unplug()
-    until(lambda: process._phase in (PHASE_DISARMED, PHASE_STOPPED), "the loop to notice")
+    until(lambda: process._phase in (Phase.DISARMED, Phase.STOPPED), "the loop to notice")
     until(lambda: not process._mailboxes["command"].record[0].armed, "the rig to be disarmed")
     assert process.alive and not commander.arm().accepted
     cable.plug()
     until(lambda: process._link.status is not None, "the board to be found again")
-    until(lambda: process._phase == PHASE_DISARMED, "the loop to say that it is disarmed")
+    until(lambda: process._phase == Phase.DISARMED, "the loop to say that it is disarmed")
     for _ in range(20):
         time.sleep(0.02)
-        assert process._phase == PHASE_DISARMED
+        assert process._phase == Phase.DISARMED
     assert process._link.phase in (LinkPhase.CONFIGURE, LinkPhase.READY)
     until(armed_and_holding, "the rig to be armed again by its operator")
     assert process.alive

@@ -54,7 +54,7 @@ def test_header_holds_every_frame_code_and_the_hash() -> None:
     text = c_header.header_text()
     for frame in FRAMES:
         assert f"#define FRAME_{frame.name} 0x{frame.id:02X} " in text
-    for enum in ENUMS:
+    for enum in ENUMS.values():
         for member in enum:
             assert re.search(rf"_{member.name} = {member.value},", text)
     assert f"PROTOCOL_HASH {PROTOCOL_HASH}UL" in text or f"PROTOCOL_HASH 0x{PROTOCOL_HASH:08X}UL" in text

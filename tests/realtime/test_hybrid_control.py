@@ -7,17 +7,11 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from protocol.enums import CommandKind, Phase
 from protocol.rig_file import Rig, parse_rig
 from realtime.control import backlash, constraint_frame, free_tip, hybrid, inverse_kinematics
 from realtime.control.configure import tick_parameters
-from realtime.control.records import (
-    BACKLASH_STATE,
-    COMMAND_HOLD,
-    HISTORY,
-    HYBRID_STATE,
-    PHASE_CONTACT,
-    new,
-)
+from realtime.control.records import BACKLASH_STATE, HISTORY, HYBRID_STATE, new
 from realtime.core.intake import rotation
 from sim.heart import HeartConfig
 from sim.ideal_rig import IdealRig, Trace
@@ -67,13 +61,13 @@ def still_catheter_N(rig: Rig) -> float:
     """RMS force about its mean with the stages held still in contact."""
     run = bench(rig, HeartConfig())
     run.press(WANTED_N, WALL_m, 3.0)
-    run._command(COMMAND_HOLD)
+    run._command(CommandKind.HOLD)
     return float(np.std(run.run(6.0).force_N))
 
 
 def test_force_on_a_beating_wall_against_thesis_and_still_catheter(rig: Rig) -> None:
     ours = pressed(rig, HeartConfig())
-    assert np.all(ours.phase == PHASE_CONTACT) and np.min(ours.force_N) > 0.0
+    assert np.all(ours.phase == Phase.CONTACT) and np.min(ours.force_N) > 0.0
     assert rms_N(ours) < 0.25 * still_catheter_N(rig)
     assert rms_N(ours) < 0.5 * rms_N(pressed(changed(rig, law="thesis"), HeartConfig()))
     assert np.mean(ours.force_N[ours.time_s > 4.0]) == pytest.approx(WANTED_N, abs=0.005)
@@ -106,14 +100,14 @@ def test_changes_of_phase_have_no_bump(rig: Rig) -> None:
     """Through approach, touch, hold and release the stages stay within their limits, and the force does not kick."""
     run = bench(rig, HeartConfig())
     stages = [run.press(WANTED_N, WALL_m, 5.0).stage]
-    run._command(COMMAND_HOLD)
+    run._command(CommandKind.HOLD)
     stages.append(run.run(0.5).stage)
     after = run.press(WANTED_N, WALL_m, 1.0)
     speed = np.diff(np.concatenate([*stages, after.stage]), axis=0) * 1000
     limit = run.params[0].stage
     assert np.all(np.abs(speed) <= limit.max_speed * (1 + 1e-3) + 1e3 / limit.steps_per_unit)
     assert np.all(np.abs(np.diff(speed, axis=0)) * 1000 <= limit.max_accel + 4e6 / limit.steps_per_unit)
-    assert np.max(after.force_N) < WANTED_N + 0.15 and after.phase[-1] == PHASE_CONTACT
+    assert np.max(after.force_N) < WANTED_N + 0.15 and after.phase[-1] == Phase.CONTACT
 
 
 def test_the_wall_s_normal_is_learned_from_the_force(rig: Rig) -> None:
@@ -122,7 +116,7 @@ def test_the_wall_s_normal_is_learned_from_the_force(rig: Rig) -> None:
     run.inputs[0].command.normal[:] = (0.0, 0.0, -1.0)
     run.press(0.15, WALL_m, 8.0)
     learned = run.state[0].predictive.normal
-    assert run.outputs[0].phase == PHASE_CONTACT
+    assert run.outputs[0].phase == Phase.CONTACT
     assert np.degrees(np.arccos(learned @ (0.0, np.sin(tilt), -np.cos(tilt)))) < 2.0
 
 

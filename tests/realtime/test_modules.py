@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.enums import SafetyAction
 from protocol.rig_file import Rig
 from realtime.control import backlash, inverse_kinematics, predictor, safety, stage_limiter
 from realtime.control.configure import tick_parameters
@@ -121,7 +122,7 @@ def test_each_cause_leads_to_its_action(cause: tuple) -> None:
     decided, latched = safety.decide(bit, 0, False)
     assert decided == action and words in safety.in_words(bit)
     after, _ = safety.decide(0, latched, False)
-    assert after == (action if latches else safety.NONE)
+    assert after == (action if latches else SafetyAction.NONE)
 
 
 @given(flags=FLAGS, more=FLAGS, latched=FLAGS, clear=st.booleans())

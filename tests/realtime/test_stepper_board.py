@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from protocol.enums import BoardState
 from protocol.serial_codec import StreamDecoder, encode
-from protocol.serial_frames import FRAME_BY_NAME, PROTOCOL_HASH, Fault, Result, State
+from protocol.serial_frames import FRAME_BY_NAME, PROTOCOL_HASH, Fault, Result
 from realtime.drivers.stepper_board import (
     FAULT_ADVICE,
     RETRY_NS,
@@ -89,7 +90,7 @@ def test_bring_up_and_arm() -> None:
     events = link.feed(peer.answer(link.arm()), 9 * MS)
     assert [(e.kind, e.command) for e in events] == [(EventKind.ACK, "ARM")]
     assert not link.armed
-    link.feed(peer.status(state=State.ARMED), 10 * MS)
+    link.feed(peer.status(state=BoardState.ARMED), 10 * MS)
     assert link.armed
 
 
@@ -126,7 +127,7 @@ def test_a_newer_minor_version_is_taken() -> None:
 
 def test_a_refused_command_says_why() -> None:
     link, peer = ready()
-    link.feed(peer.status(state=State.FAULT, fault=Fault.ESTOP), 7 * MS)
+    link.feed(peer.status(state=BoardState.FAULT, fault=Fault.ESTOP), 7 * MS)
     peer.refuse["CLEAR_FAULT"] = Result.CAUSE_PRESENT
     events = link.feed(peer.answer(link.clear_fault(Fault.ESTOP)), 8 * MS)
     assert kinds(events) == [EventKind.REFUSED]
@@ -143,7 +144,7 @@ def test_refused_limits_are_not_taken_as_set() -> None:
 
 def test_a_board_with_a_fault_is_not_configured_until_it_is_cleared() -> None:
     link, peer = StepperBoardLink(LIMITS), Peer()
-    link.feed(peer.answer(link.advance(0)) + peer.status(state=State.FAULT, fault=Fault.DEADMAN), MS)
+    link.feed(peer.answer(link.advance(0)) + peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), MS)
     assert link.advance(500 * MS) == b""
     link.feed(peer.status(), 501 * MS)
     assert link.advance(502 * MS)
@@ -153,11 +154,11 @@ def test_a_fault_is_told_once_with_advice() -> None:
     link, peer = ready()
     events = []
     for ms in range(10, 60, 5):
-        events += link.feed(peer.status(state=State.FAULT, fault=Fault.DEADMAN), ms * MS)
+        events += link.feed(peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), ms * MS)
     told = [e for e in events if e.kind is EventKind.FAULT]
     assert len(told) == 1 and FAULT_ADVICE[Fault.DEADMAN] in told[0].message
     link.feed(peer.status(), 60 * MS)
-    assert EventKind.FAULT in kinds(link.feed(peer.status(state=State.FAULT, fault=Fault.DEADMAN), 65 * MS))
+    assert EventKind.FAULT in kinds(link.feed(peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), 65 * MS))
 
 
 def test_every_fault_has_advice() -> None:
@@ -166,7 +167,7 @@ def test_every_fault_has_advice() -> None:
 
 def test_a_reset_is_a_fault_that_ends_the_session() -> None:
     link, peer = ready()
-    link.feed(peer.status(state=State.RUNNING), 10 * MS)
+    link.feed(peer.status(state=BoardState.RUNNING), 10 * MS)
     events = link.feed(peer.status(boot_count=4) + peer.status(boot_count=4), 15 * MS)
     assert kinds(events).count(EventKind.RESET) == 1
     assert "found start 4, wanted 3" in events[0].message
@@ -217,7 +218,7 @@ def test_wrong_number_of_axes_is_refused() -> None:
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=20), st.binary(max_size=40))
 def test_any_portions_and_any_noise_before(sizes: list[int], noise: bytes) -> None:
     link, peer = StepperBoardLink(LIMITS), Peer()
-    stream = noise + b"\0" + peer.answer(link.advance(0)) + peer.status(state=State.DISARMED, last_setpoint=9)
+    stream = noise + b"\0" + peer.answer(link.advance(0)) + peer.status(state=BoardState.DISARMED, last_setpoint=9)
     events, at, turn = [], 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]
@@ -229,11 +230,11 @@ def test_any_portions_and_any_noise_before(sizes: list[int], noise: bytes) -> No
 
 def test_a_board_unplugged_and_back_is_brought_up_again() -> None:
     link, peer = ready()
-    link.feed(peer.status(state=State.RUNNING), 10 * MS)
+    link.feed(peer.status(state=BoardState.RUNNING), 10 * MS)
     link.unplugged()
     assert link.phase is LinkPhase.HELLO and link.status is None and not link.armed
     peer.heard.clear()
-    link.feed(peer.status(state=State.DISARMED), 900 * MS)
+    link.feed(peer.status(state=BoardState.DISARMED), 900 * MS)
     for ms in range(1000, 1005):
         link.feed(peer.answer(link.advance(ms * MS)), ms * MS)
     assert link.phase is LinkPhase.READY and peer.heard == ["HELLO", "CONFIGURE", "CONFIGURE", "CONFIGURE"]

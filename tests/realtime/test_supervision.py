@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from protocol.enums import SafetyAction
 from realtime.control import safety
 from realtime.core.supervision import FORCE_APART_N, HOST_SILENT_NS, STEPS_APART, Supervision
 
@@ -29,7 +30,7 @@ def test_steps_that_stay_lost_are_told_once_and_stand_until_the_restart() -> Non
     told = [supervision.status(ZERO, -lost * (tick > 3), tick * 5 * MS) for tick in range(40)]
     words = [text for text in told if text]
     assert len(words) == 1 and words[0].startswith("roll: encoder and steps are 151 steps apart")
-    assert supervision.flags == safety.STEPS_LOST and safety.action_of(supervision.flags) == safety.RETRACT
+    assert supervision.flags == safety.STEPS_LOST and safety.action_of(supervision.flags) == SafetyAction.RETRACT
     supervision.restart()
     assert supervision.flags == 0
 
@@ -55,7 +56,7 @@ def test_a_noisy_model_agrees_and_a_drifting_sensor_does_not() -> None:
         )
     )
     assert FORCE_APART_N < 0.1 * found * 0.025 < FORCE_APART_N + 0.15
-    assert safety.action_of(supervision.flags) == safety.RETRACT
+    assert safety.action_of(supervision.flags) == SafetyAction.RETRACT
 
 
 def test_nan_of_either_side_counts_for_nothing() -> None:

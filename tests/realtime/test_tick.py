@@ -5,31 +5,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.enums import CommandKind, Phase, SafetyAction
 from protocol.rig_file import Rig, parse_rig
 from realtime.control import safety
-from realtime.control.records import (
-    COMMAND_CONTACT,
-    COMMAND_HOLD,
-    COMMAND_POSITION,
-    INPUTS,
-    OUTPUTS,
-    PHASE_APPROACH,
-    PHASE_CONTACT,
-    PHASE_DISARMED,
-    PHASE_HOLD,
-    PHASE_STOPPED,
-    STATE,
-    new,
-)
+from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from tests.realtime.conftest import Bench
 
 
 def armed(bench: Bench) -> Bench:
     bench.run(0.1)
-    bench.command(COMMAND_HOLD)
+    bench.command(CommandKind.HOLD)
     bench.run(0.1)
-    assert bench.outputs[0].phase == PHASE_HOLD
+    assert bench.outputs[0].phase == Phase.HOLD
     return bench
 
 
@@ -40,18 +28,18 @@ def with_law(rig: Rig, law: str) -> Rig:
 
 def in_contact(bench: Bench, force_N: float = 0.1) -> Bench:
     armed(bench)
-    bench.command(COMMAND_CONTACT, target_m=(0.0, -0.006, 0.040), force_N=0.2)
+    bench.command(CommandKind.CONTACT, target_m=(0.0, -0.006, 0.040), force_N=0.2)
     bench.run(0.2)
-    assert bench.outputs[0].phase == PHASE_APPROACH
+    assert bench.outputs[0].phase == Phase.APPROACH
     bench.force[:] = (0.0, 0.0, force_N)
     bench.run(0.1)
-    assert bench.outputs[0].phase == PHASE_CONTACT
+    assert bench.outputs[0].phase == Phase.CONTACT
     return bench
 
 
 def test_nothing_is_sent_before_an_explicit_arm(bench: Bench) -> None:
     assert bench.run(0.2).valid == 0
-    assert bench.outputs[0].phase == PHASE_DISARMED
+    assert bench.outputs[0].phase == Phase.DISARMED
 
 
 def test_arming_does_not_move_the_stages(bench: Bench) -> None:
@@ -62,7 +50,7 @@ def test_arming_does_not_move_the_stages(bench: Bench) -> None:
 
 def test_position_command_moves_towards_the_goal_within_stage_limits(bench: Bench) -> None:
     armed(bench)
-    bench.command(COMMAND_POSITION, target_m=(0.0, -0.006, 0.040))
+    bench.command(CommandKind.POSITION, target_m=(0.0, -0.006, 0.040))
     stage = bench.params[0].stage
     last, last_speed = np.array(bench.outputs[0].stage_unit), np.zeros(3)
     for _ in range(400):
@@ -95,33 +83,33 @@ def test_no_fresh_pose_holds_then_stops(bench: Bench) -> None:
     in_contact(bench)
     bench.with_pose = False
     bench.run(0.080)
-    assert bench.outputs[0].action == safety.HOLD
+    assert bench.outputs[0].action == SafetyAction.HOLD
     joint = bench.run(0.030).joint[0]
     assert bench.run(0.020).joint[0] == joint
     bench.run(0.050)
-    assert bench.outputs[0].action == safety.STOP and bench.outputs[0].phase == PHASE_STOPPED
+    assert bench.outputs[0].action == SafetyAction.STOP and bench.outputs[0].phase == Phase.STOPPED
     bench.with_pose = True
     bench.run(0.5)
-    assert bench.outputs[0].phase == PHASE_STOPPED, "a stop must not end by itself"
+    assert bench.outputs[0].phase == Phase.STOPPED, "a stop must not end by itself"
 
 
 def test_over_force_retracts_and_stays_stopped(bench: Bench) -> None:
     in_contact(bench)
     bench.force[:] = (0.0, 0.0, 0.55)
     bench.run(0.02)
-    assert bench.outputs[0].action == safety.RETRACT
+    assert bench.outputs[0].action == SafetyAction.RETRACT
     start = bench.outputs[0].joint[0]
     bench.force[:] = 0.0
     bench.run(1.0)
     assert bench.outputs[0].joint[0] <= start - 0.009
-    assert bench.outputs[0].phase == PHASE_STOPPED
+    assert bench.outputs[0].phase == Phase.STOPPED
 
 
 def test_board_fault_and_silence_stop(bench: Bench) -> None:
     armed(bench)
     bench.with_board = False
     bench.run(0.05)
-    assert bench.outputs[0].action == safety.STOP
+    assert bench.outputs[0].action == SafetyAction.STOP
     assert "board_silent" in safety.names(int(bench.outputs[0].cause))
 
 
@@ -148,7 +136,7 @@ def test_force_not_finite_is_rejected_and_goes_stale(bench: Bench) -> None:
     bench.run(0.1)
     assert bench.outputs[0].forces_rejected == 100
     assert np.all(np.isfinite(bench.outputs[0].force_N))
-    assert bench.outputs[0].action >= safety.HOLD
+    assert bench.outputs[0].action >= SafetyAction.HOLD
 
 
 any_float = st.floats(allow_nan=True, allow_infinity=True)

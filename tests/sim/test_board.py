@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from protocol.enums import BoardState
 from protocol.serial_codec import encode
-from protocol.serial_frames import DEADMAN_US, STOP_US, Fault, InputBit, Reject, State
+from protocol.serial_frames import DEADMAN_US, STOP_US, Fault, InputBit, Reject
 from realtime.drivers.stepper_board import LinkPhase
 from sim import board as board_module
 from sim.board import Board, BoardUnavailable, ensure_built, resolve_kind
@@ -68,7 +69,7 @@ def test_commanded_is_made_is_reported(armed: BoardRig) -> None:
     path = ramped_moves(240, seed=1)
     armed.follow(path, traffic=True)
     assert_clean(armed)
-    assert armed.status.state == State.RUNNING
+    assert armed.status.state == BoardState.RUNNING
     assert tuple(armed.position) == tuple(path[-1]) == armed.status.position_steps == armed.status.encoder_counts
 
 
@@ -150,19 +151,19 @@ def test_deadman(armed: BoardRig) -> None:
     commanded = cruise(armed, 60, (15, 12, -12))
     last_sent_us = armed.time_us - 1000
     armed.run_ms(150)
-    assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.DEADMAN)
+    assert (armed.status.state, armed.status.fault) == (BoardState.FAULT, Fault.DEADMAN)
     assert_stopped_on_a_ramp(armed, commanded, (15, 12, -12), last_sent_us + 4000, DEADMAN_US + STOP_US)
     assert tuple(armed.position) == armed.status.position_steps == armed.status.encoder_counts
     at_rest = armed.position.copy()
     for _ in range(20):
         armed.slice(armed.setpoint(at_rest + 5))
     armed.run_ms(20, armed.link.hello())
-    assert armed.status.state == State.FAULT and armed.status.last_reject == Reject.STATE
+    assert armed.status.state == BoardState.FAULT and armed.status.last_reject == Reject.STATE
     assert (armed.position == at_rest).all(), "moved while a fault was latched"
     armed.run_ms(8, armed.link.clear_fault(Fault.ESTOP))
-    assert armed.status.state == State.FAULT
+    assert armed.status.state == BoardState.FAULT
     armed.run_ms(8, armed.link.clear_fault(Fault.DEADMAN))
-    assert armed.status.state == State.DISARMED
+    assert armed.status.state == BoardState.DISARMED
 
 
 def test_emergency_stop(armed: BoardRig) -> None:
@@ -171,15 +172,15 @@ def test_emergency_stop(armed: BoardRig) -> None:
     pressed_us = armed.time_us
     for _ in range(90):
         armed.slice(armed.setpoint(commanded))
-    assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.ESTOP)
+    assert (armed.status.state, armed.status.fault) == (BoardState.FAULT, Fault.ESTOP)
     assert armed.status.inputs & 1 << InputBit.ESTOP
     assert_stopped_on_a_ramp(armed, commanded, (15, -12, 12), pressed_us + 3000, STOP_US)
     armed.run_ms(8, armed.link.clear_fault(Fault.ESTOP))
-    assert armed.status.state == State.FAULT, "cleared with the button pressed"
+    assert armed.status.state == BoardState.FAULT, "cleared with the button pressed"
     armed.inputs = {}
     armed.run_ms(8)
     armed.run_ms(8, armed.link.clear_fault(Fault.ESTOP))
-    assert armed.status.state == State.DISARMED
+    assert armed.status.state == BoardState.DISARMED
 
 
 def test_limit_switch(armed: BoardRig) -> None:
@@ -188,7 +189,7 @@ def test_limit_switch(armed: BoardRig) -> None:
     opened_us = armed.time_us
     for _ in range(80):
         armed.slice(armed.setpoint(commanded))
-    assert (armed.status.state, armed.status.fault) == (State.FAULT, Fault.LIMIT)
+    assert (armed.status.state, armed.status.fault) == (BoardState.FAULT, Fault.LIMIT)
     assert armed.status.inputs == 1 << InputBit.LIMIT_1_MAX
     assert_stopped_on_a_ramp(armed, commanded, (0, 8, 0), opened_us + 3000, STOP_US)
     armed.run_ms(8, armed.link.clear_fault(Fault.LIMIT))
@@ -198,7 +199,7 @@ def test_limit_switch(armed: BoardRig) -> None:
         armed.slice(armed.setpoint(at_end + np.array([0, k, 0])))
     assert armed.position[1] == at_end[1] and armed.status.last_reject == Reject.LIMIT_SWITCH
     armed.follow(at_end - np.arange(40)[:, None] * np.array([0, 3, 0]))
-    assert armed.position[1] == at_end[1] - 117 and armed.status.state == State.RUNNING
+    assert armed.position[1] == at_end[1] - 117 and armed.status.state == BoardState.RUNNING
 
 
 @pytest.mark.parametrize("how", ["reset", "power_cycle", "freeze"])
@@ -211,7 +212,7 @@ def test_a_restarted_processor_is_a_fault(armed: BoardRig, how: str) -> None:
     assert armed.link.phase is LinkPhase.RESET
     assert any("board was reset: found start 2, wanted 1" in line for line in armed.events)
     assert [len(edges) for edges in armed.edge_us] == before, "moved after a restart"
-    assert armed.status.state == (State.FAULT if how == "freeze" else State.DISARMED)
+    assert armed.status.state == (BoardState.FAULT if how == "freeze" else BoardState.DISARMED)
     assert armed.status.fault == (Fault.WATCHDOG if how == "freeze" else Fault.NONE)
     with pytest.raises(ValueError, match="wanted ready"):
         armed.link.arm()
@@ -285,7 +286,7 @@ def test_nothing_is_executed_that_was_not_sent(faults: list[tuple[str, int, int]
         names = [1_000_000 + 7919 * k for k in range(20)]
         rig.run_ms(20, b"".join(apply_damage([rig.link.set_position(0, name) for name in names], faults)))
         assert rig.status.position_steps[0] in (0, *names)
-        assert rig.status.position_steps[1:] == (0, 0) and rig.status.state == State.DISARMED
+        assert rig.status.position_steps[1:] == (0, 0) and rig.status.state == BoardState.DISARMED
     finally:
         rig.close()
 
@@ -311,7 +312,7 @@ def test_damaged_setpoints_are_not_executed(faults: list[tuple[str, int, int]]) 
         rig.follow(np.arange(31, 51)[:, None] * slope)
         assert rig.accepted <= set(range(rig.number + 1))
         assert tuple(rig.position) == tuple(50 * slope) == rig.status.position_steps
-        assert rig.status.state == State.RUNNING and rig.number - 9 < rig.status.last_setpoint <= rig.number
+        assert rig.status.state == BoardState.RUNNING and rig.number - 9 < rig.status.last_setpoint <= rig.number
     finally:
         rig.close()
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from protocol.enums import Phase
 from protocol.rig_file import load_rig
 from protocol.topics import MAX_PAYLOAD_BYTES, Command, Message, Reply, decode, encode
-from realtime.control.records import PHASE_STOPPED
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
@@ -201,12 +201,12 @@ def test_a_stop_from_a_second_commander_stops_and_stays_stopped(board: LibraryBo
     run.run(0.1)
     stop = run.forged(action="stop", target="none", target_m=None)
     assert run.loop.request("intruder", encode(stop)).result == "accepted"  # type: ignore[union-attr]
-    assert run.run(0.2, lambda: run.phase == PHASE_STOPPED)
+    assert run.run(0.2, lambda: run.phase == Phase.STOPPED)
     run.run(0.2)
     at_rest = moved(run)
     assert run.command("hold").accepted and run.command("target", "position", target_m=ELSEWHERE).accepted
     run.run(0.2)
-    assert moved(run).steps == at_rest.steps and run.phase == PHASE_STOPPED
+    assert moved(run).steps == at_rest.steps and run.phase == Phase.STOPPED
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from protocol.enums import Phase
 from protocol.rig_file import load_rig
 from protocol.topics import Message
-from realtime.control.records import PHASE_CONTACT
 from realtime.core.lockstep import Leaving
 from sim.board import Board
 from sim.plant import Plant, PlantConfig
@@ -89,7 +89,7 @@ def in_contact(run: Scenario) -> None:
     assert run.arm()
     run._shape(TARGET)
     run.command("target", "contact", target_m=TARGET.target_m, normal=TARGET.into, force_N=0.2)
-    assert run.run(10.0, lambda: run.phase == PHASE_CONTACT)
+    assert run.run(10.0, lambda: run.phase == Phase.CONTACT)
     run.run(0.5)
 
 

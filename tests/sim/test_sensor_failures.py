@@ -5,11 +5,10 @@ from collections import deque
 import numpy as np
 import pytest
 
+from protocol.enums import ForceSource, Phase
 from protocol.rig_file import load_rig
 from protocol.topics import ForceEstimate, Message
 from realtime.control import safety
-from realtime.control.force_source import ESTIMATE, SENSOR
-from realtime.control.records import PHASE_APPROACH, PHASE_CONTACT, PHASE_RETRACT, PHASE_STOPPED
 from sim.forked_board import forkable_board
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
@@ -39,7 +38,7 @@ class Job:
         self.run.command("target", "contact", target_m=JOB.target_m, normal=JOB.into, force_N=JOB.force_N)
         self.go(0.1)
         if phase != "approach":
-            assert self.run.run(10.0, lambda: self._watch() or self.run.phase == PHASE_CONTACT)
+            assert self.run.run(10.0, lambda: self._watch() or self.run.phase == Phase.CONTACT)
             self.go(0.3 if phase == "contact" else 3.0)
         if phase == "retract":
             self.run.command("target", "retract")
@@ -96,7 +95,7 @@ def test_without_poses_it_holds_then_stops_and_stays(phase: str) -> None:
     job.fail("tracker", "silent", 3.0)
     job.go(0.3)
     assert {"pose_stale", "pose_lost"} <= job.causes
-    assert job.phase == PHASE_STOPPED
+    assert job.phase == Phase.STOPPED
     steps = job.world.steps.copy()
     force_N = job.go(1.0)
     assert np.array_equal(job.world.steps, steps), "stages moved after the stop"
@@ -108,7 +107,7 @@ def test_without_force_it_holds_then_retracts(phase: str) -> None:
     job = Job(phase)
     job.fail("force", "silent", 3.0)
     force_N = job.go(1.2)
-    assert job.phase == PHASE_STOPPED and np.max(force_N) < PEAK_N
+    assert job.phase == Phase.STOPPED and np.max(force_N) < PEAK_N
     assert force_N[-1] == 0.0, "it must have let go of the wall"
     if phase != "retract":
         assert {"force_stale", "force_lost"} <= job.causes
@@ -120,10 +119,10 @@ def test_in_contact_the_estimate_takes_over_and_hands_back_without_a_bump(kind: 
     before = job.go(1.0)
     job.fail("force", kind, 2.0)
     during = job.go(2.0)
-    assert job.phase == PHASE_CONTACT and job.source == ESTIMATE
+    assert job.phase == Phase.CONTACT and job.source == ForceSource.ESTIMATE
     assert job.causes == {"force_handover"}
     after = job.go(3.0)
-    assert job.phase == PHASE_CONTACT and job.source == SENSOR
+    assert job.phase == Phase.CONTACT and job.source == ForceSource.SENSOR
     assert np.min([*during, *after]) > 0.0 and np.max([*during, *after]) < JOB.force_N + 0.08
     assert abs(np.mean(during) - np.mean(before)) < 0.03
     every_50_ms = np.concatenate([before, during, after])[::50]
@@ -135,7 +134,7 @@ def test_before_any_contact_there_is_nothing_to_hand_over_to() -> None:
     job = Job("approach", modelled=True)
     job.fail("force", "silent", 3.0)
     job.go(1.2)
-    assert job.phase == PHASE_STOPPED and "force_handover" not in job.causes
+    assert job.phase == Phase.STOPPED and "force_handover" not in job.causes
 
 
 @pytest.mark.parametrize("phase", ["approach", "hold"])
@@ -144,7 +143,7 @@ def test_a_short_gap_in_the_poses_is_bridged(phase: str) -> None:
     job.fail("tracker", "missing", 0.045)
     job.go(0.5)
     assert "pose_lost" not in job.causes
-    assert job.phase in (PHASE_APPROACH, PHASE_CONTACT)
+    assert job.phase in (Phase.APPROACH, Phase.CONTACT)
 
 
 def test_wild_poses_are_told_and_not_followed() -> None:
@@ -152,5 +151,5 @@ def test_wild_poses_are_told_and_not_followed() -> None:
     box = job.world.tracker
     box.faults.append(Fault("wild", job.world.now_ns, job.world.now_ns + 60_000_000, value=0.1))
     force_N = job.go(0.6)
-    assert "pose_rejected" in job.causes and job.phase in (PHASE_CONTACT, PHASE_RETRACT)
+    assert "pose_rejected" in job.causes and job.phase in (Phase.CONTACT, Phase.RETRACT)
     assert np.max(np.abs(force_N - JOB.force_N)) < 0.2

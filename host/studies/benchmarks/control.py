@@ -13,20 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from host.studies.benchmarks.runner import Report, Row, Timed, alternate, row_of
+from protocol.enums import CommandKind, Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control import predictor
 from realtime.control.configure import tick_parameters
-from realtime.control.records import (
-    COMMAND_CONTACT,
-    INPUTS,
-    OUTPUTS,
-    PHASE_CONTACT,
-    POSE,
-    PREDICTOR_PARAMS,
-    PREDICTOR_STATE,
-    STATE,
-    new,
-)
+from realtime.control.records import INPUTS, OUTPUTS, POSE, PREDICTOR_PARAMS, PREDICTOR_STATE, STATE, new
 from realtime.control.tick import tick
 
 Array = NDArray[np.float64]
@@ -74,7 +65,7 @@ class Loop:
         self.run(APPROACH_TICKS // 3)
         u.command.count, u.command.armed = 1, 1
         self.run(APPROACH_TICKS // 3)
-        u.command.count, u.command.kind, u.command.force_N = 2, COMMAND_CONTACT, 0.2
+        u.command.count, u.command.kind, u.command.force_N = 2, CommandKind.CONTACT, 0.2
         u.command.target_m[:] = (0.0, -0.006, 0.040)
         self.force[2] = 0.15
         self.run(APPROACH_TICKS // 3)
@@ -112,7 +103,7 @@ def control_tick(seed: int, _report: Report) -> list[Row]:
 
     ours, peer = Loop(_ticks), Loop(plain_ticks)
     phases = [int(loop.outputs[0].phase) for loop in (ours, peer)]
-    assert phases == [PHASE_CONTACT, PHASE_CONTACT], phases
+    assert phases == [Phase.CONTACT, Phase.CONTACT], phases
     apart = float(np.abs(ours.outputs[0].joint - peer.outputs[0].joint).max())
     timed: Timed = alternate([ours.run] * READINGS, [lambda: peer.run(TICKS)] * READINGS)
     timed.peer_s = [seconds / TICKS for seconds in timed.peer_s]

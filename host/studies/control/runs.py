@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
+from protocol.enums import Phase
 from protocol.rig_file import Rig, parse_rig
 from protocol.topics import Message
 from realtime.control import free_tip, target_predictor
 from realtime.control.configure import tick_parameters
-from realtime.control.records import PHASE_CONTACT, TARGET_STATE, new
+from realtime.control.records import TARGET_STATE, new
 from realtime.control.target_models import LOCAL, position
 from sim import heart
 from sim.aurora_emulator import Pose
@@ -55,7 +56,7 @@ class Held(NamedTuple):
 
     def kept(self) -> float:
         """Share of the time in contact, from the first touch on."""
-        return float(np.mean((self.force_N > 0.0) & (self.phase == PHASE_CONTACT))) if self.reached else 0.0
+        return float(np.mean((self.force_N > 0.0) & (self.phase == Phase.CONTACT))) if self.reached else 0.0
 
 
 def with_control(rig: Rig, section: str = "control", **values: object) -> Rig:
@@ -96,7 +97,7 @@ def hold(
         rows.append((run.now_ns * 1e-9, float(run.world.plant.contact_force_N @ JOB.into), run.phase))
         return False
 
-    reached = run.run(JOB.approach_s, lambda: run.phase == PHASE_CONTACT)
+    reached = run.run(JOB.approach_s, lambda: run.phase == Phase.CONTACT)
     if reached:
         run.run(min(seconds, still_after_s), watch)
         if still_after_s < seconds:

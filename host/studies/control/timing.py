@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 
 from host.studies.control.runs import REGULAR
+from protocol.enums import Phase
 from protocol.rig_file import Rig
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
-from realtime.control.records import PHASE_CONTACT
 from realtime.control.tick import tick
 from realtime.loop.libc import monotonic_ns
 from sim.ideal_rig import IdealRig
@@ -56,7 +56,7 @@ def tick_us(rig: Rig, seed: int = 1) -> dict[str, float]:
         seed,
     )
     bench.press(0.2, np.array(TARGET_M), WARM_UP_S)
-    if bench.outputs[0].phase != PHASE_CONTACT:
+    if bench.outputs[0].phase != Phase.CONTACT:
         raise ValueError("control study: found no contact, wanted it before the tick is timed")
     noise_N = rig.force_sensor.noise_N * np.random.default_rng(seed).standard_normal(TICKS)
     records = (bench.params, bench.state, bench.inputs, bench.outputs)
@@ -66,7 +66,7 @@ def tick_us(rig: Rig, seed: int = 1) -> dict[str, float]:
         times_us = np.zeros(TICKS)
         _timed(*records, noise_N, period_ns, times_us)
         rounds.append(np.percentile(times_us, (50, 99, 99.9)))
-    if bench.outputs[0].phase != PHASE_CONTACT:
+    if bench.outputs[0].phase != Phase.CONTACT:
         raise ValueError("control study: found the contact lost, wanted it for as long as the tick is timed")
     p50, p99, p999 = np.min(rounds, axis=0)
     return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "ticks": float(TICKS)}

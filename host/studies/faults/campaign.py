@@ -19,9 +19,9 @@ import numpy as np
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.recording import Recording, RecordingWriter, header_of
+from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message
-from realtime.control.records import PHASE_CONTACT
 from sim.fault_run import FaultyScenario, Watcher
 from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
 from sim.forked_board import ForkableBoard, forkable_board
@@ -143,7 +143,7 @@ def _bring_to(run: FaultyScenario, phase: str) -> None:
         run._shape(JOB)
         run.command("target", "contact", target_m=JOB.target_m, normal=JOB.into, force_N=JOB.force_N)
     elif phase == "contact":
-        if not run.run(10.0, lambda: run.phase == PHASE_CONTACT):
+        if not run.run(10.0, lambda: run.phase == Phase.CONTACT):
             raise RuntimeError("no contact within 10 s, wanted it before the fault")
     else:
         run.run(HOLD_AFTER_S)

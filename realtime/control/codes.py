@@ -1,0 +1,22 @@
+"""The codes of `protocol.enums` as plain integers: compiled kernels compare these, everything else uses the enums."""
+
+from __future__ import annotations
+
+from protocol.enums import BoardState, CommandKind, ControlLaw, ForceSource, Phase, SafetyAction
+
+(
+    PHASE_DISARMED,
+    PHASE_HOLD,
+    PHASE_POSITION,
+    PHASE_APPROACH,
+    PHASE_CONTACT,
+    PHASE_RETRACT,
+    PHASE_STOPPED,
+) = (int(phase) for phase in Phase)
+ACTION_NONE, ACTION_WARN, ACTION_HOLD, ACTION_RETRACT, ACTION_STOP = (int(action) for action in SafetyAction)
+COMMAND_NONE, COMMAND_HOLD, COMMAND_POSITION, COMMAND_CONTACT, COMMAND_RETRACT, COMMAND_STOP = (
+    int(kind) for kind in CommandKind
+)
+SOURCE_SENSOR, SOURCE_ESTIMATE = (int(source) for source in ForceSource)
+LAW_THESIS, LAW_PREDICTIVE = (int(law) for law in ControlLaw)
+BOARD_FAULT = int(BoardState.FAULT)
