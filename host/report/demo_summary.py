@@ -98,12 +98,12 @@ def _table(result: dict[str, Any], summary: RunSummary) -> Table:
         (
             "mean force, last 10 s",
             quantity(result["force_mean_last_10_s_N"], "N", 3),
-            f"wanted {quantity(result['target_force_N'], 'N', 2)}",
+            f"set-point {quantity(result['target_force_N'], 'N', 2)}",
         ),
         ("RMS force error", quantity(result["force_rms_error_N"], "N", 3), "after 3 s of settling"),
         ("peak force", quantity(result["force_peak_N"], "N", 3), f"limit {quantity(summary.force_limit_N, 'N', 2)}"),
-        ("tip off target, sideways", quantity(result["tip_rms_error_m"] * 1e3, "mm", 2), "RMS, tracker noise included"),
-        ("in touch", quantity(result["contact_seconds"], "s", 1), ""),
+        ("tip error across the normal", quantity(result["tip_rms_error_m"] * 1e3, "mm", 2), "RMS, tracker noise included"),
+        ("in contact", quantity(result["contact_seconds"], "s", 1), ""),
         (
             "tick",
             quantity(ticks.p50_us, "µs", 1),

@@ -86,7 +86,7 @@ class RunFigures:
         if state is not None:
             time_s, wanted_N = self._seconds(state["stamp_ns"]), state["target_force_N"]
             show = (time_s >= from_s) & (time_s <= to_s)
-            axes.plot(time_s[show], wanted_N[show], color=WANTED, linewidth=1.3, linestyle=(0, (4, 2)), label="wanted")
+            axes.plot(time_s[show], wanted_N[show], color=WANTED, linewidth=1.3, linestyle=(0, (4, 2)), label="set-point")
         axes.set_xlim(from_s, to_s)
         axes.set_xlabel("time, s")
         axes.set_ylabel("force into the wall, N")
@@ -114,9 +114,9 @@ class RunFigures:
             3.0,
             3.1,
             "Force on the wall",
-            "Force wanted, measured and estimated over the run.",
-            "Along the wall's normal; the bands are the phases named in the timeline. The estimate comes from "
-            "the tracked poses alone, with two standard deviations either way.",
+            "Set-point, measured and estimated force over the run.",
+            "Force along the wall's normal. Coloured bands are the phases of the timeline. The estimate comes from "
+            "the tracked poses alone; its band is two standard deviations.",
         )
 
     def force_detail(self) -> Picture | None:
@@ -136,9 +136,9 @@ class RunFigures:
             draw,
             2.7,
             3.0,
-            "The same, close up",
+            "Force in the last seconds of contact",
             f"Force over the last {to_s - from_s:.0f} seconds of contact.",
-            f"The last {to_s - from_s:.0f} s of contact: what is left of the heart beat in the force.",
+            f"The last {to_s - from_s:.0f} s of contact. Variation with the heart beat is control error.",
         )
 
     def tip(self) -> Picture | None:
@@ -166,7 +166,7 @@ class RunFigures:
                     *thinned(self._seconds(truth["stamp_ns"]), wall_mm),
                     color=TRUTH,
                     linewidth=0.9,
-                    label="wall, untouched (simulator)",
+                    label="wall without contact (simulator)",
                 )
             along.plot(*thinned(time_s, tip_m @ normal * 1e3), color=MEASURED, linewidth=0.9, label="tip, tracked")
             along.plot(
@@ -180,7 +180,7 @@ class RunFigures:
             along.set_ylabel("towards the wall, mm")
             legend_above(along, 2 if narrow else 3)
             across.plot(*thinned(time_s, across_m * 1e3), color=MEASURED, linewidth=0.9)
-            across.set_ylabel("off sideways, mm")
+            across.set_ylabel("error across, mm")
             across.set_ylim(bottom=0)
             across.set_xlabel("time, s")
             across.set_xlim(0, self.end_s)
@@ -191,9 +191,9 @@ class RunFigures:
             4.2,
             "Tip, target and wall",
             "Tip position against target and wall over the run.",
-            "Above: along the wall's normal; in contact force decides here, and the target only says how far to "
-            "look for the wall. Below: distance from the target across the normal, where position decides. "
-            "Tracker readings as they came, noise included.",
+            "Above: along the wall's normal. In contact the force is controlled there, and the target only limits "
+            "the search for the wall. Below: distance from the target across the normal, where the position is "
+            "controlled. Tracker readings include noise.",
         )
 
     def path(self) -> Picture | None:
@@ -222,7 +222,7 @@ class RunFigures:
             draw,
             high_in,
             narrow_high_in,
-            "The tip's way",
+            "Path of the tip",
             "Path of the tip in two projections with the catheter's shape.",
             "The sheath ends at 0, its axis to the right. Lines are the catheter between its two tracked "
             "sensors, a cubic through both poses.",
@@ -291,7 +291,7 @@ class RunFigures:
             4.4,
             "Stages",
             "Commands and encoders of insertion, roll and knob over the run.",
-            "The handle's axes: what was commanded and what the encoders answered.",
+            "Axes of the handle: commanded positions and encoder readings.",
         )
 
     def timeline(self) -> Picture | None:
@@ -322,7 +322,7 @@ class RunFigures:
             axes.tick_params(length=0)
             axes.grid(False)
             if not self.summary.safety:
-                axes.text(self.end_s / 2, 0, "nothing to report", ha="center", va="center", color=MUTED, fontsize=8)
+                axes.text(self.end_s / 2, 0, "no safety action", ha="center", va="center", color=MUTED, fontsize=8)
             axes.set_ylim(-0.6, 1.6)
             axes.set_xlim(0, self.end_s)
             axes.set_xlabel("time, s")
@@ -334,7 +334,7 @@ class RunFigures:
             2.1,
             "Timeline",
             "Phases of the loop and safety actions over the run.",
-            "What the loop was doing, and when safety stepped in.",
+            "Phases of the control loop, and safety actions.",
         )
 
     def ticks(self) -> Picture | None:
@@ -346,9 +346,9 @@ class RunFigures:
         filled = np.flatnonzero(times.histogram)
         period_us = 1e6 / times.loop_hz
         beyond = (
-            "In virtual time the world waits for a tick that takes longer than its period; on a rig it would come too late."
+            "In virtual time the simulation waits for a tick that takes longer than its period. On a rig it would be late."
             if self.summary.virtual
-            else "Everything right of “period” came too late."
+            else "Ticks to the right of “period” were late."
         )
 
         def draw(figure: Figure, narrow: bool) -> None:

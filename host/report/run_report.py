@@ -72,8 +72,8 @@ def signed(value: float, unit: str, digits: int) -> str:
 
 
 def lateness_of(summary: RunSummary) -> str:
-    """How many ticks came too late; in virtual time none can, whatever they took, because the world waits."""
-    return "virtual time: the world waits" if summary.virtual else f"{summary.ticks.missed} too late"
+    """Say how many ticks were late. In virtual time none is, because the simulation waits for each tick."""
+    return "virtual time: the simulation waits" if summary.virtual else f"{summary.ticks.missed} late"
 
 
 def verdict_of(summary: RunSummary) -> Verdict:
@@ -85,12 +85,12 @@ def verdict_of(summary: RunSummary) -> Verdict:
         return Verdict("bad" if stopped or summary.target_force_N > 0 else "fair", sentence, remarks)
     held = f"The wall was touched for {quantity(summary.contact_seconds, 's', 1)}"
     if not math.isfinite(summary.target_force_N):
-        return Verdict("bad" if stopped else "fair", held + "; no force was asked for.", remarks)
+        return Verdict("bad" if stopped else "fair", held + "; no force was requested.", remarks)
     sentence = (
-        f"{quantity(summary.force_mean_last_10_s_N, 'N', 3)} held on average over the last "
-        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact, "
-        f"{quantity(summary.target_force_N, 'N', 2)} wanted; "
-        f"{quantity(summary.force_rms_error_N * 1e3, 'mN', 0)} RMS off from moment to moment."
+        f"{quantity(summary.force_mean_last_10_s_N, 'N', 3)} mean force over the last "
+        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact, set-point "
+        f"{quantity(summary.target_force_N, 'N', 2)}; "
+        f"{quantity(summary.force_rms_error_N * 1e3, 'mN', 0)} RMS error."
     )
     if stopped:
         return Verdict("bad", f"{held}, then the run was stopped.", remarks)
@@ -102,21 +102,21 @@ def _remarks(summary: RunSummary) -> tuple[str, ...]:
     """Everything that is not as it should be."""
     board, ticks = summary.board, summary.ticks
     said = [
-        (summary.truncated, "The recording is incomplete: it was cut short or damaged; the rest is judged."),
+        (summary.truncated, "The recording ended early or is damaged; the figures are those of its readable part."),
         (
             not summary.force_kept and math.isfinite(summary.force_mean_last_10_s_N),
-            "The mean force is more than a tenth off its target.",
+            "The mean force differs from the set-point by more than a tenth.",
         ),
         (
             summary.force_peak_N > summary.force_limit_N,
-            f"The force went to {summary.force_peak_N:.3f} N, above the limit of {summary.force_limit_N:.2f} N.",
+            f"The force reached {summary.force_peak_N:.3f} N, above the limit of {summary.force_limit_N:.2f} N.",
         ),
         (bool(board.faults), "The stepper board latched: " + "; ".join(board.faults) + "."),
         (board.crc_errors > 0, f"{board.crc_errors} damaged frames on the serial line."),
-        (board.underruns > 0, f"The board ran out of setpoints {board.underruns} times while moving."),
-        (board.rejected > 0, f"The board refused {board.rejected} setpoints."),
+        (board.underruns > 0, f"The board ran out of set-points {board.underruns} times while moving."),
+        (board.rejected > 0, f"The board refused {board.rejected} set-points."),
         (board.resets > 0, f"The board was reset {board.resets} times."),
-        (ticks.missed > 0, f"{ticks.missed} ticks of the loop came too late."),
+        (ticks.missed > 0, f"{ticks.missed} ticks of the loop were late."),
         (
             bool(summary.lost),
             "Messages are missing from the recording: "
@@ -129,22 +129,22 @@ def _remarks(summary: RunSummary) -> tuple[str, ...]:
 
 
 def lines_of(summary: RunSummary) -> list[Line]:
-    """The short table, in the units of people."""
+    """Return the short table, in mN, mm and µs."""
     ticks, estimate = summary.ticks, summary.estimate
     limit = quantity(summary.force_limit_N, "N", 2)
     lines = [
         Line(
             "Mean force, last 10 s",
             quantity(summary.force_mean_last_10_s_N, "N", 3),
-            f"wanted {quantity(summary.target_force_N, 'N', 2)}",
+            f"set-point {quantity(summary.target_force_N, 'N', 2)}",
         ),
         Line("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),
         Line("Peak force", quantity(summary.force_peak_N, "N", 3), f"limit {limit}"),
-        Line("Tip off target, sideways", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"),
+        Line("Tip error across the normal", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"),
         Line(
-            "Time in touch",
+            "Time in contact",
             quantity(summary.contact_seconds, "s", 1),
-            f"of {quantity(summary.contact.seconds, 's', 1)} of contact" if summary.contact else "",
+            f"of {quantity(summary.contact.seconds, 's', 1)} in the phase contact" if summary.contact else "",
         ),
         Line("Tick, median", quantity(ticks.p50_us, "µs", 1), f"99.9 %: {quantity(ticks.p999_us, 'µs', 1)}"),
         Line("Longest tick", quantity(ticks.max_us, "µs", 0), lateness_of(summary)),
@@ -153,16 +153,16 @@ def lines_of(summary: RunSummary) -> list[Line]:
         lines.insert(
             3,
             Line(
-                "Estimated against measured",
+                "Estimated minus measured force",
                 quantity(estimate.rms_error_N * 1e3, "mN", 0),
                 f"RMS; mean {signed(estimate.mean_error_N * 1e3, 'mN', 0)}, "
-                f"sd given {quantity(estimate.median_sd_N * 1e3, 'mN', 0)}",
+                f"stated sd {quantity(estimate.median_sd_N * 1e3, 'mN', 0)}",
             ),
         )
     if math.isfinite(ticks.lateness_p99_us):
         lines.append(
             Line(
-                "Woken late, 99 %",
+                "Wake-up delay, 99 %",
                 quantity(ticks.lateness_p99_us, "µs", 0),
                 f"worst {quantity(ticks.lateness_max_us, 'µs', 0)}",
             )
@@ -171,7 +171,7 @@ def lines_of(summary: RunSummary) -> list[Line]:
 
 
 def firmware_of(summary: RunSummary) -> list[Line]:
-    """The board's health; empty where it was never heard."""
+    """Return the board's counters; empty if the recording has no message of the board."""
     board, ticks = summary.board, summary.ticks
     if not board.known:
         return []
@@ -181,12 +181,12 @@ def firmware_of(summary: RunSummary) -> list[Line]:
         Line("Faults", ", ".join(board.faults) or "none"),
         Line("Damaged frames", str(board.crc_errors)),
         Line("Queue underruns", str(board.underruns)),
-        Line("Setpoints refused", str(board.rejected)),
+        Line("Set-points refused", str(board.rejected)),
         Line("Resets", str(board.resets)),
-        Line("Encoder against steps, largest", f"{gap} steps", "insertion, roll, knob"),
+        Line("Encoder minus steps, largest", f"{gap} steps", "insertion, roll, knob"),
     ]
     if ticks.longest_gap_ns:
-        lines.append(Line("Longest gap between setpoints", f"{ticks.longest_gap_ns * 1e-6:.1f} ms{where}"))
+        lines.append(Line("Longest gap between set-points", f"{ticks.longest_gap_ns * 1e-6:.1f} ms{where}"))
     return lines
 
 

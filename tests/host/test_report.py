@@ -223,7 +223,7 @@ def test_estimate_is_judged_along_the_force_direction(good: Recording) -> None:
     ("story", "level", "says"),
     [
         (Story(), "good", "0.200"),
-        (Story(force_N=0.25), "fair", "a tenth off"),
+        (Story(force_N=0.25), "fair", "by more than a tenth"),
         (Story(force_N=0.5, swing_N=0.2), "fair", "above the limit"),
         (Story(action="hold", cause="no fresh pose"), "fair", "hold, no fresh pose"),
         (Story(action="stop", cause="pose lost"), "bad", "stop, pose lost"),
@@ -295,8 +295,8 @@ def test_report_shows_figures_and_settings(good: Recording) -> None:
 
 
 def test_ticks_beyond_the_period_are_not_passed_over(good: Recording) -> None:
-    assert "virtual time: the world waits" in render(good) and "too late" not in lateness_of(summarize(good))
-    assert lateness_of(replace(summarize(good), virtual=False)) == "0 too late"
+    assert "virtual time: the simulation waits" in render(good) and "0 late" not in lateness_of(summarize(good))
+    assert lateness_of(replace(summarize(good), virtual=False)) == "0 late"
 
 
 def test_same_recording_same_report(good: Recording) -> None:
@@ -337,7 +337,7 @@ def test_recordings_without_some_topics_are_reported_too(topics: set[str], good:
 def test_a_cut_recording_is_reported_as_such(good: Recording, tmp_path: Path) -> None:
     content = good.path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
-    assert "The recording is incomplete" in render(Recording(tmp_path / "cut.mcap"))
+    assert "The recording ended early" in render(Recording(tmp_path / "cut.mcap"))
 
 
 @dataclass
@@ -391,7 +391,7 @@ def test_table_for_people(good: Recording) -> None:
     buffer = io.StringIO()
     print_summary(demo_result(good, run, Path("r.html")), run, Console(file=buffer, width=160))
     shown = buffer.getvalue()
-    for text in ("0.200\u00a0N", "wanted 0.20\u00a0N", "no fault", "differ", "SIGINT", str(good.path), "r.html"):
+    for text in ("0.200\u00a0N", "set-point 0.20\u00a0N", "no fault", "differ", "SIGINT", str(good.path), "r.html"):
         assert text in shown, text
 
 
