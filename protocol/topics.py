@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import math
 import re
-from typing import NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 from protocol.enums import CommandKind, Phase, SafetyAction
 from protocol.messages import (
     MAX_PAYLOAD_BYTES,
     SCHEMA_VERSION,
+    Count,
     Message,
-    Vector,
+    Stamp_ns,
+    Text,
+    bounds,
     choice,
     columns,
+    columns_of,
     decode,
+    doc,
     encode,
-    flag,
-    integer,
-    integers,
     json_schema,
-    message,
-    number,
     specs,
-    text,
-    vector,
 )
 
 __all__ = [
@@ -88,37 +86,67 @@ def _axes(prefix: str, unit: str) -> tuple[str, ...]:
     return tuple(f"{prefix}_{axis}_{unit}" for axis in ("insertion", "roll", "knob"))
 
 
-@message
-class Stage(Message):
+# Units and bounds. Each is wider than any rig of this kind reaches, and narrow enough that no reader overflows, plots a
+# single dot or computes for seconds: a catheter with 1e6 m outside its sheath would be cut into 2e8 arcs.
+Travel_m = Annotated[float, bounds("m", -1.0, 1.0)]
+Turn_rad = Annotated[float, bounds("rad", -1000.0, 1000.0)]
+Curvature_per_m = Annotated[float, bounds("1/m", -1000.0, 1000.0)]
+Place_m = Annotated[float, bounds("m", -10.0, 10.0)]
+Speed_m_per_s = Annotated[float, bounds("m/s", -100.0, 100.0)]
+Force_N = Annotated[float, bounds("N", -1000.0, 1000.0)]
+# What a command may ask for at all; the rig's own limit is lower (protocol.rig_file.HARD_MAX_FORCE_N).
+AllowedForce_N = Annotated[float, bounds("N", 0.0, 1.0)]
+Torque_Nm = Annotated[float, bounds("N m", -100.0, 100.0)]
+# An unobservable direction has a standard deviation of up to 1e6 N: it says that nothing is known there.
+Covariance_N2 = Annotated[float, bounds("N^2", -1e12, 1e12)]
+# Of a unit vector or quaternion, whose length is checked apart.
+UnitPart = Annotated[float, bounds("", -2.0, 2.0)]
+Number = Annotated[float, bounds("", -1e12, 1e12)]
+Score = Annotated[float, bounds("", 0.0, 1e12)]
+Share = Annotated[float, bounds("", 0.0, 1.0)]
+Duration_us = Annotated[float, bounds("us", 0.0, 1e12)]
+Duration_ms = Annotated[float, bounds("ms", 0.0, 1e9)]
+Rate_hz = Annotated[float, bounds("Hz", 1.0, 1e5)]
+U8 = Annotated[int, bounds("", 0, 2**8 - 1)]
+U16 = Annotated[int, bounds("", 0, 2**16 - 1)]
+U32 = Annotated[int, bounds("", 0, 2**32 - 1)]
+Clock_us = Annotated[int, bounds("us", 0, 2**32 - 1)]
+Steps = Annotated[int, bounds("steps", -(2**31), 2**31 - 1)]
+EncoderCounts = Annotated[int, bounds("counts", -(2**31), 2**31 - 1)]
+Ticks = Annotated[int, bounds("ticks", 0, 2**32 - 1)]
+
+
+class Stage(Message, frozen=True, kw_only=True):
     """The handle: what the loop commands and what the encoders say, and the catheter joints behind the transmission."""
 
-    command_insertion_m: float = number("m", "commanded insertion of the handle")
-    command_roll_rad: float = number("rad", "commanded roll of the handle")
-    command_knob_rad: float = number("rad", "commanded bending knob")
-    encoder_insertion_m: float | None = number("m", "insertion by its encoder", default=None)
-    encoder_roll_rad: float | None = number("rad", "roll by its encoder", default=None)
-    encoder_knob_rad: float | None = number("rad", "knob by its encoder", default=None)
-    joint_insertion_m: float | None = number("m", "distal insertion, as the controller has it", default=None)
-    joint_roll_rad: float | None = number("rad", "distal roll, as the controller has it", default=None)
-    joint_curvature_per_m: float | None = number("1/m", "unloaded curvature, as the controller has it", default=None)
+    command_insertion_m: Annotated[Travel_m, doc("commanded insertion of the handle")]
+    command_roll_rad: Annotated[Turn_rad, doc("commanded roll of the handle")]
+    command_knob_rad: Annotated[Turn_rad, doc("commanded bending knob")]
+    encoder_insertion_m: Annotated[Travel_m | None, doc("insertion by its encoder")] = None
+    encoder_roll_rad: Annotated[Turn_rad | None, doc("roll by its encoder")] = None
+    encoder_knob_rad: Annotated[Turn_rad | None, doc("knob by its encoder")] = None
+    joint_insertion_m: Annotated[Travel_m | None, doc("distal insertion, as the controller has it")] = None
+    joint_roll_rad: Annotated[Turn_rad | None, doc("distal roll, as the controller has it")] = None
+    joint_curvature_per_m: Annotated[Curvature_per_m | None, doc("unloaded curvature, as the controller has it")] = None
 
 
-@message
-class Pose(Message):
+class Pose(Message, frozen=True, kw_only=True):
     """One reading of one tracker tool, in the base frame. `stamp_ns` is when it was measured, latency taken off."""
 
-    arrival_ns: int = integer("ns", "when its last byte arrived")
-    frame: int = integer("", "the tracker's frame number", bits=32)
-    missing: bool = flag("the tool was not seen; position and quaternion are nil")
-    position_m: Vector | None = vector("m", "position of the sensor", _XYZ_m, default=None)
-    quaternion_wxyz: Vector | None = vector(
-        "", "rotation sensor to base, scalar first", ("qw", "qx", "qy", "qz"), default=None
-    )
-    quality_m: float | None = number("m", "the tracker's own error indicator", default=None)
+    arrival_ns: Annotated[Stamp_ns, doc("when its last byte arrived")]
+    frame: Annotated[U32, doc("the tracker's frame number")]
+    missing: Annotated[bool, doc("the tool was not seen; position and quaternion are nil")]
+    position_m: Annotated[tuple[Place_m, ...], columns_of("position of the sensor", _XYZ_m)] | None = None
+    quaternion_wxyz: (
+        Annotated[tuple[UnitPart, ...], columns_of("rotation sensor to base, scalar first", ("qw", "qx", "qy", "qz"))] | None
+    ) = None
+    quality_m: Annotated[Place_m | None, doc("the tracker's own error indicator")] = None
 
     def check(self) -> None:
-        """A pose that is not missing has a position and a unit quaternion."""
+        """Check that a pose has a position and a unit quaternion, and a missing one neither."""
         if self.missing:
+            if self.position_m is not None or self.quaternion_wxyz is not None:
+                raise ValueError("Pose: found a position or a quaternion with missing true, wanted neither")
             return
         if self.position_m is None or self.quaternion_wxyz is None:
             raise ValueError("Pose: found no position or no quaternion, wanted both, or missing true")
@@ -127,30 +155,28 @@ class Pose(Message):
             raise ValueError(f"Pose.quaternion_wxyz: found length {length:.6g}, wanted 1 within 1e-3")
 
 
-@message
-class ForceSensor(Message):
+class ForceSensor(Message, frozen=True, kw_only=True):
     """One reading of the force sensor: the force on the tissue, in the base frame."""
 
-    arrival_ns: int = integer("ns", "when the datagram arrived")
-    force_N: Vector = vector("N", "force on the tissue, base frame", _FORCE)
-    torque_Nm: Vector | None = vector("N m", "torque, base frame", _triple("torque", "Nm"), default=None)
-    status: int = integer("", "the sensor's status word, 0 is healthy", bits=32, default=0)
+    arrival_ns: Annotated[Stamp_ns, doc("when the datagram arrived")]
+    force_N: Annotated[tuple[Force_N, ...], columns_of("force on the tissue, base frame", _FORCE)]
+    torque_Nm: Annotated[tuple[Torque_Nm, ...], columns_of("torque, base frame", _triple("torque", "Nm"))] | None = None
+    status: Annotated[U32, doc("the sensor's status word, 0 is healthy")] = 0
 
 
-@message
-class ForceEstimate(Message):
+class ForceEstimate(Message, frozen=True, kw_only=True):
     """The tip force that explains a pose. `stamp_ns` is that pose's; no force without its covariance."""
 
-    frame: str = choice("frame of force and covariance", FRAMES)
-    converged: bool = flag("a force explains the pose; if false, force and covariance may be nil")
-    force_N: Vector | None = vector("N", "force of the tip on the tissue", _FORCE, default=None)
-    covariance_N2: Vector | None = vector("N^2", "covariance, row by row", _COVARIANCE, default=None)
-    residual: float | None = number("", "what the best force leaves unexplained", default=None)
-    published_ns: int = integer("ns", "when the estimate left the estimator")
-    compute_us: float = number("us", "time the estimator took", minimum=0)
+    frame: Annotated[str, choice("frame of force and covariance", FRAMES)]
+    converged: Annotated[bool, doc("a force explains the pose; if false, force and covariance may be nil")]
+    force_N: Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue", _FORCE)] | None = None
+    covariance_N2: Annotated[tuple[Covariance_N2, ...], columns_of("covariance, row by row", _COVARIANCE)] | None = None
+    residual: Annotated[Number | None, doc("what the best force leaves unexplained")] = None
+    published_ns: Annotated[Stamp_ns, doc("when the estimate left the estimator")]
+    compute_us: Annotated[Duration_us, doc("time the estimator took")]
 
     def check(self) -> None:
-        """A converged estimate has a force and a covariance whose diagonal is not negative."""
+        """Check that a converged estimate has a force and a covariance whose diagonal is not negative."""
         if not self.converged:
             return
         if self.force_N is None or self.covariance_N2 is None:
@@ -159,104 +185,112 @@ class ForceEstimate(Message):
             raise ValueError("ForceEstimate.covariance_N2: found a negative variance, wanted none")
 
 
-@message
-class RigState(Message):
+class RigState(Message, frozen=True, kw_only=True):
     """What the loop does and why: mode, safety action and its cause in words, target, and what it steers by."""
 
-    mode: str = choice("phase of the control loop", Phase.labels())
-    safety_action: str = choice("what safety asks for, weakest first", SafetyAction.labels())
-    cause: str = text("why, in words; empty when nothing is wrong", default="")
-    target_m: Vector | None = vector("m", "tip wanted, base frame", _triple("target", "m"), default=None)
-    tip_m: Vector | None = vector("m", "tip predicted for now, base frame", _triple("tip", "m"), default=None)
-    tip_velocity_m_per_s: Vector | None = vector(
-        "m/s", "tip velocity predicted for now", _triple("tip_velocity", "m_per_s"), default=None
-    )
-    force_direction: Vector | None = vector(
-        "", "unit vector along which force is controlled, nil if none is", _triple("force_direction"), default=None
-    )
-    target_force_N: float | None = number("N", "force wanted along that direction", default=None)
-    force_N: float | None = number("N", "force along that direction that the loop steers by", default=None)
-    pose_age_ns: int = integer("ns", "age of the newest accepted pose", default=0)
-    poses_rejected: int = integer("", "poses refused since the start", default=0)
-    forces_rejected: int = integer("", "force readings refused since the start", default=0)
+    mode: Annotated[str, choice("phase of the control loop", Phase.labels())]
+    safety_action: Annotated[str, choice("what safety asks for, weakest first", SafetyAction.labels())]
+    cause: Annotated[Text, doc("why, in words; empty when nothing is wrong")] = ""
+    target_m: Annotated[tuple[Place_m, ...], columns_of("tip wanted, base frame", _triple("target", "m"))] | None = None
+    tip_m: Annotated[tuple[Place_m, ...], columns_of("tip predicted for now, base frame", _triple("tip", "m"))] | None = None
+    tip_velocity_m_per_s: (
+        Annotated[
+            tuple[Speed_m_per_s, ...],
+            columns_of("tip velocity predicted for now, base frame", _triple("tip_velocity", "m_per_s")),
+        ]
+        | None
+    ) = None
+    force_direction: (
+        Annotated[
+            tuple[UnitPart, ...],
+            columns_of(
+                "unit vector along which force is controlled, base frame, nil if none is", _triple("force_direction")
+            ),
+        ]
+        | None
+    ) = None
+    target_force_N: Annotated[Force_N | None, doc("force wanted along that direction")] = None
+    force_N: Annotated[Force_N | None, doc("force along that direction that the loop steers by")] = None
+    pose_age_ns: Annotated[Stamp_ns, doc("age of the newest accepted pose")] = 0
+    poses_rejected: Annotated[Count, doc("poses refused since the start")] = 0
+    forces_rejected: Annotated[Count, doc("force readings refused since the start")] = 0
 
 
-@message
-class BoardCounters(Message):
+class BoardCounters(Message, frozen=True, kw_only=True):
     """The stepper board's own account of itself, from its status frame, and the host's count of damaged frames."""
 
-    mcu_time_us: int = integer("us", "the board's clock", bits=32)
-    state: int = integer("", "0 disarmed, 1 armed, 2 running, 3 stopping, 4 fault", bits=8)
-    fault: int = integer("", "fault code, 0 is none", bits=8)
-    fault_name: str = text("the fault in words, empty when none", default="")
-    inputs: int = integer("", "limit switches and emergency stop, bit by bit", bits=8)
-    queue_depth: int = integer("", "setpoints waiting", bits=8)
-    last_setpoint: int = integer("", "number of the newest executed setpoint", bits=16)
-    position_steps: tuple[int, ...] = integers("steps", "position of each axis", _axes("position", "steps"))
-    encoder_counts: tuple[int, ...] = integers("counts", "encoder of each axis", _axes("encoder", "counts"))
-    crc_errors: int = integer("", "damaged frames that the board saw", bits=32)
-    host_crc_errors: int = integer("", "damaged frames that the host saw", bits=32, default=0)
-    underruns: int = integer("", "times the queue ran dry while moving", bits=32)
-    rejected: int = integer("", "setpoints refused", bits=32)
-    last_reject: str = text("why the last one was refused, empty when none was", default="")
-    boot_count: int = integer("", "resets of the board", bits=32)
-    deadman_age_ms: float = number("ms", "time since the newest valid setpoint", minimum=0)
+    mcu_time_us: Annotated[Clock_us, doc("the board's clock")]
+    state: Annotated[U8, doc("0 disarmed, 1 armed, 2 running, 3 stopping, 4 fault")]
+    fault: Annotated[U8, doc("fault code, 0 is none")]
+    fault_name: Annotated[Text, doc("the fault in words, empty when none")] = ""
+    inputs: Annotated[U8, doc("limit switches and emergency stop, bit by bit")]
+    queue_depth: Annotated[U8, doc("setpoints waiting")]
+    last_setpoint: Annotated[U16, doc("number of the newest executed setpoint")]
+    position_steps: Annotated[tuple[Steps, ...], columns_of("position of each axis", _axes("position", "steps"))]
+    encoder_counts: Annotated[tuple[EncoderCounts, ...], columns_of("encoder of each axis", _axes("encoder", "counts"))]
+    crc_errors: Annotated[U32, doc("damaged frames that the board saw")]
+    host_crc_errors: Annotated[U32, doc("damaged frames that the host saw")] = 0
+    underruns: Annotated[U32, doc("times the queue ran dry while moving")]
+    rejected: Annotated[U32, doc("setpoints refused")]
+    last_reject: Annotated[Text, doc("why the last one was refused, empty when none was")] = ""
+    boot_count: Annotated[U32, doc("resets of the board")]
+    deadman_age_ms: Annotated[Duration_ms, doc("time since the newest valid setpoint")]
 
 
-@message
-class LoopTiming(Message):
+class LoopTiming(Message, frozen=True, kw_only=True):
     """The control loop's timing since its start: exact percentiles, and histograms over HISTOGRAM_EDGES_US."""
 
-    loop_hz: float = number("Hz", "rate wanted", minimum=0)
-    ticks: int = integer("", "ticks since the start")
-    missed_ticks: int = integer("", "ticks that began after their period was over")
-    tick_p50_us: float = number("us", "time of the tick's work, median", minimum=0)
-    tick_p99_us: float = number("us", "time of the tick's work, 99th percentile", minimum=0)
-    tick_p999_us: float = number("us", "time of the tick's work, 99.9th percentile", minimum=0)
-    tick_max_us: float = number("us", "time of the tick's work, longest", minimum=0)
-    lateness_p50_us: float | None = number("us", "wake-up after due time, median; nil in virtual time", default=None)
-    lateness_p99_us: float | None = number("us", "the same, 99th percentile", default=None)
-    lateness_p999_us: float | None = number("us", "the same, 99.9th percentile", default=None)
-    lateness_max_us: float | None = number("us", "the same, longest", default=None)
-    longest_gap_ns: int = integer("ns", "longest time between two setpoints sent", default=0)
-    longest_gap_where: str = text("where that gap arose, empty where not known", default="")
-    tick_histogram: tuple[int, ...] = integers("ticks", "ticks by the time of their work", _BUCKETS, bits=32)
+    loop_hz: Annotated[Rate_hz, doc("rate wanted")]
+    ticks: Annotated[Count, doc("ticks since the start")]
+    missed_ticks: Annotated[Count, doc("ticks that began after their period was over")]
+    tick_p50_us: Annotated[Duration_us, doc("time of the tick's work, median")]
+    tick_p99_us: Annotated[Duration_us, doc("time of the tick's work, 99th percentile")]
+    tick_p999_us: Annotated[Duration_us, doc("time of the tick's work, 99.9th percentile")]
+    tick_max_us: Annotated[Duration_us, doc("time of the tick's work, longest")]
+    lateness_p50_us: Annotated[Duration_us | None, doc("wake-up after due time, median; nil in virtual time")] = None
+    lateness_p99_us: Annotated[Duration_us | None, doc("the same, 99th percentile")] = None
+    lateness_p999_us: Annotated[Duration_us | None, doc("the same, 99.9th percentile")] = None
+    lateness_max_us: Annotated[Duration_us | None, doc("the same, longest")] = None
+    longest_gap_ns: Annotated[Stamp_ns, doc("longest time between two setpoints sent")] = 0
+    longest_gap_where: Annotated[Text, doc("where that gap arose, empty where not known")] = ""
+    tick_histogram: Annotated[tuple[Ticks, ...], columns_of("ticks by the time of their work", _BUCKETS)]
 
 
-@message
-class Log(Message):
+class Log(Message, frozen=True, kw_only=True):
     """One line of a log."""
 
-    level: str = choice("how serious", LOG_LEVELS)
-    source: str = text("process or part that says it")
-    text: str = text("what it says")
+    level: Annotated[str, choice("how serious", LOG_LEVELS)]
+    source: Annotated[Text, doc("process or part that says it")]
+    text: Annotated[Text, doc("what it says")]
 
 
-@message
-class Command(Message):
+class Command(Message, frozen=True, kw_only=True):
     """What a commander asks of the rig, always answered. Judged by who gives it, under which lease, and how fresh it is.
 
     `stamp_ns` is when it was issued, on the rig's clock; `sequence` grows with each command of one lease.
     """
 
-    id: str = text("unique to this command; the same id twice is refused")
-    commander: str = text("who gives it; must be the name in the key that it came on")
-    lease: str = text("the lease under which it is given; clock, take, hold and stop need none", default="")
-    expires_ns: int = integer("ns", "not to be executed after this time, on the rig's clock")
-    action: str = choice("what to do", ACTIONS)
-    target: str = choice(
-        "kind of the target; none unless action is target",
-        TARGETS,
-    )
-    target_m: Vector | None = vector("m", "tip position, base frame", _triple("target", "m"), default=None)
-    normal: Vector | None = vector(
-        "", "unit vector into the tissue, base frame, along which to press", _triple("normal"), default=None
-    )
-    force_N: float | None = number("N", "force to hold along the normal", default=None, minimum=0, maximum=1)
-    fault: int = integer("", "fault code that clear_fault clears, 0 for all", bits=8, default=0)
+    measured: ClassVar[bool] = False
+
+    id: Annotated[Text, doc("unique to this command; the same id twice is refused")]
+    commander: Annotated[Text, doc("who gives it; must be the name in the key that it came on")]
+    lease: Annotated[Text, doc("the lease under which it is given; clock, take, hold and stop need none")] = ""
+    expires_ns: Annotated[Stamp_ns, doc("not to be executed after this time, on the rig's clock")]
+    action: Annotated[str, choice("what to do", ACTIONS)]
+    target: Annotated[str, choice("kind of the target; none unless action is target", TARGETS)]
+    target_m: Annotated[tuple[Place_m, ...], columns_of("tip position, base frame", _triple("target", "m"))] | None = None
+    normal: (
+        Annotated[
+            tuple[UnitPart, ...],
+            columns_of("unit vector into the tissue, base frame, along which to press", _triple("normal")),
+        ]
+        | None
+    ) = None
+    force_N: Annotated[AllowedForce_N | None, doc("force to hold along the normal")] = None
+    fault: Annotated[U8, doc("fault code that clear_fault clears, 0 for all")] = 0
 
     def check(self) -> None:
-        """Each action carries what it needs; expiry comes after issue."""
+        """Check that each action carries what it needs, and that expiry comes after issue."""
         if not 0 < len(self.id) <= 64:
             raise ValueError(f"Command.id: found {len(self.id)} characters, wanted 1 to 64")
         check_name(self.commander)
@@ -277,54 +311,54 @@ class Command(Message):
             raise ValueError("Command: found no force_N or no unit normal, wanted both for contact")
 
 
-@message
-class Reply(Message):
+class Reply(Message, frozen=True, kw_only=True):
     """The answer to a command. `stamp_ns` is the rig's clock when it was answered."""
 
-    id: str = text("id of the command that it answers")
-    result: str = choice("what became of it", RESULTS)
-    lease: str = text("the lease that a take has given, empty otherwise", default="")
-    lease_expires_ns: int = integer("ns", "when that lease ends if it is not renewed", default=0)
-    text: str = text("why, in words", default="")
+    measured: ClassVar[bool] = False
+
+    id: Annotated[Text, doc("id of the command that it answers")]
+    result: Annotated[str, choice("what became of it", RESULTS)]
+    lease: Annotated[Text, doc("the lease that a take has given, empty otherwise")] = ""
+    lease_expires_ns: Annotated[Stamp_ns, doc("when that lease ends if it is not renewed")] = 0
+    text: Annotated[Text, doc("why, in words")] = ""
 
 
-@message
-class CommandCounts(Message):
+class CommandCounts(Message, frozen=True, kw_only=True):
     """Who holds the lease, and what became of all commands since the start."""
 
-    holder: str = text("commander that holds the lease, empty when nobody does", default="")
-    lease_expires_ns: int = integer("ns", "when the lease ends if it is not renewed", default=0)
-    accepted: int = integer("", "commands carried out")
-    refused: int = integer("", "refused: no lease, wrong role, or not possible now")
-    expired: int = integer("", "came after their expiry")
-    replayed: int = integer("", "came a second time, or out of sequence")
-    malformed: int = integer("", "no command at all, or larger than a command may be")
-    flooded: int = integer("", "not even read, because their sender sends too many")
+    holder: Annotated[Text, doc("commander that holds the lease, empty when nobody does")] = ""
+    lease_expires_ns: Annotated[Stamp_ns, doc("when the lease ends if it is not renewed")] = 0
+    accepted: Annotated[Count, doc("commands carried out")]
+    refused: Annotated[Count, doc("refused: no lease, wrong role, or not possible now")]
+    expired: Annotated[Count, doc("came after their expiry")]
+    replayed: Annotated[Count, doc("came a second time, or out of sequence")]
+    malformed: Annotated[Count, doc("no command at all, or larger than a command may be")]
+    flooded: Annotated[Count, doc("not even read, because their sender sends too many")]
 
 
-@message
-class Alarm(Message):
-    """Rig and twin have parted: where, and what is probably missing from the twin."""
+class Alarm(Message, frozen=True, kw_only=True):
+    """Rig and simulation disagree: where, and what is probably missing from the simulation."""
 
-    subsystem: str = text("link of the chain, as in a diagnosis")
-    effect: str = text("probable cause: an id of the vocabulary, or unlisted")
-    channel: str = text("output that is furthest off")
-    score: float = number("", "how far it is beyond what is allowed; above 1 is an alarm", minimum=0)
-    explained: float = number("", "share of the mismatch that the cause explains", minimum=0, maximum=1)
-    since_ns: int = integer("ns", "when it was first seen, on the rig's clock")
-    words: str = text("the same in one sentence")
+    subsystem: Annotated[Text, doc("link of the chain, as in a diagnosis")]
+    effect: Annotated[Text, doc("probable cause: an id of the vocabulary, or unlisted")]
+    channel: Annotated[Text, doc("output that is furthest off")]
+    score: Annotated[Score, doc("how far it is beyond what is allowed; above 1 is an alarm")]
+    explained: Annotated[Share, doc("share of the mismatch that the cause explains")]
+    since_ns: Annotated[Stamp_ns, doc("when it was first seen, on the rig's clock")]
+    words: Annotated[Text, doc("the same in one sentence")]
 
 
-@message
-class SimulatedTruth(Message):
+class SimulatedTruth(Message, frozen=True, kw_only=True):
     """What only a simulator can know. Drawn into reports; no controller, estimator or verdict reads it."""
 
-    tip_m: Vector = vector("m", "true tip, base frame", _triple("tip", "m"))
-    wall_m: Vector | None = vector("m", "a point of the wall now, base", _triple("wall", "m"), default=None)
-    contact_force_N: Vector = vector("N", "true force on the tissue, base frame", _FORCE)
-    distal_insertion_m: float | None = number("m", "true insertion of the distal end", default=None)
-    distal_roll_rad: float | None = number("rad", "true roll of the distal end", default=None)
-    distal_curvature_per_m: float | None = number("1/m", "true unloaded curvature", default=None)
+    tip_m: Annotated[tuple[Place_m, ...], columns_of("true tip, base frame", _triple("tip", "m"))]
+    wall_m: (
+        Annotated[tuple[Place_m, ...], columns_of("a point of the wall now, base frame", _triple("wall", "m"))] | None
+    ) = None
+    contact_force_N: Annotated[tuple[Force_N, ...], columns_of("true force on the tissue, base frame", _FORCE)]
+    distal_insertion_m: Annotated[Travel_m | None, doc("true insertion of the distal end")] = None
+    distal_roll_rad: Annotated[Turn_rad | None, doc("true roll of the distal end")] = None
+    distal_curvature_per_m: Annotated[Curvature_per_m | None, doc("true unloaded curvature")] = None
 
 
 class Topic(NamedTuple):
@@ -392,7 +426,7 @@ def topic_of(key_expression: str) -> tuple[str, Topic]:
 
 
 def as_markdown() -> str:
-    """The table as a page for people: every topic, then every message with its fields and units."""
+    """Return the table as Markdown: every topic, then every message with its fields, units and bounds."""
     lines = ["| topic | message | rate | direction | what |", "|---|---|---|---|---|"]
     for topic in _TABLE:
         rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "when it happens"
@@ -404,12 +438,15 @@ def as_markdown() -> str:
             "",
             (declared.__doc__ or "").strip(),
             "",
-            "| field | type | unit | what |",
-            "|---|---|---|---|",
+            "| field | type | unit | bounds | what |",
+            "|---|---|---|---|---|",
         ]
         for name, spec in specs(declared).items():
             kind = f"{spec.kind}[{len(spec.columns)}]" if spec.columns else spec.kind
-            lines.append(f"| `{name}` | {kind}{' or nil' if spec.optional else ''} | {spec.unit or '-'} | {spec.doc} |")
+            allowed = "-" if spec.minimum is None else f"{spec.minimum:.4g} to {spec.maximum:.4g}"
+            allowed = ", ".join(spec.choices) or allowed
+            nil = " or nil" if spec.optional else ""
+            lines.append(f"| `{name}` | {kind}{nil} | {spec.unit or '-'} | {allowed} | {spec.doc} |")
     return "\n".join(lines) + "\n"
 
 

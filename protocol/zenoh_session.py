@@ -94,20 +94,35 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
 
 
 class Publisher:
-    """Publishes one topic, numbered. `put` never blocks: what a reader cannot take in time is dropped."""
+    """Publishes one topic, numbered. `put` never blocks: what a reader cannot take in time is dropped.
+
+    refused, complaint: how many messages were not sent because a field was out of bounds, and the newest reason.
+    """
 
     def __init__(self, session: zenoh.Session, rig: str, topic: str) -> None:
         self.topic = TOPICS[topic]
         self.sequence = 0
+        self.refused = 0
+        self.complaint = ""
         self._publisher = session.declare_publisher(
             key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False
         )
 
     def put(self, message: Message) -> None:
-        """Publish `message`. Raises ValueError where it is not what the topic declares."""
+        """Publish `message`, or count it as refused: a device that reports nonsense must not end the thread that reads it.
+
+        Raises:
+            TypeError: The message is of another topic's class.
+        """
         if type(message) is not self.topic.message:
-            raise ValueError(f"{self.topic.name}: found {type(message).__name__}, wanted {self.topic.message.__name__}")
-        self._publisher.put(encode(message, self.sequence))
+            raise TypeError(f"{self.topic.name}: found {type(message).__name__}, wanted {self.topic.message.__name__}")
+        try:
+            payload = encode(message, self.sequence)
+        except ValueError as error:
+            self.refused += 1
+            self.complaint = str(error)
+            return
+        self._publisher.put(payload)
         self.sequence += 1
 
 
@@ -139,6 +154,7 @@ class Everything:
     def __init__(self, session: zenoh.Session, rig: str, depth: int = RECORDER_DEPTH) -> None:
         self.malformed = 0
         self.complaint = ""
+        self._depth = depth
         names = [name for name, topic in TOPICS.items() if topic.kind != "query"]
         self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth)) for name in names]
 
@@ -146,7 +162,11 @@ class Everything:
         """(topic, message, payload) of all that came since the last call, topic by topic."""
         taken = []
         for subscriber in self._subscribers:
-            while (sample := subscriber.try_recv()) is not None:
+            # No more than a ring holds: a publisher that is faster than this reader must not keep it here.
+            for _ in range(self._depth):
+                sample = subscriber.try_recv()
+                if sample is None:
+                    break
                 payload = bytes(sample.payload)
                 try:
                     _, topic = topic_of(str(sample.key_expr))

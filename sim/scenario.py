@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from protocol.commander import Acknowledgement, Commander
@@ -217,7 +217,7 @@ class Scenario:
 
 
 def _published_at(estimate: ForceEstimate, published_ns: int) -> ForceEstimate:
-    return dataclasses.replace(estimate, published_ns=published_ns)
+    return msgspec.structs.replace(estimate, published_ns=published_ns)
 
 
 def _truth(world: World) -> SimulatedTruth:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json as json_text
 import os
 import signal
@@ -11,6 +10,7 @@ import threading
 from pathlib import Path
 from types import FrameType
 
+from protocol.messages import body_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm
 from protocol.zenoh_session import Session
@@ -47,6 +47,6 @@ def watch_rig(rig_file: str | None, json: bool) -> None:
             alarms.put(alarm)
             tell(f"ALARM at {alarm.stamp_ns * 1e-9:.1f} s of the rig's clock: {alarm.words}")
             if json:
-                print(json_text.dumps(dataclasses.asdict(alarm)), flush=True)
+                print(json_text.dumps(body_of(alarm)), flush=True)
 
         watch(rig, session.everything(), publish, tell, stopped.is_set)

@@ -125,8 +125,8 @@ class EstimationService:
             frame="base",
             converged=True,
             published_ns=now_ns,
-            force_N=np.asarray(answer.force_N),
-            covariance_N2=np.asarray(answer.covariance_N2),
+            force_N=tuple(map(float, answer.force_N)),
+            covariance_N2=tuple(map(float, np.ravel(answer.covariance_N2))),
             residual=answer.residual,
             compute_us=compute_us,
         )

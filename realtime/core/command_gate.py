@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import secrets
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+
+import msgspec
 
 from protocol.topics import Command, CommandCounts, Reply, decode
 
@@ -221,4 +222,4 @@ def for_the_record(command: Command | None, reply: Reply | None) -> tuple[Comman
         return None
     if command.action == "take" and reply.result == "accepted" and reply.lease == command.lease:
         return None
-    return dataclasses.replace(command, lease=""), dataclasses.replace(reply, lease="")
+    return msgspec.structs.replace(command, lease=""), msgspec.structs.replace(reply, lease="")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import json
 import subprocess
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zenoh
 from cryptography import x509
@@ -161,7 +161,7 @@ def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory,
         time.sleep(0.3)
         assert all_heard()
         for message in messages[0] + messages[1]:
-            assert message == dataclasses.replace(reading(), sequence=message.sequence)
+            assert message == msgspec.structs.replace(reading(), sequence=message.sequence)
         assert not any(everything.malformed for everything in inside)
         assert not hijacked and taken is not None
 

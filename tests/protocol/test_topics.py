@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.messages import MAX_TEXT, Spec, specs
+from protocol.messages import MAX_TEXT, FieldSpec, specs
 from protocol.topics import (
     HISTOGRAM_EDGES_US,
     MAX_PAYLOAD_BYTES,
@@ -39,7 +39,7 @@ CLASSES = sorted({topic.message for topic in TOPICS.values()}, key=lambda cls: c
 UNIT_SUFFIXES = ("m", "rad", "N", "N2", "Nm", "ns", "us", "ms", "Hz", "hz", "per_m", "per_s", "steps", "counts")
 
 
-def scalar(spec: Spec) -> st.SearchStrategy[Any]:
+def scalar(spec: FieldSpec) -> st.SearchStrategy[Any]:
     if spec.kind == "float":
         return st.floats(spec.minimum, spec.maximum, allow_nan=False, allow_infinity=False)
     if spec.kind == "integer":
@@ -50,7 +50,7 @@ def scalar(spec: Spec) -> st.SearchStrategy[Any]:
     return st.sampled_from(spec.choices) if spec.choices else st.text(max_size=MAX_TEXT // 10)
 
 
-def any_value(spec: Spec) -> st.SearchStrategy[Any]:
+def any_value(spec: FieldSpec) -> st.SearchStrategy[Any]:
     count = len(spec.columns)
     value = st.tuples(*[scalar(spec)] * count) if count else scalar(spec)
     return st.none() | value if spec.optional else value
@@ -59,7 +59,7 @@ def any_value(spec: Spec) -> st.SearchStrategy[Any]:
 def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
     """`values` made to satisfy what holds between the fields of `cls`."""
     if cls is Pose:
-        return values | {"missing": True}
+        return values | {"missing": True, "position_m": None, "quaternion_wxyz": None}
     if cls is ForceEstimate:
         return values | {"converged": False}
     if cls is Command:
@@ -148,6 +148,9 @@ def test_the_body_used_below_is_good() -> None:
         (pose_body(position_m=None), "wanted both, or missing true"),
         (pose_body(quaternion_wxyz=[1.1, 0.0, 0.0, 0.0]), "length 1.1, wanted 1"),
         (pose_body(missing=0), "true or false"),
+        (pose_body(missing=True), "wanted neither"),
+        (pose_body(position_m=[0.0, 1e300, 0.0]), "from -10 to 10 m"),
+        (pose_body(stamp_ns=2**62), "from 0 to 4e+18 ns"),
     ],
 )
 def test_malformed_payloads_are_refused_in_one_line(payload: bytes, says: str) -> None:
@@ -198,6 +201,24 @@ def test_numpy_values_travel_and_optional_nan_becomes_nil() -> None:
     message = ForceEstimate(**values)
     back = decode(ForceEstimate, encode(message))
     assert back.force_N == (1.0, 2.0, 3.0) and back.residual is None and back.covariance_N2 == tuple(np.eye(3).ravel())
+
+
+def test_an_implausible_measurement_is_sent_as_nil_and_an_implausible_command_is_not_sent() -> None:
+    body: dict[str, Any] = {"command_insertion_m": 0.0, "command_roll_rad": 0.0, "command_knob_rad": 0.0}
+    sent = decode(Stage, encode(Stage(stamp_ns=0, encoder_insertion_m=-26_843.0, encoder_roll_rad=0.5, **body)))
+    assert sent.encoder_insertion_m is None and sent.encoder_roll_rad == 0.5
+    with pytest.raises(
+        ValueError, match=r"Stage\.command_insertion_m: found 1e\+300, wanted a finite number from -1 to 1 m"
+    ):
+        encode(Stage(stamp_ns=0, **body | {"command_insertion_m": 1e300}))
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_every_number_has_bounds(cls: type[Message]) -> None:
+    for name, spec in specs(cls).items():
+        if spec.kind in ("float", "integer"):
+            assert spec.minimum is not None and spec.maximum is not None, name
+            assert abs(spec.maximum) <= 4e18 and abs(spec.minimum) <= 4e18, name
 
 
 def test_sequence_can_be_given_when_sending() -> None:

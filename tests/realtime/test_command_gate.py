@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -127,7 +127,7 @@ def test_what_comes_twice_or_out_of_sequence_is_a_replay() -> None:
     first = rig.command(lease=lease)
     assert rig.said(first)[0] == "accepted"
     assert rig.said(first) == ("replayed", "this id was answered before")
-    assert rig.said(dataclasses.replace(first, id="new"))[0] == "replayed"
+    assert rig.said(msgspec.structs.replace(first, id="new"))[0] == "replayed"
     rig.now_ns += LEASE_NS + 1
     rig.leased()
     assert rig.said(first)[0] == "expired" and len(rig.done) == 1 and rig.gate.counts["replayed"] == 2
@@ -151,7 +151,7 @@ def test_a_hold_must_be_fresh() -> None:
     hold = rig.command(action="hold")
     assert rig.said(hold)[0] == "accepted" and rig.said(hold)[0] == "replayed"
     rig.now_ns += 5 * S
-    assert rig.said(dataclasses.replace(hold, id="again"))[0] == "expired" and len(rig.done) == 1
+    assert rig.said(msgspec.structs.replace(hold, id="again"))[0] == "expired" and len(rig.done) == 1
 
 
 def test_a_reader_commands_nothing_not_even_a_stop() -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import msgpack
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -70,7 +70,7 @@ def replayed(run: Tapped, number: int) -> tuple[str, bytes]:
 
 def replayed_under_a_new_id(run: Tapped, number: int) -> tuple[str, bytes]:
     old = decode(Command, run.heard[number % len(run.heard)])
-    fresh = dataclasses.replace(old, id=f"r{number}", stamp_ns=run.loop.now_ns, expires_ns=run.loop.now_ns + 10**8)
+    fresh = msgspec.structs.replace(old, id=f"r{number}", stamp_ns=run.loop.now_ns, expires_ns=run.loop.now_ns + 10**8)
     return "scenario", encode(fresh)
 
 
