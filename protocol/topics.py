@@ -117,21 +117,21 @@ Ticks = Annotated[int, bounds("ticks", 0, 2**32 - 1)]
 
 
 class Stage(Message, frozen=True, kw_only=True):
-    """The handle: what the loop commands and what the encoders say, and the catheter joints behind the transmission."""
+    """Commanded and measured stage positions at the handle, and the joints behind the transmission."""
 
     command_insertion_m: Annotated[Travel_m, doc("commanded insertion of the handle")]
     command_roll_rad: Annotated[Turn_rad, doc("commanded roll of the handle")]
-    command_knob_rad: Annotated[Turn_rad, doc("commanded bending knob")]
+    command_knob_rad: Annotated[Turn_rad, doc("commanded knob angle")]
     encoder_insertion_m: Annotated[Travel_m | None, doc("insertion by its encoder")] = None
     encoder_roll_rad: Annotated[Turn_rad | None, doc("roll by its encoder")] = None
     encoder_knob_rad: Annotated[Turn_rad | None, doc("knob by its encoder")] = None
-    joint_insertion_m: Annotated[Travel_m | None, doc("distal insertion, as the controller has it")] = None
-    joint_roll_rad: Annotated[Turn_rad | None, doc("distal roll, as the controller has it")] = None
-    joint_curvature_per_m: Annotated[Curvature_per_m | None, doc("unloaded curvature, as the controller has it")] = None
+    joint_insertion_m: Annotated[Travel_m | None, doc("distal insertion, estimated by the controller")] = None
+    joint_roll_rad: Annotated[Turn_rad | None, doc("distal roll, estimated by the controller")] = None
+    joint_curvature_per_m: Annotated[Curvature_per_m | None, doc("unloaded curvature, estimated by the controller")] = None
 
 
 class Pose(Message, frozen=True, kw_only=True):
-    """One reading of one tracker tool, in the base frame. `stamp_ns` is when it was measured, latency taken off."""
+    """One reading of one tracker tool, in the base frame. `stamp_ns` is the time of measurement, latency subtracted."""
 
     arrival_ns: Annotated[Stamp_ns, doc("when its last byte arrived")]
     frame: Annotated[U32, doc("the tracker's frame number")]
@@ -171,7 +171,7 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
     converged: Annotated[bool, doc("a force explains the pose; if false, force and covariance may be nil")]
     force_N: Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue", _FORCE)] | None = None
     covariance_N2: Annotated[tuple[Covariance_N2, ...], columns_of("covariance, row by row", _COVARIANCE)] | None = None
-    residual: Annotated[Number | None, doc("what the best force leaves unexplained")] = None
+    residual: Annotated[Number | None, doc("residual of the best force")] = None
     published_ns: Annotated[Stamp_ns, doc("when the estimate left the estimator")]
     compute_us: Annotated[Duration_us, doc("time the estimator took")]
 
@@ -186,10 +186,10 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
 
 
 class RigState(Message, frozen=True, kw_only=True):
-    """What the loop does and why: mode, safety action and its cause in words, target, and what it steers by."""
+    """State of the loop: phase, safety action and its cause in words, target, and the force that is controlled."""
 
     mode: Annotated[str, choice("phase of the control loop", Phase.labels())]
-    safety_action: Annotated[str, choice("what safety asks for, weakest first", SafetyAction.labels())]
+    safety_action: Annotated[str, choice("safety action, weakest first", SafetyAction.labels())]
     cause: Annotated[Text, doc("why, in words; empty when nothing is wrong")] = ""
     target_m: Annotated[tuple[Place_m, ...], columns_of("tip wanted, base frame", _triple("target", "m"))] | None = None
     tip_m: Annotated[tuple[Place_m, ...], columns_of("tip predicted for now, base frame", _triple("tip", "m"))] | None = None
@@ -209,38 +209,38 @@ class RigState(Message, frozen=True, kw_only=True):
         ]
         | None
     ) = None
-    target_force_N: Annotated[Force_N | None, doc("force wanted along that direction")] = None
-    force_N: Annotated[Force_N | None, doc("force along that direction that the loop steers by")] = None
+    target_force_N: Annotated[Force_N | None, doc("requested force along that direction")] = None
+    force_N: Annotated[Force_N | None, doc("force along that direction that the loop controls")] = None
     pose_age_ns: Annotated[Stamp_ns, doc("age of the newest accepted pose")] = 0
     poses_rejected: Annotated[Count, doc("poses refused since the start")] = 0
     forces_rejected: Annotated[Count, doc("force readings refused since the start")] = 0
 
 
 class BoardCounters(Message, frozen=True, kw_only=True):
-    """The stepper board's own account of itself, from its status frame, and the host's count of damaged frames."""
+    """Counters of the stepper board from its status frame, and the host's count of damaged frames."""
 
     mcu_time_us: Annotated[Clock_us, doc("the board's clock")]
     state: Annotated[U8, doc("0 disarmed, 1 armed, 2 running, 3 stopping, 4 fault")]
     fault: Annotated[U8, doc("fault code, 0 is none")]
     fault_name: Annotated[Text, doc("the fault in words, empty when none")] = ""
     inputs: Annotated[U8, doc("limit switches and emergency stop, bit by bit")]
-    queue_depth: Annotated[U8, doc("setpoints waiting")]
-    last_setpoint: Annotated[U16, doc("number of the newest executed setpoint")]
+    queue_depth: Annotated[U8, doc("set-points in the queue")]
+    last_setpoint: Annotated[U16, doc("number of the newest executed set-point")]
     position_steps: Annotated[tuple[Steps, ...], columns_of("position of each axis", _axes("position", "steps"))]
     encoder_counts: Annotated[tuple[EncoderCounts, ...], columns_of("encoder of each axis", _axes("encoder", "counts"))]
-    crc_errors: Annotated[U32, doc("damaged frames that the board saw")]
-    host_crc_errors: Annotated[U32, doc("damaged frames that the host saw")] = 0
-    underruns: Annotated[U32, doc("times the queue ran dry while moving")]
-    rejected: Annotated[U32, doc("setpoints refused")]
+    crc_errors: Annotated[U32, doc("damaged frames that the board received")]
+    host_crc_errors: Annotated[U32, doc("damaged frames that the host received")] = 0
+    underruns: Annotated[U32, doc("times the queue was empty while moving")]
+    rejected: Annotated[U32, doc("set-points refused")]
     last_reject: Annotated[Text, doc("why the last one was refused, empty when none was")] = ""
     boot_count: Annotated[U32, doc("resets of the board")]
-    deadman_age_ms: Annotated[Duration_ms, doc("time since the newest valid setpoint")]
+    deadman_age_ms: Annotated[Duration_ms, doc("time since the newest valid set-point")]
 
 
 class LoopTiming(Message, frozen=True, kw_only=True):
     """The control loop's timing since its start: exact percentiles, and histograms over HISTOGRAM_EDGES_US."""
 
-    loop_hz: Annotated[Rate_hz, doc("rate wanted")]
+    loop_hz: Annotated[Rate_hz, doc("configured rate")]
     ticks: Annotated[Count, doc("ticks since the start")]
     missed_ticks: Annotated[Count, doc("ticks that began after their period was over")]
     tick_p50_us: Annotated[Duration_us, doc("time of the tick's work, median")]
@@ -251,7 +251,7 @@ class LoopTiming(Message, frozen=True, kw_only=True):
     lateness_p99_us: Annotated[Duration_us | None, doc("the same, 99th percentile")] = None
     lateness_p999_us: Annotated[Duration_us | None, doc("the same, 99.9th percentile")] = None
     lateness_max_us: Annotated[Duration_us | None, doc("the same, longest")] = None
-    longest_gap_ns: Annotated[Stamp_ns, doc("longest time between two setpoints sent")] = 0
+    longest_gap_ns: Annotated[Stamp_ns, doc("longest time between two set-points sent")] = 0
     longest_gap_where: Annotated[Text, doc("where that gap arose, empty where not known")] = ""
     tick_histogram: Annotated[tuple[Ticks, ...], columns_of("ticks by the time of their work", _BUCKETS)]
 
@@ -260,12 +260,12 @@ class Log(Message, frozen=True, kw_only=True):
     """One line of a log."""
 
     level: Annotated[str, choice("how serious", LOG_LEVELS)]
-    source: Annotated[Text, doc("process or part that says it")]
-    text: Annotated[Text, doc("what it says")]
+    source: Annotated[Text, doc("process or part that wrote it")]
+    text: Annotated[Text, doc("text")]
 
 
 class Command(Message, frozen=True, kw_only=True):
-    """What a commander asks of the rig, always answered. Judged by who gives it, under which lease, and how fresh it is.
+    """Command of a commander; each is answered. It is checked by commander, lease and age.
 
     `stamp_ns` is when it was issued, on the rig's clock; `sequence` grows with each command of one lease.
     """
@@ -273,7 +273,7 @@ class Command(Message, frozen=True, kw_only=True):
     measured: ClassVar[bool] = False
 
     id: Annotated[Text, doc("unique to this command; the same id twice is refused")]
-    commander: Annotated[Text, doc("who gives it; must be the name in the key that it came on")]
+    commander: Annotated[Text, doc("commander; must be the name in the key that it came on")]
     lease: Annotated[Text, doc("the lease under which it is given; clock, take, hold and stop need none")] = ""
     expires_ns: Annotated[Stamp_ns, doc("not to be executed after this time, on the rig's clock")]
     action: Annotated[str, choice("what to do", ACTIONS)]
@@ -317,39 +317,39 @@ class Reply(Message, frozen=True, kw_only=True):
     measured: ClassVar[bool] = False
 
     id: Annotated[Text, doc("id of the command that it answers")]
-    result: Annotated[str, choice("what became of it", RESULTS)]
+    result: Annotated[str, choice("result of the command", RESULTS)]
     lease: Annotated[Text, doc("the lease that a take has given, empty otherwise")] = ""
     lease_expires_ns: Annotated[Stamp_ns, doc("when that lease ends if it is not renewed")] = 0
     text: Annotated[Text, doc("why, in words")] = ""
 
 
 class CommandCounts(Message, frozen=True, kw_only=True):
-    """Who holds the lease, and what became of all commands since the start."""
+    """Holder of the lease, and the results of all commands since the start."""
 
-    holder: Annotated[Text, doc("commander that holds the lease, empty when nobody does")] = ""
+    holder: Annotated[Text, doc("commander that holds the lease, empty when there is none")] = ""
     lease_expires_ns: Annotated[Stamp_ns, doc("when the lease ends if it is not renewed")] = 0
     accepted: Annotated[Count, doc("commands carried out")]
     refused: Annotated[Count, doc("refused: no lease, wrong role, or not possible now")]
     expired: Annotated[Count, doc("came after their expiry")]
     replayed: Annotated[Count, doc("came a second time, or out of sequence")]
-    malformed: Annotated[Count, doc("no command at all, or larger than a command may be")]
-    flooded: Annotated[Count, doc("not even read, because their sender sends too many")]
+    malformed: Annotated[Count, doc("not a command, or larger than a command may be")]
+    flooded: Annotated[Count, doc("not read, because their sender sends too many")]
 
 
 class Alarm(Message, frozen=True, kw_only=True):
-    """Rig and simulation disagree: where, and what is probably missing from the simulation."""
+    """Rig and twin disagree: subsystem and probable cause."""
 
-    subsystem: Annotated[Text, doc("link of the chain, as in a diagnosis")]
+    subsystem: Annotated[Text, doc("subsystem, as in a diagnosis")]
     effect: Annotated[Text, doc("probable cause: an id of the vocabulary, or unlisted")]
-    channel: Annotated[Text, doc("output that is furthest off")]
-    score: Annotated[Score, doc("how far it is beyond what is allowed; above 1 is an alarm")]
+    channel: Annotated[Text, doc("output with the largest mismatch")]
+    score: Annotated[Score, doc("mismatch relative to its limit; above 1 is an alarm")]
     explained: Annotated[Share, doc("share of the mismatch that the cause explains")]
     since_ns: Annotated[Stamp_ns, doc("when it was first seen, on the rig's clock")]
     words: Annotated[Text, doc("the same in one sentence")]
 
 
 class SimulatedTruth(Message, frozen=True, kw_only=True):
-    """What only a simulator can know. Drawn into reports; no controller, estimator or verdict reads it."""
+    """True values that only a simulator knows. For reports; no controller, estimator or verdict reads them."""
 
     tip_m: Annotated[tuple[Place_m, ...], columns_of("true tip, base frame", _triple("tip", "m"))]
     wall_m: (
@@ -383,10 +383,10 @@ _TABLE = (
     Topic("loop", LoopTiming, 2, "state", "realtime -> host, tools", "timing of the control loop"),
     Topic("log", Log, 0, "event", "all -> host, tools", "log lines"),
     Topic("request", Command, 0, "query", "commander -> realtime", "commands, on request/NAME; each is answered by a Reply"),
-    Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as they came, for the record"),
-    Topic("reply", Reply, 0, "event", "realtime -> host, tools", "what became of them"),
-    Topic("commander", CommandCounts, 2, "state", "realtime -> host, tools", "who holds the lease; counts of commands"),
-    Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin have parted: subsystem and probable cause"),
+    Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as received, for the recording"),
+    Topic("reply", Reply, 0, "event", "realtime -> host, tools", "results of the commands"),
+    Topic("commander", CommandCounts, 2, "state", "realtime -> host, tools", "holder of the lease; counts of commands"),
+    Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin disagree: subsystem and probable cause"),
     Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
 )
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
