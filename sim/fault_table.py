@@ -147,7 +147,7 @@ _BIT = "share of bits"
 _CHANCE = "chance per frame"
 
 FAULTS: tuple[FaultKind, ...] = (
-    FaultKind("none", "nothing is wrong: whatever is detected is a false alarm", _none, must_detect=_never),
+    FaultKind("none", "no fault: any detection is a false alarm", _none, must_detect=_never),
     FaultKind(
         "serial_bit_errors",
         "bits flipped on the board's line, both ways",
@@ -167,7 +167,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "frames_duplicated",
-        "frames that come twice",
+        "frames that arrive twice",
         _on_line("duplicate"),
         (0.02, 1.0),
         _CHANCE,
@@ -183,7 +183,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "link_cut",
-        "the board's cable pulled, for good",
+        "the board's cable unplugged, permanently",
         _on_line("cut"),
         seconds=(1.0, 1.0),
         tail_s=0.0,
@@ -193,14 +193,14 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "link_interrupted",
-        "the board's cable out for a moment",
+        "the board's cable unplugged for a moment",
         _on_line("cut"),
         seconds=(0.005, 0.5),
         must_detect=_long(0.012),
     ),
     FaultKind("mcu_reset", "the board's reset pin pulled", _on_board("reset"), stops=True, rest_s=LINK_REST_S),
     FaultKind(
-        "power_cycle", "the board's supply lost in mid move", _on_board("power_cycle"), stops=True, rest_s=LINK_REST_S
+        "power_cycle", "the board's supply lost during a motion", _on_board("power_cycle"), stops=True, rest_s=LINK_REST_S
     ),
     FaultKind(
         "mcu_hang",
@@ -211,7 +211,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "encoder_loss",
-        "one encoder's plug out: its count stands",
+        "one encoder unplugged: its count does not change",
         lambda run, size, seconds: run.world.stages.unplug_encoder(_axis(size)),
         (1.0, 3.99),
         "axis",
@@ -220,7 +220,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "missed_steps",
-        "a jam: one rotor stands, and what is commanded meanwhile is lost",
+        "a jam: one rotor does not move, and commanded steps are lost",
         _jam,
         (20.0, 2000.0),
         "steps at most",
@@ -266,14 +266,14 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "frozen_poses",
-        "the same pose under fresh frame numbers",
+        "the same pose with new frame numbers",
         _on_tracker("frozen"),
         seconds=(0.3, 1.5),
         within_s=0.35,
         must_detect=_long(0.3),
     ),
     FaultKind(
-        "tracker_stuck", "frame counter and pose stand still", _on_tracker("stuck"), seconds=(0.2, 1.5), within_s=0.35
+        "tracker_stuck", "frame counter and pose do not change", _on_tracker("stuck"), seconds=(0.2, 1.5), within_s=0.35
     ),
     FaultKind(
         "force_drift",
@@ -288,8 +288,8 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind("force_saturated", "the gauges at their limit", _on_force("saturated")),
     FaultKind("force_unplugged", "no record of the force sensor", _on_force("silent")),
-    FaultKind("force_frozen", "the same reading under fresh numbers", _on_force("frozen")),
-    FaultKind("host_killed", "the model process is gone", _host("dead"), seconds=(0.5, 0.5), within_s=0.35),
+    FaultKind("force_frozen", "the same reading with new sequence numbers", _on_force("frozen")),
+    FaultKind("host_killed", "the model process was killed", _host("dead"), seconds=(0.5, 0.5), within_s=0.35),
     FaultKind(
         "host_slow",
         "the model process answers late",
@@ -302,7 +302,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "computer_paused",
-        "the realtime process stands still; the world does not",
+        "the realtime process is paused; the rig is not",
         _pause,
         (0.005, 0.5),
         "s",

@@ -87,7 +87,16 @@ def _tell(results: list[RunResult], bad: list[RunResult]) -> None:
     """A row per fault, and every broken rule, on standard error."""
     console = Console(stderr=True, highlight=False)
     table = Table(box=None, padding=(0, 2, 0, 0))
-    for heading in ("fault", "runs", "had to be found", "missed", "found after, ms", "peak, N", "actions", "broken rules"):
+    for heading in (
+        "fault",
+        "runs",
+        "must be detected",
+        "missed",
+        "detected after, ms",
+        "peak, N",
+        "actions",
+        "broken rules",
+    ):
         table.add_column(heading, no_wrap=heading == "fault")
     for row in FAULTS:
         mine = [result for result in results if result.plan.fault == row.name]

@@ -1,4 +1,4 @@
-"""docs/reliability.md: sections that commands write between their own marks, so that each figure has its command.
+"""docs/reliability.md: each section is written by one command between two markers, so that each figure has its command.
 
 `make fuzz` writes its own by `python -m host.studies.reliability_page PAGE < RESULT.json`.
 """
@@ -11,9 +11,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-_HEAD = """# Reliability: what was measured
+_HEAD = """# Reliability: what happens when something breaks
 
-Each section below is written by the command that it names; run the command to make it again.
+This page gives the measured behaviour under injected faults, over hours of operation, with disturbing subscribers, and under
+random input to the firmware. Each section is written by the command that it names. Run the command to make it again.
 """
 
 
@@ -36,10 +37,10 @@ def fuzz_section(found: dict[str, Any]) -> str:
             "",
             f"`make fuzz INPUTS={found['inputs']}`",
             "",
-            f"{found['inputs']} inputs (raw bytes, whole frames, time going by, switches) into parser, commands, gate and",
+            f"{found['inputs']} inputs (raw bytes, whole frames, passing time, switches) into parser, commands, gate and",
             f"interpolator, under the address and undefined-behaviour sanitizers: **{found['findings']} findings**.",
             f"{found['edges']} edges of the code reached, {found['corpus']} inputs kept in `firmware/fuzz/corpus`.",
-            "A step pin that moves out of turn, or more than a step a tick, counts as a finding too.",
+            "A step pin that moves without a command, or by more than one step in a tick, counts as a finding too.",
         ]
     )
 

@@ -28,7 +28,7 @@ MAX_MEMORY_SLOPE_MB_PER_H, MAX_CLOCK_ERROR_S, MAX_RECORDING_MB_PER_MIN = 1.0, 1e
 MAX_INTERRUPT_SHARE, MIN_STACK_FREE_BYTES = 0.8, 256
 # The first minutes compile, fill caches and the filters' windows; they are not part of the slope.
 WARM_UP_SHARE = 0.3
-NOT_KNOWN = "not known of the native board"
+NOT_KNOWN = "not measured with the native board"
 
 
 @dataclass
@@ -177,7 +177,7 @@ def page_section(result: SoakResult, minutes: float, seed: int, board: str) -> s
             "",
             f"{result.virtual_s / 60:.1f} minutes of virtual time, {result.edges} step edges.",
             "",
-            "| what | found | wanted |",
+            "| quantity | found | limit |",
             "|---|---|---|",
             f"| memory, after the first {100 * WARM_UP_SHARE:.0f} % | {result.memory_slope_mb_per_h:+.2f} MB per hour, "
             f"{result.memory_mb[-1] if result.memory_mb else 0:.0f} MB at the end | below {MAX_MEMORY_SLOPE_MB_PER_H:g} |",

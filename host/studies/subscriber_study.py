@@ -25,7 +25,7 @@ from realtime.loop.latency import percentiles_us, run_cyclictest
 from realtime.loop.native_loop import LATENESS_BIN_NS, WORK_BIN_NS
 
 NOBODY, IDLE = "nobody", "cyclictest"
-SAYS = {NOBODY: "only the recorder listens"} | KINDS
+SAYS = {NOBODY: "only the recorder"} | KINDS
 ROUNDS = 3
 _SETTLED_S, _OVER_S = 2.0, 1.0
 
@@ -139,15 +139,15 @@ def _reference(process: RealtimeProcess, seconds: float, found: Study) -> None:
 def page_section(found: Study, kinds: Sequence[str], seconds: float) -> str:
     """The section on subscribers in docs/reliability.md, times in us."""
     lines = [
-        "## Who listens",
+        "## Subscribers and the loop",
         "",
         f"`seldinger latency-check --with {','.join(kinds)} --seconds {seconds:g} --docs docs/reliability.md`",
         "",
         "The loop at 1 kHz on the wall clock, the model process and the simulated rig on the same machine; kinds in turn,",
-        "so that all share its noise; times in us. In virtual time every step edge is the same beside each of them",
+        "so that all share its disturbances; times in us. In virtual time every step edge is the same with each of them",
         "(`pytest tests/host/test_subscribers.py`).",
         "",
-        "| beside | ticks | missed | late by p50 | p99 | p99.9 | pass p50 | p99 | p99.9 | threads late p50 | p99 | "
+        "| with | ticks | missed | lateness p50 | p99 | p99.9 | pass p50 | p99 | p99.9 | threads late p50 | p99 | "
         "queries dropped |",
         "|---|" + "---:|" * 11,
     ]
@@ -170,8 +170,9 @@ def page_section(found: Study, kinds: Sequence[str], seconds: float) -> str:
         )
     lines += [
         "",
-        "*late by*: how long after its due time the loop woke; *pass*: one pass of its work; *threads late*: how",
+        "*lateness*: time between the due time of a tick and the wake-up of the loop; *pass*: one pass of its work;",
+        "*threads late*: how",
         "late a thread of the same process woke that slept 1 ms, as those that read the devices do. Compare with the",
-        "first row and with cyclictest: what else the machine did is in all of them.",
+        "first row and with cyclictest: other load of the machine is in all of them.",
     ]
     return "\n".join(lines)

@@ -17,37 +17,37 @@ _PAGE = """## Faults
 
 `seldinger faults --runs {runs} --seed {seed} --board {board} --docs docs/reliability.md`
 
-{runs} runs in lock step, each from a rig without a fault brought to its phase (approach: on the way to the beating wall;
-contact: up to {touch_s:g} s after the touch; hold: from {hold_s:g} s after it). Force and motion are the plant's own, not
-what a sensor says.
+{runs} runs in lock step, each with a rig that reached its phase without a fault (approach: on the way to the beating wall;
+contact: up to {touch_s:g} s after first contact; hold: from {hold_s:g} s after it). Force and motion are those of the plant,
+not readings of a sensor.
 
 Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {limit_N} N). Unhandled exceptions:
-{unhandled}. Recordings that could not be read: {unreadable}. Motion by itself after a stop: {rearmed}.
+{unhandled}. Recordings that could not be read: {unreadable}. Motion without a command after a stop: {rearmed}.
 
-| fault | drawn | runs | had to be found, missed | found after, ms (median, 99 %) | first found by | strongest action \
-| peak, N | into the tissue after, mm | poses lost |
+| fault | drawn | runs | must be detected, missed | detected after, ms (median, 99 %) | first detected by \
+| strongest action | peak, N | motion into the tissue after, mm | poses lost |
 |---|---|---|---|---|---|---|---|---|---|
 {rows}
 
-- *had to be found*: runs in which the fault was large or long enough to matter (`sim/fault_table.py`); the others may be
-  found or not. *first found by*: a cause of the failsafe, a line in the log, or a count of a driver or of the board.
+- *must be detected*: runs in which the fault was large or long enough to matter (`sim/fault_table.py`); the others may or
+  may not be detected. *first detected by*: a cause of the failsafe, a line in the log, or a count of a driver or the board.
   Of a jam or slip what was really lost counts, and the time from when it was more than {steps_to_find} steps for good
   ({lost_s:g} s or longer).
-- *into the tissue after*: how far the insertion stage went on after the fault was found, where the action was hold,
+- *motion into the tissue after*: motion of the insertion stage after the fault was detected, if the action was hold,
   retract or stop.
 - After a lost link, reset or power cycle all stages must be at rest within {rest_ms:.0f} ms: longest {longest_ms:.0f} ms.
 
 {violations}
 
-Not in lock step, so not here: loss of the zenoh router, processes killed with SIGKILL and real disks
-(`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that stands while its axis stands is not
-found until the axis moves. A force sensor that drifts is found by its distance from the model, so only once it has been off
-by {apart_N} N for about a second.
+Loss of the zenoh router, processes killed with SIGKILL and real disks need the wall clock and are tested elsewhere
+(`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that fails while its axis is at rest is
+detected when the axis moves. A force sensor that drifts is detected by its difference from the model, so only after it was
+wrong by {apart_N} N for about a second.
 
-**A knob that slips at the stage's full speed breaks the limit**; `slipped_steps` therefore draws half of it. At full
-speed, towards straight, 3 of 48 runs went above the limit where the loop stopped on lost steps, 1 of 48 where it
-retracts, as it does now, and single ones reached 0.68 N: the catheter straightens before the insertion stage is
-through its play ({crossing_ms:.0f} ms). A motor with torque to spare over its load slips more slowly; see that yours has it.
+**A knob that slips at the stage's full speed exceeds the force limit**; `slipped_steps` therefore draws half of it. At
+full speed, towards straight, 3 of 48 runs exceeded the limit when the loop stopped on lost steps, and 1 of 48 when it
+retracted, as it does now. Single runs reached 0.68 N: the catheter straightens before the insertion stage has crossed its
+backlash ({crossing_ms:.0f} ms). A motor with a torque reserve slips more slowly; use one.
 """
 
 
