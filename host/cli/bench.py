@@ -1,4 +1,4 @@
-"""`seldinger bench`: times of the kernels, each beside a peer in the same run, with the accuracy of both."""
+"""`seldinger bench`: times of the kernels, each with a peer in the same run, with the accuracy of both."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Annotated, Any
 import typer
 
 from host.cli.contract_io import write_json
-from host.studies.benchmarks import runner as benchmarks
-from protocol.errors import InputError
+from host.cli.options import Json, Seed, checked_seed
 
 ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"))
 
 
 def bench(
-    json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-    only: Annotated[list[str] | None, typer.Option(help="run this benchmark alone; may be given several times")] = None,
-    seed: Annotated[int, typer.Option(help="of the random inputs")] = 1,
+    json: Json = False,
+    only: Annotated[list[str] | None, typer.Option(help="Run this benchmark alone; may be given several times.")] = None,
+    seed: Seed = 1,
 ) -> None:
     """Time the kernels and their peers on equal inputs, one core. Progress on standard error."""
-    if seed < 0:
-        raise InputError("seed", seed, "0 or more")
+    from host.studies.benchmarks import runner as benchmarks
+
+    checked_seed(seed)
     rows, missing = benchmarks.run(only or [], seed, lambda line: print(f"seldinger: {line}", file=sys.stderr))
     if json:
         write_json({"results": rows, "missing": missing})

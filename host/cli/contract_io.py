@@ -1,4 +1,4 @@
-"""JSON requests in, one JSON object out."""
+"""Output of a command as one JSON object."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from protocol.requests import plain
-
 
 def write_json(value: Any, target: str | None = None) -> None:
-    """One JSON object on standard output, or into file `target`."""
+    """Write one JSON object to standard output, or into file `target`; NaN and infinity become null."""
+    from protocol.requests import plain
+
     text = json.dumps(plain(value), allow_nan=False)
     if target is None or target == "-":
         print(text)

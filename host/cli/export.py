@@ -2,45 +2,30 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.recordings.export import FORMATS
-from host.recordings.export import export as export_tables
-from host.recordings.recording import Recording
+from host.cli.options import Json, one_of, writable_folder
+from host.cli.recordings import open_recording
 from protocol.errors import InputError
 
 
-def open_recording(path: Path) -> Recording:
-    """The recording at `path`, with a line on standard error where it is incomplete. Raises InputError."""
-    try:
-        recording = Recording(path)
-    except ValueError as error:
-        found, _, wanted = str(error).removeprefix(f"{path}: found ").partition(", wanted ")
-        raise InputError(str(path), found, wanted) from None
-    if recording.truncated or recording.damaged_chunks:
-        print(
-            f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "
-            f"({recording.damaged_chunks} damaged chunks): using the messages that are intact",
-            file=sys.stderr,
-        )
-    return recording
-
-
 def export(
-    recording: Annotated[Path, typer.Argument(help="the recording (MCAP)")],
-    folder: Annotated[Path, typer.Argument(help="where the tables go; made if need be")],
-    to: Annotated[str, typer.Option(help="parquet or csv")] = "parquet",
-    json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    recording: Annotated[Path, typer.Argument(help="The recording (MCAP).")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the tables; made if it does not exist.")],
+    to: Annotated[str, typer.Option(help="parquet or csv.")] = "parquet",
+    json: Json = False,
 ) -> None:
     """Write one table for each topic: `seldinger export REC.mcap --to parquet DIR`."""
-    if to not in FORMATS:
-        raise InputError("to", to, f"one of {', '.join(FORMATS)}")
+    from host.recordings.export import FORMATS
+    from host.recordings.export import export as export_tables
+
+    one_of("--to", to, FORMATS)
     opened = open_recording(recording)
+    writable_folder("folder", folder)
     try:
         written = export_tables(opened, to, folder)
     except OSError as error:

@@ -1,54 +1,57 @@
-"""`seldinger faults`: random faults in virtual time; what is found, how soon, and what the rig does about it."""
+"""`seldinger faults`: random faults in virtual time; which are detected, how soon, and how the rig reacts."""
 
 from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from host.cli.contract_io import write_json
-from host.studies.faults.campaign import RunResult, by_fault, run_campaign, summary_of
-from host.studies.faults.report import page_section
-from host.studies.reliability_page import write_section
-from protocol.errors import InputError
-from sim.board import KINDS, BoardUnavailable
-from sim.fault_table import FAULTS
+from host.cli.options import BOARDS, Board, Docs, Json, Seed, checked_seed, one_of, within, writable_file
+from host.cli.progress import Progress
+
+if TYPE_CHECKING:
+    from host.studies.faults.campaign import RunResult
 
 
 def faults(
-    runs: Annotated[int, typer.Option(help="How many.")] = 100,
-    seed: Annotated[int, typer.Option(help="Decides every run.")] = 1,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
+    seed: Seed = 1,
+    json: Json = False,
     jobs: Annotated[int, typer.Option(help="Processes at a time.")] = min(os.cpu_count() or 1, 2),
-    board: Annotated[str, typer.Option(help="avr (the ELF in simavr), native, or auto.")] = "native",
+    board: Board = "native",
     fault: Annotated[list[str] | None, typer.Option(help="Only this one; may be given several times.")] = None,
-    docs: Annotated[Path | None, typer.Option(help="Page whose section on faults is to be written anew.")] = None,
+    docs: Docs = None,
 ) -> None:
-    """Inject faults into the job, in approach, contact and hold. Exit status 1 when a run broke a rule."""
-    if not 1 <= runs <= 100_000:
-        raise InputError("--runs", runs, "1 to 100000")
-    if not 1 <= jobs <= 64:
-        raise InputError("--jobs", jobs, "1 to 64")
-    if seed < 0:
-        raise InputError("--seed", seed, "0 or more")
-    if board not in KINDS:
-        raise InputError("--board", board, " or ".join(KINDS))
+    """Inject faults in approach, contact and hold. Exit status 1 when a run broke a rule."""
+    from host.studies.faults.campaign import by_fault, run_campaign
+    from host.studies.faults.report import page_section
+    from host.studies.reliability_page import write_section
+    from sim.board import BoardUnavailable
+    from sim.fault_table import FAULTS
+
+    within("--runs", runs, 1, 100_000)
+    within("--jobs", jobs, 1, 64)
+    checked_seed(seed)
+    one_of("--board", board, BOARDS)
     for name in fault or ():
-        if name not in {row.name for row in FAULTS}:
-            raise InputError("--fault", name, "one of " + ", ".join(row.name for row in FAULTS))
+        one_of("--fault", name, [row.name for row in FAULTS])
+    if docs is not None:
+        writable_file("--docs", docs)
     try:
-        results = _with_progress(runs, seed, jobs, board, tuple(fault or ()))
+        with Progress() as bar:
+
+            def progress(done: int, total: int) -> None:
+                bar("faults", done / total, f"{done}/{total}")
+
+            results = run_campaign(runs, seed, jobs, board, tuple(fault or ()), progress)
     except (BoardUnavailable, RuntimeError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     bad = [result for result in results if result.violations]
-    _tell(results, bad)
+    _print_for_people(results, bad)
     if docs is not None:
         write_section(docs, "faults", page_section(results, seed, board))
     if json:
@@ -76,15 +79,14 @@ def _broken(result: RunResult) -> dict[str, object]:
     }
 
 
-def _with_progress(runs: int, seed: int, jobs: int, board: str, names: tuple[str, ...]) -> list[RunResult]:
-    columns = (TextColumn("faults"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("faults", total=runs)
-        return run_campaign(runs, seed, jobs, board, names, lambda done, total: bar.update(task, completed=done))
+def _print_for_people(results: list[RunResult], bad: list[RunResult]) -> None:
+    """Print a row per fault, and every broken rule, on standard error."""
+    from rich.console import Console
+    from rich.table import Table
 
+    from host.studies.faults.campaign import summary_of
+    from sim.fault_table import FAULTS
 
-def _tell(results: list[RunResult], bad: list[RunResult]) -> None:
-    """A row per fault, and every broken rule, on standard error."""
     console = Console(stderr=True, highlight=False)
     table = Table(box=None, padding=(0, 2, 0, 0))
     for heading in (

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from host.run.service_units import UnitSettings, install, undo, unit_texts
+from host.cli.options import RigFile
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
@@ -19,13 +19,15 @@ _MANAGER = Path("/run/systemd/system")
 
 
 def install_services(
-    rig: Annotated[Path, typer.Option(help="Rig file.")] = SIMULATED_RIG,
-    simulated: Annotated[bool, typer.Option("--simulated", help="With the simulated rig as a service.")] = False,
+    rig: RigFile = SIMULATED_RIG,
+    simulated: Annotated[bool, typer.Option("--simulated", help="Add the simulated rig as a service.")] = False,
     cpu: Annotated[int, typer.Option(help="Processor of the control loop; -1: the last.")] = -1,
-    root: Annotated[Path, typer.Option(help="Write below this directory; systemd is then left alone.")] = Path("/"),
+    root: Annotated[Path, typer.Option(help="Write below this directory, without calling systemd.")] = Path("/"),
     take_away: Annotated[bool, typer.Option("--undo", help="Stop the services and remove what was installed.")] = False,
 ) -> None:
-    """Write unit files and the service user, tell systemd. Nothing is started or enabled: the command for that is shown."""
+    """Write unit files and the service user, and reload systemd. Nothing is started; the command for that is printed."""
+    from host.run.service_units import UnitSettings, install, unit_texts
+
     system = root == Path("/")
     if system and os.geteuid() != 0:
         raise InputError("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
@@ -39,8 +41,7 @@ def install_services(
     try:
         written = install(root, unit_texts(settings, load_rig(rig)))
     except ValueError as error:
-        key, _, rest = str(error).partition(": found ")
-        raise InputError(key, *rest.split(", wanted ", 1)) from None
+        raise InputError.from_sentence(str(error)) from None
     except FileExistsError as error:
         raise InputError("--root", str(error), "a place without files of that name") from None
     for path in written:
@@ -52,6 +53,8 @@ def install_services(
 
 
 def _undo(root: Path, system: bool) -> None:
+    from host.run.service_units import undo
+
     managed = system and _MANAGER.is_dir()
     if managed:
         _call("systemctl", "disable", "--now", *(f"seldinger-{name}.service" for name in ("realtime", "host", "rig")))
@@ -69,7 +72,7 @@ def _undo(root: Path, system: bool) -> None:
 
 
 def _call(*command: str) -> None:
-    """Run one of systemd's tools; its complaint is told, and is no reason to stop."""
+    """Run one of systemd's tools; print what it complains of, and go on."""
     if shutil.which(command[0]) is None:
         return
     result = subprocess.run(command, capture_output=True, text=True, check=False)

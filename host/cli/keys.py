@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from host.cli.contract_io import write_json
+from host.cli.options import Json
 
 keys = typer.Typer(help="Certificates for access from other machines (docs/security.md).", no_args_is_help=True)
-Directory = Annotated[Path, typer.Option("--directory", "-d", help="Where authority and certificates are kept.")]
+Directory = Annotated[Path, typer.Option("--directory", "-d", help="Folder of authority and certificates.")]
 KEYS = Path("keys")
-SOON = datetime.timedelta(days=30)
+EXPIRES_SOON = datetime.timedelta(days=30)
 
 
 @keys.callback()
@@ -27,28 +26,28 @@ def _group() -> None:
 @keys.command()
 def init(
     directory: Directory = KEYS,
-    laboratory: Annotated[str, typer.Option(help="Its name, in the authority's certificate.")] = "laboratory",
+    laboratory: Annotated[str, typer.Option(help="Name of the laboratory, for the authority's certificate.")] = "laboratory",
 ) -> None:
-    """Make the laboratory's authority. Refuses where there is one: its certificates would all be worthless."""
+    """Make the laboratory's authority. Refused where there is one: all its certificates would become invalid."""
     from host.security.keys import make_authority
 
     folder = make_authority(directory, laboratory)
     print(
-        f"authority in {folder}; whoever has its key.pem can command every rig: keep it off the rigs, and back it up",
+        f"authority in {folder}; its key.pem gives command over every rig: keep it off the rigs, and back it up",
         file=sys.stderr,
     )
 
 
 @keys.command()
 def issue(
-    name: Annotated[str, typer.Argument(help="Of the rig's machine, or of who reads or commands: a-z, 0-9, - and _.")],
+    name: Annotated[str, typer.Argument(help="Name of the rig's machine, the reader or the commander: a-z, 0-9, - and _.")],
     role: Annotated[str, typer.Option(help="rig (the machine that listens), reader, or commander (reads too).")],
     directory: Directory = KEYS,
     address: Annotated[list[str] | None, typer.Option(help="Of a rig: IP address or host name; may be repeated.")] = None,
     connect: Annotated[str, typer.Option(help="Of a reader or commander: the rig, as tls/ADDRESS:PORT.")] = "",
     days: Annotated[int, typer.Option(help="How long it is valid.")] = 365,
 ) -> None:
-    """A key and a certificate in a folder of its own, to be copied to that machine; and what the rig file needs."""
+    """Issue a key and a certificate, in a folder to be copied to that machine; print the lines that the rig file needs."""
     from host.security.keys import CLIENT_FILE, network_lines
     from host.security.keys import issue as issue_certificate
 
@@ -56,17 +55,18 @@ def issue(
     one = issue_certificate(directory, name, role, addresses=addresses, days=days, connect=connect)
     print(f"{one.folder}: {one.role} {one.name}, serial {one.serial}, until {one.expires:%Y-%m-%d}", file=sys.stderr)
     if connect:
-        print(f"{one.folder / CLIENT_FILE}: all that the other machine needs, key and certificate in it", file=sys.stderr)
-    print("in the rig file, for all that were issued here:", file=sys.stderr)
+        print(
+            f"{one.folder / CLIENT_FILE}: the only file that the other machine needs; it contains key and certificate",
+            file=sys.stderr,
+        )
+    print("lines for the rig file, for all certificates issued here:", file=sys.stderr)
     port = connect or (f"tls/{_bracketed(addresses[0])}:7448" if addresses else "")
     print(network_lines(directory, port), end="")
 
 
 @keys.command()
-def show(
-    directory: Directory = KEYS, json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False
-) -> None:
-    """All certificates: whose, for what, until when. Exit status 1 when one has expired."""
+def show(directory: Directory = KEYS, json: Json = False) -> None:
+    """List all certificates: name, role, expiry. Exit status 1 when one has expired."""
     from host.security.keys import issued
 
     now = datetime.datetime.now(datetime.UTC)
@@ -74,6 +74,9 @@ def show(
     if json:
         write_json({"certificates": [_row(one, now) for one in found]})
     else:
+        from rich.console import Console
+        from rich.table import Table
+
         table = Table("name", "role", "serial", "until", "", box=None, padding=(0, 2, 0, 0))
         for one in found:
             table.add_row(one.name, one.role, one.serial, f"{one.expires:%Y-%m-%d}", _row(one, now)["state"])
@@ -83,7 +86,7 @@ def show(
 
 
 def _row(one: Any, now: datetime.datetime) -> dict[str, str]:
-    state = "expired" if one.expires < now else "expires soon" if one.expires < now + SOON else "valid"
+    state = "expired" if one.expires < now else "expires soon" if one.expires < now + EXPIRES_SOON else "valid"
     return {"name": one.name, "role": one.role, "serial": one.serial, "until": one.expires.isoformat(), "state": state}
 
 

@@ -1,52 +1,58 @@
-"""`seldinger latency-check`: how punctual the loop is on this machine, beside cyclictest."""
+"""`seldinger latency-check`: how punctual the loop is on this machine, compared with cyclictest."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
+from host.cli.options import Json, one_of, within, writable_file
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
-from realtime.control.configure import tick_parameters
-from realtime.control.tick import tick
-from realtime.loop.latency import LatencyResult, as_contract, check_latency, text_histogram
-from realtime.loop.native_loop import GAP_PLACES
-from realtime.loop.scheduling import RealtimeSettings
+
+if TYPE_CHECKING:
+    from realtime.loop.latency import LatencyResult
 
 RATES_HZ = (100, 4000)
 MAX_SECONDS = 86_400
-_RIG = SIMULATED_RIG
 
 
 def latency_check(
-    seconds: Annotated[float, typer.Option(help="how long in all; cyclictest, where installed, takes half")] = 20.0,
-    hz: Annotated[int, typer.Option(help="ticks per second, 100 to 4000")] = 1000,
-    json: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    seconds: Annotated[float, typer.Option(help="How long in all; cyclictest, where installed, takes half.")] = 20.0,
+    hz: Annotated[int, typer.Option(help="Ticks per second, 100 to 4000.")] = 1000,
+    json: Json = False,
     beside: Annotated[
         str,
         typer.Option(
             "--with",
-            help="subscribers beside which to measure, by commas: frozen, flooding, "
-            "leaving, view, or all; runs the simulated rig",
+            help="Subscribers to run during the measurement, comma separated: frozen, flooding, "
+            "leaving, view, or all; runs the simulated rig.",
         ),
     ] = "",
-    docs: Annotated[Path | None, typer.Option(help="with --with: page whose section on subscribers is written anew")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="With --with: page whose section on subscribers is written again.")
+    ] = None,
 ) -> None:
-    """Run the wall-clock loop with the real tick and say how late it woke and how long it worked."""
-    if not RATES_HZ[0] <= hz <= RATES_HZ[1]:
-        raise InputError("hz", hz, f"{RATES_HZ[0]} to {RATES_HZ[1]}")
+    """Run the wall-clock loop with the real tick; report how late it woke and how long it worked."""
+    within("--hz", hz, *RATES_HZ)
     if not 0 < seconds <= MAX_SECONDS:
-        raise InputError("seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
-    if beside:
-        _beside(beside, seconds, json, docs)
-        return
+        raise InputError("--seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
     if docs is not None:
-        raise InputError("docs", docs, "--with beside it")
-    params = tick_parameters(load_rig(_RIG))
+        if not beside:
+            raise InputError("--docs", str(docs), "--with too: the page has the section on subscribers alone")
+        writable_file("--docs", docs)
+    if beside:
+        _with_subscribers(beside, seconds, json, docs)
+        return
+    from realtime.control.configure import tick_parameters
+    from realtime.control.tick import tick
+    from realtime.loop.latency import as_contract, check_latency
+    from realtime.loop.scheduling import RealtimeSettings
+
+    params = tick_parameters(load_rig(SIMULATED_RIG))
     params[0].period_s = 1.0 / hz
     result = check_latency(tick, params, hz, seconds, RealtimeSettings())
     if result.granted.warning:
@@ -59,15 +65,14 @@ def latency_check(
         print(_table(result))
 
 
-def _beside(names: str, seconds: float, json: bool, docs: Path | None) -> None:
+def _with_subscribers(names: str, seconds: float, json: bool, docs: Path | None) -> None:
     from host.studies.bad_subscriber import KINDS
     from host.studies.reliability_page import write_section
     from host.studies.subscriber_study import page_section, study
 
     kinds = list(KINDS) if names == "all" else names.split(",")
     for kind in kinds:
-        if kind not in KINDS:
-            raise InputError("with", kind, f"all, or some of {', '.join(KINDS)}")
+        one_of("--with", kind, KINDS)
     try:
         found = study(kinds, seconds)
     except OSError as error:
@@ -83,6 +88,9 @@ def _beside(names: str, seconds: float, json: bool, docs: Path | None) -> None:
 
 
 def _table(result: LatencyResult) -> str:
+    from realtime.loop.latency import as_contract, text_histogram
+    from realtime.loop.native_loop import GAP_PLACES
+
     figures = as_contract(result)
     columns = {"loop": result.lateness}
     if result.cyclictest is not None:

@@ -1,48 +1,67 @@
-"""`seldinger`: finds the command's file and runs it. Only the file of the command that is called gets imported."""
+"""`seldinger`: find the command's file and run it. Only the file of the command that is called gets imported."""
 
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import sys
+from pathlib import Path
 from types import FrameType
 
 import typer
 
+from host.cli.extras import missing_extra
 from protocol.errors import InputError
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
-    "demo": ("host.cli.demo", "demo", "Bring the tip of the simulated rig to a beating wall and hold a force on it."),
-    "solve": ("host.cli.solve", "solve", "Shape of a catheter under a force, from a JSON request."),
-    "estimate": ("host.cli.estimate", "estimate", "Force at the tip from measured poses, from a JSON request."),
-    "calibrate": ("host.cli.calibrate", "calibrate", "Stiffness of a catheter from shapes under known loads."),
-    "bench": ("host.cli.bench", "bench", "Times of the kernels, each beside a peer in the same run."),
-    "diagnose": ("host.cli.diagnose", "diagnose", "Where recordings and simulation part, and what physics is missing."),
-    "experiment": ("host.cli.experiment", "experiment", "The script of a diagnosis on the rig, or checked only."),
-    "prove": ("host.cli.prove", "prove", "The finder on concealed cases, scored against sealed labels."),
-    "reproduce": ("host.cli.reproduce", "reproduce", "The thesis' figures again: mechanics or control."),
-    "characterize": ("host.cli.characterize", "characterize", "Backlash, slopes and dead zones of a rig, by sweeps."),
-    "tune": ("host.cli.tune", "tune", "Gains of the force controller on the simulated rig."),
-    "control-study": ("host.cli.control_study", "control_study", "The controller's figures, each beside its reference."),
-    "plan": ("host.cli.plan", "plan", "A path of the tip past obstacles, from a JSON request."),
-    "faults": ("host.cli.faults", "faults", "Faults in every phase on the simulated rig: what is detected, and when."),
+    "demo": ("host.cli.demo", "demo", "Hold a contact force on the beating wall of the simulated rig."),
+    "solve": ("host.cli.solve", "solve", "Compute the shape of a catheter under a tip force, from a JSON request."),
+    "estimate": ("host.cli.estimate", "estimate", "Estimate the tip force from measured poses, from a JSON request."),
+    "calibrate": ("host.cli.calibrate", "calibrate", "Identify a catheter's stiffness from shapes under known loads."),
+    "bench": ("host.cli.bench", "bench", "Measure the kernels' times, each with a peer in the same run."),
+    "diagnose": (
+        "host.cli.diagnose",
+        "diagnose",
+        "Find where recordings and simulation differ, and which physics is missing.",
+    ),
+    "experiment": ("host.cli.experiment", "experiment", "Check the script of a diagnosis, or run it on the rig."),
+    "prove": ("host.cli.prove", "prove", "Score the mismatch finder on concealed cases with sealed labels."),
+    "reproduce": ("host.cli.reproduce", "reproduce", "Reproduce the thesis' figures: mechanics or control."),
+    "characterize": ("host.cli.characterize", "characterize", "Measure a rig's backlash, slopes and dead zones by sweeps."),
+    "tune": ("host.cli.tune", "tune", "Tune the force controller's gains on the simulated rig."),
+    "control-study": (
+        "host.cli.control_study",
+        "control_study",
+        "Measure the controller's figures, each with its reference.",
+    ),
+    "plan": ("host.cli.plan", "plan", "Plan a path of the tip past obstacles, from a JSON request."),
+    "faults": ("host.cli.faults", "faults", "Inject faults in every phase on the simulated rig; report their detection."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
-    "check-device": ("host.cli.check_device", "check_device", "Talk to one device of a rig and say what it answers."),
-    "home": ("host.cli.home", "home", "Find an axis' home switch; the stage moves."),
+    "check-device": (
+        "host.cli.check_device",
+        "check_device",
+        "Read one device of a rig and report whether it is fit for use.",
+    ),
+    "home": ("host.cli.home", "home", "Find the home switch of an axis; the stage moves."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
-    "install-services": ("host.cli.install_services", "install_services", "systemd units of the rig, and their undo."),
-    "keys": ("host.cli.keys", "keys", "Certificates for readers and commanders on other machines."),
-    "soak": ("host.cli.soak", "soak", "Hours of virtual operation: memory, clocks, steps."),
-    "view": ("host.cli.view", "view", "The running rig on a page: shape, force, safety; arm, hold, stop."),
-    "play": ("host.cli.play", "play", "A recording on the same page, with the windows of its diagnosis."),
-    "export": ("host.cli.export", "export", "Tables of a recording as parquet or csv."),
-    "latency-check": ("host.cli.latency_check", "latency_check", "How punctual the loop is here, beside cyclictest."),
+    "install-services": (
+        "host.cli.install_services",
+        "install_services",
+        "Install the rig's systemd services, or remove them.",
+    ),
+    "keys": ("host.cli.keys", "keys", "Issue certificates for readers and commanders on other machines."),
+    "soak": ("host.cli.soak", "soak", "Run for hours of virtual time; check memory, clocks and steps."),
+    "view": ("host.cli.view", "view", "Show the running rig on a page: shape, force, safety; arm, hold, stop."),
+    "play": ("host.cli.play", "play", "Show a recording on the same page, with the windows of its diagnosis."),
+    "export": ("host.cli.export", "export", "Write a recording's topics as parquet or csv tables."),
+    "latency-check": ("host.cli.latency_check", "latency_check", "Measure how punctual the loop is on this machine."),
 }
 
 
 def build(argv: list[str]) -> typer.Typer:
-    """The application with the called command in it, or with all their lines when none is named (help)."""
+    """Make the application with the called command in it, or with all their lines when none is named (help)."""
     app = typer.Typer(
         name="seldinger",
         help="Control stack for robotic steerable catheters. Not a medical device.",
@@ -51,11 +70,11 @@ def build(argv: list[str]) -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
-    app.callback()(lambda: None)
+    app.callback()(_options)
     called = next((word for word in argv if not word.startswith("-")), None)
     if called not in COMMANDS:
         for name, (_, _, line) in COMMANDS.items():
-            app.command(name, help=line)(_only_listed)
+            app.command(name, help=line, short_help=line)(_only_listed)
         return app
     module, function, line = COMMANDS[called]
     target = getattr(importlib.import_module(module), function)
@@ -66,8 +85,59 @@ def build(argv: list[str]) -> typer.Typer:
     return app
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"seldinger {version('seldinger')}")
+        raise typer.Exit()
+
+
+def _options(
+    version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Print the version."),
+) -> None:
+    """Options that stand before the command."""
+
+
 def _only_listed() -> None:
-    """Stands for every command where none is called, so that the overview imports nothing."""
+    """Stand in for every command where none is called, so that the overview imports nothing."""
+
+
+def error_log() -> Path:
+    """The file that keeps the traceback of the last unexpected error: below XDG_STATE_HOME, or ~/.local/state."""
+    chosen = os.environ.get("XDG_STATE_HOME")
+    return (Path(chosen) if chosen else Path.home() / ".local" / "state") / "seldinger" / "last_error.log"
+
+
+def _keep_traceback(error: Exception, argv: list[str]) -> str:
+    """Write the traceback of `error` into the log; return the end of the sentence that says where it is."""
+    import traceback
+
+    text = "".join(traceback.format_exception(error))
+    path = error_log()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"seldinger {' '.join(argv)}\n\n{text}", encoding="utf-8")
+    except OSError as failed:
+        sys.stderr.write(text)
+        return f"the traceback is above; {path} could not be written ({failed.strerror})"
+    return f"the traceback is in {path}"
+
+
+def _report(error: Exception, argv: list[str]) -> int:
+    """Print one line about `error`. Return the exit status: 2 for bad input, 1 for anything else."""
+    if isinstance(error, InputError):
+        print(f"seldinger: {error}", file=sys.stderr)
+        return 2
+    command = " ".join(["seldinger", *(word for word in argv[:1] if not word.startswith("-"))])
+    missing = missing_extra(error, command) if isinstance(error, ModuleNotFoundError) else None
+    if missing is not None:
+        print(f"seldinger: {missing}", file=sys.stderr)
+        return 1
+    said = str(error).strip().partition("\n")[0]
+    what = f"{type(error).__name__}: {said}" if said else type(error).__name__
+    print(f"seldinger: unexpected error, {what}; {_keep_traceback(error, argv)}", file=sys.stderr)
+    return 1
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -75,19 +145,24 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Entry point. Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else.
+    """Run the command line.
 
-    SIGTERM ends a command as Ctrl-C does: what it has started is stopped in order.
+    Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else, one line on standard error, and the
+    traceback of an unexpected error in a log file. SIGTERM ends a command as Ctrl-C does: what it has started is stopped in
+    order.
     """
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
+    argv = sys.argv[1:]
     try:
-        build(sys.argv[1:])()
-    except InputError as error:
-        print(f"seldinger: {error}", file=sys.stderr)
-        sys.exit(2)
+        build(argv)()
+    except BrokenPipeError:  # the reader of the output has closed it, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        sys.exit(_report(error, argv))
     finally:
-        if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server hands it on as it ends: nothing is left to do
+        if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server passes the signal on as it ends: nothing is left to do
             signal.signal(signal.SIGTERM, lambda number, frame: None)
 
 

@@ -1,35 +1,35 @@
-"""`seldinger plan`: a collision-free, time-optimal way of the tip to a goal, from a JSON request (docs/navigation.md)."""
+"""`seldinger plan`: a collision-free, time-optimal path of the tip to a goal, from a JSON request (docs/navigation.md)."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.commissioning.characterization import load_calibrated_rig
-from protocol.requests import read_json, validate
+from host.cli.options import Json, RequestFile, RigFile
 from protocol.rig_file import SIMULATED_RIG
 
 
 def plan(
-    request: Annotated[str, typer.Argument(help="the request: a JSON file, or - for standard input")],
-    json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
-    rig: Annotated[Path, typer.Option(help="Rig file.")] = SIMULATED_RIG,
+    request: RequestFile,
+    json: Json = False,
+    rig: RigFile = SIMULATED_RIG,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file, as `characterize` writes it.")] = None,
 ) -> None:
-    """Plan a way of the tip past obstacles. Nothing moves. Status 1 where no way was found."""
-    from host.navigation import PlanRequest
+    """Plan a path of the tip past obstacles. Nothing moves. Exit status 1 where no path was found."""
+    from host.commissioning.characterization import load_calibrated_rig
     from host.navigation import plan as search
+    from host.navigation.request import read_plan_request
 
     loaded = load_calibrated_rig(rig, calibration)
-    checked = validate(PlanRequest, _with_tuples(read_json(request)))
+    checked = read_plan_request(request)
     answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:
         print(
-            f"seldinger: no way found in {checked.samples} samples; more samples or less clearance_m may find one",
+            f"seldinger: no path found in {checked.samples} samples; more samples or less clearance_m may find one",
             file=sys.stderr,
         )
         if json:
@@ -42,15 +42,3 @@ def plan(
     )
     if json:
         write_json(answer.as_json())
-
-
-def _with_tuples(value: Any) -> Any:
-    """Lists of three numbers become tuples, as strict checking of points wants them."""
-    if isinstance(value, dict):
-        return {key: _with_tuples(item) for key, item in value.items()}
-    if isinstance(value, list):
-        items = [_with_tuples(item) for item in value]
-        if len(items) == 3 and all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in items):
-            return tuple(float(item) for item in items)
-        return items
-    return value

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from host.cli.export import open_recording
-from host.cli.view import serve
-from host.view.replay import Replay, read_findings
+from host.cli.recordings import open_recording
 
 
 def play(
     recording: Annotated[Path, typer.Argument(help="The recording (MCAP).")],
     speed: Annotated[float, typer.Option(help="Times real time, 0.05 to 50.")] = 1.0,
     diagnosis: Annotated[str | None, typer.Option(help="JSON of `seldinger diagnose`: its windows are marked.")] = None,
-    port: Annotated[int, typer.Option(min=1024, max=65535, help="Of the page, on 127.0.0.1.")] = 8448,
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page, on 127.0.0.1.")] = 8448,
 ) -> None:
     """Show a recording in a browser: play, pause, seek."""
-    findings = None if diagnosis is None else read_findings(diagnosis)
-    serve(Replay(open_recording(recording), speed, findings), port, str(recording))
+    from host.view.serve import serve_recording
+
+    opened = open_recording(recording)
+    serve_recording(opened, speed, diagnosis, port, lambda line: print(line, file=sys.stderr))

@@ -1,4 +1,4 @@
-"""`seldinger reproduce`: the thesis' figures again, mechanics or control, as one page with a verdict each."""
+"""`seldinger reproduce`: reproduce the thesis' figures, mechanics or control, on one page with a verdict each."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.report.figure_page import WORDS, as_json
-from protocol.errors import InputError
+from host.cli.options import Folder, Json, one_of, writable_folder
 
 # part -> module with run(directory, quick, progress) -> (sections, path of the report); imported only when asked for
 PARTS = {"mechanics": "host.studies.reproduction.mechanics", "control": "host.studies.reproduction.control"}
 
 
 def reproduce(
-    part: Annotated[str, typer.Argument(help="mechanics or control")],
-    json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Shorter runs: for a look, not for figures.")] = False,
-    directory: Annotated[Path, typer.Option("--dir", help="Where the report goes.")] = Path("runs"),
+    part: Annotated[str, typer.Argument(help="mechanics or control.")],
+    json: Json = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Shorter runs, whose figures are not to be published.")] = False,
+    directory: Folder = Path("runs"),
 ) -> None:
-    """Reproduce the thesis' figures; one section a figure, each with its verdict."""
-    if part not in PARTS:
-        raise InputError("part", part, " or ".join(PARTS))
+    """Reproduce the thesis' figures: one section for each figure, with its verdict."""
+    from host.report.figure_page import WORDS, as_json
+
+    one_of("part", part, PARTS)
+    writable_folder("--dir", directory)
 
     def progress(text: str) -> None:
         print(f"reproduce {part}: {text}", file=sys.stderr)

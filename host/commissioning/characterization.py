@@ -140,7 +140,7 @@ def characterize(recording: Recording, rig: Rig) -> Characterization:
     another catheter."""
     name = recording.catheter.get("name")
     if name != rig.catheter.name:
-        raise ValueError(f"recording: found sweeps of catheter {name}, wanted {rig.catheter.name}, the rig's")
+        raise InputError.from_sentence(f"recording: found sweeps of catheter {name}, wanted {rig.catheter.name}, the rig's")
     cuts = _Cuts(recording)
     length, tracker = rig.catheter.distal_length_m, rig.tracker
     insertion_runs = tuple(cuts.run(span, 0, _exposed_m(cuts.poses(span).position)) for span in cuts.spans(0))
@@ -199,7 +199,9 @@ class _Cuts:
     def spans(self, axis: int) -> list[_Span]:
         found = [span for span in self._spans if span.sweep["axis"] == axis]
         if not found:
-            raise ValueError(f"recording: found no whole sweep of axis {axis}, wanted sweeps of all three stages")
+            raise InputError.from_sentence(
+                f"recording: found no whole sweep of axis {axis}, wanted sweeps of all three stages"
+            )
         return found
 
     def poses(self, span: _Span) -> _Poses:

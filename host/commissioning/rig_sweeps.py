@@ -28,7 +28,7 @@ class PortNames(NamedTuple):
     force: int = RDT_PORT
 
 
-def in_words(sweeps: Sequence[Sweep]) -> str:
+def describe(sweeps: Sequence[Sweep]) -> str:
     """What will move, how far, and for how long: to be read before it is allowed."""
     parts = []
     for axis, (unit, scale) in enumerate(_UNITS):

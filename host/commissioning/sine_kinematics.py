@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from host.commissioning.characterization import KnobSweep
+from protocol.errors import InputError
 from realtime.control.inverse_kinematics import FOLD_BEND, FOLD_REACH
 
 Array = NDArray[np.float64]
@@ -60,9 +61,9 @@ class CurveErrors(NamedTuple):
 
 
 def fit_sines(x: Array, y: Array, terms_start: Array | None = None) -> SineCurve:
-    """Two sines through (x, y) by least squares from several starts. Raises ValueError for fewer than 12 points."""
+    """Two sines through (x, y) by least squares from several starts. Raises InputError for fewer than 12 points."""
     if x.size < 12:
-        raise ValueError(f"curve: found {x.size} points, wanted at least 12")
+        raise InputError.from_sentence(f"curve: found {x.size} points, wanted at least 12")
     span, size = float(np.ptp(x)), float(np.ptp(y))
     best: tuple[float, Array] | None = None
 

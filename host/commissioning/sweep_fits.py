@@ -10,6 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, lsq_linear
 
+from protocol.errors import InputError
+
 Array = NDArray[np.float64]
 Z95 = 1.959964
 # Longest delay between encoder and pose that a fit may find, and how well the stamps are trusted beforehand (s).
@@ -122,11 +124,11 @@ def fit_play(runs: Sequence[Run], max_width: float, sigma: float, with_width: bo
     """Width, slope, offset and delay common to all `runs` (Figs. 6.3 to 6.6).
 
     Arguments: max_width, greatest width looked for; sigma, expected noise of one output; both in the output's unit.
-    with_width: False fixes the width at zero. Raises ValueError where a run has no sample after its first turn.
+    with_width: False fixes the width at zero. Raises InputError where a run has no sample after its first turn.
     """
     late = [_after_first_turn(run) for run in runs]
     if any(run.time_s.size < 8 for run in late):
-        raise ValueError(
+        raise InputError.from_sentence(
             "sweep: found fewer than 8 poses after its first turn, wanted a longer sweep or a tracker that sees it"
         )
 
@@ -175,7 +177,7 @@ def dead_zone_curvature(knob_rad: Array, x: Array) -> Array:
 def fit_knob(runs: Sequence[Run], sigma_per_m: float) -> KnobFit:
     """Dead zones, gains and the monotone curve of knob sweeps whose output is curvature (1/m) (Fig. 6.8).
 
-    Raises ValueError for sweeps that do not bend the catheter.
+    Raises InputError for sweeps that do not bend the catheter.
     """
 
     def given(delay_s: float) -> Array:
@@ -203,7 +205,9 @@ def _edges_by_eye(knob: Array, curvature: Array) -> Array:
     """A first guess: stops where the curvature has reached 97 % of its range, slack where it is within 3 % of rest."""
     low, high = np.percentile(curvature, (0.5, 99.5))
     if not high - low > 0.5:
-        raise ValueError(f"knob sweep: found curvatures from {low:.2f} to {high:.2f} 1/m, wanted a catheter that bends")
+        raise InputError.from_sentence(
+            f"knob sweep: found curvatures from {low:.2f} to {high:.2f} 1/m, wanted a catheter that bends"
+        )
     rest = float(np.median(curvature[np.abs(knob - np.median(knob)) < 0.03 * np.ptp(knob)]))
     upper, lower = knob[curvature > rest + 0.97 * (high - rest)], knob[curvature < rest + 0.97 * (low - rest)]
     still = knob[np.abs(curvature - rest) < 0.03 * (high - low)]

@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution, minimize
 
 from protocol.enums import Phase
+from protocol.errors import InputError
 from protocol.rig_file import Rig, parse_rig
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
@@ -39,6 +40,8 @@ WALL_POINT_M = (0.0, -0.0107, 0.025)
 # Delay added at most: beyond it the failsafe holds for stale poses.
 MOST_DELAY_S = 0.045
 _APPROACH_S, _CLEARANCE_M = 1.2, 0.0015
+# Least gain factor and phase margin of a proposal; below, the force gains are halved once.
+LEAST_FACTOR, LEAST_PHASE_DEG = 2.0, 30.0
 
 
 class Margin(NamedTuple):
@@ -149,7 +152,7 @@ def _limit(rings: Callable[[float], bool], low: float, high: float, steps: int) 
 def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, steps: int = 5) -> Margin:
     """How far the loop with `gains` is from ringing, found by more gain and by more delay until it rings.
 
-    Raises ValueError where it rings as it is.
+    Raises InputError where it rings as it is.
     """
     seconds = 2.5
     config = still_wall(rig)
@@ -159,7 +162,7 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
         return response(_unchecked(rig, scaled), force_N, seconds, extra_delay_s=delay_s, config=config)
 
     if _rings(trial(1.0, 0.0), force_N):
-        raise ValueError(
+        raise InputError.from_sentence(
             f"gains: found a loop that rings at {rig.control.loop_hz} Hz with "
             + ", ".join(f"{key} = {value:.4g}" for key, value in gains.items())
             + ", wanted gains that settle on a still wall"
@@ -219,13 +222,13 @@ def tune(
 ) -> list[Tuned]:
     """Best gains by simplex (from the present gains and from half of them, side by side) and by differential evolution.
 
-    Arguments: names, keys of [control]; evaluations, of (7.4) for each method; iterations, of (7.4). Raises ValueError for
+    Arguments: names, keys of [control]; evaluations, of (7.4) for each method; iterations, of (7.4). Raises InputError for
     a gain that is not known or zero.
     """
     control = rig.control.model_dump()
     for name in names:
         if not isinstance(control.get(name), float) or control[name] <= 0.0:
-            raise ValueError(
+            raise InputError.from_sentence(
                 f"gains: found {name} = {control.get(name)}, wanted a positive gain of [control]: {', '.join(GAINS)}"
             )
     start = {name: float(control[name]) for name in names}
@@ -273,3 +276,46 @@ def half_way(rig: Rig, tuned: Tuned) -> Tuned:
     """`tuned` with its force gains halved: the proposal where the margin of the optimum is too small."""
     gains = {key: value * (0.5 if key in GAINS[2:] else 1.0) for key, value in tuned.gains.items()}
     return replace(tuned, gains=gains, cost_N=criterion(rig, gains), evaluations=tuned.evaluations + 1)
+
+
+def present_gains(rig: Rig) -> dict[str, float]:
+    """Return the gains of GAINS that the rig file has."""
+    return {name: float(getattr(rig.control, name)) for name in GAINS}
+
+
+def margin_report(rig: Rig) -> dict[str, Any]:
+    """Return cost and stability margin of the rig's present gains. Raises InputError where the loop rings."""
+    present = present_gains(rig)
+    return {"present": _row(Tuned("present", present, criterion(rig, present), 1), stability_margin(rig, present))}
+
+
+def proposal_report(rig: Rig, found: Sequence[Tuned]) -> dict[str, Any]:
+    """Return the proposal (best of `found`, force gains halved once if its margin is small) and the present gains."""
+    present, best = present_gains(rig), best_of(found)
+    try:
+        margin: Margin | None = stability_margin(rig, {**present, **best.gains})
+    except InputError:
+        margin = None
+    halved = margin is None or margin.gain_factor < LEAST_FACTOR or margin.phase_deg < LEAST_PHASE_DEG
+    if halved:
+        best = half_way(rig, best)
+        margin = stability_margin(rig, {**present, **best.gains})
+    return {
+        "present": _row(Tuned("present", present, criterion(rig, present), 1), None),
+        "methods": [_row(item, None) for item in found],
+        "proposal": {**_row(best, margin), "force_gains_halved_for_margin": halved},
+        "loop_hz": rig.control.loop_hz,
+        "simulated_on": "tick and plant with ideal stages, tracker and force sensor with noise and delays",
+    }
+
+
+def _row(tuned: Tuned, margin: Margin | None) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "method": tuned.method,
+        "gains": tuned.gains,
+        "cost_N": tuned.cost_N,
+        "evaluations": tuned.evaluations,
+    }
+    if margin is not None:
+        row["margin"] = margin._asdict()
+    return row

@@ -111,5 +111,5 @@ def diagnose(
     for number, recording in enumerate(recordings):
         source = table_of(recording, number)
         sources += find_files(spec, [str(source)], None) if isinstance(source, Path) else [source]
-    sources = sources or find_files(spec, [], data_folder)
+    sources = sources or [*find_files(spec, [], data_folder)]
     return Verdict(run(spec, sources, progress, frozenset(without)), time.monotonic() - began)

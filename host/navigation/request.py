@@ -14,7 +14,7 @@ from host.navigation import planner, shape, timing
 from host.navigation.obstacles import Capsule, Mesh, Obstacle, Sphere, Surroundings, load_mesh, to_line_m
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
-from protocol.requests import Request
+from protocol.requests import Request, read_json, validate
 from protocol.rig_file import Rig
 from realtime.control import inverse_kinematics as ik
 from realtime.control.configure import tick_parameters
@@ -220,3 +220,20 @@ def _dense(way: Array, scale: Array, spacing_m: float) -> Array:
         count = max(1, int(np.ceil(np.linalg.norm((end - start) * scale) / spacing_m)))
         rows += [start + (end - start) * k / count for k in range(1, count + 1)]
     return np.array(rows)
+
+
+def read_plan_request(source: str) -> PlanRequest:
+    """Read and check the request in JSON file `source` ('-': standard input). Raises InputError naming the key."""
+    return validate(PlanRequest, with_tuples(read_json(source)))
+
+
+def with_tuples(value: Any) -> Any:
+    """Return `value` with lists of three numbers as tuples, which strict checking of points wants."""
+    if isinstance(value, dict):
+        return {key: with_tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        items = [with_tuples(item) for item in value]
+        if len(items) == 3 and all(isinstance(item, (int, float)) and not isinstance(item, bool) for item in items):
+            return tuple(float(item) for item in items)
+        return items
+    return value

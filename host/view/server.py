@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib.util
 from collections import deque
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -34,16 +33,6 @@ _POLICY = (
     "default-src 'self'; style-src 'self'; script-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
-
-
-def three_js() -> Path:
-    """three.js and its orbit controls as one module, bundled in the package nicegui. Raises OSError where it is not."""
-    found = importlib.util.find_spec("nicegui")
-    places = found.submodule_search_locations if found is not None else None
-    path = Path(next(iter(places))) / "elements" / "scene" / "dist" / "index.js" if places else Path("nicegui")
-    if not path.is_file():
-        raise OSError(f"nicegui: found no {path}, wanted nicegui 3.18 to 3.x, whose three.js draws the view")
-    return path
 
 
 class Guard:
@@ -134,13 +123,11 @@ class ViewServer:
     def __init__(self, source: Source, port: int) -> None:
         self._source, self.port = source, port
         self.pages: set[Page] = set()
-        three = three_js()
         self.app = Guard(
             Starlette(
                 lifespan=self._lifespan,
                 routes=[
                     Route("/", lambda request: FileResponse(STATIC / "index.html")),
-                    Route("/lib/three.js", lambda request: FileResponse(three, media_type="text/javascript")),
                     Route("/favicon.ico", _nothing),
                     WebSocketRoute("/rig", self._rig),
                     Mount("/static", StaticFiles(directory=STATIC)),

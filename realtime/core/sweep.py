@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from protocol.errors import InputError
 from protocol.rig_file import AXES, Rig
 from protocol.setpoint_encoder import BUFFER_BYTES, encode_setpoint
 from protocol.topics import Log, Stage
@@ -59,25 +60,25 @@ class Sweep:
 
 
 def check_sweeps(rig: Rig, sweeps: Sequence[Sweep]) -> None:
-    """Raises ValueError for a sweep that leaves the travel, or asks for more speed or acceleration than a stage has."""
+    """Raises InputError for a sweep that leaves the travel, or asks for more speed or acceleration than a stage has."""
     for number, sweep in enumerate(sweeps):
         for axis in range(3):
             stage, swing = rig.stage(axis), sweep.amplitude if axis == sweep.axis else 0.0
             low, high = sweep.centre[axis] - swing, sweep.centre[axis] + swing
             if not (stage.min_unit <= low and high <= stage.max_unit):
-                raise ValueError(
+                raise InputError.from_sentence(
                     f"sweeps.{number}.{AXES[axis]}: found {low:.4g} to {high:.4g}, "
                     f"wanted within {stage.min_unit} to {stage.max_unit}"
                 )
         stage, rate = rig.stage(sweep.axis), sweep.rate_rad_per_s
         if not (0.0 < rate * sweep.amplitude <= 0.9 * stage.max_speed_unit_per_s):
-            raise ValueError(
+            raise InputError.from_sentence(
                 f"sweeps.{number}.rate_rad_per_s: found a peak speed of {rate * sweep.amplitude:.4g}, "
                 f"wanted above 0 and at most {0.9 * stage.max_speed_unit_per_s:.4g} "
                 f"(stages.{AXES[sweep.axis]})"
             )
         if rate * rate * sweep.amplitude > 0.5 * stage.max_accel_unit_per_s2 or sweep.cycles < 1:
-            raise ValueError(
+            raise InputError.from_sentence(
                 f"sweeps.{number}: found {sweep.cycles} cycles at {rate} rad/s, wanted at least one and an "
                 "acceleration of at most half the stage's"
             )

@@ -120,10 +120,22 @@ def test_a_fold_is_status_1_and_not_converged(ask: Callable, tmp_path: Path) -> 
     assert 0.2 < answer["load_reached"] < 0.3 and "fold" in said
 
 
-def test_a_pose_that_no_force_explains_is_not_an_error(ask: Callable) -> None:
-    status, answer, said = ask(estimate, {**POSE, "tip": {"position_m": [0.3, 0.0], "angle_rad": 0.0}})
-    assert status == 0 and answer["converged"] is False and answer["residual"] > 1.0 and said
+def test_a_pose_that_no_force_explains_is_status_1_and_not_converged(ask: Callable) -> None:
+    status, answer, said = ask(estimate, {**POSE, "tip": {"position_m": [0.1, 0.0], "angle_rad": 2.0}})
+    assert status == 1 and answer["converged"] is False and answer["residual"] > 0.01 and said
     assert np.isfinite(answer["force_N"]).all() and np.isfinite(answer["covariance_N2"]).all()
+
+
+@pytest.mark.parametrize(
+    ("request_", "key"),
+    [
+        ({**POSE, "tip": {"position_m": [0.14, 0.0], "angle_rad": 0.0}}, "tip.position_m"),
+        ({**SENSORS, "sensors": [{**SENSOR, "position_m": [0.0, 0.0, 0.2]}]}, "sensors.0.position_m"),
+    ],
+)
+def test_a_pose_beyond_the_catheters_reach_is_bad_input(ask: Callable, request_: dict, key: str) -> None:
+    with pytest.raises(InputError, match=f"^{key}: .*mm from the sheath's exit"):
+        ask(estimate, request_)
 
 
 def test_solve_cosserat_and_estimate_agree(ask: Callable) -> None:

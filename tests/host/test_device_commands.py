@@ -11,9 +11,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from host.cli import flash as flash_module
 from host.cli.check_device import check_device
-from host.cli.flash import avrdude_command, built, flash
+from host.cli.flash import flash
+from host.commissioning import firmware_flash as flash_module
+from host.commissioning.firmware_flash import avrdude_command, built
 from protocol.board_pins import definitions
 from protocol.errors import InputError
 from protocol.rig_file import load_rig, parse_rig, problems_of, read_rig_data
@@ -90,7 +91,7 @@ def test_flash_refuses_what_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="apt install avrdude"):
         flash(port="/dev/ttyACM0")
     monkeypatch.setattr(flash_module.shutil, "which", lambda name: f"/usr/bin/{name}")
-    with pytest.raises(InputError, match="a serial port that is there"):
+    with pytest.raises(InputError, match="a serial port that exists"):
         flash(port="/dev/nothing-here")
     with pytest.raises(InputError, match="an ELF file"):
         flash(port="/dev/null", image=Path("/no/such.elf"))

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from host.cli.experiment import experiment, run_simulated
+from host.cli.experiment import experiment
 from host.commissioning.experiment_script import Script, check_script, perform, read_script, write_script
 from host.recordings.recording import Recording
+from host.run.experiment_run import run_simulated
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig

@@ -9,7 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-import host.cli.home as command
+import host.commissioning.home_stage as homing
+from host.cli.home import home
 from protocol.rig_file import load_rig
 from tests.realtime.conftest import RIG_FILE
 from tests.sim.board_rig import BoardRig
@@ -47,15 +48,15 @@ class Port:
 @pytest.fixture
 def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[Port]:
     made = Port()
-    monkeypatch.setattr(command, "time", made)
-    monkeypatch.setattr(command, "open_serial", lambda path, baud: made)
+    monkeypatch.setattr(homing, "time", made)
+    monkeypatch.setattr(homing, "open_serial", lambda path, baud: made)
     yield made
     made.rig.close()
 
 
 def homed(*arguments: str, answer: str = "") -> Result:
     app = typer.Typer()
-    app.command()(command.home)
+    app.command()(home)
     return CliRunner().invoke(app, ["insertion", *arguments], input=answer)
 
 
@@ -73,7 +74,7 @@ def test_it_finds_the_switch_and_says_so(port: Port, tmp_path: Path) -> None:
     file = file_with_a_switch(tmp_path)
     told = homed("--rig", str(file), "--yes", "--json")
     assert told.exit_code == 0, told.output
-    assert "switch found, called -0.05 m" in told.stderr and '"axis": "insertion"' in told.stdout
+    assert "switch found, its position is -0.05 m" in told.stderr and '"axis": "insertion"' in told.stdout
     at_steps = round(load_rig(file).stages.insertion.home_unit * 320_000)
     assert abs(int(port.rig.position[0]) - int(port.rig.status.position_steps[0]) - (SWITCH_STEPS - at_steps)) <= 2
     assert port.rig.position[0] > SWITCH_STEPS and port.rig.position[1:].tolist() == [0, 0]

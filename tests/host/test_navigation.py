@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from host.cli.plan import _with_tuples
 from host.cli.plan import plan as cli_plan
 from host.navigation import PlanRequest, plan, planner, shape
 from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, winding_number
-from host.navigation.request import joints_at
+from host.navigation.request import joints_at, with_tuples
 from host.navigation.timing import ACCELERATION_SHARE, SPEED_SHARE
 from protocol.errors import InputError
 from protocol.requests import validate
@@ -38,7 +37,7 @@ def reach(rig: Rig) -> shape.Reach:
 
 
 def request(goal: Any, obstacles: list[dict] | None = None, **more: Any) -> PlanRequest:
-    return validate(PlanRequest, _with_tuples({"goal_m": list(goal), "start": START, "obstacles": obstacles or []} | more))
+    return validate(PlanRequest, with_tuples({"goal_m": list(goal), "start": START, "obstacles": obstacles or []} | more))
 
 
 def tip_at(reach: shape.Reach, *joint: float) -> np.ndarray:
@@ -95,7 +94,7 @@ def test_the_catheter_keeps_to_the_puncture(rig: Rig, reach: shape.Reach) -> Non
     puncture = {"point_m": [0.0, 0.0, 0.010], "radius_m": 0.002}
     start = {"insertion_m": 0.012, "roll_rad": 0.0, "curvature_per_m": 3.0}
     goal = tip_at(reach, 0.015, 1.0, 12.0)
-    wanted = validate(PlanRequest, _with_tuples({"goal_m": goal.tolist(), "start": start, "puncture": puncture}))
+    wanted = validate(PlanRequest, with_tuples({"goal_m": goal.tolist(), "start": start, "puncture": puncture}))
     answer = plan(wanted, rig)
     assert answer is not None
     off = [np.min(np.linalg.norm(shape.centre_line(reach, joint, 400) - [0, 0, 0.010], axis=1)) for joint in answer.joint]
@@ -139,7 +138,7 @@ def test_what_cannot_be_is_refused_in_one_line(rig: Rig, goal: list[float], obst
 )
 def test_a_request_that_is_not_one_is_refused(broken: dict) -> None:
     with pytest.raises(InputError):
-        validate(PlanRequest, _with_tuples({"start": START, **broken}))
+        validate(PlanRequest, with_tuples({"start": START, **broken}))
 
 
 def test_no_way_is_told_apart_from_bad_input(tmp_path: Path, reach: shape.Reach, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 // The catheter, the tissue and the target in three dimensions. Millimetres; the base frame with e3 upwards.
 
-import {OrbitControls, THREE} from "/lib/three.js";
+import {OrbitControls, THREE} from "./vendor/three.js";
 
 const MM = 1000, MM_PER_N = 50, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [74, -39, 36], LOOK = [0, -5, 15];
 

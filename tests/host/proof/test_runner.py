@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from host.cli.prove import Bar, prove
+from host.cli.progress import Progress
+from host.cli.prove import prove
 from host.studies.proof import baselines, picture, workers
 from host.studies.proof.runner import Settings, open_seal
 from host.studies.proof.runner import prove as run
@@ -243,13 +244,16 @@ def test_command_prints_a_table_and_keeps_its_result(
         )
 
 
-def test_bar_draws_a_line_a_tenth_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_progress_is_a_line_at_begin_and_end_and_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.StringIO()
     monkeypatch.setattr("sys.stderr", stream)
-    bar = Bar()
+    clock = iter(range(1000))
+    monkeypatch.setattr("host.cli.progress.time.monotonic", lambda: 0.5 * next(clock))
+    bar = Progress()
     for done in range(101):
-        bar("diagnose", done, 100)
-    assert stream.getvalue().count("\n") == 11 and "100/100" in stream.getvalue()
+        bar("diagnose", done / 100, f"{done}/100")
+    lines = stream.getvalue().splitlines()
+    assert "0/100" in lines[0] and "100/100" in lines[-1] and len(lines) == 2 + 5
 
 
 def test_a_case_as_a_picture(built: Built, tmp_path: Path) -> None:

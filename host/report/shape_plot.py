@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,18 +13,8 @@ VIEWS = {2: [(0, 1)], 3: [(2, 1), (2, 0)]}
 LABELS = {2: ("x", "y"), 3: ("e1", "e2", "e3")}
 
 
-def check_plot_path(path: str | None) -> None:
-    """Refuses a plot that could not be written, before anything is computed. Raises InputError."""
-    if path is None:
-        return
-    if Path(path).suffix.lower() != ".png":
-        raise InputError("plot", path, "a file name that ends in .png")
-    if not Path(path).resolve().parent.is_dir():
-        raise InputError("plot", path, "a file in a folder that exists")
-
-
 def plot_shape(path: str, title: str, loaded: Array, unloaded: Array, force_N: Array, measured: Array) -> None:
-    """Writes the picture.
+    """Draw a solution into a PNG file.
 
     Arguments: `loaded`, `unloaded` (points, 2 or 3) in m, sheath to tip; `force_N` on the tip, base frame;
     `measured` (k, 2 or 3), tracked positions, k may be 0. Raises: InputError where the file cannot be written.
@@ -46,7 +34,7 @@ def plot_shape(path: str, title: str, loaded: Array, unloaded: Array, force_N: A
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:
-        raise InputError("plot", path, error.strerror or "a file that can be written") from None
+        raise InputError("--plot", path, error.strerror or "a file that can be written") from None
     finally:
         pyplot.close(figure)
 

@@ -1,0 +1,83 @@
+"""Options that several commands share, checks of their values, and a try of the places for output before the work."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from protocol.errors import InputError
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+RigFile = Annotated[Path, typer.Option(help="Rig file (TOML).")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+Board = Annotated[str, typer.Option(help="avr (the firmware's ELF in simavr), native, or auto.")]
+Folder = Annotated[Path, typer.Option("--dir", help="Folder for recording and report.")]
+RequestFile = Annotated[str, typer.Argument(help="The request: a JSON file, or - for standard input.")]
+Docs = Annotated[Path | None, typer.Option(help="Page of the documentation whose section is to be written again.")]
+
+SEEDS = (0, 2**31 - 1)
+BOARDS = ("avr", "native", "auto")  # sim.board.KINDS, which takes the simulator's modules to import
+
+
+def one_of(key: str, value: str, allowed: Collection[str]) -> str:
+    """Return `value` if it is one of `allowed`. Raises InputError named `key`."""
+    if value not in allowed:
+        raise InputError(key, value, " or ".join(allowed) if len(allowed) < 4 else "one of " + ", ".join(allowed))
+    return value
+
+
+def within(key: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """Return `value` if it lies from `low` to `high`. Raises InputError named `key`; NaN is refused."""
+    if not low <= value <= high:
+        raise InputError(key, value, f"{low:.12g} to {high:.12g}{f' ({unit})' if unit else ''}")
+    return value
+
+
+def checked_seed(value: int) -> int:
+    """Return `value` if it can seed every generator. Raises InputError."""
+    return int(within("--seed", value, *SEEDS))
+
+
+def writable_file(key: str, path: Path) -> Path:
+    """Return `path` if a file can be written there; its folder must exist. An existing file keeps its content.
+
+    Raises:
+        InputError: named `key`, with the system's reason.
+    """
+    existed = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise InputError(key, str(path), f"a file that can be written ({error.strerror or error})") from None
+    return path
+
+
+def writable_folder(key: str, path: Path) -> Path:
+    """Make the folder `path` where it does not exist, and return it if files can be written there.
+
+    Raises:
+        InputError: named `key`, with the system's reason.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError(key, str(path), f"a folder that can be written ({error.strerror or error})") from None
+    return path
+
+
+def plot_file(path: str | None) -> None:
+    """Refuse a plot that could not be written. Raises InputError."""
+    if path is None:
+        return
+    if Path(path).suffix.lower() != ".png":
+        raise InputError("--plot", path, "a file name that ends in .png")
+    writable_file("--plot", Path(path))

@@ -1,0 +1,103 @@
+"""Is a device fit for an experiment: read tracker, force box or board for some seconds; figures and what is wrong."""
+
+from __future__ import annotations
+
+import time
+
+from protocol.rig_file import Rig
+from protocol.serial_frames import Fault
+from realtime.core.board_intake import axis_limits
+from realtime.drivers.aurora import AuroraConfig
+from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
+from realtime.drivers.stepper_board import FAULT_ADVICE, BoardStatus, EventKind, LinkPhase, StepperBoardLink
+from realtime.drivers.transport import Transport, open_serial
+
+STATUS_HZ, BRING_UP_S = 200.0, 5.0
+
+
+def check_tracker(rig: Rig, port: str, seconds: float) -> DeviceReport:
+    """Read the tracker at serial port `port` (empty: the rig file's) for `seconds`; report its rate, gaps and noise."""
+    tracker = rig.tracker
+    tools = (tracker.tip_handle, tracker.shaft_handle)
+    config = AuroraConfig(tools=tools, rate_hz=tracker.rate_hz, latency_s=tracker.latency_s)
+    return check_aurora(lambda: open_serial(port or tracker.port, 9600), config, seconds)
+
+
+def check_force_box(rig: Rig, address: str, seconds: float, udp_port: int, web_port: int) -> DeviceReport:
+    """Read the force box at `address` (empty: the rig file's) for `seconds`; report its rate, lost records and noise."""
+    return check_net_ft(address or rig.force_sensor.address, seconds, udp_port, web_port)
+
+
+def check_board(rig: Rig, port: str, seconds: float) -> DeviceReport:
+    """Bring the stepper board up (protocol, firmware, limits) and count its status for `seconds`. It is never armed.
+
+    Arguments: `port`, empty: the rig file's.
+    """
+    report = DeviceReport("board")
+    try:
+        transport = open_serial(port or rig.board.port, rig.board.baud)
+    except OSError as error:
+        report.problems.append(str(error))
+        return report
+    link = StepperBoardLink(axis_limits(rig))
+    try:
+        _read_board(link, transport, seconds, report)
+    except OSError as error:
+        report.problems.append(f"the port went away: {error}")
+    finally:
+        transport.close()
+    return report
+
+
+def _read_board(link: StepperBoardLink, transport: Transport, seconds: float, report: DeviceReport) -> None:
+    begin_ns = time.monotonic_ns()
+    ready_ns, statuses, first = 0, 0, None
+    while True:
+        now_ns = time.monotonic_ns()
+        if (now_ns - begin_ns > BRING_UP_S * 1e9 and not ready_ns) or (ready_ns and now_ns - ready_ns > seconds * 1e9):
+            break
+        for event in link.feed(transport.read(), now_ns):
+            if event.kind is EventKind.STATUS:
+                statuses += bool(ready_ns)
+            elif event.kind in (EventKind.FAULT, EventKind.MISMATCH, EventKind.REFUSED, EventKind.RESET):
+                report.problems.append(event.message)
+        if link.phase is LinkPhase.READY and not ready_ns:
+            ready_ns, first = now_ns, link.status
+        if link.phase is LinkPhase.MISMATCH:
+            break
+        sending = link.advance(now_ns)
+        if sending:
+            transport.write(sending)
+        time.sleep(0.001)
+    _judge_board(link, report, statuses / seconds if ready_ns else 0.0, first)
+
+
+def _judge_board(link: StepperBoardLink, report: DeviceReport, rate_hz: float, first: BoardStatus | None) -> None:
+    identity, status = link.identity, link.status
+    if identity is None:
+        report.problems.append(f"no answer to HELLO within {BRING_UP_S:g} s: port, power, firmware (`seldinger flash`)?")
+        return
+    if link.phase is not LinkPhase.READY:
+        report.problems.append(f"bring-up ended in phase {link.phase.value}, wanted ready")
+    report.figures |= {
+        "firmware": f"{identity.firmware_version >> 8}.{identity.firmware_version & 0xFF}",
+        "boot_count": identity.boot_count,
+        "timer_hz": identity.timer_hz,
+        "status_hz": round(rate_hz, 1),
+    }
+    if status is None or first is None:
+        return
+    damaged = link.decoder.counters.crc_errors + status.crc_errors - first.crc_errors
+    report.figures |= {
+        "damaged_frames": damaged,
+        "clock_drift": link.clock.drift,
+        "fault": FAULT_ADVICE[Fault(status.fault)],
+        "encoder_errors": status.encoder_errors,
+        "inputs": f"{status.inputs:07b}",
+    }
+    if rate_hz < 0.98 * STATUS_HZ:
+        report.problems.append(f"{rate_hz:.0f} status frames a second, wanted {STATUS_HZ:g}")
+    if damaged:
+        report.problems.append(f"{damaged} damaged frames: cable, shield, speed of the port")
+    if status.inputs & 0x40:
+        report.problems.append("the emergency stop is open")

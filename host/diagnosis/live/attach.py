@@ -1,0 +1,50 @@
+"""Attach the live diagnosis to a running rig: compare it with its twin, publish and report alarms until it is stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+from host.diagnosis.live.watch import warm_up, watch
+from protocol.rig_file import SIMULATED_RIG, load_rig
+from protocol.topics import Alarm
+from protocol.zenoh_session import Session
+
+STATES = {
+    "waiting": "waiting for an armed rig",
+    "learning": "learning the usual difference of rig and twin",
+    "watching": "watching",
+}
+
+
+def attach(rig_file: str | None, report: Callable[[str], None], on_alarm: Callable[[Alarm], None]) -> None:
+    """Watch the rig of `rig_file` (None: the simulated rig) until SIGINT or SIGTERM.
+
+    Arguments: `report` gets a line for each change of state and each alarm; `on_alarm` gets each alarm once it is published.
+    Raises: InputError for a bad rig file.
+    """
+    os.nice(10)  # below the rig's own processes
+    rig = load_rig(Path(rig_file) if rig_file else SIMULATED_RIG)
+    stopped = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stopped.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+
+    report("loading models")
+    warm_up(rig)
+    with Session(rig.name, [], rig.zenoh.connect) as session:
+        alarms = session.publisher("alarm")
+
+        def publish(alarm: Alarm) -> None:
+            alarms.put(alarm)
+            report(f"ALARM at {alarm.stamp_ns * 1e-9:.1f} s of the rig's clock: {alarm.words}")
+            on_alarm(alarm)
+
+        watch(rig, session.everything(), publish, lambda text: report(STATES.get(text, text)), stopped.is_set)

@@ -1,0 +1,59 @@
+"""Serve the page: of a running rig, of a simulated rig started for it, or of a recording, until SIGINT or SIGTERM."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from host.recordings.recording import Recording, new_recording_path
+from host.run.demo import DemoSettings
+from host.run.wall_clock import Fleet
+from host.view.live import LiveRig
+from host.view.replay import Replay, read_findings
+from host.view.server import ADDRESS, ViewServer
+from host.view.source import Source
+from protocol.errors import InputError
+from protocol.rig_file import load_rig
+from protocol.zenoh_session import Session
+
+Report = Callable[[str], None]
+
+
+def serve(source: Source, port: int, title: str, report: Report) -> None:
+    """Serve `source` on 127.0.0.1 until SIGINT. Raises InputError for a port that is in use."""
+    server = ViewServer(source, port)
+    report(f"{title}: http://{ADDRESS}:{port}/  (Ctrl-C ends it)")
+    try:
+        server.serve()
+    except SystemExit:
+        raise InputError("--port", port, "a port that is free") from None
+
+
+def serve_rig(rig_file: Path, port: int, report: Report) -> None:
+    """Serve the running rig of `rig_file`. Raises InputError."""
+    rig = load_rig(rig_file)
+    with Session(rig.name, [], rig.zenoh.connect) as session, contextlib.closing(LiveRig(rig, session)) as source:
+        serve(source, port, f"rig {rig.name}", report)
+
+
+def serve_recording(recording: Recording, speed: float, diagnosis: str | None, port: int, report: Report) -> None:
+    """Serve a recording at `speed` times real time, with the windows of the verdict in JSON file `diagnosis` marked.
+
+    Raises: InputError.
+    """
+    findings = None if diagnosis is None else read_findings(diagnosis)
+    serve(Replay(recording, speed, findings), port, str(recording.path), report)
+
+
+@contextlib.contextmanager
+def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[Path]:
+    """Run the simulated rig of `rig_file`, recorded into `directory`; gives its rig file, with an endpoint of its own."""
+    report("starting the simulated rig")
+    recording = new_recording_path(directory, "view")
+    try:
+        with Fleet(DemoSettings(rig_file=rig_file), recording) as fleet:
+            fleet.wait_until_heard()
+            yield fleet.rig_file
+    finally:
+        report(f"recording: {recording}")
