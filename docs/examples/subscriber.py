@@ -1,20 +1,13 @@
-"""Print a rig's state as it comes, by plain zenoh and msgpack. Argument: an endpoint, or a file from `seldinger keys`."""
+"""Print a rig's state as it arrives, with zenoh and msgpack alone. Argument: an endpoint, or a file of `seldinger keys`."""
 
 import sys
 
 import msgpack
 import zenoh
 
+CLIENT = '{mode: "client", connect: {endpoints: ["%s"], timeout_ms: -1}, scouting: {multicast: {enabled: false}}}'
 where = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7451"
-config = (
-    zenoh.Config.from_file(where)
-    if where.endswith(".json5")
-    else zenoh.Config.from_json5(
-        '{mode: "client", connect: {endpoints: ["HERE"], timeout_ms: -1}, scouting: {multicast: {enabled: false}}}'.replace(
-            "HERE", where
-        )
-    )
-)
+config = zenoh.Config.from_file(where) if where.endswith(".json5") else zenoh.Config.from_json5(CLIENT % where)
 with zenoh.open(config) as session:
     latest = session.declare_subscriber("seldinger/v1/*/state", zenoh.handlers.RingChannel(1))
     while True:

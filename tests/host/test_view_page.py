@@ -105,7 +105,7 @@ def test_a_recording_is_drawn_and_can_be_moved_about_in(browser: Any, size: tupl
         page = open_page.page
         open_page.wait(lambda: open_page.text("#play") == "Again")
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        assert open_page.text("#mode") == "Contact" and open_page.text("#action") == "All well"
+        assert open_page.text("#mode") == "Contact" and open_page.text("#action") == "No fault"
         assert open_page.text("#force") == "0.200 N" and "Play of 3.1 mm" in page.text_content("#findings")
         mark = page.evaluate("[...document.querySelectorAll('#windows i')].map(i => [i.style.left, i.style.width])")
         assert [[round(float(part.rstrip("%"))) for part in one] for one in mark] == [[20, 20]]
@@ -189,7 +189,7 @@ def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, 
         open_page.wait(lambda: len(fake.asked) == 2)
         assert fake.asked == [{"button": "arm", "confirmed": True}, {"button": "stop", "confirmed": True}]
         fake.silent_s = 3.0
-        open_page.wait(lambda: open_page.text("#action") == "Silent")
+        open_page.wait(lambda: open_page.text("#action") == "No data")
         assert "old" in open_page.text("#cause") and open_page.complaints == []
 
 

@@ -1,7 +1,7 @@
 // The buttons. Stop acts at once; every other asks for a second press within a few seconds. The answer is shown.
 
 const ASKS_MS = 4000;
-const QUESTIONS = {arm: "Arm: sure?", hold: "Hold: sure?", disarm: "Disarm: sure?", clear: "Clear: sure?"};
+const QUESTIONS = {arm: "Confirm arm", hold: "Confirm hold", disarm: "Confirm disarm", clear: "Confirm clear"};
 const NAMES = {arm: "Arm", hold: "Hold", stop: "Stop", disarm: "Disarm", clear: "Clear fault"};
 
 export class Controls {

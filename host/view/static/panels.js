@@ -1,10 +1,10 @@
 // What the numbers mean in words: safety, loop timing, firmware, log.
 
-const ACTIONS = {none: "All well", warn: "Warning", hold: "Holding", retract: "Retracting", stop: "Stopped"};
+const ACTIONS = {none: "No fault", warn: "Warning", hold: "Holding", retract: "Retracting", stop: "Stopped"};
 const MODES = {disarmed: "Disarmed", hold: "Holding", position: "Moving", approach: "Approach", contact: "Contact",
   retract: "Retract", stopped: "Stopped"};
-const IDLE = {disarmed: "Nothing is wrong. The stages will not move until the rig is armed.",
-  hold: "Nothing is wrong. Armed and holding still."};
+const IDLE = {disarmed: "No fault. The stages do not move until the rig is armed.",
+  hold: "No fault. Armed and holding."};
 
 const element = id => document.getElementById(id);
 
@@ -32,25 +32,25 @@ export function showSafety(frame, live) {
   const silent = live && (frame.silent_s === null || frame.silent_s > 1);
   const action = silent ? "silent" : frame.action;
   if (element("safety").dataset.action !== action) element("safety").dataset.action = action;
-  set("action", silent ? (frame.silent_s === null ? "No word yet" : "Silent") : ACTIONS[frame.action] || frame.action || "–");
+  set("action", silent ? (frame.silent_s === null ? "No data yet" : "No data") : ACTIONS[frame.action] || frame.action || "–");
   set("mode", silent ? "–" : MODES[frame.mode] || frame.mode || "–");
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;
   set("force", force);
-  const said = frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "Nothing is wrong.";
-  set("cause", !silent ? said : frame.silent_s === null ? "Nothing has been heard of the rig yet. Is it running, on this rig file’s endpoints?"
-    : `Nothing heard of the rig for ${frame.silent_s.toFixed(0)} s. What is shown is old.`);
+  const said = frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No fault.";
+  set("cause", !silent ? said : frame.silent_s === null ? "No message of the rig yet. Check that it runs, with the endpoints of this rig file."
+    : `No message of the rig for ${frame.silent_s.toFixed(0)} s. The values shown are old.`);
 }
 
 export function showLoop(loop, frame) {
-  if (!loop) return fill(element("loop"), [["", "no word yet"]]);
+  if (!loop) return fill(element("loop"), [["", "no data yet"]]);
   const virtual = loop.lateness_p99_us === null || loop.lateness_p99_us === undefined;
   const rows = [
     ["rate", `${loop.loop_hz.toFixed(0)} Hz`], ["missed ticks", ...count(loop.missed_ticks)],
     ["tick 50 / 99 %", `${us(loop.tick_p50_us)} / ${us(loop.tick_p99_us)}`],
     ["tick 99.9 % / longest", `${us(loop.tick_p999_us)} / ${us(loop.tick_max_us)}`]];
-  if (virtual) rows.push(["late", "virtual time"]);
-  else rows.push(["late 50 / 99 %", `${us(loop.lateness_p50_us)} / ${us(loop.lateness_p99_us)}`],
-    ["late 99.9 % / longest", `${us(loop.lateness_p999_us)} / ${us(loop.lateness_max_us)}`]);
+  if (virtual) rows.push(["lateness", "virtual time"]);
+  else rows.push(["lateness 50 / 99 %", `${us(loop.lateness_p50_us)} / ${us(loop.lateness_p99_us)}`],
+    ["lateness 99.9 % / longest", `${us(loop.lateness_p999_us)} / ${us(loop.lateness_max_us)}`]);
   rows.push(["longest gap", loop.longest_gap_ms ? `${loop.longest_gap_ms.toFixed(1)} ms` : "–"],
     ["pose age", frame.pose_age_ms === null ? "–" : `${frame.pose_age_ms.toFixed(0)} ms`],
     ["refused poses, forces", `${whole(frame.rejected[0])}, ${whole(frame.rejected[1])}`]);
@@ -58,14 +58,14 @@ export function showLoop(loop, frame) {
 }
 
 export function showBoard(board) {
-  if (!board) return fill(element("board"), [["", "no word yet"]]);
+  if (!board) return fill(element("board"), [["", "no data yet"]]);
   const fault = board.fault ? board.fault_name || `fault ${board.fault}` : "none";
   fill(element("board"), [
     ["state", board.state, board.state === "fault" ? "bad" : ""], ["fault", fault, board.fault ? "bad" : "good"],
     ["last status", `${board.age_ms.toFixed(0)} ms ago`, board.age_ms > 500 ? "bad" : ""],
-    ["set-points waiting", whole(board.queue_depth)],
-    ["since a set-point", `${board.deadman_age_ms.toFixed(0)} ms`],
-    ["queue ran dry", ...count(board.underruns)],
+    ["set-points in the queue", whole(board.queue_depth)],
+    ["since the last set-point", `${board.deadman_age_ms.toFixed(0)} ms`],
+    ["queue underruns", ...count(board.underruns)],
     ["damaged frames", ...count(board.crc_errors + (board.host_crc_errors || 0))],
     ["refused set-points", `${whole(board.rejected)}${board.last_reject ? ` (${board.last_reject})` : ""}`, board.rejected ? "bad" : ""],
     ["starts of the board", whole(board.boot_count)]]);
@@ -75,7 +75,7 @@ export function showLog(lines, origin) {
   const list = element("log");
   list.replaceChildren(...(lines.length ? [...lines].reverse() : [null]).map(line => {
     const item = document.createElement("li");
-    if (!line) { item.textContent = "nothing yet"; item.className = "muted"; return item; }
+    if (!line) { item.textContent = "no lines yet"; item.className = "muted"; return item; }
     const time = document.createElement("time");
     time.textContent = `${(line.t - origin).toFixed(1)} s`;
     const text = document.createElement("span");

@@ -29,7 +29,7 @@ function link(text, state) {
 const force = new Traces(element("force-card").querySelector("canvas"), [{
   label: "", unit: "N", scale: 1, digits: 3, least: 0.1, lines: [
     {name: "estimate", label: "estimate", color: "estimate", band: true},
-    {name: "wanted", label: "wanted", color: "target", dash: [5, 4]}, {name: "force", label: "in the loop", color: "force"}]}]);
+    {name: "wanted", label: "set-point", color: "target", dash: [5, 4]}, {name: "force", label: "in the loop", color: "force"}]}]);
 const pose = new Traces(element("pose-card").querySelector("canvas"), ["e1", "e2", "e3"].map((axis, index) => ({
   label: axis, unit: "mm", scale: 1000, digits: 2, least: 0.002, lines: [
     {name: `target${index}`, label: "target", color: "target", dash: [5, 4]}, {name: `tip${index}`, label: "tip", color: "catheter"}]})));
@@ -55,7 +55,7 @@ async function begin(hello) {
       page.scene = new Scene(element("scene"), hello.radius_m);
       element("home").addEventListener("click", () => page.scene.home());
     } catch (error) {
-      element("scene-note").textContent = `No 3-D here: ${error.message}`;
+      element("scene-note").textContent = `No 3-D view in this browser: ${error.message}`;
       page.scene = {show() {}, broken: true};
     }
   }
@@ -103,9 +103,9 @@ function draw() {
   if (page.scene && !page.scene.broken) {
     page.scene.show(frame.scene, frame.mode);
     const gap = frame.scene.gap_m;
-    write(element("scene-note"), "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Twin and tracker are ${(gap * 1000).toFixed(1)} mm apart at the tip.`));
+    write(element("scene-note"), "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Model and tracker differ by ${(gap * 1000).toFixed(1)} mm at the tip.`));
   }
-  link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "rig silent") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
+  link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "no data") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
 }
 
 function connect() {
