@@ -54,7 +54,7 @@ def lines_of(found: Characterization) -> list[Line]:
     """The figures in people's units, each with its interval."""
     width, slope, roll, edges = found.insertion.width, found.insertion.slope, found.roll.slope, found.knob.edges_rad
     lines = [
-        Line("Play of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),
+        Line("Backlash of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),
         Line("Slope of insertion", f"{slope.value:.4f}", _bounded(slope, 1.0, 4)),
         Line(
             "Body at home",
@@ -63,7 +63,7 @@ def lines_of(found: Characterization) -> list[Line]:
         ),
         Line("Slope of roll", f"{roll.value:.4f}", _bounded(roll, 1.0, 4)),
         Line(
-            "Play of roll",
+            "Backlash of roll",
             quantity(found.roll_backlash_rad.value * _DEG, "°", 2),
             _bounded(found.roll_backlash_rad, _DEG, 2),
         ),

@@ -132,7 +132,7 @@ def run_live(script: Script, rig: Rig, progress: Callable[[float], None]) -> Non
         if not taken.accepted:
             raise RuntimeError(f"lease: {taken.reason}")
         if not desk.wait(2.0, lambda: desk.mode() != ""):
-            raise RuntimeError("no state heard from the rig")
+            raise RuntimeError("no message of the topic state from the rig within 2 s; check that it runs")
         if desk.mode() == "disarmed":
             armed = commander.arm()
             if not armed.accepted or not desk.wait(ARM_WITHIN_S, lambda: desk.mode() == "hold"):

@@ -55,7 +55,7 @@ def make_authority(directory: Path, laboratory: str = "laboratory") -> Path:
     """
     folder = directory / CA_FOLDER
     if folder.exists():
-        raise InputError("directory", f"an authority in {folder}", "a directory without one; move it away to begin anew")
+        raise InputError("directory", f"an authority in {folder}", "a directory without one; move it away to start again")
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(
         [

@@ -35,11 +35,11 @@ def keys_problems(folder: Path, listen: Sequence[str], now: datetime.datetime | 
             problems += _in_time(certificate, folder / name, now)
     if own is not None and ca is not None and not _issued_by(own, ca):
         problems.append(
-            f"{folder / CERTIFICATE_FILE}: found a certificate of another authority, wanted one of {CA_FILE} beside it"
+            f"{folder / CERTIFICATE_FILE}: found a certificate of another authority, wanted one of {CA_FILE} in that folder"
         )
     if own is not None and key is not None and key != own.public_key():
         problems.append(
-            f"{folder / KEY_FILE}: found the key of another certificate, wanted that of {CERTIFICATE_FILE} beside it"
+            f"{folder / KEY_FILE}: found the key of another certificate, wanted that of {CERTIFICATE_FILE} there"
         )
     if own is not None:
         problems += _fits_a_rig(own, folder / CERTIFICATE_FILE, listen)

@@ -97,7 +97,7 @@ class LiveRig:
         answer = self._command(press.button)
         text = answer.reason.removeprefix(f"{answer.result}: ")
         if answer.result == "unanswered" and self._heard_s is None:
-            text = "no answer: nothing has been heard of the rig yet, it may still be starting"
+            text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}
 
     def _command(self, button: str) -> Acknowledgement:

@@ -227,7 +227,7 @@ class AuroraClient:
             self._fail(f"{self.config.reply}: {ndi.words(text)}", now_ns, self.config.retry_s)
             return []
         if text == "RESET":
-            self._fail("the device has been reset or switched on anew", now_ns, self.config.retry_s)
+            self._fail("the device was reset or switched on again", now_ns, self.config.retry_s)
             return []
         try:
             if reply.binary is not None:
@@ -277,7 +277,7 @@ class AuroraClient:
                 self._strange_in_row += 1
                 if self._strange_in_row < _STRANGE_IN_ROW:
                     return None
-                text = f"frame counter went from {self._frame} to {newest}: times learnt anew"
+                text = f"frame counter went from {self._frame} to {newest}: learning its clock again"
                 self.event(EventKind.WARNING, text, now_ns)
                 self.clock.reset()
                 self._frame = None
@@ -336,7 +336,7 @@ class AuroraClient:
             self.event(EventKind.WARNING, ndi.system_words(risen) or f"system status {risen:04X}", now_ns)
         # What stands since before the ports were last read is no change.
         if not first and risen & (ndi.PORT_OCCUPIED | ndi.PORT_UNOCCUPIED):
-            self.event(EventKind.LOST, "a tool was plugged in or pulled: ports are read anew", now_ns)
+            self.event(EventKind.LOST, "a tool was plugged in or unplugged; reading the ports again", now_ns)
             self._start_session(enumerate_and_start(self, stop_first=True), now_ns)
 
 

@@ -45,7 +45,9 @@ class RealtimeReport:
         """One line for people, or None where everything asked for was granted."""
         if not self.refused:
             return None
-        return f"the loop runs with less than it asked for: {'; '.join(self.refused)}. Ticks can be late; {_ADVICE}"
+        return (
+            f"the loop runs without the settings that it requested: {'; '.join(self.refused)}. Ticks can be late; {_ADVICE}"
+        )
 
 
 @contextlib.contextmanager

@@ -186,7 +186,7 @@ def _limits(runs: _Runs) -> dict[str, Any]:
     for name, off_m in (("narrower", -PLAY_OFF_m), ("wider", PLAY_OFF_m)):
         rig = with_control(runs.rig, "transmission", insertion_backlash_m=play_m + off_m)
         for source in ("sensor", "estimate"):
-            runs.progress(f"play believed {off_m * 1e3:+.1f} mm {name}, {source}")
+            runs.progress(f"configured backlash off by {off_m * 1e3:+.1f} mm {name}, {source}")
             run = control_runs.hold(rig, seed, REGULAR, min(runs.settings.hold_s, 20.0), source, WANTED_N)
             table[f"play_believed_{name}_{source}_rms_N"] = run.rms_N(WANTED_N)
     return table

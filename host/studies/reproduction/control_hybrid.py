@@ -369,7 +369,8 @@ def _heart() -> list[Section]:
             "fig_7.16",
             "Fig. 7.16: force on the beating heart",
             "Force oscillates little about 0.1, 0.2 and 0.3 N.",
-            "The same three forces, beside a catheter left alone: most of the steadiness is the shaft's softness across.",
+            "The same three forces, compared with a catheter that does not move: most of the steadiness comes from "
+            "the lateral compliance of the shaft.",
             verdict(better),
             said + ".",
             (second,),

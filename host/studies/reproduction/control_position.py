@@ -115,14 +115,14 @@ def _commands(runs: list[Navigation]) -> Section:
     back = [int(np.sum(np.abs(np.diff(run.stage[:, 0])) > 1e-3)) for run in runs]
     says = (
         f"Greatest change of a command's step from frame to frame: {share[1] * 100:.1f} % of the travel for roll, "
-        f"{share[2] * 100:.1f} % for the knob; insertion jumps by the play (3.1 mm) at a reversal, as compensation "
-        "must."
+        f"{share[2] * 100:.1f} % for the knob; insertion jumps by the backlash width (3.1 mm) at a reversal, "
+        "as compensation must."
     )
     return Section(
         "fig_6.17",
         "Fig. 6.17: commands to the steppers",
         "Smooth commands without jerky oscillation.",
-        f"As commanded; {', '.join(map(str, back))} reversals of insertion, each a jump of the play.",
+        f"As commanded; {', '.join(map(str, back))} reversals of insertion, each with a jump by the backlash width.",
         verdict(bool(np.max(share[1:]) < 0.05)),
         says,
         (figure,),

@@ -12,9 +12,9 @@ from host.studies.reproduction import planar, spatial, spatial_experiments, spat
 PAGE = "reproduction-mechanics.html"
 NOT_WHEN_QUICK = (planar.figure_2_5, planar.figure_4_8)  # they identify the planar arcs first, most of a minute
 LEAD = (
-    "Chapters 2 to 5 of the seed thesis made again: planar arcs, the spatial rod, and the force estimated from poses "
+    "Chapters 2 to 5 of the thesis, reproduced: planar arcs, the spatial rod, and the force estimated from poses "
     "of each. The thesis' own "
-    "schemes run beside ours, with its errata applied. Where its recordings would be needed a finer, independent "
+    "schemes run together with ours, with its errata applied. Where its recordings would be needed a finer, independent "
     "catheter stands in, and "
     "the caption says so. A statement that does not come out is marked as not holding."
 )

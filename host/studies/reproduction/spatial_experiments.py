@@ -144,8 +144,8 @@ def figure_5_8(quick: bool) -> Section:
         f"{said('livewire', False)}; "
         f"catheter 2: {said('steerocath_t', True)}, {said('steerocath_t', False)}",
         f"catheter 1, load tracked while it grows: {said('livewire', True)} in cases 2, 4, 6; each sample alone "
-        f"{said('livewire', False)}; without any noise {model}: the rest is the tracker's noise along the direction "
-        f"that the poses tell least, which on the mean adds to a size",
+        f"{said('livewire', False)}; without any noise {model}: the remainder is the tracker's noise along the direction "
+        f"that the poses determine least, which on average increases a magnitude",
         "The thesis' recordings are not published. In their place the finer catheter of Table 3.3's section (stiff "
         "electrodes, uneven "
         "pre-curvature), 15 1/m, d = 10 mm, five pushes, noise of 0.29 mm and 0.2 degrees per axis; stiffness identified "
