@@ -5,11 +5,13 @@ BIN    := $(VENV)/bin
 BOARD  ?= auto
 TEST_ARGS ?= -n 2 --dist loadfile
 INPUTS ?= 10000000
+FILES  ?= 100000
+SEED   ?= 1
 
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
 
-.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults fuzz soak clean
+.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults fuzz fuzz-files soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -65,6 +67,10 @@ faults: setup
 fuzz: setup
 	@$(MAKE) -s -C firmware/fuzz run INPUTS=$(INPUTS) >build/fuzz.json && cat build/fuzz.json
 	@$(BIN)/python -m host.studies.reliability_page docs/reliability.md <build/fuzz.json
+
+# Crafted recordings read by every reader of them; those that broke one stay in build/crafted_recordings and are read again.
+fuzz-files: setup
+	@$(BIN)/python -m tests.host.crafted_recordings $(FILES) $(SEED)
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md

@@ -69,7 +69,7 @@ def characterize(
 
 def _record_simulated(rig: Rig, repeats: int, seed: int, board: str, directory: Path) -> Path:
     from host.commissioning.characterization import record_simulated, standard_sweeps
-    from host.recordings.recording import new_recording_path
+    from host.recordings.writer import new_recording_path
 
     sweeps, path = standard_sweeps(rig, repeats), new_recording_path(directory, "characterize")
     with share_bar("sweeps") as progress:
@@ -80,7 +80,7 @@ def _record_on_rig(rig: Rig, repeats: int, ports: PortNames, yes: bool, director
     """Ask first: sweeps swing the tip through free space, and the command cannot see what stands there."""
     from host.commissioning.characterization import standard_sweeps
     from host.commissioning.rig_sweeps import describe, record_on_rig
-    from host.recordings.recording import new_recording_path
+    from host.recordings.writer import new_recording_path
 
     sweeps = standard_sweeps(rig, repeats)
     print(f"seldinger: {describe(sweeps)}", file=sys.stderr)

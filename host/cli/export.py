@@ -9,7 +9,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, one_of, writable_folder
-from host.cli.recordings import open_recording
+from host.cli.recordings import UnpackLimit, open_recording
 from protocol.errors import InputError
 
 
@@ -18,13 +18,14 @@ def export(
     folder: Annotated[Path, typer.Argument(help="Folder for the tables; made if it does not exist.")],
     to: Annotated[str, typer.Option(help="parquet or csv.")] = "parquet",
     json: Json = False,
+    unpack_limit: UnpackLimit = None,
 ) -> None:
     """Write one table for each topic: `seldinger export REC.mcap --to parquet DIR`."""
     from host.recordings.export import FORMATS
     from host.recordings.export import export as export_tables
 
     one_of("--to", to, FORMATS)
-    opened = open_recording(recording)
+    opened = open_recording(recording, unpack_limit)
     writable_folder("folder", folder)
     try:
         written = export_tables(opened, to, folder)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from host.cli.recordings import open_recording
+from host.cli.recordings import UnpackLimit, open_recording
 
 
 def play(
@@ -16,9 +16,10 @@ def play(
     speed: Annotated[float, typer.Option(help="Times real time, 0.05 to 50.")] = 1.0,
     diagnosis: Annotated[str | None, typer.Option(help="JSON of `seldinger diagnose`: its windows are marked.")] = None,
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page, on 127.0.0.1.")] = 8448,
+    unpack_limit: UnpackLimit = None,
 ) -> None:
     """Show a recording in a browser: play, pause, seek."""
     from host.view.serve import serve_recording
 
-    opened = open_recording(recording)
+    opened = open_recording(recording, unpack_limit)
     serve_recording(opened, speed, diagnosis, port, lambda line: print(line, file=sys.stderr))

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from protocol.errors import InputError
+import typer
 
 if TYPE_CHECKING:
     from host.recordings.recording import Recording
 
 
-def open_recording(path: Path) -> Recording:
+UnpackLimit = Annotated[
+    int | None,
+    typer.Option("--unpack-limit", min=1, help="MiB that the file may unpack to; default 64, or 64 times the file's size."),
+]
+
+
+def open_recording(path: Path, unpack_limit_MiB: int | None = None) -> Recording:
     """Open the recording at `path`; say on standard error where it is incomplete. Raises InputError."""
     from host.recordings.recording import Recording
 
-    try:
-        recording = Recording(path)
-    except ValueError as error:
-        found, _, wanted = str(error).removeprefix(f"{path}: found ").partition(", wanted ")
-        raise InputError(str(path), found, wanted) from None
+    recording = Recording(path, None if unpack_limit_MiB is None else unpack_limit_MiB * 2**20)
     if recording.truncated or recording.damaged_chunks:
         print(
             f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.commissioning.sweep_fits import Estimate, KnobFit, PlayFit, Run, fit_knob, fit_play
-from host.recordings.recording import Recording, RecordingWriter, header_of
+from host.recordings.header import header_of
+from host.recordings.recording import Recording
+from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.rig_file import Rig, load_rig, parse_rig
 from protocol.topics import Message

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from host.commissioning.characterization import Characterization, transmission_toml
 from host.commissioning.sweep_fits import Estimate, Run, dead_zone_curvature, play
-from host.recordings.recording import software_version
+from host.recordings.header import software_version
 from host.report.figure_page import page_environment
 from host.report.run_report import Line, quantity
 from host.report.style import ESTIMATED, MEASURED, MUTED, TRUTH, WANTED, Picture, legend_above, picture

@@ -9,7 +9,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
-from host.recordings.recording import RecordingWriter, header_of
+from host.recordings.header import header_of
+from host.recordings.writer import RecordingWriter
 from protocol.rig_file import AXES, Rig
 from protocol.topics import Message
 from realtime.core.sweep import MOVE_SPEED, REST_S, Sweep, SweepLoop

@@ -5,16 +5,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import BinaryIO
 
-import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -24,7 +20,6 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # of every record: what it is, its length after this head
@@ -130,15 +125,3 @@ def file_end(stream: BinaryIO, schemas: Iterable[Schema], channels: Iterable[Cha
     footer = RecordBuilder()
     Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=check).write(footer)
     return ended + text + footer.end() + MAGIC
-
-
-def is_whole(path: Path) -> bool:
-    """Whether the file has its end and every chunk of it unpacks to what went in; reads a chunk at a time."""
-    try:
-        with path.open("rb") as stream:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(record, Chunk):
-                    get_chunk_data_stream(record, validate_crc=True)
-    except (McapError, ValueError, struct.error, zstandard.ZstdError):
-        return False
-    return True

@@ -1,328 +1,228 @@
-"""Recordings: MCAP files of the topics' messages, self-describing, readable up to the last chunk after a power cut."""
+"""Reading a recording: which messages the file has, and each topic as messages or as a table.
+
+Opening goes over the file once and keeps the place of each message, 24 bytes, not the message. A file that was cut off or
+damaged gives every message that is intact. What a file may unpack to is bounded, so that a crafted one fills no memory.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import errno
+import io
 import json
 import struct
-import subprocess
-import time
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+import zlib
+from array import array
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-import msgpack
+import lz4.frame
+import msgspec
 import numpy as np
 import orjson
 import zstandard
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
-from mcap.records import Header as McapHeader
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
 
-from host.recordings.chunk import ChunkBuilder
-from host.recordings.file import GuardedFile
-from host.recordings.foxglove import PREFIX, SCHEMAS, FoxgloveChannels, plain_schema
-from host.recordings.index import MAGIC, file_end
-from protocol.catheter import load_catheter
-from protocol.rig_file import Rig
-from protocol.topics import TOPICS, Message, encode
+from host.recordings.foxglove import PREFIX
+from host.recordings.index import MAGIC
+from protocol.errors import InputError
+from protocol.topics import TOPICS, Message
 
-PROFILE = "seldinger"
-CHUNK_BYTES = 256 * 1024
-CHUNK_NS = 1_000_000_000
-# Schemas and channels are said again after so many chunks: a damaged one does not cost what follows for ever.
-CHUNKS_PER_DESCRIPTION = 60
-_MAX_RECORD_BYTES = 64 * 1024 * 1024
-_DAMAGE = (McapError, ValueError, struct.error, zstandard.ZstdError, OverflowError, MemoryError)
-
-
-def software_version() -> str:
-    """The installed version of this software, `unknown` when it is not installed."""
-    try:
-        return version("seldinger")
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def git_revision() -> str:
-    """The revision that this code stands at, with `+changes` where files differ from it; `unknown` outside git."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return "unknown"
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=40", "--dirty=+changes", "--exclude=*"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return "unknown"
-    return done.stdout.strip() or "unknown"
+# A chunk is held whole while it is read; other recorders make chunks of 1 to 4 MB.
+CHUNK_LIMIT_BYTES = 64 * 1024 * 1024
+# All chunks together may unpack to this much, or to 64 times the file where that is more: messages of a rig pack 6 to 1.
+UNPACKED_LIMIT_BYTES = 64 * 1024 * 1024
+UNPACKED_PER_PACKED = 64
+# A table is held whole: at most 512 MB of it.
+TABLE_LIMIT_BYTES = 512 * 1024 * 1024
+_RECORD_HEAD = struct.Struct("<BQ")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_LATEST_NS = 2**63 - 1
+_DAMAGE = (
+    McapError,
+    ValueError,
+    struct.error,
+    zstandard.ZstdError,
+    RuntimeError,  # lz4 and RecursionError
+    EOFError,
+    OverflowError,
+    MemoryError,
+    IndexError,
+)
+_BAD_CONTENT = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
+_OUTSIDE = -1  # the number of a chunk that a message is in, for a message in none
 
 
-class Header(NamedTuple):
-    """What must be known to understand a recording, besides its messages."""
+class _Places(NamedTuple):
+    """Of each message of a topic: when it was recorded, its chunk, and the place and length of its data in it."""
 
-    rig: str
-    clock: str
-    configuration: dict[str, Any]
-    catheter: dict[str, Any]
-    seed: int | None = None
-    notes: dict[str, str] = {}  # noqa: RUF012 - a NamedTuple's default, never written to
+    recorded_ns: array[int]
+    chunk: array[int]
+    start: array[int]
+    length: array[int]
 
-    def sections(self) -> dict[str, dict[str, str]]:
-        """The MCAP metadata records: name -> texts."""
-        run = {
-            "rig": self.rig,
-            "clock": self.clock,
-            "seed": "" if self.seed is None else str(self.seed),
-            "software_version": software_version(),
-            "git_revision": git_revision(),
-            "started_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-            **self.notes,
-        }
-        return {
-            "run": run,
-            "configuration": {"json": json.dumps(self.configuration)},
-            "catheter": {"json": json.dumps(self.catheter)},
-        }
+    @classmethod
+    def empty(cls) -> _Places:
+        return cls(array("q"), array("i"), array("q"), array("I"))
+
+    def add(self, recorded_ns: int, chunk: int, start: int, length: int) -> None:
+        self.recorded_ns.append(recorded_ns)
+        self.chunk.append(chunk)
+        self.start.append(start)
+        self.length.append(length)
 
 
-def _description(topic: str) -> tuple[str, str, dict[str, str]]:
-    """Name and text of a channel's schema, and its metadata."""
-    if topic in SCHEMAS:
-        return SCHEMAS[topic]["title"], json.dumps(SCHEMAS[topic]), {}
-    row = TOPICS[topic]
-    metadata = {"rate_hz": f"{row.rate_hz:g}", "direction": row.direction, "description": row.doc}
-    return row.message.__name__, plain_schema(row.message), metadata
+class RecordedTable(dict[str, np.ndarray]):
+    """The columns of one topic, (n,) each. A column that the file does not have is bad input, not a KeyError."""
 
+    def __init__(self, source: str, columns: dict[str, np.ndarray]) -> None:
+        super().__init__(columns)
+        self._source = source
 
-def header_of(rig: Rig, clock: str, seed: int | None = None, notes: dict[str, str] | None = None) -> Header:
-    """The recording's header for `rig`. clock: `virtual` or `wall`."""
-    return Header(
-        rig=rig.name,
-        clock=clock,
-        configuration=rig.effective(),
-        catheter=dataclasses.asdict(load_catheter(rig.catheter.name)),
-        seed=seed,
-        notes=notes or {},
-    )
-
-
-def new_recording_path(directory: Path, name: str) -> Path:
-    """A path in `directory` (made if needed) that no file has yet: name, date and time, and a number if needed."""
-    directory.mkdir(parents=True, exist_ok=True)
-    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    path, number = directory / f"{stem}.mcap", 1
-    while path.exists():
-        number += 1
-        path = directory / f"{stem}-{number}.mcap"
-    return path
-
-
-class RecordingWriter:
-    """Writes one recording. Not thread-safe: one thread records.
-
-    path: a file that does not exist yet (FileExistsError otherwise). on_failure: called once, with one sentence,
-    when the disk is full or gone; writing then goes on doing nothing, so that nothing else has to stop.
-    """
-
-    def __init__(self, path: str | Path, header: Header, on_failure: Callable[[str], None] | None = None) -> None:
-        self.path = Path(path)
-        self.failure = ""
-        self._on_failure = on_failure
-        self._file = GuardedFile(self.path)
-        self._chunk = ChunkBuilder()
-        self._channels: dict[str, Channel] = {}
-        self._schemas: dict[str, Schema] = {}
-        self._foxglove = FoxgloveChannels(header.configuration, header.catheter)
-        self._sequence: dict[str, int] = {}
-        self._chunk_bytes, self._chunk_start_ns, self._chunks = 0, 0, 0
-        self._closed = False
-        self._file.write(MAGIC)
-        self._record(McapHeader(profile=PROFILE, library=f"seldinger {software_version()}"))
-        for name, texts in header.sections().items():
-            self._record(Metadata(name=name, metadata=texts))
-        self._sync()
-
-    def _record(self, record: McapRecord) -> None:
-        """A record outside the chunks."""
-        out = RecordBuilder()
-        record.write(out)
-        self._file.write(out.end())
-
-    def _channel(self, topic: str) -> int:
-        known = self._channels.get(topic)
-        if known is not None:
-            return known.id
-        name, text, metadata = _description(topic)
-        if name not in self._schemas:
-            schema = Schema(id=len(self._schemas) + 1, data=text.encode(), encoding="jsonschema", name=name)
-            self._schemas[name] = schema
-            self._chunk.describe(schema)
-        channel = Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding="json",
-            metadata=metadata,
-            schema_id=self._schemas[name].id,
-        )
-        self._channels[topic] = channel
-        self._chunk.describe(channel)
-        return channel.id
-
-    def write(self, topic: str, message: Message, recorded_ns: int | None = None) -> None:
-        """Append `message` of `topic`, numbered here. recorded_ns: the rig's clock now, else the message's own stamp.
-
-        Raises ValueError for a message of another topic or with a field that is not what its class declares.
-        """
-        if type(message) is not TOPICS[topic].message:
-            raise ValueError(f"{topic}: found {type(message).__name__}, wanted {TOPICS[topic].message.__name__}")
-        sequence = self._sequence.get(topic, 0)
-        self._sequence[topic] = sequence + 1
-        self.write_encoded(topic, encode(message, sequence), message.stamp_ns, sequence, recorded_ns)
-
-    def write_encoded(
-        self, topic: str, payload: bytes, stamp_ns: int, sequence: int, recorded_ns: int | None = None
-    ) -> None:
-        """Append a payload that has already been decoded (and so checked) as a message of `topic`."""
-        if self._closed or self.failure:
-            return
-        now_ns = stamp_ns if recorded_ns is None else recorded_ns
-        body = {name: value for name, value in msgpack.unpackb(payload).items() if value is not None}
-        self._add(topic, body, stamp_ns, sequence, now_ns)
-        for derived in self._foxglove.hear(topic, body):
-            self._add(derived.topic, derived.body, derived.stamp_ns, 0, now_ns)
-        if self._chunk_bytes >= CHUNK_BYTES or abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
-            self._sync()
-
-    def _add(self, topic: str, body: dict[str, Any], stamp_ns: int, sequence: int, now_ns: int) -> None:
-        data = orjson.dumps(body)
-        self._chunk.add(
-            McapMessage(
-                channel_id=self._channel(topic),
-                log_time=now_ns,
-                publish_time=stamp_ns,
-                data=data,
-                sequence=sequence & 0xFFFFFFFF,
-            )
-        )
-        if self._chunk_bytes == 0:
-            self._chunk_start_ns = now_ns
-        self._chunk_bytes += len(data) + 31
-
-    def _sync(self) -> None:
-        if not self._chunk.empty:
-            self._file.write(self._chunk.end())
-            self._chunks += 1
-            if self._chunks % CHUNKS_PER_DESCRIPTION == 0:
-                records: list[Schema | Channel] = [*self._schemas.values(), *self._channels.values()]
-                for record in records:
-                    self._chunk.describe(record)
-        self._file.flush()
-        self._chunk_bytes = 0
-        self._report()
-
-    def flush(self) -> None:
-        """End the chunk in progress and bring it to the disk; for quiet times, when no message ends it."""
-        if not self._closed and not self.failure and self._chunk_bytes:
-            self._sync()
-
-    def _report(self) -> None:
-        error = self._file.error
-        if error is None or self.failure:
-            return
-        cause = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error.strerror or error)
-        self.failure = f"recording {self.path} ended early: {cause}; what was written before is readable"
-        if self._on_failure is not None:
-            self._on_failure(self.failure)
-
-    def close(self) -> None:
-        """Finish the file with its index. Safe to call twice."""
-        if self._closed:
-            return
-        self._closed = True
-        if not self.failure:
-            self._sync()
-        if not self.failure:
-            with self._file.read_back() as stream:
-                end = file_end(stream, self._schemas.values(), self._channels.values())
-            self._file.write(end)
-            self._file.flush()
-            self._report()
-        self._file.close()
-
-    def __enter__(self) -> RecordingWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-
-class _Row(NamedTuple):
-    recorded_ns: int
-    data: bytes
+    def __missing__(self, column: str) -> np.ndarray:
+        raise InputError(self._source, f"no column {column}", "a recording that has it: " + ", ".join(self)[:200])
 
 
 class Recording:
-    """A recording, read whole. A file cut short, or with damaged chunks, gives every message that is intact.
+    """A recording. A file that was cut off, or has damaged chunks, gives every message that is intact.
 
-    path: the MCAP file. Raises ValueError where it cannot be read at all or is no recording.
+    Args:
+        path: The MCAP file.
+        unpacked_limit_bytes: What all chunks together may unpack to; by default UNPACKED_LIMIT_BYTES, or
+            UNPACKED_PER_PACKED times the file's size where that is more.
+
+    Raises:
+        InputError: The file cannot be read, is no recording, or unpacks to more than the limit.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, unpacked_limit_bytes: int | None = None) -> None:
         self.path = Path(path)
-        self.truncated = False
+        self.truncated = True
         self.damaged_chunks = 0
         self._metadata: dict[str, dict[str, str]] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._rows: dict[str, list[_Row]] = {}
-        self._of_channel: dict[int, list[_Row]] = {}
-        self._tables: dict[str, dict[str, np.ndarray]] = {}
+        self._of_channel: dict[int, _Places] = {}
+        self._chunk_places: list[tuple[int, int]] = []
+        self._tables: dict[str, RecordedTable] = {}
+        self._unpacked_bytes = 0
+        self._held: tuple[int, bytes] = (_OUTSIDE, b"")
         try:
             with self.path.open("rb") as stream:
-                self._read(stream)
+                size = stream.seek(0, io.SEEK_END)
+                self._limit_bytes = unpacked_limit_bytes or max(UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED * size)
+                self._scan(stream, size)
         except OSError as error:
-            raise ValueError(f"{path}: found {error.strerror or error}, wanted a readable recording") from None
-        for number, rows in self._of_channel.items():
-            if number in self._channels and not self._channels[number].topic.startswith(PREFIX):
-                self._rows.setdefault(self._channels[number].topic, []).extend(rows)
+            raise InputError(str(path), error.strerror or str(error), "a readable recording") from None
+        self._places = self._by_topic()
 
-    def _read(self, stream: Any) -> None:
-        magic = stream.read(8)
+    def _by_topic(self) -> dict[str, tuple[int, _Places]]:
+        """Topic -> schema's number and places. A topic that several channels carry keeps the order of the channels."""
+        found: dict[str, tuple[int, _Places]] = {}
+        for number, places in self._of_channel.items():
+            channel = self._channels.get(number)
+            if channel is None or channel.topic.startswith(PREFIX) or channel.schema_id not in self._schemas:
+                continue
+            if channel.topic in found:
+                for own, more in zip(found[channel.topic][1], places, strict=True):
+                    own.extend(more)
+            else:
+                found[channel.topic] = (channel.schema_id, places)
+        return found
+
+    def _scan(self, stream: BinaryIO, size: int) -> None:
+        """Go over all records once; stops at the first that is not whole."""
+        magic = stream.seek(0) or stream.read(len(MAGIC))
         if magic != MAGIC:
-            raise ValueError(f"{self.path}: found {magic!r} at its start, wanted an MCAP recording")
-        records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=_MAX_RECORD_BYTES).records
-        self.truncated = True
-        try:
-            for record in records:
-                self._take(record)
-            self.truncated = False
-        except _DAMAGE:
-            return
-
-    def _take(self, record: Any) -> None:
-        if isinstance(record, Chunk):
-            try:
-                inside = breakup_chunk(record, validate_crc=True)
-            except _DAMAGE:
-                self.damaged_chunks += 1
+            raise InputError(str(self.path), repr(magic), "an MCAP recording")
+        place = len(MAGIC)
+        while len(head := stream.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
+            opcode, length = _RECORD_HEAD.unpack(head)
+            place += _RECORD_HEAD.size
+            if place + length > size:
                 return
-            for item in inside:
-                self._take(item)
-        elif isinstance(record, McapMessage):
-            self._of_channel.setdefault(record.channel_id, []).append(_Row(record.log_time, record.data))
-        elif isinstance(record, Schema):
-            self._schemas.setdefault(record.id, record)
-        elif isinstance(record, Channel):
-            self._channels.setdefault(record.id, record)
-        elif isinstance(record, Metadata):
-            self._metadata[record.name] = record.metadata
+            if opcode == Opcode.FOOTER:
+                stream.seek(place + length)
+                self.truncated = stream.read(len(MAGIC)) != MAGIC
+                return
+            try:
+                self._take(stream, opcode, place, length)
+            except _DAMAGE as error:
+                if isinstance(error, InputError):
+                    raise
+                if opcode != Opcode.CHUNK:
+                    return
+                self.damaged_chunks += 1
+            place += length
+            stream.seek(place)
+
+    def _take(self, stream: BinaryIO, opcode: int, place: int, length: int) -> None:
+        if opcode == Opcode.CHUNK:
+            content = self._unpacked(stream, length)
+            number = len(self._chunk_places)
+            for inside, start, end in _records(content):
+                self._describe(inside, content[start:end]) if inside != Opcode.MESSAGE else None
+            for inside, start, end in _records(content):
+                if inside == Opcode.MESSAGE:
+                    self._add(content, number, start, end)
+            self._chunk_places.append((place, length))
+        elif opcode == Opcode.MESSAGE:
+            if length < _MESSAGE_HEAD.size:
+                raise ValueError("a message shorter than its head")
+            self._note(stream.read(_MESSAGE_HEAD.size), 0, _OUTSIDE, place + _MESSAGE_HEAD.size, length - _MESSAGE_HEAD.size)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            if length > CHUNK_LIMIT_BYTES:
+                raise ValueError("a description larger than a chunk may be")
+            self._describe(opcode, stream.read(length))
+
+    def _describe(self, opcode: int, data: bytes) -> None:
+        stream = ReadDataStream(io.BytesIO(data))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas.setdefault(schema.id, schema)
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self._channels.setdefault(channel.id, channel)
+        elif opcode == Opcode.METADATA:
+            metadata = Metadata.read(stream)
+            self._metadata[metadata.name] = metadata.metadata
+
+    def _add(self, content: bytes, chunk: int, start: int, end: int) -> None:
+        self._note(content, start, chunk, start + _MESSAGE_HEAD.size, end - start - _MESSAGE_HEAD.size)
+
+    def _note(self, content: bytes, at: int, chunk: int, start: int, length: int) -> None:
+        channel, _, recorded_ns, _ = _MESSAGE_HEAD.unpack_from(content, at)
+        known = self._channels.get(channel)
+        if known is None or not known.topic.startswith(PREFIX):  # Foxglove's channels are derived from the others
+            self._of_channel.setdefault(channel, _Places.empty()).add(min(recorded_ns, _LATEST_NS), chunk, start, length)
+
+    def _unpacked(self, stream: BinaryIO, length: int) -> bytes:
+        """Return the content of the chunk record that `stream` stands at.
+
+        Raises:
+            InputError: With this chunk the file unpacks to more than its limit.
+        """
+        if length > CHUNK_LIMIT_BYTES:
+            raise ValueError("a chunk larger than a chunk may be")
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(stream.read(length))))
+        if chunk.uncompressed_size > CHUNK_LIMIT_BYTES:
+            raise ValueError("a chunk that unpacks to more than a chunk may")
+        self._unpacked_bytes += chunk.uncompressed_size
+        if self._unpacked_bytes > self._limit_bytes:
+            raise InputError(
+                str(self.path),
+                f"chunks that unpack to more than {self._limit_bytes / 2**20:.0f} MiB",
+                "less; a recording that is trusted and really so large is read with a higher unpack limit",
+            )
+        content = _unpack(chunk)
+        if len(content) != chunk.uncompressed_size or (
+            chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc
+        ):
+            raise ValueError("a chunk whose content does not match its checksum")
+        return content
 
     @property
     def run(self) -> dict[str, str]:
@@ -332,34 +232,51 @@ class Recording:
     @property
     def configuration(self) -> dict[str, Any]:
         """The effective configuration of the rig."""
-        return json.loads(self._metadata.get("configuration", {}).get("json", "{}"))
+        return self._section("configuration")
 
     @property
     def catheter(self) -> dict[str, Any]:
         """The catheter's parameters."""
-        return json.loads(self._metadata.get("catheter", {}).get("json", "{}"))
+        return self._section("catheter")
+
+    def _section(self, name: str) -> dict[str, Any]:
+        text = self._metadata.get(name, {}).get("json", "{}")
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{self.path} {name}", str(error), "a JSON object") from None
+        if not isinstance(found, dict):
+            raise InputError(f"{self.path} {name}", found, "a JSON object")
+        return found
 
     @property
     def topics(self) -> dict[str, int]:
         """Topic -> number of messages, for topics that have any."""
-        return {topic: len(rows) for topic, rows in self._rows.items()}
+        return {topic: len(places.chunk) for topic, (_, places) in self._places.items()}
 
     @property
     def span_ns(self) -> tuple[int, int]:
         """Earliest and latest time of recording, (0, 0) for an empty one."""
-        times = [row.recorded_ns for rows in self._rows.values() for row in (rows[0], rows[-1])]
+        times = [time for _, places in self._places.values() for time in (places.recorded_ns[0], places.recorded_ns[-1])]
         return (min(times), max(times)) if times else (0, 0)
 
     def schema(self, topic: str) -> dict[str, Any]:
-        """The JSON Schema of `topic` as this file carries it. Raises ValueError for a topic that is not in it."""
-        for channel in self._channels.values():
-            if channel.topic == topic and channel.schema_id in self._schemas:
-                return json.loads(self._schemas[channel.schema_id].data)
-        known = ", ".join(sorted(self._rows)) or "none, the recording is empty"
-        raise ValueError(f"topic: found {topic!r}, wanted one of {known}")
+        """Return the JSON Schema of `topic` as the file has it.
+
+        Raises:
+            InputError: The topic is not in the file, or its schema is none that this reader knows.
+        """
+        if topic not in self._places:
+            known = ", ".join(sorted(self._places)) or "none, the recording is empty"
+            raise InputError("topic", topic, f"one of {known}")
+        data = self._schemas[self._places[topic][0]].data
+        try:
+            return _plain_properties(data)
+        except _BAD_CONTENT as error:
+            raise InputError(f"{self.path} {topic}", _brief(error), "a JSON Schema of numbers, texts and flags") from None
 
     def units(self, topic: str) -> dict[str, str]:
-        """Column -> unit of `topic`'s table, empty text where it has none."""
+        """Return column -> unit of `topic`'s table, empty text where it has none. Raises InputError as `schema`."""
         units = {}
         for name, item in self.schema(topic)["properties"].items():
             if name != "schema_version":
@@ -368,53 +285,204 @@ class Recording:
         return {**units, "recorded_ns": "ns"}
 
     def messages(self, topic: str) -> Iterator[dict[str, Any]]:
-        """The messages of `topic` as dicts, in the order of recording, nil as None; none for a topic that is not there."""
-        if topic in self._rows:
+        """Yield the messages of `topic` as dicts, in the order of recording, nil as None.
+
+        None are yielded for a topic that is not in the file. Raises InputError for a message that is not readable.
+        """
+        if topic in self._places:
             names = list(self.schema(topic)["properties"])
-            for row in self._rows[topic]:
-                body = _body(row.data)
+            for body in self._bodies(topic):
                 yield {name: body.get(name) for name in names}
 
-    def message(self, topic: str, index: int) -> dict[str, Any]:
-        """Message number `index` of `topic`, in the order of recording; nil is absent. Raises KeyError, IndexError."""
-        return _body(self._rows[topic][index].data)
+    def _bodies(self, topic: str) -> Iterator[dict[str, Any]]:
+        places = self._places[topic][1]
+        try:
+            with self.path.open("rb") as stream:
+                for index in range(len(places.chunk)):
+                    yield self._body(stream, topic, places, index)
+        except OSError as error:
+            raise InputError(str(self.path), error.strerror or str(error), "a readable recording") from None
+
+    def _body(self, stream: BinaryIO, topic: str, places: _Places, index: int) -> dict[str, Any]:
+        number, start, length = places.chunk[index], places.start[index], places.length[index]
+        try:
+            if number == _OUTSIDE:
+                stream.seek(start)
+                data = stream.read(length)
+            else:
+                data = self._chunk(stream, number)[start : start + length]
+            # Older recordings hold msgpack, whose maps never begin with the byte of `{`.
+            body = orjson.loads(data) if data[:1] == b"{" else msgspec.msgpack.decode(data)
+            return {name: value for name, value in body.items() if value is not None}
+        except (*_DAMAGE, *_BAD_CONTENT) as error:
+            key = f"{self.path} {topic}"
+            raise InputError(key, f"message {index} that is {_brief(error)}", "one JSON or msgpack map") from None
+
+    def _chunk(self, stream: BinaryIO, number: int) -> bytes:
+        """Return the content of a chunk; the newest is kept, because readers go through a file in order."""
+        if self._held[0] != number:
+            place, length = self._chunk_places[number]
+            stream.seek(place)
+            self._held = (number, _unpack(Chunk.read(ReadDataStream(io.BytesIO(stream.read(length))))))
+        return self._held[1]
+
+    def message(self, topic: str, index: int) -> dict[str, Any] | None:
+        """Return message number `index` of `topic`, in the order of recording; nil is absent.
+
+        A message of a topic that this software knows is checked as if it came over the network: None where it is not
+        what the topic declares. Raises KeyError, IndexError.
+        """
+        with self.path.open("rb") as stream:
+            body = self._body(stream, topic, self._places[topic][1], index)
+        return body if topic not in TOPICS or _valid(TOPICS[topic].message, body) else None
 
     def times_ns(self, topic: str) -> np.ndarray:
-        """When each message of `topic` was recorded, (n,), not falling; empty for a topic that is not there."""
-        return np.maximum.accumulate(np.array([row.recorded_ns for row in self._rows.get(topic, [])], dtype=np.int64))
+        """Return when each message of `topic` was recorded, (n,), not falling; empty for a topic that is not there."""
+        times = self._places[topic][1].recorded_ns if topic in self._places else array("q")
+        return np.maximum.accumulate(np.array(times, dtype=np.int64))
 
-    def table(self, topic: str) -> dict[str, np.ndarray]:
-        """The messages of `topic` as columns, one array of shape (n,) each; vectors are spread over named columns.
+    def table(self, topic: str) -> RecordedTable:
+        """Return the messages of `topic` as columns, one array of shape (n,) each.
 
-        nil becomes NaN. `recorded_ns` is when it was recorded. Raises ValueError for a topic that is not in the file.
+        A vector is spread over its named columns, nil becomes NaN, and `recorded_ns` is when a message was recorded.
+        Names end in the unit (`command_insertion_m`); `units` has it as a text.
+
+        Raises:
+            InputError: The topic is not in the file, its messages are not what its schema says, or the table would take
+                more than TABLE_LIMIT_BYTES.
         """
         if topic not in self._tables:
-            bodies = list(self.messages(topic))
-            table = {}
-            for name, item in self.schema(topic)["properties"].items():
-                if name != "schema_version":
-                    table.update(_columns(name, item, [body.get(name) for body in bodies]))
-            table["recorded_ns"] = np.array([row.recorded_ns for row in self._rows.get(topic, [])], dtype=np.int64)
-            self._tables[topic] = table
+            key = f"{self.path} {topic}"
+            properties = {n: item for n, item in self.schema(topic)["properties"].items() if n != "schema_version"}
+            recorded_ns = np.array(self._places[topic][1].recorded_ns, dtype=np.int64)
+            cells = len(recorded_ns) * sum(len(item.get("columns", "x")) for item in properties.values())
+            if 8 * cells > TABLE_LIMIT_BYTES:
+                raise InputError(key, f"a table of {cells} cells", f"at most {TABLE_LIMIT_BYTES // 8}")
+            try:
+                columns = _columns(properties, self._bodies(topic), len(recorded_ns))
+            except InputError:
+                raise
+            except _BAD_CONTENT as error:
+                raise InputError(key, _brief(error), "messages as their schema in the file declares") from None
+            self._tables[topic] = RecordedTable(key, {**columns, "recorded_ns": recorded_ns})
         return self._tables[topic]
 
 
-def _body(data: bytes) -> dict[str, Any]:
-    # Older recordings hold msgpack, whose maps never begin with the byte of `{`.
-    body = orjson.loads(data) if data[:1] == b"{" else msgpack.unpackb(data)
-    return {name: value for name, value in body.items() if value is not None}
+def is_whole(path: Path) -> bool:
+    """Return whether the file has its end and every chunk of it is intact. Raises InputError as `Recording`."""
+    recording = Recording(path)
+    return not recording.truncated and recording.damaged_chunks == 0
+
+
+def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of each record in a chunk's content. Raises ValueError where one is not whole."""
+    place, size = 0, len(content)
+    while place < size:
+        opcode, length = _RECORD_HEAD.unpack_from(content, place)
+        start = place + _RECORD_HEAD.size
+        place = start + length
+        if place > size or (opcode == Opcode.MESSAGE and length < _MESSAGE_HEAD.size):
+            raise ValueError("a record that is not whole")
+        yield opcode, start, place
+
+
+def _unpack(chunk: Chunk) -> bytes:
+    """Return a chunk's content, never more than it declares. Raises ValueError, ZstdError, RuntimeError."""
+    if chunk.compression == "":
+        return chunk.data
+    if chunk.compression == "zstd":
+        # Not `decompress`, which allocates what the packed data's own head declares.
+        with zstandard.ZstdDecompressor(max_window_size=2 * CHUNK_LIMIT_BYTES).stream_reader(chunk.data) as reader:
+            return reader.read(chunk.uncompressed_size)
+    if chunk.compression == "lz4":
+        return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size)
+    raise ValueError(f"packing {chunk.compression!r}")
 
 
 _DTYPES: dict[str, Any] = {"number": np.float64, "integer": np.int64, "boolean": np.bool_, "string": np.str_}
 
 
-def _columns(name: str, item: dict[str, Any], values: list[Any]) -> dict[str, np.ndarray]:
-    """The columns that one property of a schema makes out of its values."""
+@cache
+def _plain_properties(data: bytes) -> dict[str, Any]:
+    """Return the schema in `data`, each property checked to be one that makes columns."""
+    schema = json.loads(data)
+    for name, item in schema["properties"].items():
+        if name == "schema_version":
+            continue
+        names = item.get("columns")
+        kind = item["items"]["type"] if names is not None else _kind(item)
+        if kind not in _DTYPES or (names is not None and not all(isinstance(column, str) for column in names)):
+            raise ValueError(f"{name} of type {kind!r}")
+    return dict(schema)
+
+
+def _kind(item: dict[str, Any]) -> str:
+    return item["type"][0] if isinstance(item["type"], list) else item["type"]
+
+
+def _columns(properties: dict[str, Any], bodies: Iterable[dict[str, Any]], count: int) -> dict[str, np.ndarray]:
+    """Return the columns of all properties. Numbers go straight into arrays, so that memory is that of the table."""
+    texts: dict[str, list[str]] = {}
+    numbers: dict[str, np.ndarray] = {}
+    for name, item in properties.items():
+        names = item.get("columns")
+        kind = item["items"]["type"] if names is not None else _kind(item)
+        if kind == "string":
+            texts[name] = []
+        else:
+            numbers[name] = np.empty((count, len(names)) if names is not None else (count,), dtype=_DTYPES[kind])
+            if kind == "number":
+                numbers[name].fill(np.nan)
+    for row, body in enumerate(bodies):
+        for name, values in numbers.items():
+            value = body.get(name)
+            if value is None:
+                if values.dtype != np.float64:
+                    raise ValueError(f"message {row} without {name}")
+            elif not _fits(value, values):
+                raise ValueError(f"{name} {_brief(value)}")
+            else:
+                values[row] = value
+        for name, column in texts.items():
+            text = body.get(name, "")
+            if not isinstance(text, str):
+                raise ValueError(f"{name} {_brief(text)}")
+            column.append(text)
+    return {column: values for name, item in properties.items() for column, values in _spread(name, item, numbers, texts)}
+
+
+def _fits(value: Any, values: np.ndarray) -> bool:
+    """Return whether `value` is a row of `values`, without any silent conversion."""
+    if values.ndim == 2:
+        return isinstance(value, list) and len(value) == values.shape[1]
+    if values.dtype == np.float64:
+        return isinstance(value, (int, float))
+    return type(value) is (int if values.dtype == np.int64 else bool)
+
+
+def _spread(
+    name: str, item: dict[str, Any], numbers: dict[str, np.ndarray], texts: dict[str, list[str]]
+) -> list[tuple[str, np.ndarray]]:
+    if name in texts:
+        longest = max(map(len, texts[name]), default=1)
+        if 4 * longest * len(texts[name]) > TABLE_LIMIT_BYTES:
+            raise ValueError(f"{len(texts[name])} texts {name} of up to {longest} characters")
+        return [(name, np.array(texts[name], dtype=np.str_))]
+    values = numbers[name]
     names = item.get("columns")
     if names is None:
-        kind = item["type"][0] if isinstance(item["type"], list) else item["type"]
-        return {name: np.array(values, dtype=_DTYPES[kind])}
-    hole = [None] * len(names)
-    dtype = _DTYPES[item["items"]["type"]]
-    rows = np.array([hole if value is None else value for value in values], dtype=dtype).reshape(-1, len(names))
-    return {column: np.ascontiguousarray(rows[:, index]) for index, column in enumerate(names)}
+        return [(name, values)]
+    return [(column, np.ascontiguousarray(values[:, index])) for index, column in enumerate(names)]
+
+
+def _valid(message_class: type[Message], body: dict[str, Any]) -> bool:
+    try:
+        msgspec.convert(body, message_class).check()
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        return False
+    return True
+
+
+def _brief(value: object) -> str:
+    text = " ".join(f"{type(value).__name__} {value}".split()) if isinstance(value, Exception) else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

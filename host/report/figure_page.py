@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from host.recordings.recording import software_version
+from host.recordings.header import software_version
 from host.report.style import Picture
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"

@@ -10,7 +10,8 @@ from types import FrameType
 from typing import Any
 
 from host.estimation.service import EstimationService, load_estimator
-from host.recordings.recording import RecordingWriter, header_of, new_recording_path
+from host.recordings.header import header_of
+from host.recordings.writer import RecordingWriter, new_recording_path
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message
 from sim.board import Board

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from host.commissioning.experiment_script import Script, perform
-from host.recordings.recording import RecordingWriter, header_of, new_recording_path
+from host.recordings.header import header_of
+from host.recordings.writer import RecordingWriter, new_recording_path
 from host.run.commander import Commander
 from protocol.commander import Acknowledgement
 from protocol.enums import Phase

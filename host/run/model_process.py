@@ -13,7 +13,8 @@ from types import FrameType
 
 from host.estimation.interface import Estimator
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
-from host.recordings.recording import RecordingWriter, header_of
+from host.recordings.header import header_of
+from host.recordings.writer import RecordingWriter
 from protocol.rig_file import load_rig
 from protocol.topics import Log
 from protocol.zenoh_session import Session

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from host.recordings.recording import new_recording_path
+from host.recordings.writer import new_recording_path
 from host.run.commander import Commander
 from host.run.demo import DemoRun, DemoSettings, Progress
 from protocol.rig_file import load_rig

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
-from host.recordings.index import is_whole
-from host.recordings.recording import RecordingWriter, header_of
+from host.recordings.header import header_of
+from host.recordings.recording import is_whole
+from host.recordings.writer import RecordingWriter
 from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message

@@ -71,7 +71,12 @@ def read_findings(source: str) -> Findings:
 def origin_ns(recording: Recording) -> int:
     """Where the time of a diagnosis begins: the first stamp of the topic with most messages."""
     base = max(recording.topics, key=lambda topic: recording.topics[topic])
-    return int(recording.message(base, 0)["stamp_ns"])
+    first = recording.message(base, 0)
+    if first is None:
+        raise InputError(
+            str(recording.path), f"a first message of {base} that is not what the topic declares", "one that is"
+        )
+    return int(first["stamp_ns"])
 
 
 class Replay:
@@ -165,7 +170,9 @@ class Replay:
                 if topic in EVERY:
                     chosen = sorted(set(np.linspace(first, upto - 1, min(upto - first, WAITING)).round().astype(int)))
                 for index in chosen:
-                    self._picture.hear(topic, self._recording.message(topic, int(index)))
+                    body = self._recording.message(topic, int(index))
+                    if body is not None:
+                        self._picture.hear(topic, body)
             self._next[topic] = upto
 
     def _seek(self, at_s: float) -> None:

@@ -6,7 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from host.recordings.recording import Recording, new_recording_path
+from host.recordings.recording import Recording
+from host.recordings.writer import new_recording_path
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet
 from host.view.live import LiveRig

@@ -13,8 +13,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
-from host.recordings.recording import Recording, RecordingWriter, header_of
+from host.recordings.header import header_of
+from host.recordings.recording import Recording
 from host.recordings.rig_picture import Picture
+from host.recordings.writer import RecordingWriter
 from host.report.run_report import render
 from protocol.catheter import load_catheter
 from protocol.messages import FieldSpec, specs

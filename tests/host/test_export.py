@@ -16,11 +16,13 @@ from typer.testing import CliRunner
 
 from host.cli.export import export as export_command
 from host.recordings.export import export
-from host.recordings.recording import Header, Recording, RecordingWriter
+from host.recordings.header import RecordingHeader
+from host.recordings.recording import Recording
+from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.topics import Pose, RigState
 
-HEADER = Header(
+HEADER = RecordingHeader(
     rig="simulated", clock="virtual", configuration={"control": {"loop_hz": 1000}}, catheter={"name": "x"}, seed=1
 )
 
@@ -38,7 +40,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
                     arrival_ns=frame * 25_000_000 + 1,
                     frame=frame,
                     missing=not seen,
-                    position_m=(0.1, -0.2, 0.3 + frame / 3) if seen else None,
+                    position_m=(0.1, -0.2, 0.3 + frame / 300) if seen else None,
                     quaternion_wxyz=(1.0, 0.0, 0.0, 0.0) if seen else None,
                 ),
             )

@@ -15,7 +15,9 @@ from mcap.writer import Writer
 
 from host.diagnosis.model.tables import read_table
 from host.recordings.foxglove import SCHEMAS, plain_schema
-from host.recordings.recording import Header, Recording, RecordingWriter
+from host.recordings.header import RecordingHeader
+from host.recordings.recording import Recording
+from host.recordings.writer import RecordingWriter
 from protocol.catheter import load_catheter
 from protocol.messages import json_schema
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -32,9 +34,9 @@ PLAIN = {
 MS = 1_000_000
 
 
-def header() -> Header:
+def header() -> RecordingHeader:
     rig = load_rig(SIMULATED_RIG)
-    return Header("simulated", "virtual", rig.effective(), dataclasses.asdict(load_catheter(rig.catheter.name)))
+    return RecordingHeader("simulated", "virtual", rig.effective(), dataclasses.asdict(load_catheter(rig.catheter.name)))
 
 
 @pytest.fixture(scope="module")

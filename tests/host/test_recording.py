@@ -24,14 +24,16 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import Writer
 
-from host.recordings import recording as recording_module
-from host.recordings.index import file_end, is_whole
-from host.recordings.recording import Header, Recording, RecordingWriter
+from host.recordings import writer as writer_module
+from host.recordings.header import RecordingHeader
+from host.recordings.index import file_end
+from host.recordings.recording import Recording, is_whole
+from host.recordings.writer import RecordingWriter
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 from tests.small_disk import fill_up
 from tests.waiting import PATIENCE_S
 
-HEADER = Header(
+HEADER = RecordingHeader(
     rig="simulated",
     clock="virtual",
     configuration={"control": {"loop_hz": 1000}},
@@ -160,7 +162,7 @@ def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fdatasync", lambda fd: None)
-    monkeypatch.setattr(recording_module, "CHUNKS_PER_DESCRIPTION", 20)
+    monkeypatch.setattr(writer_module, "CHUNKS_PER_DESCRIPTION", 20)
     path, held = tmp_path / "a.mcap", []
     tracemalloc.start()
     with RecordingWriter(path, HEADER) as writer:
@@ -252,7 +254,7 @@ def test_full_disk_is_told_once_and_what_was_there_is_readable(tmp_path: Path, m
 def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
     program = textwrap.dedent("""
         import signal, sys, time
-        from host.recordings.recording import RecordingWriter
+        from host.recordings.writer import RecordingWriter
         from tests.host.test_recording import HEADER, stage
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         with RecordingWriter(sys.argv[1], HEADER) as writer:
@@ -285,7 +287,7 @@ def test_refusals_name_the_thing(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", 1)
     with pytest.raises(FileExistsError):
         RecordingWriter(path, HEADER)
-    with pytest.raises(ValueError, match="'force/sensor', wanted one of pose/tip, stage"):
+    with pytest.raises(ValueError, match='"force/sensor", wanted one of pose/tip, stage'):
         Recording(path).table("force/sensor")
 
 

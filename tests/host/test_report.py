@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from host.recordings.recording import Header, Recording, RecordingWriter
+from host.recordings.header import RecordingHeader
+from host.recordings.recording import Recording
+from host.recordings.writer import RecordingWriter
 from host.report.demo_summary import demo_result, print_summary
 from host.report.run_report import lateness_of, render, verdict_of, write_report
 from host.report.run_summary import spans, summarize
@@ -69,7 +71,9 @@ class Story:
         return "contact" if ms < 18000 else "retract"
 
     def write(self, path: Path) -> Recording:
-        header = Header("simulated", "virtual", CONFIGURATION, {"name": "blazer_prime_xp", "distal_length_m": 0.11}, 5)
+        header = RecordingHeader(
+            "simulated", "virtual", CONFIGURATION, {"name": "blazer_prime_xp", "distal_length_m": 0.11}, 5
+        )
         with RecordingWriter(path, header) as writer:
             for ms in range(0, 20000, 10):
                 self._tick(writer, ms)
@@ -239,7 +243,7 @@ def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_pat
 
 
 def test_missing_messages_are_counted(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a.mcap", Header("simulated", "wall", {}, {})) as writer:
+    with RecordingWriter(tmp_path / "a.mcap", RecordingHeader("simulated", "wall", {}, {})) as writer:
         for number in (0, 1, 2, 7, 8):
             writer._sequence["log"] = number
             writer.write("log", Log(stamp_ns=number, level="info", source="a", text="b"))
@@ -325,7 +329,7 @@ def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
     ],
 )
 def test_recordings_without_some_topics_are_reported_too(topics: set[str], good: Recording, tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "part.mcap", Header("simulated", "wall", {}, {})) as writer:
+    with RecordingWriter(tmp_path / "part.mcap", RecordingHeader("simulated", "wall", {}, {})) as writer:
         for topic in sorted(topics):
             for body in itertools.islice(good.messages(topic), 50):
                 writer.write_encoded(topic, msgpack.packb(body), body["stamp_ns"], 0)

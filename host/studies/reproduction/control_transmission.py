@@ -12,7 +12,8 @@ from host.commissioning.characterization import Characterization, KnobSweep, cha
 from host.commissioning.characterization_report import knob_picture, pictures_of
 from host.commissioning.sine_kinematics import CurveErrors, SineKinematics, compare, fit_sine_kinematics
 from host.commissioning.sweep_fits import Run, fit_knob
-from host.recordings.recording import Recording, new_recording_path
+from host.recordings.recording import Recording
+from host.recordings.writer import new_recording_path
 from host.report.figure_page import Section, verdict
 from host.report.style import ESTIMATED, MEASURED, TRUTH, Picture
 from host.studies.reproduction.drawing import Curve, Panel, panels
