@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from host.recordings.recording import Recording
-from host.report.run_report import lateness_of, quantity, verdict_of
+from host.report.run_report import duration, lateness_of, quantity, verdict_of
 from host.report.run_summary import RunSummary, summarize
 
 
@@ -106,8 +106,8 @@ def _table(result: dict[str, Any], summary: RunSummary) -> Table:
         ("in contact", quantity(result["contact_seconds"], "s", 1), ""),
         (
             "tick",
-            quantity(ticks.p50_us, "µs", 1),
-            f"99.9 %: {quantity(ticks.p999_us, 'µs', 1)}, longest {quantity(ticks.max_us, 'µs', 0)}, {lateness_of(summary)}",
+            duration(ticks.p50_us),
+            f"99.9 %: {duration(ticks.p999_us)}, longest {duration(ticks.max_us)}, {lateness_of(summary)}",
         ),
         (
             "firmware",

@@ -66,6 +66,11 @@ def quantity(value: float, unit: str, digits: int) -> str:
     return f"{value:.{digits}f}{NBSP}{unit}" if math.isfinite(value) else "–"
 
 
+def duration(time_us: float) -> str:
+    """Return `time_us` (µs) as people read it: in µs below 10 ms, in ms above."""
+    return quantity(time_us, "µs", 1) if time_us < 1e4 else quantity(time_us * 1e-3, "ms", 0)
+
+
 def signed(value: float, unit: str, digits: int) -> str:
     """As `quantity`, with its sign."""
     return f"{value:+.{digits}f}{NBSP}{unit}".replace("-", "\u2212") if math.isfinite(value) else "–"
@@ -87,10 +92,10 @@ def verdict_of(summary: RunSummary) -> Verdict:
     if not math.isfinite(summary.target_force_N):
         return Verdict("bad" if stopped else "fair", held + "; no force was requested.", remarks)
     sentence = (
-        f"{quantity(summary.force_mean_last_10_s_N, 'N', 3)} mean force over the last "
-        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact, set-point "
-        f"{quantity(summary.target_force_N, 'N', 2)}; "
-        f"{quantity(summary.force_rms_error_N * 1e3, 'mN', 0)} RMS error."
+        f"Mean force {quantity(summary.force_mean_last_10_s_N, 'N', 3)} over the last "
+        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact (set\N{NON-BREAKING HYPHEN}point "
+        f"{quantity(summary.target_force_N, 'N', 2)}), "
+        f"RMS error {quantity(summary.force_rms_error_N * 1e3, 'mN', 0)}."
     )
     if stopped:
         return Verdict("bad", f"{held}, then the run was stopped.", remarks)
@@ -146,8 +151,8 @@ def lines_of(summary: RunSummary) -> list[Line]:
             quantity(summary.contact_seconds, "s", 1),
             f"of {quantity(summary.contact.seconds, 's', 1)} in the phase contact" if summary.contact else "",
         ),
-        Line("Tick, median", quantity(ticks.p50_us, "µs", 1), f"99.9 %: {quantity(ticks.p999_us, 'µs', 1)}"),
-        Line("Longest tick", quantity(ticks.max_us, "µs", 0), lateness_of(summary)),
+        Line("Tick, median", duration(ticks.p50_us), f"99.9 %: {duration(ticks.p999_us)}"),
+        Line("Longest tick", duration(ticks.max_us), lateness_of(summary)),
     ]
     if estimate.count:
         lines.insert(
