@@ -1,4 +1,4 @@
-"""Writes the C header of the firmware from the declaration of the frames; `--check` tells whether it is stale."""
+"""Writes the C header of the firmware from the declaration of the frames; `--check` reports whether it is out of date."""
 
 import argparse
 import sys

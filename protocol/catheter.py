@@ -55,7 +55,7 @@ class ConstitutiveParameters:
 
 @dataclass(frozen=True)
 class Catheter:
-    """One catheter type. A parameter group is None where nobody has identified it."""
+    """One catheter type. A parameter group is None where it was not identified."""
 
     name: str
     distal_length_m: float

@@ -1,4 +1,4 @@
-"""Whoever commands a rig: takes the lease, keeps it, gives commands under it, and hears what became of each."""
+"""A commander of a rig: takes the lease, keeps it, gives commands under it, and returns the result of each."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Asker(Protocol):
     """Whatever carries a command to a rig and its reply back: a zenoh session, or a rig in the same process."""
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        """The reply, None where nobody answers in time."""
+        """The reply, None where no answer arrives in time."""
 
 
 class Commander:
@@ -127,7 +127,7 @@ class Commander:
             return Acknowledgement(False, str(error), "malformed")
 
     def _stop(self) -> Acknowledgement:
-        """Waits for no lock and no other command; asks again where nobody answers."""
+        """Waits for no lock and no other command; asks again where no answer arrives."""
         for _ in range(_STOP_TRIES):
             reply = self._send("stop", "none", 0)
             if reply is not None:

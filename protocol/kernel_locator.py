@@ -1,4 +1,4 @@
-"""Tells numba in which folder a kernel of this project is cached. Loaded by numba itself; see `kernel_cache`."""
+"""Set the folder in which numba caches a kernel of this project. Loaded by numba itself; see `kernel_cache`."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class Request(BaseModel):
-    """Base of every request: unknown keys refused, NaN and infinity refused, no silent conversion of strings."""
+    """Base of every request: unknown keys refused, NaN and infinity refused, strings are not converted."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 

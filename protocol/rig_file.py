@@ -226,7 +226,7 @@ class Zenoh(_Section):
 
 
 class NetworkAccess(_Section):
-    """Other machines: where they reach the rig, with whose keys, who may read and who command. Nothing: nobody."""
+    """Other machines: where they reach the rig, with whose keys, who may read and who command. Empty: no one."""
 
     listen: list[str] = []
     keys: str = ""

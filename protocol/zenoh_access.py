@@ -105,7 +105,7 @@ def readable(rig: str) -> list[str]:
 def access_control(network: Network) -> dict[str, Any]:
     """Zenoh's access control: this machine may all; a certificate may what its role and its place in the lists say.
 
-    Readers subscribe and receive. Commanders do that too, and ask under their own name. Nobody else publishes, answers
+    Readers subscribe and receive. Commanders do that too, and ask under their own name. No other client publishes, answers
     or asks: what has no rule is denied, both ways.
     """
     for name in network.readers + network.commanders:

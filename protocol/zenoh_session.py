@@ -74,7 +74,7 @@ def check_endpoint(endpoint: str) -> str:
 def configuration(listen: list[str], connect: list[str], network: Network | None = None) -> zenoh.Config:
     """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints.
 
-    network: what it listens on for other machines besides; without it nothing leaves this one.
+    network: what it also listens on for other machines; without it nothing leaves this one.
     """
     settings = _SETTINGS | {
         "listen/endpoints": [check_endpoint(endpoint) for endpoint in listen],
@@ -236,7 +236,7 @@ def _open(config: zenoh.Config, listen: list[str]) -> zenoh.Session:
 class Session:
     """One open session of a rig. Use as a context, or `close` it.
 
-    listen, connect: endpoints, as in `check_endpoint`; network: for other machines, besides. Normally one process
+    listen, connect: endpoints, as in `check_endpoint`; network: for other machines too. Normally one process
     listens and the others connect to it; those also reach each other through it. Who starts first does not matter.
     Raises ValueError for an endpoint that leaves this machine, OSError where it cannot listen.
     """
@@ -253,7 +253,7 @@ class Session:
     def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
         """A session to a rig on another machine, with the certificate in folder `keys`.
 
-        Raises ValueError for an endpoint that is not TLS, OSError where nobody answers or the certificate is refused.
+        Raises ValueError for an endpoint that is not TLS, OSError where no one answers or the certificate is refused.
         """
         key(rig, "state")
         session = cls.__new__(cls)
@@ -280,7 +280,7 @@ class Session:
         return server
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        """Send `command`, wait for its reply; None where nobody answers in time: it may or may not have arrived."""
+        """Send `command`, wait for its reply; None where no answer arrives in time: it may or may not have arrived."""
         try:
             replies = self.zenoh.get(
                 request_key(self.rig, command.commander),

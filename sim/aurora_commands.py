@@ -115,13 +115,13 @@ class Port:
 
     @property
     def status(self) -> int:
-        """The port's status bits, without those that only a measurement tells."""
+        """The port's status bits, without those that only a measurement sets."""
         return 0x01 * self.occupied | 0x10 * self.initialised | 0x20 * self.enabled
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Reply, the time that the command takes, and whether the device starts anew instead of replying."""
+    """Reply, the time that the command takes, and whether the device restarts instead of replying."""
 
     reply: str | bytes
     takes_s: float = 0.0

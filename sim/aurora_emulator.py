@@ -77,7 +77,7 @@ class AuroraEmulator:
         self._host_baud = baud
 
     def serial_break(self, now_ns: int) -> None:
-        """The host holds the line low: the device starts anew at 9600 baud."""
+        """The host holds the line low: the device restarts at 9600 baud."""
         self._run(now_ns)
         self.power_cycle(now_ns)
 

@@ -118,7 +118,7 @@ class FaultOutcome:
 
 
 class Watcher:
-    """Stands beside a run from the moment of the fault on and notes what happens. `close` gives the outcome.
+    """Observes a run from the moment of the fault on and notes what happens. `close` gives the outcome.
 
     Detected is: a cause of the failsafe that did not stand before, a logged warning or error, or a driver's or the
     board's count of bad frames or readings that has grown; whichever is first. `large` and `within_s` are the fault's

@@ -69,7 +69,7 @@ class IdealRig:
         extra_delay_s: float = 0.0,
         with_force: bool = True,
     ) -> None:
-        """`extra_delay_s`: poses and forces arrive so much later (stamps tell the truth), to find a loop's margin."""
+        """`extra_delay_s`: poses and forces arrive so much later (stamps stay true), to find a loop's margin."""
         self.rig, self.plant = rig, Plant(replace(config, tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), seed)
         self.params, self.state = tick_parameters(rig, force_source), new(STATE)
         self.inputs, self.outputs = new(INPUTS), new(OUTPUTS)

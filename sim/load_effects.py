@@ -63,7 +63,7 @@ def alter_tissue(effects: Array, tissue, time_s: float) -> None:  # type: ignore
 
 @njit(cache=True)
 def disturb_wall(effects: Array, time_s: float) -> float:
-    """Displacement of the wall along its normal (m) besides the heart's."""
+    """Displacement of the wall along its normal (m) in addition to the heart's."""
     total = 0.0
     for k in range(effects.shape[0]):
         e = effects[k]
@@ -164,7 +164,7 @@ def _material(e, p, chain, curvature: float, dt_s: float) -> None:  # type: igno
 
 @njit(cache=True)
 def _beside(e, chain) -> tuple[int, float]:  # type: ignore[no-untyped-def]
-    """The joint beyond the obstacle's place along e3 and its share of the touch (the rest is on the next joint back)."""
+    """The joint beyond the obstacle along e3 and its share of the contact force (the next joint back has the remainder)."""
     for j in range(chain.cells - 1, 0, -1):
         here, beyond = chain.joint[j, 2], chain.joint[j - 1, 2]
         if here <= e.p[0] < beyond:

@@ -84,7 +84,7 @@ class NetFtEmulator:
         return self.config.start_ns + round(self._samples * 1e9 / (self.config.rate_hz * (1 + self.config.clock_error)))
 
     def start_sequences_at(self, rdt_sequence: int, ft_sequence: int) -> None:
-        """Set the counters, to come to their wrap-around soon."""
+        """Set the counters, to reach their wrap-around quickly."""
         self._rdt_sequence, self._ft_sequence = rdt_sequence, ft_sequence
 
     def power_cycle(self) -> None:

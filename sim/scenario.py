@@ -91,7 +91,7 @@ class Scenario:
         self._stop = True
 
     def _heard(self, topic: str, message: Message) -> None:
-        """All that the loop publishes goes out, and the estimator hears the poses."""
+        """All that the loop publishes goes out, and the estimator receives the poses."""
         self._publish(topic, message)
         self._latest[topic] = message
         if topic != "pose/tip" or self._estimator is None or "stage" not in self._latest:

@@ -49,7 +49,7 @@ class AuroraPty:
             self._link.symlink_to(os.ttyname(self._slave))
 
     def unplug(self) -> None:
-        """Pull the cable: the port is gone, and whoever has it open is told so."""
+        """Pull the cable: the port is gone, and the program that has it open gets an error."""
         if self._link is not None:
             self._link.unlink(missing_ok=True)
         for fd in (self._master, self._slave):
@@ -78,7 +78,7 @@ class AuroraPty:
 
 
 class NetFtUdp:
-    """An emulated Net F/T box: RDT on a UDP port and netftapi2.xml on a web port, on loopback unless told otherwise."""
+    """An emulated Net F/T box: RDT on a UDP port and netftapi2.xml on a web port, on loopback by default."""
 
     def __init__(self, emulator: NetFtEmulator, host: str = "127.0.0.1", rdt_port: int = 0, web_port: int = 0) -> None:
         self.emulator, self._host = emulator, host
@@ -105,7 +105,7 @@ class NetFtUdp:
         self.emulator.power_cycle()
 
     def step(self, now_ns: int) -> None:
-        """Move what is due by now, both ways. Records go to whoever asked last, as with the box."""
+        """Move what is due by now, both ways. Records go to the client that asked last, as with the box."""
         records = self.emulator.read(now_ns)
         if self._link is None:
             return

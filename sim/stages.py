@@ -128,7 +128,7 @@ class Stages:
 
     @property
     def step_counts(self) -> Array:
-        """Edges counted on the pins (3,), as the board believes the stages to be."""
+        """Edges counted on the pins (3,), as the board counts the stages."""
         return self._counts.copy()
 
     @property

@@ -67,7 +67,7 @@ def parameters(config: VesselConfig) -> np.record:
 
 
 def start(config: VesselConfig, handle_m: float, roll_rad: float) -> np.record:
-    """State with the body at rest inside the play as `start_in_play` says, roll settled."""
+    """State with the body at rest inside the backlash as `start_in_play` says, roll settled."""
     s = np.zeros(1, VESSEL_STATE).view(np.recarray)[0]
     side = min(1.0, max(-1.0, config.start_in_play))
     s.body_m = config.home_insertion_m + config.insertion_slope * handle_m - 0.5 * side * config.play_width_m
@@ -118,5 +118,5 @@ def roll_compliance(p, dt_s: float) -> float:  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def free_roll(p, s, handle_rad: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """Roll after one step without torque at the exit (rad); add roll_compliance * torque for the rest."""
+    """Roll after one step without torque at the exit (rad); add roll_compliance * torque for the remainder."""
     return (p.windup * handle_rad + p.roll_damping / dt_s * s.roll_rad) * roll_compliance(p, dt_s)

@@ -1,4 +1,4 @@
-"""`seldinger faults`: random faults in virtual time; which are detected, how soon, and how the rig reacts."""
+"""`seldinger faults`: random faults in virtual time; which are detected, after which time, and how the rig reacts."""
 
 from __future__ import annotations
 

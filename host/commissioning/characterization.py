@@ -70,7 +70,7 @@ class Characterization:
 
     @property
     def insertion_at_home_m(self) -> Estimate:
-        """Body insertion where the stage reads zero, in the middle of the play."""
+        """Body insertion where the stage reads zero, in the middle of the backlash."""
         return Estimate(self.insertion.offset.value - self.distal_length_m, self.insertion.offset.half95)
 
 

@@ -189,7 +189,7 @@ class Desk(Protocol):
 def perform(script: Script, desk: Desk, progress: Callable[[float], None] = lambda share: None) -> None:
     """Give `script` (checked before) to an armed rig: to the start, then row by row; at the end hold, or retract.
 
-    Raises RuntimeError where a command is refused or the rig leaves its mode; it is then told to hold.
+    Raises RuntimeError where a command is refused or the rig leaves its mode; it then gets the command to hold.
     """
     try:
         _ask(desk, "target", "position", target_m=tuple(script.start_m))

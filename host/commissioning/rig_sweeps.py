@@ -1,4 +1,4 @@
-"""The sweeps of a characterization on a real rig's ports, recorded; nothing moves before somebody has said that it may."""
+"""The sweeps of a characterization on a real rig's ports, recorded; nothing moves before the operator has confirmed."""
 
 from __future__ import annotations
 

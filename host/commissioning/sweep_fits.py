@@ -79,7 +79,7 @@ class KnobFit(NamedTuple):
 
 @njit(cache=True)
 def play(inputs: Array, width: float, start: float) -> Array:
-    """The play operator of `width` over `inputs` (n,), from `start` on; what moves is dragged by whoever pushes it."""
+    """The play operator of `width` over `inputs` (n,), from `start` on; the output follows the side that pushes it."""
     out, y = np.empty_like(inputs), start
     for i in range(inputs.size):
         y = min(max(y, inputs[i] - 0.5 * width), inputs[i] + 0.5 * width)

@@ -65,7 +65,7 @@ class Tuned:
 
 
 def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
-    """The demo's plant with a heart that stands still, the tip `clearance_m` before the wall, the play taken up forward."""
+    """The demo's plant with a still heart, the tip `clearance_m` before the wall, the backlash taken up forward."""
     out = np.zeros(3)
     kinematics = tick_parameters(rig)[0].kinematics
     inverse_kinematics.apply(kinematics, np.array([*WALL_POINT_M[:2], WALL_POINT_M[2] - clearance_m]), 0.0, out)

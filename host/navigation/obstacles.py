@@ -90,7 +90,7 @@ def _turn_to(axis: Array) -> Array:
 
 
 class Surroundings:
-    """All obstacles together, asked for the distance of a polyline with thickness."""
+    """All obstacles together; give the distance of a polyline with thickness."""
 
     def __init__(self, obstacles: list[Obstacle]) -> None:
         self.obstacles = obstacles

@@ -84,7 +84,7 @@ class PlanRequest(Request):
 
 
 class Answer(NamedTuple):
-    """A plan: a row a period, at rest at both ends. `clearance_m` is the least on the way, beside the catheter's radius."""
+    """A plan: a row a period, at rest at both ends. `clearance_m`: least on the way, in addition to the catheter's radius."""
 
     time_s: Array
     stage: Array
@@ -149,7 +149,7 @@ def _obstacle(item: Any, folder: Path) -> Obstacle:
 def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> Answer | None:
     """The fastest found way of the tip to the goal; None where `request.samples` found none. Mesh files are in `folder`.
 
-    Raises InputError: goal inside an obstacle, out of reach, reachable only in touch; start not free; a mesh not usable.
+    Raises InputError: goal inside an obstacle, out of reach, reachable only in contact; start not free; a mesh not usable.
     """
     try:
         world = _World(request, rig, folder)

@@ -84,7 +84,7 @@ def within(reach: Reach, joint: Array) -> bool:
 
 
 def stages_of(rig: Rig, joint: Array) -> Array:
-    """Stage positions (n, 3) (m, rad, rad) of joints (n, 3), in the middle of the play: which flank is control's
+    """Stage positions (n, 3) (m, rad, rad) of joints (n, 3), in the middle of the backlash: which flank is control's
     business."""
     t = rig.transmission
     config = tick_parameters(rig)[0].kinematics

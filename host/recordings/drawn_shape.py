@@ -67,7 +67,7 @@ def twin(
 
 
 def through(points_m: Array, tip_m: Sequence[float] | None) -> Shape:
-    """`points_m` bent, most at the tip, so that they end at `tip_m` where that is near; the gap is told in any case."""
+    """`points_m` bent, most at the tip, so that they end at `tip_m` where that is near; the gap is always returned."""
     if tip_m is None:
         return Shape(points_m, None)
     off = np.asarray(tip_m, dtype=float) - points_m[-1]

@@ -40,7 +40,7 @@ def arrow_table(recording: Recording, topic: str) -> pa.Table:
 def export(recording: Recording, form: str, folder: Path) -> list[Path]:
     """One file a topic, named after it (`pose/tip` gives pose_tip.parquet), into `folder`, which is made if need be.
 
-    form: one of FORMATS. A CSV cannot carry units: units.json beside it does, topic -> column -> unit; NaN is an empty
+    form: one of FORMATS. A CSV cannot carry units: units.json next to it does, topic -> column -> unit; NaN is an empty
     cell. Returns the files written. Raises ValueError for an unknown format, OSError where it cannot write.
     """
     if form not in FORMATS:

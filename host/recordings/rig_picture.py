@@ -1,4 +1,4 @@
-"""The rig as it is now, gathered from its messages: what the page is told in one frame, and what the 3-D scene needs."""
+"""The rig as it is now, gathered from its messages: the content of one frame for the page, and of the 3-D scene."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Picture:
         self.now_ns = 0
 
     def clear(self) -> None:
-        """Forget everything heard, for a jump in time."""
+        """Forget all messages, for a jump in time."""
         self._newest.clear()
         self._log.clear()
         for rows in (self._force_rows, self._estimate_rows, *self._kept.values()):

@@ -17,7 +17,7 @@ from host.report.run_summary import RunSummary, summarize
 
 
 class Run(Protocol):
-    """What is known of a run beside its recording: how its scenario ended, and what the loop and the board counted."""
+    """What is known of a run in addition to its recording: how it ended, and what the loop and the board counted."""
 
     @property
     def recording(self) -> Path: ...

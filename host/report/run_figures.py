@@ -403,7 +403,7 @@ def _last_target_mm(state: dict[str, Array] | None) -> Array | None:
 
 
 def _moments(summary: RunSummary, stamp_ns: Array) -> list[tuple[str, int, str]]:
-    """(name, index of the pose, colour) of the shapes worth drawing."""
+    """(name, index of the pose, colour) of the shapes to draw."""
     wanted = [("start", int(stamp_ns[0]), MUTED)]
     if summary.contact is not None:
         wanted.append(("at contact", summary.contact.start_ns, MEASURED))

@@ -317,7 +317,7 @@ def estimate_along(table: dict[str, Array], direction: Array) -> tuple[Array, Ar
 
 
 def _lost(recording: Recording) -> dict[str, int]:
-    """Topic -> messages that its numbering says are missing (a publisher that starts anew counts from 0 again)."""
+    """Topic -> messages that its numbering says are missing (a publisher that restarts counts from 0 again)."""
     lost = {}
     for topic in recording.topics:
         steps = np.diff(recording.table(topic)["sequence"])

@@ -115,7 +115,7 @@ class LiveDesk:
         return time.monotonic()
 
     def mode(self) -> str:
-        """The loop's phase, empty before it was heard of."""
+        """The loop's phase, empty before the first message."""
         self._look()
         return self._state.mode if self._state else ""
 

@@ -1,4 +1,4 @@
-"""The model process: hears the rig over zenoh, estimates the tip force, publishes it, and records everything."""
+"""The model process: receives the rig's messages, estimates the tip force, publishes it, and records everything."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class EstimatorProcess:
     """Everything of the process between its start and its end; `run` until `stop` is set.
 
     recording: where to write, None to record nothing. clock: `wall` is CLOCK_MONOTONIC, as in all processes of a rig;
-    `virtual` is handed out by the simulated rig, and known here as the newest stamp heard.
+    `virtual` is handed out by the simulated rig, and known here as the newest stamp received.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class EstimatorProcess:
             self.log("warning", text)
 
     def run(self, stop: threading.Event) -> None:
-        """Steps until `stop`, then takes in what is left. Steps feed the service manager's watchdog."""
+        """Steps until `stop`, then takes in what has arrived. Steps feed the service manager's watchdog."""
         manager = ServiceNotifier()
         manager.ready("waits for poses")
         while not stop.is_set():

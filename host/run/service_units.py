@@ -1,4 +1,4 @@
-"""Unit files of the services: the templates beside this file, filled in; written to a root and taken away again."""
+"""Unit files of the services: the templates in the folder units, filled in; written to a root and removed again."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ _STOP_TIMEOUT_S = 20.0  # for all to end of themselves; a recorder that is kille
 class Fleet:
     """The three processes. Use as a context: leaving it stops everything in order.
 
-    loop: with the realtime process; without it whoever asks runs the loop, on `ports`. endpoint: where it is heard, one
+    loop: with the realtime process; without it the caller runs the loop, on `ports`. endpoint: where it listens, one
     of its own, so that fleets do not meet.
     """
 
@@ -238,7 +238,7 @@ class Operator:
         return self.mode() in ("stopped", "disarmed")
 
     def mode(self) -> str:
-        """The loop's phase, empty before it was heard of."""
+        """The loop's phase, empty before the first message."""
         return self.state.mode if self.state else ""
 
 

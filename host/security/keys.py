@@ -1,4 +1,4 @@
-"""The laboratory's own certificates: one authority, a folder for each holder, and what zenoh is to be told of them."""
+"""The laboratory's own certificates: one authority, a folder for each holder, and zenoh's settings for them."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def _builder(
 
 
 def _life(days: int, ca: x509.Certificate) -> datetime.timedelta:
-    """`days`, or what is left of the authority's own."""
+    """`days`, or what remains of the authority's own."""
     return min(datetime.timedelta(days=days), ca.not_valid_after_utc - datetime.datetime.now(datetime.UTC))
 
 

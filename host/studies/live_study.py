@@ -1,4 +1,4 @@
-"""How soon the live watch raises its alarm, and how often for nothing: virtual time, lock step, the table of docs/live.md.
+"""How fast the live watch raises its alarm, and how often without a cause: the table of docs/live.md.
 
 python -m host.studies.live_study                          # the table of effects, and 120 s without any
 python -m host.studies.live_study --quiet-s 1800 --docs docs/live.md
@@ -68,7 +68,7 @@ class Row:
 
 
 def round_trip(rig: Rig, seconds: float) -> Script:
-    """The tip to and fro on an arc of 60 degrees either way before the wall, in and out besides."""
+    """The tip to and fro on an arc of 60 degrees either way before the wall, with motions in and out."""
     t = np.arange(0.0, seconds, 0.1)
     angle = math.radians(60.0) * np.sin(2.0 * math.pi * 0.1 * t)
     depth = 0.018 + 0.002 * np.sin(2.0 * math.pi * 0.17 * t)

@@ -1,4 +1,4 @@
-"""The running rig for the page: hears its topics through small rings that lose their oldest, and sends its commands."""
+"""The running rig for the page: receives its topics through small rings that lose their oldest, and sends its commands."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class LiveRig:
         }
 
     def frame(self) -> dict[str, Any]:
-        """The picture, and how long the rig has been silent (nil before it was heard of)."""
+        """The picture, and the time since the rig's last message (nil before the first)."""
         for topic, subscriber in self._subscribers.items():
             while (sample := subscriber.try_recv()) is not None:
                 self._take(topic, bytes(sample.payload))

@@ -161,7 +161,7 @@ class Replay:
             }
 
     def _catch_up(self) -> None:
-        """Tell the picture all that was recorded up to now; of a long stretch an even choice."""
+        """Give the picture all that was recorded up to now; of a long stretch an even choice."""
         for topic in (*NEWEST, *EVERY):
             upto = int(np.searchsorted(self._times[topic], self._at_ns, side="right"))
             first = self._next[topic]

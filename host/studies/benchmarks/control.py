@@ -93,7 +93,7 @@ def plain_tick() -> Callable[..., None]:
 
 
 def control_tick(seed: int, _report: Report) -> list[Row]:
-    """One period in contact, poses, force and board status coming in, beside the same code as plain Python."""
+    """One period in contact, poses, force and board status coming in, compared with the same code as plain Python."""
     plain = plain_tick()
 
     def plain_ticks(params: Any, state: Any, inputs: Any, outputs: Any, force: Array, first: int, count: int) -> None:
@@ -147,7 +147,7 @@ class TextbookFilter:
 
 
 def kalman_predict(seed: int, _report: Report) -> list[Row]:
-    """A pose taken in and the tip predicted 25 ms ahead, beside the textbook's matrices in numpy."""
+    """A pose taken in and the tip predicted 25 ms ahead, compared with the textbook's matrices in numpy."""
     config = new(PREDICTOR_PARAMS)
     config[0] = tick_parameters(load_rig(RIG))[0].predictor
     poses = np.recarray(POSES, dtype=POSE)

@@ -1,4 +1,4 @@
-"""Benchmarks of the force estimation: the six cases cold and warm beside scipy, noise beside its bound, whole recordings."""
+"""Benchmarks of force estimation: the six cases compared with scipy, noise with its bound, whole recordings."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ case_1, case_2, case_3, case_4, case_5, case_6 = (_case(number) for number in ra
 
 
 def batch(seed: int, _report: Report) -> list[Row]:
-    """Case 4 of noisy recorded poses, each on its own: processor time per pose beside a loop of single calls."""
+    """Case 4 of noisy recorded poses, each on its own: processor time per pose compared with a loop of single calls."""
     from host.estimation.spatial import PoseSensor, estimate_cosserat
     from host.estimation.spatial_batch import estimate_batch
     from host.mechanics.cosserat import solve_cosserat

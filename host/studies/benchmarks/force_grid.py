@@ -29,7 +29,7 @@ EXACT_N = 1e-6
 
 @dataclass
 class Count:
-    """Of one catheter and case: how many were exact; off, but warned of; said to be not converged; wrong in silence."""
+    """Counts of one catheter and case: exact; error with a warning; not converged; error without a warning."""
 
     exact: int = 0
     warned: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Benchmarks of the planar model: statics and force from tip pose, beside scipy's fsolve on the same equations."""
+"""Benchmarks of the planar model: statics and force from tip pose, compared with scipy's fsolve on the same equations."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _tip(arcs: pcar.Arcs, kappa: Array) -> Array:
 
 
 def direct(seed: int, _report: Report) -> list[Row]:
-    """Shape under a force, cold, beside fsolve on the moments from the unloaded shape."""
+    """Shape under a force, cold, compared with fsolve on the moments from the unloaded shape."""
     ours, peers, truth, answers, theirs = [], [], [], [], []
     for arcs, force, found in random_inputs(seed):
         kappa, work = np.empty_like(arcs.length_m), np.empty((pcar_kernels.ROWS, arcs.length_m.size))
@@ -98,7 +98,7 @@ def direct(seed: int, _report: Report) -> list[Row]:
 
 
 def inverse(seed: int, _report: Report) -> list[Row]:
-    """Force from the tip's pose as in chapter 4, beside fsolve for curvatures, then force by least squares."""
+    """Force from the tip's pose as in chapter 4, compared with fsolve for curvatures, then force by least squares."""
     ours, peers, truth, answers, theirs = [], [], [], [], []
     covariance = tip_covariance()
     for arcs, force, found in random_inputs(seed):

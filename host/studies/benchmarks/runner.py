@@ -52,7 +52,7 @@ class Timed:
 def alternate(ours: Sequence[Callable[[int], object]], peers: Sequence[Callable[[], object]]) -> Timed:
     """Times ours[i](repeats) and peers[i]() in turn, input by input.
 
-    Arguments: ours[i] runs input i as often as it is told, inside compiled code; peers[i] runs it once.
+    Arguments: ours[i] runs input i as often as given, inside compiled code; peers[i] runs it once.
     """
     timed = Timed()
     for mine, theirs in zip(ours, peers, strict=True):

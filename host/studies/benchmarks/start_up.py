@@ -34,7 +34,7 @@ def _seconds(job: str) -> float:
 
 
 def import_and_solve(seed: int, _report: Report) -> list[Row]:
-    """Import and first solution in a fresh interpreter, beside scipy's: both without the interpreter's own start."""
+    """Import and first solution in a fresh interpreter, compared with scipy's: both without the interpreter's own start."""
     _seconds(OURS)
     timed = Timed()
     for _ in range(TURNS):

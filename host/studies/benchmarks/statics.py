@@ -120,7 +120,7 @@ def compared(name: str, variant: str, peer: str, ours: list[Ours], peers: list[P
 
 
 def tip_frame(seed: int, _report: Report) -> list[Row]:
-    """Force in the tip frame, one sweep, beside the thesis' two sweeps of Euler with 500 elements."""
+    """Force in the tip frame, one sweep, compared with the thesis' two sweeps of Euler with 500 elements."""
     cases = random_cases(CASES, seed)
     shape = np.empty((ELEMENTS + 1, 7))
 
@@ -137,7 +137,7 @@ def tip_frame(seed: int, _report: Report) -> list[Row]:
 
 
 def base_frame(seed: int, report: Report) -> list[Row]:
-    """Force in the base frame: cold and warm beside solve_bvp, cold beside Algorithm 3.1, and the hard cases."""
+    """Force in the base frame: cold and warm compared with solve_bvp, cold with Algorithm 3.1, and the hard cases."""
     cases = random_cases(CASES, seed)
     cold = [_cold_side(case) for case in cases]
     rows = [compared("cosserat_global", "cold", "scipy solve_bvp, tol 1e-6", cold, [_bvp_cold(c) for c in cases], seed)]
@@ -176,7 +176,7 @@ def base_frame(seed: int, report: Report) -> list[Row]:
 
 
 def helical(seed: int, _report: Report) -> list[Row]:
-    """Four helical segments beside the rod, for ordinary load numbers and for large ones."""
+    """Four helical segments compared with the rod, for ordinary load numbers and for large ones."""
     rows = []
     for variant, largest in (("4 segments", None), (f"4 segments, load numbers to {LARGEST_NUMBER:g}", LARGEST_NUMBER)):
         cases = random_cases(CASES, seed, largest)

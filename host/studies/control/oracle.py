@@ -1,4 +1,4 @@
-"""The oracle of the control study: it knows the wall's motion and the play exactly, and obeys the stages' limits only."""
+"""The oracle of the control study: it knows wall motion and backlash exactly, and obeys the stages' limits."""
 
 from __future__ import annotations
 

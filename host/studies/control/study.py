@@ -1,4 +1,4 @@
-"""Figures of the controller on the simulated rig, each beside what it is compared with in the same run."""
+"""Figures of the controller on the simulated rig, each with its reference from the same run."""
 
 from __future__ import annotations
 

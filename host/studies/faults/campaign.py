@@ -152,7 +152,7 @@ def _bring_to(run: FaultyScenario, phase: str) -> None:
 
 
 def _forked(run: FaultyScenario, board: ForkableBoard, plan: RunPlan) -> RunResult:
-    """The run in a copy of this process; its end, however bad, is told through a pipe."""
+    """The run in a copy of this process; its result, or its failure, comes back through a pipe."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -257,7 +257,7 @@ def violations(result: RunResult) -> Iterator[str]:
 
 
 def by_fault(results: list[RunResult]) -> list[dict[str, Any]]:
-    """A row per fault and phase, as the command's contract has it, and the actions and violations beside."""
+    """A row per fault and phase, as the command's contract has it, with the actions and violations."""
     rows = []
     for fault in FAULTS:
         for phase in PHASES:

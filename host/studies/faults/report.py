@@ -111,7 +111,7 @@ def _what(found: str) -> str:
 
 
 def _crossing_ms() -> float:
-    """Time that the insertion stage of the simulated rig takes through the play."""
+    """Time that the insertion stage of the simulated rig takes to cross the backlash."""
     rig = load_rig(SIMULATED_RIG)
     insertion = rig.stages.insertion
     return 1e3 * crossing_time_s(

@@ -1,1 +1,1 @@
-"""The thesis' figures and tables again: ours beside the thesis' statement, a verdict to each."""
+"""The thesis' figures and tables, reproduced: ours with the thesis' statement, and a verdict for each."""

@@ -230,7 +230,7 @@ def _effect_section(
 
 
 def _optimum(best: Gains) -> Section:
-    """7.13: our minimum of (7.4) beside the printed gains."""
+    """7.13: our minimum of (7.4) compared with the printed gains."""
     forces = (0.1, 0.2, 0.3)
     t = np.arange(40)
     runs = {force: (hybrid(force, 40, best), hybrid(force, 40)) for force in forces}
@@ -302,7 +302,7 @@ def _stiffness(best: Gains) -> Section:
 
 
 def _heart() -> list[Section]:
-    """7.15 and 7.16: the beating wall, three forces, beside a catheter left alone."""
+    """7.15 and 7.16: the beating wall, three forces, compared with a catheter that does not move."""
     forces, n = (0.1, 0.2, 0.3), 600
     shown = slice(n - 160, n)
     stiller: dict[float, tuple[Run, Run]] = {}

@@ -307,7 +307,7 @@ def _judge(runs: Sequence[Run], kind: str) -> tuple[bool, str]:
 
 
 def _rise_s(run: Run) -> float:
-    """When 80 % of the wanted force are there; infinite where never."""
+    """Time at which 80 % of the requested force are reached; infinite where never."""
     there = np.flatnonzero(_smooth(run.force_N) > 0.8 * run.wanted_N)
     return float(run.time_s[there[0]]) if there.size else float("inf")
 

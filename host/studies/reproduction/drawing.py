@@ -37,7 +37,7 @@ class Panel(NamedTuple):
 
 
 def panels(title: str, alt: str, caption: str, parts: Sequence[Panel], height_in: float = 2.9) -> Picture:
-    """The panels beside one another, on a phone below one another."""
+    """The panels side by side, on a narrow screen below each other."""
     across = min(len(parts), 3)
     rows = -(-len(parts) // across)
 

@@ -37,7 +37,7 @@ def sections_of(quick: bool) -> Iterator[tuple[str, Callable[[], Section]]]:
 
 
 def run(directory: Path, quick: bool, progress: Callable[[str], None]) -> tuple[list[Section], Path]:
-    """Make every section, tell `progress` each one's name before it, write the page into `directory`.
+    """Make every section, call `progress` with each one's name before it, write the page into `directory`.
 
     Result: the sections and the page's path. Raises OSError where the page cannot be written.
     """

@@ -338,7 +338,7 @@ def _sensitivity_claims(linear: dict[tuple[int, float], Array], alphas: Array) -
 
 
 def figure_5_6(quick: bool) -> Section:
-    """The shaft's bending stiffness 10 % higher than the estimator believes."""
+    """The shaft's bending stiffness 10 % higher than in the estimator."""
     alphas, k0, p = np.linspace(0.0, 2.0 * math.pi, 9 if quick else 37), 10.0, LIVEWIRE.cosserat
     assert p is not None
     stiffer = {

@@ -1,4 +1,4 @@
-"""What the thesis compares with or draws beside its schemes: iterates, internal loads of (3.18), the conventional BVP."""
+"""What the thesis compares or draws with its schemes: iterates, internal loads of (3.18), the conventional BVP."""
 
 from __future__ import annotations
 
