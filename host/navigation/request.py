@@ -84,7 +84,7 @@ class PlanRequest(Request):
 
 
 class Answer(NamedTuple):
-    """A plan: a row a period, at rest at both ends. `clearance_m`: least on the way, in addition to the catheter's radius."""
+    """A plan: a row a period, at rest at the ends. `clearance_m`: least on the way, in addition to the catheter's radius."""
 
     time_s: Array
     stage: Array
