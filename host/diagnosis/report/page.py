@@ -83,7 +83,7 @@ def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
 
 
 def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
-    """What stands under the verdict."""
+    """The sentence below the verdict."""
     fit = verdict["fit"]
     unit = fit["unit"]
     if verdict["verdict"] == "nothing_missing":
@@ -94,9 +94,9 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
     said += f"{before} to {after}."
     if verdict["verdict"] == "mismatch_not_identified":
         return (
-            "What was tried stands below; its parts are probably stand-ins for something else."
+            "The effects below were fitted, but their names are probably wrong."
             if verdict["effects"]
-            else "Windows and conditions stand below."
+            else "Windows and conditions are below."
         )
     return said
 
@@ -111,7 +111,7 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     if verdict["located"]:
         found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
     if result.found.best.terms:
-        found.append(Line("mismatch still left", f"{100 * result.rest.left:.1f}{NBSP}%", "of what was above noise"))
+        found.append(Line("remaining mismatch", f"{100 * result.rest.left:.1f}{NBSP}%", "of the part above noise"))
     return found
 
 
@@ -186,7 +186,7 @@ def candidates(result: Diagnosis) -> list[Row]:
             rows.append(
                 Row(
                     str(count),
-                    f"{words(step.key)} dropped again",
+                    f"{words(step.key)} removed again",
                     short(step.gain.log_likelihood),
                     short(step.gain.p_value),
                     "",

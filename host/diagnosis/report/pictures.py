@@ -80,7 +80,7 @@ def chain(result: Diagnosis) -> Picture:
 
     words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
     height = 0.55 * np.ceil(len(names) / 4) + 0.1
-    return picture(draw, float(height), float(0.55 * np.ceil(len(names) / 3) + 0.1), "The chain", words, "")
+    return picture(draw, float(height), float(0.55 * np.ceil(len(names) / 3) + 0.1), "The links", words, "")
 
 
 def over_time(result: Diagnosis) -> Picture:
@@ -113,7 +113,7 @@ def over_time(result: Diagnosis) -> Picture:
         if result.found.best.terms:
             bottom.plot(*thinned(t, y - best, bins), color=INK, lw=0.9)
         top.set_ylabel(f"{output.channel.replace('_', ' ')} ({unit})")
-        bottom.set_ylabel(f"left ({unit})")
+        bottom.set_ylabel(f"residual ({unit})")
         bottom.set_xlabel("time (s)" if piece.recording.timed else "sample")
         legend_above(top, 2 if narrow else 3)
 
@@ -159,7 +159,7 @@ def loop(result: Diagnosis) -> Picture | None:
         axes: Axes = figure.add_subplot()
         step = max(1, x.size // 6000)
         axes.plot(x[::step], left[::step], ".", color=ESTIMATED, ms=2.0, label="recording minus nominal")
-        axes.plot(x[::step], extra[::step], color=INK, lw=1.0, label="what the effects add")
+        axes.plot(x[::step], extra[::step], color=INK, lw=1.0, label="response of the effects")
         axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
         legend_above(axes, 1 if narrow else 2)
 
@@ -168,8 +168,8 @@ def loop(result: Diagnosis) -> Picture | None:
         3.3,
         3.0,
         "Loop",
-        "Input against what the nominal model leaves, and what the effects add.",
-        "A loop means memory or rate; a single curve means neither.",
+        "Residual of the nominal model against the input, and the response of the effects.",
+        "A loop indicates memory or rate dependence; a single curve indicates neither.",
     )
 
 
