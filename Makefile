@@ -11,7 +11,7 @@ SEED   ?= 1
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
 
-.PHONY: demo test setup board-tools lint types nojit bench prove prove-small faults fuzz fuzz-files soak clean
+.PHONY: demo test setup board-tools lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -60,6 +60,13 @@ prove: setup
 
 prove-small: setup
 	@$(BIN)/seldinger prove --cases 24 --seed 1
+
+prove-worlds: setup
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[mujoco]"
+	@$(BIN)/seldinger prove --cases 100 --seed $(SEED) --world all
+
+live-study: setup
+	@$(BIN)/python -m host.studies.live_study --quiet-hours 5 --planted 60 --doubled --out runs/live --docs docs/live.md
 
 faults: setup
 	@$(BIN)/seldinger faults --runs 2000 --seed 1 --jobs 2 --docs docs/reliability.md

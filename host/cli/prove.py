@@ -29,13 +29,20 @@ def prove(
     ] = None,
     finder: Annotated[str | None, typer.Option(help="Another command to score, called as `seldinger diagnose` is.")] = None,
     limit_s: Annotated[float, typer.Option(help="Longest time for one case (s).")] = 900.0,
-    baselines: Annotated[bool, typer.Option(help="Run the baselines too.")] = True,
+    baselines: Annotated[bool, typer.Option(help="Run the baselines too, on the project's own world.")] = True,
+    world: Annotated[
+        str, typer.Option(help="own, mujoco, ode, contact, several joined by commas, or all; --cases of each.")
+    ] = "own",
+    calibration: Annotated[
+        Path | None, typer.Option(help="Table of host.studies.proof.calibrate to apply to the raw probabilities.")
+    ] = None,
 ) -> None:
     """Score the mismatch finder on concealed cases."""
     from host.studies.proof import workers
-    from host.studies.proof.runner import Settings
+    from host.studies.proof.calibration import as_stated, read
+    from host.studies.proof.runner import Settings, is_spent
     from host.studies.proof.runner import prove as run
-    from host.studies.proof.table import markdown
+    from host.studies.proof.table import markdown, worlds_markdown
 
     within("--cases", cases, 1, 1_000_000)
     within("--jobs", jobs, 1, 1024)
@@ -43,11 +50,16 @@ def prove(
     checked_seed(seed)
     if resume is not None and not (resume / "suite.json").exists():
         raise InputError("--resume", str(resume), "a folder that an earlier run made")
-    folder = writable_folder("--dir", resume or dir or Path("runs") / f"prove_{seed}_{cases}")
+    chosen = _worlds(world)
+    named = "" if chosen == ("own",) else "_" + "_".join(chosen)
+    folder = writable_folder("--dir", resume or dir or Path("runs") / f"prove_{seed}_{cases}{named}")
     command = tuple(shlex.split(finder)) if finder else workers.FINDER
+    if is_spent(seed):
+        print(f"seed {seed} was used while the finder was built: its figures prove nothing", file=sys.stderr)
+    calibrate = read(calibration) if calibration else as_stated
     with Progress() as bar:
         result = run(
-            Settings(cases, seed, folder, jobs, scheduler, command, limit_s, baselines),
+            Settings(cases, seed, folder, jobs, scheduler, command, limit_s, baselines, chosen, calibrate),
             lambda stage, done, total: bar(stage, done / max(total, 1), f"{done}/{total}"),
             lambda digest: print(f"labels sha256 {digest}", file=sys.stderr, flush=True),
         )
@@ -57,7 +69,20 @@ def prove(
     if json:
         write_json(result)
         return
-    print(markdown(result["table"], result["baselines"]))
+    if chosen == ("own",):
+        print(markdown(result["table"], result["baselines"]))
+    else:
+        print(worlds_markdown({name: each["table"] for name, each in result["worlds"].items()}, "own"))
+
+
+def _worlds(text: str) -> tuple[str, ...]:
+    """Worlds that `--world` names. Raises InputError for one that is not known."""
+    from host.studies.proof.worlds.suite import WORLDS
+
+    chosen = WORLDS if text == "all" else tuple(text.split(","))
+    if unknown := [name for name in chosen if name not in WORLDS]:
+        raise InputError("--world", unknown[0], f"one of {', '.join(WORLDS)}, several joined by commas, or all")
+    return chosen
 
 
 def _line(case: dict) -> str:  # type: ignore[type-arg]
@@ -66,6 +91,7 @@ def _line(case: dict) -> str:  # type: ignore[type-arg]
     truth = " + ".join(case["truth"]) or "nothing"
     loop = "closed" if case["closed_loop"] else "open"
     return (
-        f"{'right' if case['right'] else 'WRONG'}  {case['id']}  {case['kind']:<12} {loop:<6} rho {case['rho']:.2f}  "
+        f"{'right' if case['right'] else 'WRONG'}  {case['world']} {case['id']}  {case['kind']:<12} {loop:<6} "
+        f"rho {case['rho']:.2f}  "
         f"{case['category']}: {truth}  ->  {case['verdict'].get('verdict')} {effects}"
     )

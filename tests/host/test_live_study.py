@@ -1,43 +1,104 @@
-"""The live study's table: rows, silence, the page it is written to."""
+"""The live study: rows and lines, sizes of planted effects, runs that go on, and the short form without an effect."""
 
+import json
+import math
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from host.commissioning.experiment_script import check_script
-from host.studies.live_study import BEGIN, CASES, END, ON_S, Row, quiet_line, round_trip, table, write_docs
+from host.studies import live_study
+from host.studies.live_study import BEGIN, CASES, END, ON_S, Book, Row, Task
 from protocol.rig_file import SIMULATED_RIG, load_rig
-from protocol.topics import Alarm
-from sim.effects import parse
 
 
-def alarm(since_s: float, at_s: float) -> Alarm:
-    words = "roll: probably whip (as well may be latency@roll); tip_x"
-    return Alarm(stamp_ns=round(at_s * 1e9), subsystem="roll", effect="whip", channel="tip_x", score=2.0, explained=0.9,
-                 since_ns=round(since_s * 1e9), words=words)  # fmt: skip
+def alarm(since_s: float, at_s: float, subsystem: str = "roll") -> dict[str, object]:
+    words = "roll: probably whip (indistinguishable from latency@roll); tip_x"
+    return {"at_s": at_s, "since_s": since_s, "subsystem": subsystem, "effect": "whip", "words": words}
+
+
+def row(part: str = "planted", *alarms: dict[str, object], ratio: float = 2.0, seconds: float = 60.0) -> Row:
+    return Row(Task(part, "whip@roll", "round", 1, 32.0), seconds, alarms, 0.9, ratio)
 
 
 def test_a_row_says_when_what_and_what_else() -> None:
-    row = Row("whip@roll", "round", 60.0, [alarm(ON_S + 0.5, ON_S + 5.5)], 0.9)
-    assert row.line == "| whip@roll | round | 0.5 | 5.5 | roll: whip | latency@roll |"
-    assert "never | never | silent; largest score 0.90 of 1" in Row("whip@roll", "round", 60.0, [], 0.9).line
-    early = Row("whip@roll", "round", 60.0, [alarm(10.0, 15.0)], 0.9)
-    assert "never" in early.line and "1 alarms in 0.02 hours" in quiet_line([early])
-    assert table([row]).count("\n") == 2
+    told = row("default", alarm(ON_S + 0.5, ON_S + 5.5))
+    assert told.line == "| whip@roll | round | 1 | 2.0 | 5.5 | roll: whip | latency@roll |"
+    assert "no alarm; largest score 0.90 of 1" in row().line
+    early = row("default", alarm(10.0, 15.0))
+    assert early.delay_s is None and "no alarm" in early.line
+    assert live_study.table([told]).count("\n") == 2
 
 
-def test_every_case_can_be_planted_and_the_round_trip_is_allowed() -> None:
+def test_figures_are_counted() -> None:
+    late, soon, never = row("doubled", alarm(ON_S, ON_S + 5.5)), row("doubled", alarm(ON_S, ON_S + 2.0)), row("doubled")
+    said = live_study.doubled_line([late, soon, never])
+    assert "1 of 3 reported within 3 s, 1 not reported, median 3.8 s" in said
+    wrong = row("planted", alarm(ON_S, ON_S + 5.0, "knob"))
+    said = live_study.planted_line([wrong, soon, never])
+    assert "3; 2 reported, 1 of them with a wrong subsystem (whip@roll as knob)" in said
+    quiet = Row(Task("quiet", "", "press", 1, 600.0), 1800.0, (alarm(10.0, 15.0),), 1.2, 1.0)  # type: ignore[arg-type]
+    assert "press 1 alarms in 0.50 hours (1 runs)" in live_study.quiet_line([quiet])
+
+
+def test_every_effect_can_be_planted_at_other_sizes() -> None:
+    for name, job, _ in CASES:
+        once = live_study.effect_of(Task("planted", name, job, 1, 10.0, 1.0))[0]
+        twice = live_study.effect_of(Task("planted", name, job, 1, 10.0, 2.0))[0]
+        assert once.start_s == ON_S and once.parameters and once.parameters != twice.parameters
+    assert live_study.effect_of(Task("quiet", "", "press", 1, 10.0)) == ()
+
+
+def test_a_doubled_run_is_sized_by_the_residual_of_the_default_one() -> None:
+    task = live_study.doubled(row("default", ratio=2.0))
+    assert task is not None and task.size == pytest.approx(1.0)
+    task = live_study.doubled(row("default", ratio=4.0))
+    assert task is not None and task.size == pytest.approx(math.sqrt(3.0 / 15.0), abs=1e-3)
+    assert live_study.doubled(row("default", ratio=1.0)) is None
+
+
+def test_the_full_form_is_five_hours_of_each_job_and_sixty_planted_runs() -> None:
+    all_tasks = list(live_study.tasks(5 * 3600.0, 60))
+    assert len({task.key for task in all_tasks}) == len(all_tasks)
+    for job in ("press", "round"):
+        assert sum(t.seconds for t in all_tasks if t.part == "quiet" and t.job == job) == pytest.approx(5 * 3600.0)
+    assert sum(t.part == "planted" for t in all_tasks) == 60
+
+
+def test_finished_runs_are_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = []
+
+    def fake(task: Task, board: str) -> Row:
+        done.append(task)
+        return Row(task, 60.0, (), 0.5, 1.5)
+
+    monkeypatch.setattr(live_study, "run", fake)
+    task = Task("quiet", "", "press", 3, 60.0)
+    path = tmp_path / "runs.jsonl"
+    first = Book(path, "native").row(task)
+    path.write_text(path.read_text() + json.dumps(asdict(first))[:20])  # a line that was cut off
+    assert Book(path, "native").row(task) == first and done == [task]
+
+
+def test_the_round_trip_is_allowed() -> None:
     rig = load_rig(SIMULATED_RIG)
-    assert all(parse(planted) for planted, _ in CASES)
-    path = check_script(round_trip(rig, 60.0), rig)
+    path = check_script(live_study.round_trip(rig, 60.0), rig)
     assert path.travel["roll"][1] - path.travel["roll"][0] > 4.0 and path.high_m[2] < 0.021
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("job", ["press", "round"])
+def test_half_a_minute_of_watching_without_an_effect_raises_no_alarm(job: str) -> None:
+    quiet = live_study.run(Task("quiet", "", job, 1, 30.0))
+    assert quiet.alarms == () and quiet.seconds > 30.0 and quiet.residual_ratio > 0.0
 
 
 def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "p.md"
     page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    write_docs(page, "new")
+    live_study.write_docs(page, "new")
     assert page.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
     page.write_text("no marks")
     with pytest.raises(ValueError, match="marks"):
-        write_docs(page, "new")
+        live_study.write_docs(page, "new")

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from host.studies.proof.calibration import Calibration, as_stated
 from host.studies.proof.equation_form import right_form
+from sim.concealed.label import Label, PlantedTruth
 
 Array = np.ndarray
+CONFIDENT = 0.9  # stated probability from which on a name is a confident one
 SILENT_BELOW = 0.19  # rho under which nothing is promised: silence is no fault there
 FROM_THE_BEGIN = {"clock_drift"}
 BEHIND = "behind the gain"  # in the equation of an effect that acts on the output of its link
@@ -40,10 +43,25 @@ class Facts:
     gap_closed: float | None
     seconds: float
     right: bool = field(default=False)
+    named: bool = False  # verdict `missing_physics`
+    processor_s: float = math.nan  # for the case, or for 60 s of it where it is longer
+    stated: tuple[tuple[float, bool], ...] = ()  # (probability that the verdict gives to a statement, whether it is true)
 
 
-def judge(label: dict[str, Any], verdict: dict[str, Any], heldout: dict[str, Array] | None = None) -> Facts:
-    """Facts of one case. heldout: columns of the held-out recording, for equations; without them no form is right."""
+def judge(
+    label: Label,
+    verdict: dict[str, Any],
+    heldout: dict[str, Array] | None = None,
+    calibrate: Calibration = as_stated,
+) -> Facts:
+    """Facts of one case.
+
+    Args:
+        label: the sealed truth.
+        verdict: as the contract has it.
+        heldout: columns of the held-out recording, for equations; without them no form is right.
+        calibrate: what turns a verdict's probabilities into those that count.
+    """
     kind = verdict.get("verdict")
     effects = [e for e in verdict.get("effects") or [] if isinstance(e, dict)]
     said = [_claim(e) for e in effects] if kind == "missing_physics" else []
@@ -61,18 +79,49 @@ def judge(label: dict[str, Any], verdict: dict[str, Any], heldout: dict[str, Arr
         "detected": kind in ("missing_physics", "mismatch_not_identified"),
         "named_first": first,
         "in_set": any(everything & n for n in names),
-        "wrong": _wrong(label, kind, said, names),
+        "wrong": _wrong(label, kind, _confident(effects, said, calibrate), names),
         "subsystem": _subsystem(label, verdict, effects, places),
         "window_f1": window_f1(label, verdict),
         "exact": _exact(said, names),
-        "flagged": kind == "mismatch_not_identified" or any("unlisted" in claim for _, claim in said),
+        "flagged": kind == "mismatch_not_identified"
+        or any("unlisted" in claim for _, claim in said)
+        or (label["category"] == "outside" and first),
         "form": label["category"] == "outside" and _form(label, effects, heldout),
         "parameter_errors": errors,
         "covered": covered,
         "gap_closed": gap_closed(label, verdict),
         "seconds": float(verdict.get("wall_s", verdict.get("seconds", math.nan)) or math.nan),
+        "named": kind == "missing_physics",
+        "processor_s": float(verdict.get("processor_s", math.nan) or math.nan)
+        * 60.0
+        / max(float(verdict.get("recorded_s", 60.0)), 60.0),
+        "stated": _stated(label, verdict, effects if said else [], names, calibrate),
     }
-    return Facts(**facts, right=_right(label, kind, said, facts))
+    stray = _wrong(label, kind, said, names)
+    return Facts(**facts, right=_right(label, kind, said, facts) and not (stray and label["category"] != "unidentifiable"))
+
+
+def _confident(
+    effects: list[dict[str, Any]], said: list[tuple[str, set[str]]], calibrate: Calibration
+) -> list[tuple[str, set[str]]]:
+    """Those claims whose probability makes them confident; a claim without one is taken for certain."""
+    return [
+        claim
+        for effect, claim in zip(effects, said, strict=False)
+        if not isinstance(effect.get("probability"), (int, float)) or calibrate("effect", effect) >= CONFIDENT
+    ]
+
+
+def _stated(
+    label: Label, verdict: dict[str, Any], effects: list[dict[str, Any]], names: list[set[str]], calibrate: Calibration
+) -> tuple[tuple[float, bool], ...]:
+    """What the verdict says with a probability: that its first effect is there, and that nothing is missing."""
+    out = []
+    if effects and isinstance(effects[0].get("probability"), (int, float)):
+        out.append((calibrate("effect", effects[0]), any(str(effects[0].get("id")) in n for n in names)))
+    if isinstance(verdict.get("probability_none"), (int, float)):
+        out.append((calibrate("none", verdict), not label["planted"]))
+    return tuple(out)
 
 
 def _claim(effect: dict[str, Any]) -> tuple[str, set[str]]:
@@ -82,7 +131,7 @@ def _claim(effect: dict[str, Any]) -> tuple[str, set[str]]:
     return name, {name, *(str(o).partition("@")[0] for o in others)}
 
 
-def _wrong(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
+def _wrong(label: Label, kind: Any, said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
     """Confident and wrong: an effect is named, and neither it nor anything it may be is true.
 
     Outside the library: a listed effect is named first and `unlisted` is not among what it may be.
@@ -90,7 +139,7 @@ def _wrong(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], n
     if kind != "missing_physics" or not said:
         return False
     if label["category"] == "outside":
-        return "unlisted" not in said[0][1]
+        return not said[0][1] & {"unlisted", *set().union(*names)}
     true = [*names, set(label["set"])]
     return any(not any(claim & n for n in true) for _, claim in said)
 
@@ -108,17 +157,15 @@ def _exact(said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
     return True
 
 
-def _subsystem(
-    label: dict[str, Any], verdict: dict[str, Any], effects: list[dict[str, Any]], places: list[str]
-) -> bool | None:
+def _subsystem(label: Label, verdict: dict[str, Any], effects: list[dict[str, Any]], places: list[str]) -> bool | None:
     """Whether the first place named is true; None where the nominal model has one place only, or nothing was planted."""
-    if not places or label["kind"] in ("axis", "impedance"):
+    if not places or label["kind"] not in ("rig", "transmission"):
         return None
     named = [*effects, *(x for x in verdict.get("located") or [] if isinstance(x, dict))]
     return bool(named) and named[0].get("subsystem") in places
 
 
-def window_f1(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:
+def window_f1(label: Label, verdict: dict[str, Any]) -> float | None:
     """F1 of the time that reported and true windows share, within the recordings that the verdict has windows in.
 
     Windows are in the recordings' own time, which runs on through the session. None without true or reported windows.
@@ -144,7 +191,7 @@ def _joined(pieces: list[list[float]]) -> list[list[float]]:
     return out
 
 
-def _form(label: dict[str, Any], effects: list[dict[str, Any]], heldout: dict[str, Array] | None) -> bool:
+def _form(label: Label, effects: list[dict[str, Any]], heldout: dict[str, Array] | None) -> bool:
     """Whether one of the equations found has the form of the true one."""
     if heldout is None:
         return False
@@ -170,7 +217,7 @@ def _base(name: str) -> str:
     return "_".join(words)
 
 
-def parameters(label: dict[str, Any], effects: list[dict[str, Any]]) -> tuple[tuple[float, ...], tuple[bool, ...]]:
+def parameters(label: Label, effects: list[dict[str, Any]]) -> tuple[tuple[float, ...], tuple[bool, ...]]:
     """(relative errors, whether the 95 % interval holds the truth) of all comparable parameters of truly named effects."""
     errors, covered = [], []
     for planted, names in zip(label["planted"], label["names"], strict=True):
@@ -187,7 +234,7 @@ def parameters(label: dict[str, Any], effects: list[dict[str, Any]]) -> tuple[tu
     return tuple(errors), tuple(covered)
 
 
-def comparable(planted: dict[str, Any], effect: dict[str, Any]) -> dict[str, float]:
+def comparable(planted: PlantedTruth, effect: dict[str, Any]) -> dict[str, float]:
     """True values that the parameters of `effect` can be held against, by name, as the label or its equivalents have them.
 
     An amplitude that the effect counts behind the gain is turned there; a drift that began later than the recordings is
@@ -199,7 +246,7 @@ def comparable(planted: dict[str, Any], effect: dict[str, Any]) -> dict[str, flo
     return {name: gain * float(planted["parameters"][name]) for name in planted["compared"]} | planted.get("equivalent", {})
 
 
-def gap_closed(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:
+def gap_closed(label: Label, verdict: dict[str, Any]) -> float | None:
     """(E_nominal - E_fit) / (E_nominal - E_true), held out, on the channel that shows the mismatch most.
 
     E_true is the noise that was in fact added there: what the true model leaves. None below rho 0.5 on held-out data.
@@ -218,7 +265,7 @@ def gap_closed(label: dict[str, Any], verdict: dict[str, Any]) -> float | None:
     return float((before - after) / (before - noise))
 
 
-def _right(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], facts: dict[str, Any]) -> bool:
+def _right(label: Label, kind: Any, said: list[tuple[str, set[str]]], facts: dict[str, Any]) -> bool:
     """The verdict in one word, by the category's rule (docs/proof.md)."""
     category = label["category"]
     if facts["failed"]:
@@ -234,7 +281,7 @@ def _right(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]], f
     return bool((facts["named_first"] if category == "single" else facts["exact"]) and not facts["wrong"])
 
 
-def _honest(label: dict[str, Any], kind: Any, said: list[tuple[str, set[str]]]) -> bool:
+def _honest(label: Label, kind: Any, said: list[tuple[str, set[str]]]) -> bool:
     """An undecidable case: silence where that is in the set, doubt, or a true name with another of the set beside it."""
     allowed = set(label["set"])
     if kind == "nothing_missing":

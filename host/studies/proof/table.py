@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,13 @@ KEYS = (
     "gap_closed_in_library",
     "gap_closed_outside",
     "seconds_per_case_median",
+    "nulls_named",
+    "confident_wrong",
+    "gap_closed",
+    "reliability_worst",
+    "processor_s_per_60_s_median",
+    "processor_s_per_60_s_worst",
+    "failed",
 )
 TARGETS = {
     "false_alarms": "0",
@@ -48,6 +57,24 @@ TARGETS = {
     "gap_closed_outside": "0.60",
     "seconds_per_case_median": "at most 60 per 60 s",
 }
+# figure -> (what it must reach on the project's own world, on worlds left out of all choices)
+WORLD_TARGETS = {
+    "nulls_named": ("0", "0"),
+    "false_alarms": ("0", "at most 2 % of nulls"),
+    "named_first": ("0.92", "0.80"),
+    "truth_in_set": ("0.98", "0.92"),
+    "confident_wrong": ("0.02", "0.04"),
+    "pairs_exact": ("0.85", "0.60"),
+    "outside_flagged": ("0.97", "0.85"),
+    "reliability_worst": ("0.05", "0.10"),
+    "coverage_95": ("0.93-0.97", "0.90-0.98"),
+    "gap_closed": ("0.99", "0.90"),
+    "processor_s_per_60_s_median": ("10", "10"),
+    "processor_s_per_60_s_worst": ("90", "90"),
+    "failed": ("0", "0"),
+}
+BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
+LEAST_IN_BIN = 5  # statements below which a bin's frequency says nothing
 WIDE = 1.34  # a case counts for rho where its own is within this factor
 Table = dict[str, float | int | None]
 
@@ -87,7 +114,66 @@ def tabulate(facts: Sequence[Facts]) -> Table:
         "gap_closed_in_library": middle([f.gap_closed for f in library if f.gap_closed is not None]),
         "gap_closed_outside": middle([f.gap_closed for f in facts if f.category == "outside" and f.gap_closed is not None]),
         "seconds_per_case_median": middle([f.seconds for f in facts if np.isfinite(f.seconds)]),
+        "nulls_named": sum(f.category == "null" and f.named for f in facts),
+        "confident_wrong": mean([float(f.wrong) for f in facts if f.category != "null"]),
+        "gap_closed": middle([f.gap_closed for f in facts if f.gap_closed is not None]),
+        "reliability_worst": worst_bin(reliability(facts)),
+        "processor_s_per_60_s_median": middle([f.processor_s for f in facts if np.isfinite(f.processor_s)]),
+        "processor_s_per_60_s_worst": max((f.processor_s for f in facts if np.isfinite(f.processor_s)), default=None),
+        "failed": sum(f.failed for f in facts),
     }
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Statements whose probability lies between `low` and `high`."""
+
+    low: float
+    high: float
+    count: int
+    stated: float  # mean probability
+    true: float  # share that is true
+
+
+def reliability(facts: Sequence[Facts]) -> list[Bin]:
+    """Bins of all statements with a probability, empty ones left out."""
+    statements = [pair for f in facts for pair in f.stated]
+    found = []
+    for low, high in itertools.pairwise(BINS):
+        inside = [(p, true) for p, true in statements if low <= p < high or (high == 1.0 and p == 1.0)]
+        if inside:
+            p, true = zip(*inside, strict=True)
+            found.append(Bin(low, high, len(inside), float(np.mean(p)), float(np.mean(true))))
+    return found
+
+
+def worst_bin(bins: Sequence[Bin]) -> float | None:
+    """Largest distance between stated probability and frequency, over bins with enough statements."""
+    return max((abs(b.stated - b.true) for b in bins if b.count >= LEAST_IN_BIN), default=None)
+
+
+def reliability_markdown(bins: dict[str, list[Bin]]) -> str:
+    """Reliability of every world as markdown."""
+    lines = ["| world | stated | statements | mean stated | true |", "|---|---|---|---|---|"]
+    lines += [
+        f"| {world} | {b.low:.1f} to {b.high:.1f} | {b.count} | {b.stated:.2f} | {b.true:.2f} |"
+        for world, each in bins.items()
+        for b in each
+    ]
+    return "\n".join(lines)
+
+
+def worlds_markdown(tables: dict[str, Table], own: str) -> str:
+    """The figures of all worlds side by side, with what is to be reached on the own world and on the others."""
+    lines = [
+        f"| figure | to reach, {own} / other | {' | '.join(tables)} |",
+        "|---|---|" + "---|" * len(tables),
+        f"| cases with nothing planted | | {' | '.join(_text(t['null_cases']) for t in tables.values())} |",
+    ]
+    for key, (here, there) in WORLD_TARGETS.items():
+        cells = " | ".join(_text(t[key]) for t in tables.values())
+        lines.append(f"| {key.replace('_', ' ')} | {here} / {there} | {cells} |")
+    return "\n".join(lines)
 
 
 def markdown(table: Table, baselines: dict[str, dict[str, Any]]) -> str:

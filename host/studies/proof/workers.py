@@ -23,31 +23,48 @@ Verdict = dict[str, Any]
 def run_case(files: dict[str, bytes], finder: Sequence[str], limit_s: float) -> Verdict:
     """Verdict of `finder` on one case, whose files (name -> content) are all that it gets, in an empty folder.
 
-    A finder that fails, or takes longer than limit_s (s), gives {"verdict": "failed", "error": one line}. `wall_s` is added.
+    A finder that fails, or takes longer than limit_s (s), gives {"verdict": "failed", "error": one line}. `wall_s` and
+    `processor_s` (user and system, of the finder's process and those it waited for) are added.
     """
-    with tempfile.TemporaryDirectory(prefix="case_") as folder:
+    with tempfile.TemporaryDirectory(prefix="case_") as folder, tempfile.TemporaryDirectory(prefix="said_") as said:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
         recordings = sorted(name for name in files if name != "nominal.toml")
         command = [*finder, *recordings, "--nominal", "nominal.toml", "--json"]
-        began = time.monotonic()
+        status, took, processor_s = _run(command, Path(folder), Path(said), limit_s)
+        spent = {"wall_s": took, "processor_s": processor_s}
+        if status is None:
+            return {"verdict": "failed", "error": f"no verdict within {limit_s:.0f} s", **spent}
+        if status < 0:
+            raise ChildProcessError(f"finder ended by signal {-status}")
         try:
-            done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            return {"verdict": "failed", "error": f"no verdict within {limit_s:.0f} s", "wall_s": limit_s}
-        took = time.monotonic() - began
-        if done.returncode < 0:
-            raise ChildProcessError(f"finder ended by signal {-done.returncode}")
-        try:
-            verdict = json.loads(done.stdout)
+            verdict = json.loads((Path(said) / "out").read_text(encoding="utf-8"))
         except ValueError:
-            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            return {"verdict": "failed", "error": f"exit status {done.returncode}: {last[:200]}", "wall_s": took}
+            lines = (Path(said) / "error").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            return {"verdict": "failed", "error": f"exit status {status}: {(lines or ['no message'])[-1][:200]}", **spent}
     return (
-        {**verdict, "wall_s": took}
-        if isinstance(verdict, dict)
-        else {"verdict": "failed", "error": "not one JSON object", "wall_s": took}
+        {**verdict, **spent} if isinstance(verdict, dict) else {"verdict": "failed", "error": "not one JSON object", **spent}
     )
+
+
+def _run(command: Sequence[str], folder: Path, said: Path, limit_s: float) -> tuple[int | None, float, float]:
+    """(exit status, wall s, processor s) of `command`, whose output goes to `said`; status None after limit_s."""
+    began = time.monotonic()
+    with (said / "out").open("wb") as out, (said / "error").open("wb") as error:
+        child = subprocess.Popen(command, cwd=folder, env=_environment(), stdout=out, stderr=error, stdin=subprocess.DEVNULL)
+        late = False
+        while True:
+            # wait4 gives this child's own processor time, which no call of subprocess does
+            pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+            if pid:
+                break
+            if not late and time.monotonic() - began > limit_s:
+                late = True
+                child.kill()
+            time.sleep(0.02)
+        child.returncode = os.waitstatus_to_exitcode(status)
+    took = time.monotonic() - began
+    return None if late else child.returncode, took, usage.ru_utime + usage.ru_stime
 
 
 def _environment() -> dict[str, str]:

@@ -26,6 +26,7 @@ DRAFTS = (
 def build(folder: Path) -> list[dict]:  # type: ignore[type-arg]
     """Cases and seal as the generator leaves them, without its costly kinds. Returns the labels."""
     plans = [Plan(SEED, i, category, kind, i % 2 == 0, rho, i) for i, (category, kind, rho) in enumerate(DRAFTS)]
+    folder = folder / "own"
     labels = [concealed.make(plan, folder / "cases" / plan.id) for plan in plans]
     (folder / "sealed").mkdir()
     content = json.dumps({"seed": SEED, "cases": len(plans), "labels": labels}, sort_keys=True)
@@ -55,7 +56,7 @@ def truthful(path: Path, folder: Path, labels: list[dict]) -> str:  # type: igno
     """A finder that was given the truth: it knows a case by the hash of its first recording."""
     answers = {}
     for label in labels:
-        first = min((folder / "cases" / label["id"]).glob("a.*"))
+        first = min((folder / "own" / "cases" / label["id"]).glob("a.*"))
         answers[hashlib.sha256(first.read_bytes()).hexdigest()] = answer(label)
     body = (
         f"known = json.loads({json.dumps(json.dumps(answers))})\n"

@@ -66,7 +66,7 @@ def test_one_that_copies_the_truth(built: Built, fresh: Fresh, tmp_path: Path) -
     ):
         assert table[key] == 1.0, key
     assert table["gap_closed_in_library"] == pytest.approx(1.0) and table["window_f1"] > 0.95
-    assert set(result) == {"labels_sha256", "cases", "table", "baselines"}
+    assert set(result) == {"labels_sha256", "cases", "table", "baselines", "worlds"}
 
 
 def test_the_finder_gets_recordings_and_nothing_else(fresh: Fresh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +76,7 @@ def test_the_finder_gets_recordings_and_nothing_else(fresh: Fresh, tmp_path: Pat
         " 'told': [k for k in os.environ if k.startswith('SELDINGER')]}"
     )
     folder = fresh()
-    (folder / "cases" / "case_0000").rename(tmp_path / "only")
+    (folder / "own" / "cases" / "case_0000").rename(tmp_path / "only")
     verdict = workers.run_case(workers.read_case(tmp_path / "only"), suite.finder(tmp_path / "f.py", spy).split(), 60.0)
     assert {name.partition(".")[0] for name in verdict["files"]} == {"a", "b", "c", "nominal"}
     assert verdict["told"] == [] and str(folder) not in " ".join(verdict["arguments"])
@@ -86,12 +86,12 @@ def test_labels_are_announced_before_and_checked_after(fresh: Fresh, tmp_path: P
     folder, order = fresh(), []
     spoiling = suite.finder(
         tmp_path / "f.py",
-        suite.NOTHING + f"\nos.chmod({str(folder / 'sealed/labels.json')!r}, 0o600)"
-        f"\nopen({str(folder / 'sealed/labels.json')!r}, 'a').write(' ')",
+        suite.NOTHING + f"\nos.chmod({str(folder / 'own/sealed/labels.json')!r}, 0o600)"
+        f"\nopen({str(folder / 'own/sealed/labels.json')!r}, 'a').write(' ')",
     )
     with pytest.raises(RuntimeError, match="changed during the run"):
         run(settings(folder, spoiling), lambda stage, *a: order.append(stage), lambda digest: order.append(digest))
-    assert len(order[1 + order.index("generate")]) == 64 and order.index("diagnose") > 1
+    assert len(order[1 + order.index("generate own")]) == 64 and order.index("diagnose own") > 1
 
 
 def test_a_stopped_run_goes_on_where_it_was(fresh: Fresh, tmp_path: Path) -> None:
@@ -99,16 +99,16 @@ def test_a_stopped_run_goes_on_where_it_was(fresh: Fresh, tmp_path: Path) -> Non
     counting = suite.finder(tmp_path / "f.py", f"open({str(log)!r}, 'a').write('x')\n{suite.NOTHING}")
 
     def stop_after_four(stage: str, done: int, total: int) -> None:
-        if stage == "diagnose" and done == 4:
+        if stage == "diagnose own" and done == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(settings(folder, counting), stop_after_four, lambda digest: None)
-    kept = {p.name: p.stat().st_mtime_ns for p in (folder / "verdicts").glob("*.json")}
+    kept = {p.name: p.stat().st_mtime_ns for p in (folder / "own" / "verdicts").glob("*.json")}
     assert 4 <= len(kept) < N or len(log.read_text()) == N
     outcome(folder, counting)
-    assert all((folder / "verdicts" / name).stat().st_mtime_ns == at for name, at in kept.items())
-    assert len(list((folder / "verdicts").glob("*.json"))) == N
+    assert all((folder / "own" / "verdicts" / name).stat().st_mtime_ns == at for name, at in kept.items())
+    assert len(list((folder / "own" / "verdicts").glob("*.json"))) == N
     before = len(log.read_text())
     outcome(folder, counting)
     assert len(log.read_text()) == before
@@ -122,7 +122,7 @@ def test_a_folder_of_another_suite_is_refused(fresh: Fresh) -> None:
 
 
 def test_a_process_that_dies_runs_again_and_a_failure_is_listed(built: Built, tmp_path: Path) -> None:
-    folders = {name: built[0] / "cases" / name for name in ("case_0000", "case_0001")}
+    folders = {name: built[0] / "own" / "cases" / name for name in ("case_0000", "case_0001")}
     mark = tmp_path / "mark"
     dying = suite.finder(
         tmp_path / "f.py",
@@ -139,7 +139,7 @@ def test_a_process_that_dies_runs_again_and_a_failure_is_listed(built: Built, tm
 
 def test_two_workers_on_loopback_and_one_is_lost(built: Built, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    folders = {label["id"]: built[0] / "cases" / label["id"] for label in built[1]}
+    folders = {label["id"]: built[0] / "own" / "cases" / label["id"] for label in built[1]}
     slow = suite.finder(tmp_path / "f.py", f"time.sleep(0.2)\n{suite.NOTHING}")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", host="127.0.0.1"
@@ -159,17 +159,19 @@ def test_two_workers_on_loopback_and_one_is_lost(built: Built, tmp_path: Path) -
 def test_no_scheduler_is_one_line(built: Built) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     with pytest.raises(InputError, match="--scheduler"):
-        list(workers.on_cluster({"case_0000": built[0] / "cases" / "case_0000"}, ["false"], 1.0, "tcp://127.0.0.1:9"))
+        list(
+            workers.on_cluster({"case_0000": built[0] / "own" / "cases" / "case_0000"}, ["false"], 1.0, "tcp://127.0.0.1:9")
+        )
 
 
 def test_a_changed_seal_is_seen(fresh: Fresh) -> None:
     with pytest.raises(RuntimeError, match="sha256"):
-        open_seal(fresh(), "0" * 64)
+        open_seal(fresh() / "own", "0" * 64)
 
 
 def test_baselines_on_a_case(built: Built) -> None:
     label = next(la for la in built[1] if la["category"] == "single" and la["kind"] == "axis")
-    rows = baselines.compare(json.loads(json.dumps(label)), built[0] / "cases" / label["id"])
+    rows = baselines.compare(json.loads(json.dumps(label)), built[0] / "own" / "cases" / label["id"])
     assert tuple(rows) == baselines.NAMES
     assert rows["refitted_nominal"]["gap_closed"] == 0.0
     assert rows["oracle"]["gap_closed"] == pytest.approx(1.0, abs=0.15) and rows["oracle"]["detected"]
@@ -180,7 +182,7 @@ def test_baselines_on_a_case(built: Built) -> None:
 def test_pysindy_absent_is_said(built: Built, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pysindy", None)
     label = built[1][1]
-    rows = baselines.compare(label, built[0] / "cases" / label["id"])
+    rows = baselines.compare(label, built[0] / "own" / "cases" / label["id"])
     assert "not installed" in rows["pysindy"]["unavailable"]
 
 
@@ -199,9 +201,11 @@ def test_command_prints_a_table_and_keeps_its_result(
         limit_s=60.0,
         baselines=False,
         finder=suite.finder(tmp_path / "f.py", suite.NOTHING),
+        world="own",
+        calibration=None,
     )
     out, err = capsys.readouterr()
-    assert "| false alarms | 0 | 0 |" in out and "labels sha256" in err and "WRONG  case_0003" in err
+    assert "| false alarms | 0 | 0 |" in out and "labels sha256" in err and "WRONG  own case_0003" in err
     assert json.loads((folder / "proof.json").read_text())["table"]["null_cases"] == 3
     prove(
         cases=N,
@@ -214,6 +218,8 @@ def test_command_prints_a_table_and_keeps_its_result(
         limit_s=60.0,
         baselines=False,
         finder=None,
+        world="own",
+        calibration=None,
     )
     assert json.loads(capsys.readouterr().out)["labels_sha256"]
     with pytest.raises(InputError, match="--cases"):
@@ -228,6 +234,8 @@ def test_command_prints_a_table_and_keeps_its_result(
             limit_s=60.0,
             baselines=False,
             finder=None,
+            world="own",
+            calibration=None,
         )
     with pytest.raises(InputError, match="--resume"):
         prove(
@@ -241,6 +249,8 @@ def test_command_prints_a_table_and_keeps_its_result(
             limit_s=60.0,
             baselines=False,
             finder=None,
+            world="own",
+            calibration=None,
         )
 
 
@@ -257,5 +267,5 @@ def test_without_a_terminal_progress_is_a_line_at_begin_and_end_and_now_and_then
 
 
 def test_a_case_as_a_picture(built: Built, tmp_path: Path) -> None:
-    picture.main(["--dir", str(built[0]), "--case", "case_0000", "--out", str(tmp_path / "case.png")])
+    picture.main(["--dir", str(built[0] / "own"), "--case", "case_0000", "--out", str(tmp_path / "case.png")])
     assert (tmp_path / "case.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

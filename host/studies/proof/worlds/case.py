@@ -217,7 +217,7 @@ def size_of(setup: Setup, left: Sequence[Columns]) -> tuple[float, dict[str, flo
 
 
 def _scaled(mechanism: Mechanism, setup: Setup, effect: Plantable, rho: float, sign: float) -> Planted | None:
-    """Return `effect` at the size whose mismatch has `rho` within 15 %, by secant steps on logarithms; None if there is none."""
+    """Return `effect` at the size whose mismatch has `rho` within 15 %, by secant steps on logarithms, or None."""
     log_size, points = 0.0, []
     for _ in range(8):
         size = sign * float(np.exp(log_size))
@@ -279,7 +279,7 @@ def _attempt(mechanism: Mechanism, plan: Plan) -> Drawn | None:
 
 
 def make(mechanisms: Sequence[Mechanism], plan: Plan) -> Case:
-    """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if no attempt succeeds."""
+    """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if none does."""
     mechanism = mechanisms[plan.mechanism]
     for attempt in range(ATTEMPTS):
         now = replace(plan, attempt=attempt)

@@ -1,7 +1,7 @@
 """World `contact`: the catheter pressed on a moving curved wall, forces out of the bending plane, large deflections.
 
-The wall's force is recorded and loads the nominal rod, so that a moving wall is nothing missing. What is planted acts between
-handle and catheter, or loads the tip.
+The wall's force is recorded and loads the nominal rod, so that a moving wall is nothing missing. What is planted acts
+between handle and catheter, or loads the tip.
 """
 
 from __future__ import annotations
@@ -48,9 +48,19 @@ class Pressed:
     effects = _handle_effects()
     outside = (
         Plantable(
-            "unlisted", "tip", lambda s, c: {"x_N": 2e-3 * s, "z_N": -4e-3 * s}, same=("gravity_load",), says="weight at the tip"
+            "unlisted",
+            "tip",
+            lambda s, c: {"x_N": 2e-3 * s, "z_N": -4e-3 * s},
+            same=("gravity_load",),
+            says="weight at the tip",
         ),
-        Plantable("unlisted", "insertion", lambda s, c: {"product": 2e-4 * s}, signed=True, says="insertion goes with roll times knob"),
+        Plantable(
+            "unlisted",
+            "insertion",
+            lambda s, c: {"product": 2e-4 * s},
+            signed=True,
+            says="insertion goes with roll times knob",
+        ),
     )
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
@@ -60,7 +70,12 @@ class Pressed:
         stamps = tuple(signals.stamps(rng, rate, duration, 0.0) for _ in range(3))
         slow = 1.0 / (2.0 * np.pi * fastest)
         scales = Scales(REACH[0], 0.1, REACH[0] / slow, slow, duration, 1.0 / rate)
-        values = (float(rng.uniform(-0.068, -0.062)), float(rng.uniform(0.85, 1.1)), float(rng.uniform(26, 32)), float(rng.uniform(5e-4, 1.2e-3)))
+        values = (
+            float(rng.uniform(-0.068, -0.062)),
+            float(rng.uniform(0.85, 1.1)),
+            float(rng.uniform(26, 32)),
+            float(rng.uniform(5e-4, 1.2e-3)),
+        )
         sigma = dict.fromkeys(self.outputs, float(rng.uniform(1e-4, 2.5e-4)))
         style = {
             "fastest_Hz": fastest,
@@ -105,12 +120,21 @@ class Pressed:
             if turn == 5:
                 raise ValueError("loop: found no stable correction, wanted one that settles")
         handle = wanted + np.column_stack([shift, np.zeros_like(shift), np.zeros_like(shift)])
-        columns = {f"{name}_{unit}": handle[:, k] for k, (name, unit) in enumerate(zip(AXES, ("m", "rad", "rad"), strict=True))}
+        columns = {
+            f"{name}_{unit}": handle[:, k] for k, (name, unit) in enumerate(zip(AXES, ("m", "rad", "rad"), strict=True))
+        }
         columns |= {f"force_{a}_N": force[:, k] for k, a in enumerate("xyz")}
         return Trace(columns | {name: tip[:, k] for k, name in enumerate(self.outputs)})
 
     def _tip(
-        self, setup: Setup, planted: Sequence[Planted], i: int, grid: Array, h: float, commands: Sequence[Array], shift: Array
+        self,
+        setup: Setup,
+        planted: Sequence[Planted],
+        i: int,
+        grid: Array,
+        h: float,
+        commands: Sequence[Array],
+        shift: Array,
     ) -> tuple[Array, Array]:
         """Return tip (n, 3) and force (n, 3) at the stamps, with the insertion corrected by shift (n,)."""
         stamps, style, law = setup.stamps[i], setup.style, setup.parameters
@@ -131,7 +155,9 @@ class Pressed:
                 moved[k] = middle + ode.moved(moved[k] - middle, other, other, h, grid, [one], c)
         handle = np.column_stack([np.interp(stamps, grid, x) for x in moved])
         p = np.array([*(law[name] for name in NAMES), TORSION_TO_BENDING, DISTAL_M])
-        tip, force, good = rod.session(p, handle, self._centre(setup, i), np.array([style["radius_m"], style["stiffness_N_per_m"]]), weight)
+        tip, force, good = rod.session(
+            p, handle, self._centre(setup, i), np.array([style["radius_m"], style["stiffness_N_per_m"]]), weight
+        )
         if not good:
             raise ValueError("rod: found no equilibrium, wanted one")
         return tip, force
@@ -151,11 +177,16 @@ class Pressed:
 
     def left(self, setup: Setup, traces: Sequence[Trace]) -> list[Columns]:
         """Return what the nominal rod, refitted by two Gauss-Newton steps, leaves."""
-        p, scale = dict(setup.parameters), {"insertion_offset_m": 1e-3, "roll_slope": 0.02, "knob_gain_per_m_rad": 0.3, "bending_stiffness_Nm2": 2e-5}
+        p, scale = (
+            dict(setup.parameters),
+            {"insertion_offset_m": 1e-3, "roll_slope": 0.02, "knob_gain_per_m_rad": 0.3, "bending_stiffness_Nm2": 2e-5},
+        )
 
         def apart(at: dict[str, float]) -> list[Array]:
             found = [tips(t.channels, at, stamps) for t, stamps in zip(traces, setup.stamps, strict=True)]
-            return [np.column_stack([t.channels[n] - f[n] for n in self.outputs]) for t, f in zip(traces, found, strict=True)]
+            return [
+                np.column_stack([t.channels[n] - f[n] for n in self.outputs]) for t, f in zip(traces, found, strict=True)
+            ]
 
         for _ in range(2):
             now = apart(p)

@@ -151,7 +151,7 @@ def run(
             before = error
             used[i] = p[2] * wanted[i] + loop.kp * error + loop.ki * total + loop.kd * slope
         span = time_s[min(i + 1, n - 1)] - time_s[i]
-        steps = max(5, int(math.ceil(span / STEP_S)))
+        steps = max(5, math.ceil(span / STEP_S))
         h = span / steps
         for step in range(steps if span > 0.0 else 0):
             t0, x0 = time_s[i] + step * h, s[0]

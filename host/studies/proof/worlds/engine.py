@@ -22,7 +22,7 @@ Control = Callable[[int, Any], None]  # (step, data): sets the controls
 
 
 def simulate(xml: str, steps: int, control: Control, read: Callable[[Any], tuple[float, ...]]) -> Array:
-    """Return (steps, k) readings of a MuJoCo model, one a step, taken before the step. Raises ValueError where it diverges."""
+    """Return (steps, k) readings of a MuJoCo model, each taken before its step. Raises ValueError where it diverges."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(xml)
@@ -39,7 +39,9 @@ def simulate(xml: str, steps: int, control: Control, read: Callable[[Any], tuple
     return out
 
 
-def sampling(rng: np.random.Generator, steps: Sequence[int] = (1, 2, 4, 5, 10)) -> tuple[Scales, tuple[Array, ...], float, int]:
+def sampling(
+    rng: np.random.Generator, steps: Sequence[int] = (1, 2, 4, 5, 10)
+) -> tuple[Scales, tuple[Array, ...], float, int]:
     """Return scales with motion and force 1, stamps of the recordings, fastest excitation (Hz), steps between samples."""
     every = int(rng.choice(steps))
     rate = 1.0 / (STEP_S * every)
@@ -110,12 +112,24 @@ class Gear(ode.Link):
         """Draw ratio, sampling and noise; the servo's loop is about the motor and reads no load encoder."""
         scales, stamps, fastest, every = sampling(rng)
         motion = float(rng.uniform(0.4, 2.5))
-        scales = Scales(motion, float(rng.uniform(0.02, 0.5)), motion / scales.slow_s, scales.slow_s, scales.duration_s, scales.period_s)
+        scales = Scales(
+            motion, float(rng.uniform(0.02, 0.5)), motion / scales.slow_s, scales.slow_s, scales.duration_s, scales.period_s
+        )
         gain = float(rng.uniform(0.3, 1.5))
         sigma = {"load_rad": gain * motion * float(np.exp(rng.uniform(np.log(2e-3), np.log(1e-2))))}
         style = {"fastest_Hz": fastest, "every": every}
         parameters = {"gain": gain, "offset": 0.0}
-        return Setup(scales, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), 0.0, parameters, style)
+        return Setup(
+            scales,
+            stamps,
+            closed_loop,
+            int(rng.integers(2**31)),
+            sigma,
+            float(rng.uniform(0.0, 0.4)),
+            0.0,
+            parameters,
+            style,
+        )
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), gain = setup.scales, _clock(setup, i), setup.parameters["gain"]
@@ -138,7 +152,12 @@ class Gear(ode.Link):
         late = _only(planted, "latency").get("delay_s", 0.0)
         motor, turned = out[:, 0], np.interp(time_s - late, time_s, out[:, 1])
         cut = slice(lead, None, setup.style["every"])
-        columns = {"motor_rad": motor[cut], "other_rad": c.motion * other[cut], "torque_Nm": load[cut], "load_rad": turned[cut]}
+        columns = {
+            "motor_rad": motor[cut],
+            "other_rad": c.motion * other[cut],
+            "torque_Nm": load[cut],
+            "load_rad": turned[cut],
+        }
         return Trace(columns)
 
     def _pull(self, planted: Sequence[Planted], setup: Setup, data: Any, other: float, load: float) -> float:
@@ -173,8 +192,16 @@ class Gear(ode.Link):
             friction, inertia = 4.0 * c.force + 20.0 * inertia * c.motion / c.slow_s**2, inertia
         damping = 2.0 * 0.15 * (stiffness * inertia) ** 0.5
         poly = f"0 {gain} 0 {-bend * gain / c.motion**2} 0"
-        rigid = f'<equality><joint joint1="load" joint2="motor" polycoef="{poly}" solref="0.002 1" solimp="0.999 0.9999 1e-6"/></equality>'
-        limit = f'limited="true" range="{-0.5 * gap["width_rad"] * gain} {0.5 * gap["width_rad"] * gain}" solreflimit="0.002 1" solimplimit="0.99 0.999 1e-6"' if gap else ""
+        rigid = (
+            f'<equality><joint joint1="load" joint2="motor" polycoef="{poly}" solref="0.002 1"'
+            ' solimp="0.999 0.9999 1e-6"/></equality>'
+        )
+        limit = (
+            f'limited="true" range="{-0.5 * gap["width_rad"] * gain} {0.5 * gap["width_rad"] * gain}"'
+            ' solreflimit="0.002 1" solimplimit="0.99 0.999 1e-6"'
+            if gap
+            else ""
+        )
         joined = (
             f'<tendon><fixed name="belt" {limit} stiffness="{stiffness}" damping="{damping}" springlength="0">'
             f'<joint joint="load" coef="1"/><joint joint="motor" coef="{-gain}"/></fixed></tendon>'
@@ -210,14 +237,14 @@ class Gear(ode.Link):
 
 _AXIS = "axis"
 _SLIDER_EFFECTS = (
-    Plantable("coulomb_friction", _AXIS, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",), says="frictionloss"),
+    Plantable(
+        "coulomb_friction", _AXIS, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",), says="frictionloss"
+    ),
     Plantable("coulomb_friction", _AXIS, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",), says="floor"),
     Plantable("rate_lag", _AXIS, lambda s, c: {"time_constant_s": 0.15 * c.slow_s * s}, compared=("time_constant_s",)),
     Plantable("saturation", _AXIS, lambda s, c: {"limit_N": 1.1 * c.force / (1.0 + 0.3 * s)}, compared=("limit_N",)),
     Plantable("latency", _AXIS, lambda s, c: {"delay_s": 0.15 * c.slow_s * s}, compared=("delay_s",)),
-    Plantable(
-        "resonance", _AXIS, lambda s, c: {"share": min(0.1 * s, 1.0), "frequency_Hz": 1.6 / (2.0 * np.pi * c.slow_s)}
-    ),
+    Plantable("resonance", _AXIS, lambda s, c: {"share": min(0.1 * s, 1.0), "frequency_Hz": 1.6 / (2.0 * np.pi * c.slow_s)}),
     Plantable(
         "periodic_disturbance",
         _AXIS,
@@ -315,16 +342,21 @@ class Slider(ode.Axis):
             if hung
             else ""
         )
-        # with friction on the floor a second slide lets the weight press: normal force mass * g, coefficient force / (mass * g)
+        # with friction on the floor a second slide lets the weight press: the coefficient is force / (mass * g)
         up = '<joint name="up" type="slide" axis="0 0 1"/>' if floor else ""
         slide = f"{floor / (p['mass'] * 9.81)} 0 0"
         touch = f'contype="1" conaffinity="1" friction="{slide}" condim="3"' if floor else 'contype="0" conaffinity="0"'
-        lagged = f'<general joint="x" dyntype="filterexact" dynprm="{lag}" gainprm="1" biastype="none"' if lag else '<motor joint="x"'
+        lagged = (
+            f'<general joint="x" dyntype="filterexact" dynprm="{lag}" gainprm="1" biastype="none"'
+            if lag
+            else '<motor joint="x"'
+        )
         limited = f' forcelimited="true" forcerange="{-limit} {limit}"' if limit else ""
         return f"""<mujoco>{_HEAD.format(gravity="0 0 -9.81" if floor else "0 0 0")}<option impratio="100" cone="elliptic"/>
 <worldbody><geom type="plane" size="100 100 1" pos="0 0 -0.05" {touch} solref="0.004 1"/>
-<body><joint name="x" type="slide" axis="1 0 0" stiffness="{p["stiffness"]}" damping="{p["damping"]}" frictionloss="{loss}"/>{up}
-<inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/><geom type="box" size="0.05 0.05 0.05" {touch} solref="0.004 1"/>{second}</body>
+<body><joint name="x" type="slide" axis="1 0 0" stiffness="{p["stiffness"]}" damping="{p["damping"]}"
+frictionloss="{loss}"/>{up}<inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/>
+<geom type="box" size="0.05 0.05 0.05" {touch} solref="0.004 1"/>{second}</body>
 </worldbody><actuator>{lagged}{limited}/></actuator></mujoco>"""
 
 
@@ -337,7 +369,12 @@ _PAD_EFFECTS = (
         lambda s, c: {"stiffness": 0.2 * s * c.force / c.motion},
         same=("nonlinear_stiffness", "static_nonlinearity", "second_contact", "dead_zone"),
     ),
-    Plantable("creep_relaxation", _PAD, lambda s, c: {"share": 0.15 * s, "time_constant_s": c.duration_s / 8.0}, same=("contact_viscous",)),
+    Plantable(
+        "creep_relaxation",
+        _PAD,
+        lambda s, c: {"share": 0.15 * s, "time_constant_s": c.duration_s / 8.0},
+        same=("contact_viscous",),
+    ),
     Plantable("latency", _PAD, lambda s, c: {"delay_s": 0.15 * c.slow_s * s}, compared=("delay_s",)),
     Plantable("saturation", _PAD, lambda s, c: {"limit_N": 1.1 * c.force / (1.0 + 0.3 * s)}),
     Plantable("sensor_drift", _PAD, lambda s, c: {"drift_N": 0.1 * c.force * s}, signed=True),
@@ -405,7 +442,9 @@ class Pad(ode.Press):
         if drift:
             force = force + drift["drift_N"] * np.maximum(time_s, 0.0) / c.duration_s
         cut = slice(lead, None, every)
-        return Trace({"motion_m": out[cut, 0], "force_N": force[cut]}, {"v": out[cut, 1], "a": np.gradient(out[:, 1], STEP_S)[cut]})
+        return Trace(
+            {"motion_m": out[cut, 0], "force_N": force[cut]}, {"v": out[cut, 1], "a": np.gradient(out[:, 1], STEP_S)[cut]}
+        )
 
     def _xml(self, setup: Setup, planted: Sequence[Planted]) -> str:
         c, p = setup.scales, setup.parameters
@@ -424,22 +463,28 @@ class Pad(ode.Press):
         if wall:  # MuJoCo's soft contact, stiffness given directly (negative solref)
             k = wall["stiffness"]
             touch = (
-                f'<geom type="sphere" size="0.01" contype="1" conaffinity="1" condim="1" solref="{-k / p["mass"]} {-0.1 * k * c.slow_s / p["mass"]}"'
+                '<geom type="sphere" size="0.01" contype="1" conaffinity="1" condim="1"'
+                f' solref="{-k / p["mass"]} {-0.1 * k * c.slow_s / p["mass"]}"'
                 ' solimp="0 0.95 0.001"/>'
             )
         plane = (
-            f'<geom type="plane" size="1 1 1" pos="{0.2 * c.motion + 0.01} 0 0" zaxis="-1 0 0" contype="1" conaffinity="1" condim="1"/>'
+            f'<geom type="plane" size="1 1 1" pos="{0.2 * c.motion + 0.01} 0 0" zaxis="-1 0 0"'
+            ' contype="1" conaffinity="1" condim="1"/>'
             if wall
             else ""
         )
         return f"""<mujoco>{_HEAD.format(gravity="0 0 0")}<worldbody>{plane}{maxwell}
 <body><joint name="x" type="slide" axis="1 0 0" stiffness="{p["stiffness"]}" damping="{p["damping"]}"
-frictionloss="{loss.get("force_N", 0.0)}"/><inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/>{touch}</body></worldbody>
+frictionloss="{loss.get("force_N", 0.0)}"/>
+<inertial pos="0 0 0" mass="{p["mass"]}" diaginertia="1 1 1"/>{touch}</body></worldbody>
 {tendon}<actuator><motor joint="x"/></actuator></mujoco>"""
 
     def left(self, setup: Setup, traces: Sequence[Trace]) -> list[Columns]:
         """Return what mass, damping, stiffness and offset leave."""
-        rows = [np.column_stack([t.hidden["a"], t.hidden["v"], t.channels["motion_m"], np.ones(t.hidden["a"].size)]) for t in traces]
+        rows = [
+            np.column_stack([t.hidden["a"], t.hidden["v"], t.channels["motion_m"], np.ones(t.hidden["a"].size)])
+            for t in traces
+        ]
         force = np.concatenate([t.channels["force_N"] for t in traces])
         rest = ode.without(np.vstack(rows), force, sum(len(r) for r in rows[:-1]))
         return [{"force_N": part} for part in ode.split(rest, [r[:, 0] for r in rows])]
@@ -455,7 +500,15 @@ frictionloss="{loss.get("force_N", 0.0)}"/><inertial pos="0 0 0" mass="{p["mass"
         }
 
 
-_LINKS = {"mass_1": 1.2, "mass_2": 0.8, "inertia_1": 0.01, "inertia_2": 0.006, "length_1": 0.3, "centre_1": 0.14, "centre_2": 0.12}
+_LINKS = {
+    "mass_1": 1.2,
+    "mass_2": 0.8,
+    "inertia_1": 0.01,
+    "inertia_2": 0.006,
+    "length_1": 0.3,
+    "centre_1": 0.14,
+    "centre_2": 0.12,
+}
 
 
 _STIFF, _DAMP = np.array([150.0, 60.0]), np.array([8.0, 3.0])
@@ -475,7 +528,9 @@ class Arm:
     )
     outside = (
         Plantable("unlisted", "elbow", lambda s, c: {"payload_kg": 0.05 * s}, same=("gravity_load",), says="payload"),
-        Plantable("unlisted", "elbow", lambda s, c: {"size": 0.05 * s}, says="joint friction goes with the other joint's torque"),
+        Plantable(
+            "unlisted", "elbow", lambda s, c: {"size": 0.05 * s}, says="joint friction goes with the other joint's torque"
+        ),
     )
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
@@ -486,7 +541,9 @@ class Arm:
         sigma = dict.fromkeys(self.outputs, force * float(np.exp(rng.uniform(np.log(3e-3), np.log(1e-2)))))
         parameters = {**_LINKS, "damping_1": float(rng.uniform(0.05, 0.3)), "damping_2": float(rng.uniform(0.02, 0.1))}
         style = {"fastest_Hz": min(fastest, 2.0), "every": every}
-        return Setup(found, stamps, True, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), 0.0, parameters, style)
+        return Setup(
+            found, stamps, True, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), 0.0, parameters, style
+        )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
         """Run all recordings."""
@@ -500,7 +557,9 @@ class Arm:
 
         def control(step: int, data: Any) -> None:
             data.ctrl[:] = _STIFF * (wanted[step] - data.qpos) - _DAMP * data.qvel  # a digital servo at 1 kHz
-            data.qfrc_applied[1] = -grip * abs(float(data.actuator_force[0])) * np.tanh(float(data.qvel[1]) / (0.02 * c.speed))
+            data.qfrc_applied[1] = (
+                -grip * abs(float(data.actuator_force[0])) * np.tanh(float(data.qvel[1]) / (0.02 * c.speed))
+            )
 
         def readings(data: Any) -> tuple[float, ...]:
             places = (_place(float(x), float(v)) for x, v in zip(data.qpos[:2], data.qvel[:2], strict=True))
@@ -519,7 +578,11 @@ class Arm:
         p = setup.parameters
         payload = next((q.parameters["payload_kg"] for q in planted if "payload_kg" in q.parameters), 0.0)
         loss = _only(planted, "coulomb_friction").get("torque_Nm", 0.0)
-        tip = f'<body pos="0 0 -0.25"><inertial pos="0 0 0" mass="{payload}" diaginertia="1e-9 1e-9 1e-9"/></body>' if payload else ""
+        tip = (
+            f'<body pos="0 0 -0.25"><inertial pos="0 0 0" mass="{payload}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+            if payload
+            else ""
+        )
 
         def inertial(k: int) -> str:
             turn = " ".join([str(p[f"inertia_{k}"])] * 3)
@@ -527,7 +590,8 @@ class Arm:
 
         return f"""<mujoco>{_HEAD.format(gravity="0 0 -9.81")}<worldbody>
 <body><joint name="shoulder" type="hinge" axis="0 -1 0" damping="{p["damping_1"]}"/>{inertial(1)}
-<body pos="0 0 {-p["length_1"]}"><joint name="elbow" type="hinge" axis="0 -1 0" damping="{p["damping_2"]}" frictionloss="{loss}"/>
+<body pos="0 0 {-p["length_1"]}">
+<joint name="elbow" type="hinge" axis="0 -1 0" damping="{p["damping_2"]}" frictionloss="{loss}"/>
 {inertial(2)}{tip}</body></body></worldbody>
 <actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator></mujoco>"""
 
@@ -537,9 +601,12 @@ class Arm:
         for i, trace in enumerate(traces):
             time_s, given = setup.stamps[i], {k: trace.channels[k] for k in ("shoulder_rad", "elbow_rad")}
             base, one, two = (
-                torques(given, {**setup.parameters, "damping_1": a, "damping_2": b}, time_s) for a, b in ((0, 0), (1, 0), (0, 1))
+                torques(given, {**setup.parameters, "damping_1": a, "damping_2": b}, time_s)
+                for a, b in ((0, 0), (1, 0), (0, 1))
             )
-            rows.append([np.column_stack([trace.channels[n] - base[n], one[n] - base[n], two[n] - base[n]]) for n in self.outputs])
+            rows.append(
+                [np.column_stack([trace.channels[n] - base[n], one[n] - base[n], two[n] - base[n]]) for n in self.outputs]
+            )
         train = np.vstack([part for row in rows[:-1] for part in row])
         found = np.linalg.lstsq(train[:, 1:], train[:, 0], rcond=None)[0]
         return [{n: part[:, 0] - part[:, 1:] @ found for n, part in zip(self.outputs, row, strict=True)} for row in rows]

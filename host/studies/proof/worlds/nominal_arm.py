@@ -1,4 +1,4 @@
-"""Nominal model of a two-link arm as a laboratory would write it: torques from recorded angles, link data from the drawing."""
+"""Nominal model of a two-link arm as a laboratory would write it: torques from angles, link data from the drawing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nominal model of the catheter in contact as a laboratory would write it: the rod of `host.mechanics` under the recorded force."""
+"""Nominal model of the catheter in contact: the rod of `host.mechanics` under the recorded force."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DISTAL_M, TORSION_TO_BENDING = 0.110, 0.77
 
 @njit(cache=True)
 def _tips(p: Array, handle: Array, force: Array, out: Array) -> None:
-    """Write tip positions (n, 3) for p: insertion offset, roll slope, knob gain, EI; handle (n, 3); force (n, 3) on the tip."""
+    """Write tip positions (n, 3). p: insertion offset, roll slope, knob gain, EI; handle, force on the tip: (n, 3)."""
     x, rows, work, stations = np.zeros(3), np.zeros((1, ROW)), np.zeros(WORK), np.zeros(0)
     soft, turned = 1.0 / p[3], np.zeros(3)
     rod = np.array([soft, soft, soft / TORSION_TO_BENDING, soft, soft, soft / TORSION_TO_BENDING, 0.0, 0.0, 0.0])
@@ -41,7 +41,7 @@ def tips(inputs: dict[str, Array], parameters: dict[str, float], time_s: Array) 
     """Return tip positions (n,) m in the base frame.
 
     Args:
-        inputs: `insertion_m`, `roll_rad`, `knob_rad`, and the force on the tip `force_x_N`, `force_y_N`, `force_z_N`, (n,) each.
+        inputs: `insertion_m`, `roll_rad`, `knob_rad`, and `force_x_N`, `force_y_N`, `force_z_N` on the tip, (n,) each.
         parameters: those of NAMES.
         time_s: (n,) s; the rod is static.
     """

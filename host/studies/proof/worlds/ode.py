@@ -65,9 +65,7 @@ def _motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, .
     """Return effects on a motion between an input and an output."""
     found = [
         Plantable("backlash", place, lambda s, c: {"width": 0.06 * c.motion * s}, compared=("width",)),
-        Plantable(
-            "presliding_friction", place, lambda s, c: {"share": min(0.3 * s, 0.9), "distance": 0.25 * c.motion}
-        ),
+        Plantable("presliding_friction", place, lambda s, c: {"share": min(0.3 * s, 0.9), "distance": 0.25 * c.motion}),
         Plantable(
             "rate_lag",
             place,
@@ -75,7 +73,9 @@ def _motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, .
             same=("viscous_friction",),
             compared=("time_constant_s",),
         ),
-        Plantable("latency", place, lambda s, c: {"delay_s": min(0.15 * c.slow_s * s, c.duration_s / 4)}, compared=("delay_s",)),
+        Plantable(
+            "latency", place, lambda s, c: {"delay_s": min(0.15 * c.slow_s * s, c.duration_s / 4)}, compared=("delay_s",)
+        ),
         Plantable(
             "creep_relaxation", place, lambda s, c: {"share": min(0.1 * s, 0.7), "time_constant_s": c.duration_s / 8.0}
         ),
@@ -94,9 +94,7 @@ def _motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, .
             same=("static_nonlinearity",),
             signed=True,
         ),
-        Plantable(
-            "periodic_disturbance", place, lambda s, c: {"amplitude": 0.03 * c.motion * s, "pitch": 0.45 * c.motion}
-        ),
+        Plantable("periodic_disturbance", place, lambda s, c: {"amplitude": 0.03 * c.motion * s, "pitch": 0.45 * c.motion}),
         Plantable(
             "resonance",
             place,
@@ -198,7 +196,15 @@ class Link:
         style = {"fastest_Hz": fastest, "late_s": float(rng.uniform(1e-3, 8e-3)), "begin_s": float(rng.uniform(0.0, 100.0))}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.4 else 0.0
         return Setup(
-            scales, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), lost, parameters, style
+            scales,
+            stamps,
+            closed_loop,
+            int(rng.integers(2**31)),
+            sigma,
+            float(rng.uniform(0.0, 0.4)),
+            lost,
+            parameters,
+            style,
         )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
@@ -240,7 +246,7 @@ class Link:
 
 
 def looped(wanted: Array, forward: Any, setup: Setup, i: int, grid: Array, h: float, channel: str) -> Array:
-    """Return the input under a controller that corrects by the delayed, noisy, filtered error. Raises ValueError if unstable.
+    """Return the input under a controller that corrects by the delayed, noisy error. Raises ValueError if unstable.
 
     The loop is solved by iterating over the whole window; the correction only looks back, so the limit is the loop's.
     """
@@ -273,7 +279,9 @@ def channels(*names: str) -> dict[str, dict[str, str]]:
 _PRESS_PLACE = "material"
 _PRESS_EFFECTS = (
     Plantable("coulomb_friction", _PRESS_PLACE, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",)),
-    Plantable("presliding_friction", _PRESS_PLACE, lambda s, c: {"force_N": 0.08 * c.force * s, "distance": 0.25 * c.motion}),
+    Plantable(
+        "presliding_friction", _PRESS_PLACE, lambda s, c: {"force_N": 0.08 * c.force * s, "distance": 0.25 * c.motion}
+    ),
     Plantable(
         "stribeck_friction",
         _PRESS_PLACE,
@@ -303,9 +311,15 @@ _PRESS_EFFECTS = (
     ),
 )
 _PRESS_OUTSIDE = (
-    Plantable("unlisted", _PRESS_PLACE, lambda s, c: {"place_speed": 0.2 * s}, says="force goes with place and speed's size"),
-    Plantable("unlisted", _PRESS_PLACE, lambda s, c: {"place_damping": 0.3 * s}, says="damping grows with the place squared"),
-    Plantable("unlisted", _PRESS_PLACE, lambda s, c: {"load_place": 0.1 * s}, signed=True, says="stiffness goes with the load"),
+    Plantable(
+        "unlisted", _PRESS_PLACE, lambda s, c: {"place_speed": 0.2 * s}, says="force goes with place and speed's size"
+    ),
+    Plantable(
+        "unlisted", _PRESS_PLACE, lambda s, c: {"place_damping": 0.3 * s}, says="damping grows with the place squared"
+    ),
+    Plantable(
+        "unlisted", _PRESS_PLACE, lambda s, c: {"load_place": 0.1 * s}, signed=True, says="stiffness goes with the load"
+    ),
 )
 
 
@@ -332,7 +346,15 @@ class Press:
         style = {"fastest_Hz": fastest, "late_s": float(rng.uniform(1e-3, 8e-3))}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.4 else 0.0
         return Setup(
-            scales, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), lost, parameters, style
+            scales,
+            stamps,
+            closed_loop,
+            int(rng.integers(2**31)),
+            sigma,
+            float(rng.uniform(0.0, 0.4)),
+            lost,
+            parameters,
+            style,
         )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
@@ -428,16 +450,20 @@ _AXIS_PLACE = "axis"
 _SLIP = 3e-3  # share of the usual speed below which dry friction is not yet full
 _DRY = (
     Plantable(
-        "coulomb_friction", _AXIS_PLACE, lambda s, c: {"force_N": 0.05 * c.force * s, "v0": _SLIP * c.speed}, compared=("force_N",)
+        "coulomb_friction",
+        _AXIS_PLACE,
+        lambda s, c: {"force_N": 0.05 * c.force * s, "v0": _SLIP * c.speed},
+        compared=("force_N",),
     ),
-    Plantable(
-        "presliding_friction", _AXIS_PLACE, lambda s, c: {"force_N": 0.08 * c.force * s, "distance": 0.2 * c.motion}
-    ),
+    Plantable("presliding_friction", _AXIS_PLACE, lambda s, c: {"force_N": 0.08 * c.force * s, "distance": 0.2 * c.motion}),
     Plantable(
         "stribeck_friction",
         _AXIS_PLACE,
         lambda s, c: {
-            "static_N": 0.12 * c.force * s, "kinetic_N": 0.05 * c.force * s, "speed": 0.12 * c.speed, "v0": _SLIP * c.speed
+            "static_N": 0.12 * c.force * s,
+            "kinetic_N": 0.05 * c.force * s,
+            "speed": 0.12 * c.speed,
+            "v0": _SLIP * c.speed,
         },
     ),
     Plantable(
@@ -463,9 +489,7 @@ _SPRUNG = (
         lambda s, c: {"force_N": 0.05 * c.force * s, "scale": 0.4 * c.motion},
         same=("static_nonlinearity",),
     ),
-    Plantable(
-        "creep_relaxation", _AXIS_PLACE, lambda s, c: {"share": 0.15 * s, "time_constant_s": c.duration_s / 8.0}
-    ),
+    Plantable("creep_relaxation", _AXIS_PLACE, lambda s, c: {"share": 0.15 * s, "time_constant_s": c.duration_s / 8.0}),
 )
 _CODES = {
     "coulomb_friction": drive.COULOMB,
@@ -497,7 +521,10 @@ class Axis:
         closed_loop = closed_loop or not self.sprung  # a free axis without a controller leaves its bench
         scales, stamps, fastest = sampling(rng, jitter_allowed=not closed_loop)
         w = 1.0 / scales.slow_s
-        mass, motion = float(np.exp(rng.uniform(np.log(0.05), np.log(20.0)))), float(np.exp(rng.uniform(np.log(1e-3), np.log(0.1))))
+        mass, motion = (
+            float(np.exp(rng.uniform(np.log(0.05), np.log(20.0)))),
+            float(np.exp(rng.uniform(np.log(1e-3), np.log(0.1)))),
+        )
         own = float(rng.uniform(0.5, 1.5)) * w
         stiffness = mass * own**2 if self.sprung else 0.0
         damping = 2.0 * float(rng.uniform(0.15, 0.7)) * mass * own * (1.0 if self.sprung else 0.3)
@@ -506,11 +533,26 @@ class Axis:
         sigma = {"position_m": motion * float(np.exp(rng.uniform(np.log(1e-3), np.log(6e-3))))}
         if not self.sprung:
             sigma = {"position_m": 2e-6 * motion, "drive_N": force * float(np.exp(rng.uniform(np.log(2e-3), np.log(1e-2))))}
-        parameters = {"mass": mass, "damping": damping, "stiffness": stiffness, "offset": 0.05 * force * float(rng.standard_normal())}
+        parameters = {
+            "mass": mass,
+            "damping": damping,
+            "stiffness": stiffness,
+            "offset": 0.05 * force * float(rng.standard_normal()),
+        }
         late = max(1, round(float(rng.uniform(1e-3, 6e-3)) / scales.period_s))
         style = {"fastest_Hz": fastest, "held": bool(closed_loop or rng.random() < 0.5), "late": late}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.3 and self.sprung else 0.0
-        return Setup(scales, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), lost, parameters, style)
+        return Setup(
+            scales,
+            stamps,
+            closed_loop,
+            int(rng.integers(2**31)),
+            sigma,
+            float(rng.uniform(0.0, 0.4)),
+            lost,
+            parameters,
+            style,
+        )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
         """Run all recordings. Raises ValueError where the motion runs away."""
@@ -606,7 +648,11 @@ def _planted_forces(planted: Sequence[Planted], setup: Setup) -> tuple[drive.Act
             rows.append((drive.SECOND_MASS, [mass, mass * w * w, 2.0 * q["damping_ratio"] * mass * w]))
         elif name == "unlisted":
             speed = "place_speed" in q
-            value = q["place_speed"] * c.force / (c.motion * c.speed) if speed else q["place_damping"] * c.force / (c.motion**2 * c.speed)
+            value = (
+                q["place_speed"] * c.force / (c.motion * c.speed)
+                if speed
+                else q["place_damping"] * c.force / (c.motion**2 * c.speed)
+            )
             rows.append((drive.PLACE_SPEED if speed else drive.PLACE_DAMPING, [value]))
         else:
             key = {"latency": "delay_s", "rate_lag": "lag_s", "dead_zone": "dead_N", "saturation": "limit_N"}[name]

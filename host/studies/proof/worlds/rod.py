@@ -1,7 +1,8 @@
-"""The catheter pressed on a moving sphere: an elastic rod with large rotations, its end moment and contact force found together.
+"""The catheter pressed on a moving sphere: an elastic rod with large rotations, base moment and wall force found together.
 
-r' = R e3, R' = R [u]x, u = (k0, 0, 0) + K^-1 R^T m, m' = -r' x F, m(L) = 0, F = F_wall(r(L)) + weight (Kirchhoff rod, shooting from
-the base by Runge-Kutta steps). Written apart from `host.mechanics`, which the nominal model uses and which shoots from the tip.
+r' = R e3, R' = R [u]x, u = (k0, 0, 0) + K^-1 R^T m, m' = -r' x F, m(L) = 0, F = F_wall(r(L)) + weight: a Kirchhoff rod, by
+shooting from the base with Runge-Kutta steps. Written apart from `host.mechanics`, which the nominal model uses and which
+shoots from the tip.
 """
 
 from __future__ import annotations

@@ -1,0 +1,89 @@
+"""Write the tables of the worlds to docs/proof.md: as the finder states its probabilities, and leaving one world out.
+
+python -m host.studies.proof.page --dir runs/prove_JUDGED --calibrate-on runs/prove_OTHER --docs docs/proof.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from host.studies.proof import table
+from host.studies.proof.calibrate import calibrated, read_run
+from host.studies.proof.calibration import Calibration, as_stated
+from host.studies.proof.scoring import Facts, judge
+from host.studies.proof.worlds.suite import OWN
+
+BEGIN, END = "<!-- worlds begin -->", "<!-- worlds end -->"
+
+
+def scored(run: Path, world: str, calibrate: Calibration) -> list[Facts]:
+    """Return the facts of one world's cases, without equations."""
+    return [judge(label, verdict, calibrate=calibrate) for label, verdict in read_run(run)[world]]
+
+
+def block(run: Path, others: Sequence[Path]) -> str:
+    """Return the generated text: both tables, reliability, and every case that was not right."""
+    note = json.loads((run / "suite.json").read_text(encoding="utf-8"))
+    worlds = note["worlds"]
+    stated = {world: scored(run, world, as_stated) for world in worlds}
+    parts = [
+        f"Seed {note['seed']}, {note['cases']} cases of each world, as the finder states its probabilities:",
+        table.worlds_markdown({w: table.tabulate(f) for w, f in stated.items()}, OWN),
+    ]
+    used = stated
+    if others:
+        used = {world: scored(run, world, calibrated(others, [world])) for world in worlds}
+        seeds = ", ".join(str(json.loads((o / "suite.json").read_text(encoding="utf-8"))["seed"]) for o in others)
+        parts += [
+            f"Leaving one world out: each world with probabilities calibrated on the other worlds of seed {seeds}:",
+            table.worlds_markdown({w: table.tabulate(f) for w, f in used.items()}, OWN),
+        ]
+    parts += [
+        "Stated probability against frequency:",
+        table.reliability_markdown({w: table.reliability(f) for w, f in used.items()}),
+    ]
+    parts += ["Cases that were not right:", _failures(run)]
+    return "\n\n".join(parts)
+
+
+def _failures(run: Path) -> str:
+    lines = ["| world | case | kind | planted | rho | verdict |", "|---|---|---|---|---|---|"]
+    for world, judged in read_run(run).items():
+        for label, verdict in judged:
+            if judge(label, verdict).right:
+                continue
+            told = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in verdict.get("effects") or [])
+            said = verdict.get("error") or f"{str(verdict.get('verdict')).replace('_', ' ')} {told}".strip()
+            kind = f"{label['kind']}, {'closed' if label['closed_loop'] else 'open'}"
+            truth = " + ".join(label["truth"]) or "nothing"
+            lines.append(f"| {world} | {label['id'][5:]} | {kind} | {truth} | {label['rho']:.2f} | {said} |")
+    return "\n".join(lines)
+
+
+def write_between(page: Path, text: str) -> None:
+    """Put `text` between the marks of `page`. Raises ValueError where they are missing."""
+    content = page.read_text(encoding="utf-8")
+    if BEGIN not in content or END not in content:
+        raise ValueError(f"{page}: found no marks {BEGIN} and {END}, wanted both")
+    page.write_text(f"{content.split(BEGIN)[0]}{BEGIN}\n{text}\n{END}{content.split(END)[1]}", encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m host.studies.proof.page")
+    parser.add_argument("--dir", type=Path, required=True, help="folder of the judged run")
+    parser.add_argument("--calibrate-on", type=Path, action="append", default=[], help="folder of another finished run")
+    parser.add_argument("--docs", type=Path, help="page whose block is to be written; else it is printed")
+    given = parser.parse_args(arguments)
+    text = block(given.dir, given.calibrate_on)
+    if given.docs is None:
+        print(text)
+    else:
+        write_between(given.docs, text)
+
+
+if __name__ == "__main__":
+    main()
