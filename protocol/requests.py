@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from protocol.errors import InputError
+from protocol.errors import InputError, Words, reason
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -26,11 +27,40 @@ def read_json(source: str) -> Any:
     try:
         text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(source, str(error), "a readable JSON file, or - for standard input") from None
+        raise InputError(source, reason(error), "a readable JSON file, or - for standard input") from None
     try:
         return json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(source, str(error), "one JSON object") from None
+        raise InputError(source, Words(error), "one JSON object") from None
+
+
+# Type of a pydantic error -> what is wanted, with the names of its context.
+_WANTED = {
+    "missing": "a value",
+    "float_type": "a number",
+    "int_type": "an integer",
+    "string_type": "a text",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "an object",
+    "model_type": "an object",
+    "finite_number": "a finite number",
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "a number of at least {ge}",
+    "less_than": "a number below {lt}",
+    "less_than_equal": "a number of at most {le}",
+    "too_short": "{min_length} items or more",
+    "too_long": "{max_length} items or fewer",
+    "string_too_short": "a text that is not empty",
+    "literal_error": "{expected}",
+}
+
+
+def wanted_of(error: Mapping[str, Any]) -> str:
+    """Say what is wanted instead of the value that `error`, one of pydantic's, refuses."""
+    pattern = _WANTED.get(error["type"])
+    return pattern.format(**error.get("ctx") or {}) if pattern else str(error["msg"]).removeprefix("Value error, ")
 
 
 def validate(model: type[Model], data: Any) -> Model:
@@ -44,8 +74,8 @@ def validate(model: type[Model], data: Any) -> Model:
         key = ".".join(str(part) for part in first["loc"]) or "request"
         if first["type"] == "extra_forbidden":
             raise InputError(key, first["input"], "no such key; known keys: " + ", ".join(model.model_fields)) from None
-        found = "nothing" if first["type"] == "missing" else first["input"]
-        raise InputError(key, found, first["msg"].removeprefix("Value error, ")) from None
+        found = Words("nothing") if first["type"] == "missing" else first["input"]
+        raise InputError(key, found, wanted_of(first)) from None
 
 
 def plain(value: Any) -> Any:
@@ -61,4 +91,4 @@ def plain(value: Any) -> Any:
     return value
 
 
-__all__ = ["InputError", "Request", "plain", "read_json", "validate"]
+__all__ = ["InputError", "Request", "plain", "read_json", "validate", "wanted_of"]

@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from protocol import board_pins, loop_margin
-from protocol.errors import InputError
+from protocol.errors import InputError, reason
+from protocol.requests import wanted_of
 from protocol.topics import check_name
 from protocol.zenoh_access import Network, check_network_endpoint
 
@@ -320,7 +321,7 @@ def _bounds(error: Any) -> str:
         for key, word in (("gt", "above"), ("ge", "at least"), ("lt", "below"), ("le", "at most"))
         if key in context
     ]
-    return " and ".join(limits) or error["msg"].removeprefix("Value error, ")
+    return " and ".join(limits) or wanted_of(error)
 
 
 def _known_keys(path: tuple[Any, ...]) -> list[str]:
@@ -372,7 +373,7 @@ def read_rig_data(path: str | Path) -> dict[str, Any]:
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError.from_sentence(f"{path}: found {error}, wanted a readable TOML file") from None
+        raise InputError.from_sentence(f"{path}: found {reason(error)}, wanted a readable TOML file") from None
 
 
 def load_rig(path: str | Path) -> Rig:

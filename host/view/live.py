@@ -15,7 +15,7 @@ from host.recordings.rig_picture import Picture
 from host.run.commander import Acknowledgement, Commander
 from host.view.source import refusal
 from protocol.catheter import load_catheter
-from protocol.requests import Request
+from protocol.requests import Request, wanted_of
 from protocol.rig_file import Rig
 from protocol.topics import TOPICS, decode, key
 from protocol.zenoh_session import Session
@@ -91,7 +91,7 @@ class LiveRig:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "message"
-            return refusal(f"{where}: found {str(first['input'])[:60]!r}, wanted: {first['msg']}")
+            return refusal(f"{where}: found {str(first['input'])[:60]!r}, wanted {wanted_of(first)}")
         if press.button != "stop" and not press.confirmed:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
         answer = self._command(press.button)

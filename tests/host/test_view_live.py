@@ -181,4 +181,4 @@ def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None
     assert answer["result"] == "unanswered" and "may still be starting" in answer["text"]
     publish_until_seen(there, view)
     answer = view.act('{"button": "stop"}')
-    assert answer["result"] == "unanswered" and "may or may not have heard" in answer["text"]
+    assert answer["result"] == "unanswered" and "may or may not have received" in answer["text"]
