@@ -10,7 +10,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Json, Seed, checked_seed
 
-ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"))
+ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"), ("width_error_rad", "rad"))
 
 
 def bench(
@@ -27,7 +27,10 @@ def bench(
         write_json({"results": rows, "missing": missing})
     else:
         print(_table(rows))
-    if only and missing:
+    lacking = benchmarks.missing_of_contract(only or [], missing)
+    for line in lacking:
+        print(f"seldinger: missing row {line}", file=sys.stderr)
+    if lacking:
         raise typer.Exit(1)
 
 

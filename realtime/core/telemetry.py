@@ -18,7 +18,7 @@ from protocol.topics import (
 )
 from realtime.control import safety
 from realtime.control.inverse_kinematics import curvature_of_knob
-from realtime.loop.latency import percentiles_us
+from realtime.loop.latency import bin_edges_ns, percentiles_us
 from realtime.loop.native_loop import WORK_BIN_NS
 
 # Ticks (of 1 ms) between two messages of a topic.
@@ -89,16 +89,16 @@ def state_message(inputs: np.record, outputs: np.record) -> RigState:
 
 
 def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
-    """The message's histogram of tick times, from the loop's (n + 2,) one with bins of WORK_BIN_NS."""
+    """The message's histogram of tick times, from the loop's, as `native_loop.count_in` keeps it."""
     work = work.copy()  # the loop's thread counts on meanwhile, which np.flatnonzero would not bear
     buckets = [0] * HISTOGRAM_BUCKETS
-    for index in np.flatnonzero(work[:-2]):
-        buckets[histogram_bucket((index + 0.5) * WORK_BIN_NS * 1e-3)] += int(work[index])
+    for index in np.flatnonzero(work[:-1]):
+        buckets[histogram_bucket(bin_edges_ns(index + 0.5, WORK_BIN_NS) * 1e-3)] += int(work[index])
     return tuple(buckets)
 
 
 def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -> LoopTiming:
-    """Histogram (n + 2,) of tick times so far, as the compiled loop keeps it; virtual time knows no lateness."""
+    """Histogram of tick times so far, as the compiled loop keeps it; virtual time knows no lateness."""
     times = percentiles_us(work, WORK_BIN_NS)
     return LoopTiming(
         stamp_ns=stamp_ns,

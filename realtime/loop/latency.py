@@ -21,7 +21,7 @@ from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.loop.clock import Clock
 from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.mailbox import Mailbox
-from realtime.loop.native_loop import BINS, LATENESS_BIN_NS, WORK_BIN_NS
+from realtime.loop.native_loop import BINS, BINS_PER_OCTAVE, HISTOGRAM_WORDS, LATENESS_BIN_NS, WORK_BIN_NS, bin_of
 from realtime.loop.scheduling import RealtimeReport, RealtimeSettings
 
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
@@ -31,21 +31,26 @@ _SLICES = 5
 _FEED_S = 0.005
 
 
+def bin_edges_ns(index: float, bin_ns: int) -> float:
+    """The shortest time that bin `index` of a histogram of `native_loop.count_in` counts, in ns."""
+    return float(bin_ns * (index if index <= BINS else BINS * 2.0 ** ((index - BINS) / BINS_PER_OCTAVE)))
+
+
 def percentiles_us(histogram: np.ndarray, bin_ns: int) -> dict[str, float]:
     """p50, p99, p999 (interpolated within a bin) and the exact max, in us.
 
-    Args: histogram (n + 2,) int64: n bins of `bin_ns`, one for all that is longer, and the maximum in ns (as
-    `native_loop.count_in` keeps it). All zero: every figure is 0. A quantile beyond the last bin is the maximum.
+    Args: histogram (HISTOGRAM_WORDS,) int64 as `native_loop.count_in` keeps it. All zero: every figure is 0.
     """
     counts, max_ns = histogram[:-1], int(histogram[-1])
     sums, out = np.cumsum(counts), {}
     for name, share in QUANTILES.items():
         rank = share * sums[-1]
         index = int(np.searchsorted(sums, rank))
-        if sums[-1] == 0 or index >= len(counts) - 1:
-            value_ns = float(max_ns)
+        if sums[-1] == 0:
+            value_ns = 0.0
         else:
-            value_ns = (index + 1 - (sums[index] - rank) / counts[index]) * bin_ns
+            low_ns, high_ns = bin_edges_ns(index, bin_ns), bin_edges_ns(index + 1, bin_ns)
+            value_ns = high_ns - (sums[index] - rank) / counts[index] * (high_ns - low_ns)
         out[name] = float(min(value_ns, max_ns)) * 1e-3
     return out | {"max": max_ns * 1e-3}
 
@@ -168,11 +173,12 @@ def run_cyclictest(hz: int, seconds: float, cpu: int | None, priority: int | Non
             said = " ".join((done.stdout + done.stderr).split())[:160]
             raise RuntimeError(f"cyclictest: found exit status {done.returncode} ({said}), wanted 0 and its report")
         thread = json.loads(report.read_text(encoding="utf-8"))["thread"]["0"]
-    histogram = np.zeros(BINS + 2, np.int64)
+    histogram = np.zeros(HISTOGRAM_WORDS, np.int64)
     for latency_us, count in thread["histogram"].items():
         histogram[min(int(latency_us), BINS)] += int(count)
-    histogram[BINS] += int(thread["cycles"]) - histogram[:-1].sum()
     histogram[-1] = int(thread["max"]) * 1000
+    # Where those are that were longer than its last bin, cyclictest does not say: at the longest, to be on the safe side.
+    histogram[bin_of(LATENESS_BIN_NS, int(histogram[-1]))] += int(thread["cycles"]) - histogram[:-1].sum()
     return histogram
 
 

@@ -12,11 +12,11 @@ from realtime.loop.atomics import get_word, put_word
 from realtime.loop.clock import Clock
 from realtime.loop.mailbox import Mailbox, Ring, n_words, record_with_words
 from realtime.loop.native_loop import (
-    BINS,
     CONTROL_WORDS,
     FRAME,
     FRAME_BYTES,
     HEARTBEAT,
+    HISTOGRAM_WORDS,
     LOOP,
     PENDING_BYTES,
     STOP,
@@ -117,8 +117,8 @@ class NativeLoop:
             pending=np.zeros(PENDING_BYTES, np.uint8),
             pending_count=np.zeros(1, np.int64),
             frame=np.zeros(FRAME_BYTES, np.uint8),
-            lateness=np.zeros(BINS + 2, np.int64),
-            work=np.zeros(BINS + 2, np.int64),
+            lateness=np.zeros(HISTOGRAM_WORDS, np.int64),
+            work=np.zeros(HISTOGRAM_WORDS, np.int64),
         )
 
     def prepare(self) -> None:
@@ -190,12 +190,12 @@ class NativeLoop:
 
     @property
     def lateness(self) -> np.ndarray:
-        """Histogram of the time between a tick's deadline and its start: BINS of 1 us, one for more, the maximum."""
+        """Histogram of the time between a tick's deadline and its start: 1 us a bin at first, the maximum last."""
         return self._memory.lateness
 
     @property
     def work(self) -> np.ndarray:
-        """Histogram of the time that a whole pass takes after waking: BINS of 0.1 us, one for more, the maximum."""
+        """Histogram of the time that a whole pass takes after waking: 0.1 us a bin at first, the maximum last."""
         return self._memory.work
 
     def snapshot(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,8 +56,11 @@ _EAGAIN, _EINTR = errno.EAGAIN, errno.EINTR
 STOPPED, TICKS_DONE = 1, 2
 # control[]: the stop flag, and on a cache line of its own the heartbeat (number of passes so far).
 STOP, HEARTBEAT, CONTROL_WORDS = 0, 8, 16
-# Histograms: bins of LATENESS_BIN_NS and WORK_BIN_NS, then one for all that is longer, then the exact maximum.
+# Histograms: BINS of LATENESS_BIN_NS and WORK_BIN_NS, then for what is longer bins that grow by 1.1 % each, up to a
+# million times the longest of the first, then the exact maximum. A percentile is exact to its bin however long a tick was.
 LATENESS_BIN_NS, WORK_BIN_NS, BINS = 1_000, 100, 20_000
+BINS_PER_OCTAVE = 64
+HISTOGRAM_WORDS = BINS + 20 * BINS_PER_OCTAVE + 1
 
 
 class LoopMemory(NamedTuple):
@@ -80,17 +84,24 @@ class LoopMemory(NamedTuple):
     pending: np.ndarray  # (PENDING_BYTES,) u1, bytes that the line has not taken yet
     pending_count: np.ndarray  # (1,) i8
     frame: np.ndarray  # (FRAME_BYTES,) u1
-    lateness: np.ndarray  # (BINS + 2,) i8
-    work: np.ndarray  # (BINS + 2,) i8
+    lateness: np.ndarray  # (HISTOGRAM_WORDS,) i8
+    work: np.ndarray  # (HISTOGRAM_WORDS,) i8
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bin_of(bin_ns: int, value_ns: int) -> int:
+    """The bin of a histogram that counts `value_ns`, with its first BINS of `bin_ns` each."""
+    index = max(value_ns // bin_ns, 0)
+    if index < BINS:
+        return index
+    return min(BINS + int(math.log2(value_ns / (BINS * bin_ns)) * BINS_PER_OCTAVE), HISTOGRAM_WORDS - 2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_in(histogram: np.ndarray, bin_ns: int, value_ns: int) -> None:
-    """Count `value_ns` in `histogram`, (n + 2,) int64: n bins of bin_ns, one for longer, and the maximum in ns."""
-    overflow = histogram.shape[0] - 2
-    index = min(max(value_ns // bin_ns, 0), overflow)
-    histogram[index] += 1
-    histogram[overflow + 1] = max(histogram[overflow + 1], value_ns)
+    """Count `value_ns` in `histogram`, (HISTOGRAM_WORDS,) int64."""
+    histogram[min(bin_of(bin_ns, value_ns), histogram.shape[0] - 2)] += 1
+    histogram[-1] = max(histogram[-1], value_ns)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -6,23 +6,17 @@ import sys
 import time
 import types
 
+import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
+from host.cli.bench import bench as bench_command
 from host.studies.benchmarks import control
 from host.studies.benchmarks import runner as bench
 from host.studies.benchmarks.runner import Timed, alternate, find, row_of, run
 from protocol.errors import InputError
 
-CONTRACT_NAMES = [
-    "pcar_direct",
-    "pcar_inverse",
-    "cosserat_tip",
-    "cosserat_global",
-    *(f"estimate_case_{i}" for i in range(1, 7)),
-    "control_tick",
-    "kalman_predict",
-    "diagnose",
-]
 CONTRACT_KEYS = ("name", "unit", "median", "p95", "seed", "peer", "peer_median", "speedup")
 
 
@@ -31,7 +25,7 @@ def quiet(_line: str) -> None:
 
 
 def test_every_name_of_the_contract_is_registered() -> None:
-    assert set(CONTRACT_NAMES) <= set(bench.BENCHMARKS)
+    assert bench.CONTRACT <= set(bench.BENCHMARKS) and len(bench.CONTRACT) == 13
 
 
 def test_both_sides_run_in_turn_on_each_input() -> None:
@@ -68,7 +62,36 @@ def test_a_benchmark_can_be_added_and_one_whose_module_is_missing_is_named(monke
         bench, "BENCHMARKS", {"added": "a_new_benchmark:added", "absent": "host.studies.benchmarks.absent:absent"}
     )
     rows, missing = run([], 3, quiet)
-    assert rows == [{"name": "added", "seed": 3}] and missing == ["absent"]
+    assert rows == [{"name": "added", "seed": 3}]
+    assert missing == {"absent": "the module host.studies.benchmarks.absent is not installed"}
+
+
+def test_a_row_of_the_contract_that_is_missing_fails_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "BENCHMARKS", {"diagnose": "no_such_module:diagnose", "extra": "no_such_module:extra"})
+    done = CliRunner().invoke(_app(), [])
+    assert done.exit_code == 1 and "missing row diagnose: the module no_such_module is not installed" in done.output
+    monkeypatch.setattr(bench, "BENCHMARKS", {"extra": "no_such_module:extra"})
+    done = CliRunner().invoke(_app(), [])
+    assert done.exit_code == 0 and "extra: left out, the module no_such_module is not installed" in done.output
+    assert CliRunner().invoke(_app(), ["--only", "extra"]).exit_code == 1
+
+
+def _app() -> typer.Typer:
+    app = typer.Typer()
+    app.command()(bench_command)
+    return app
+
+
+def test_the_diagnosis_names_the_effect_and_the_messages_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    from host.studies.benchmarks import diagnosis, messages
+
+    verdict = {"effects": [{"id": "backlash", "parameters": {"width_rad": {"value": 0.08}}}]}
+    assert diagnosis.width_in(verdict) == 0.08 and np.isnan(diagnosis.width_in({"effects": []}))
+    recordings = diagnosis.recordings_of(1, 0.08)
+    assert abs(diagnosis.fitted_width_rad(recordings) - 0.08) < 1e-3
+    monkeypatch.setattr(messages, "CASES", 7)
+    rows = [*messages.message_decode(1, quiet), *messages.message_encode(1, quiet)]
+    assert [row["right"] for row in rows] == [7, 7]
 
 
 def test_a_module_that_is_there_but_broken_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:

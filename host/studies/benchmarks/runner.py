@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,8 @@ Report = Callable[[str], None]
 Benchmark = Callable[[int, Report], list[Row]]
 
 # name -> "module:function". The function takes (seed, report) and returns rows made by `row_of`; `report` is progress
-# for people. A module that cannot be imported because it is not there leaves its row out, and says so.
+# for people. A module or a peer that is not installed leaves its row out, with the reason; a row of CONTRACT that is left
+# out makes the command fail.
 BENCHMARKS: dict[str, str] = {
     "pcar_direct": "host.studies.benchmarks.planar:direct",
     "pcar_inverse": "host.studies.benchmarks.planar:inverse",
@@ -34,7 +35,19 @@ BENCHMARKS: dict[str, str] = {
     "import_and_solve": "host.studies.benchmarks.start_up:import_and_solve",
     "control_tick": "host.studies.benchmarks.control:control_tick",
     "kalman_predict": "host.studies.benchmarks.control:kalman_predict",
+    "message_decode": "host.studies.benchmarks.messages:message_decode",
+    "message_encode": "host.studies.benchmarks.messages:message_encode",
     "diagnose": "host.studies.benchmarks.diagnosis:diagnose",
+}
+CONTRACT = {
+    "pcar_direct",
+    "pcar_inverse",
+    "cosserat_tip",
+    "cosserat_global",
+    *(f"estimate_case_{case}" for case in range(1, 7)),
+    "control_tick",
+    "kalman_predict",
+    "diagnose",
 }
 SECONDS_PER_BLOCK = 100e-6  # a call shorter than this is repeated inside one reading of the clock
 BLOCKS = 3  # readings of each side, of which the least counts: the rest is what else ran on the machine
@@ -96,34 +109,43 @@ def row_of(name: str, variant: str, peer: str, timed: Timed, seed: int, **accura
     }
 
 
-def run(only: Sequence[str], seed: int, report: Report) -> tuple[list[Row], list[str]]:
-    """Rows of the named benchmarks (all where none is named), and the names whose module is not there.
+def run(only: Sequence[str], seed: int, report: Report) -> tuple[list[Row], dict[str, str]]:
+    """Run benchmarks.
 
-    Raises: InputError for a name that is not registered.
+    Args:
+        only: Names of BENCHMARKS; all where it is empty.
+        seed: Seed of the random inputs.
+        report: Called with a line of progress.
+
+    Returns:
+        The rows, and for each benchmark that could not run the reason: a module or a peer that is not installed.
+
+    Raises:
+        InputError: A name is not registered.
     """
     for name in only:
         if name not in BENCHMARKS:
             raise InputError("only", name, "one of " + ", ".join(BENCHMARKS))
     rows: list[Row] = []
-    missing: list[str] = []
+    missing: dict[str, str] = {}
     for name in only or BENCHMARKS:
-        benchmark = find(name)
-        if benchmark is None:
-            missing.append(name)
-            report(f"{name}: not in this installation, left out")
-            continue
         report(f"{name} ...")
-        rows += benchmark(seed, report)
+        try:
+            rows += find(name)(seed, report)
+        except ModuleNotFoundError as error:
+            missing[name] = f"the module {error.name} is not installed"
+            report(f"{name}: left out, {missing[name]}")
     return rows, missing
 
 
-def find(name: str) -> Benchmark | None:
-    """The registered benchmark, or None where its module does not exist. Any other failure to import is an error."""
+def missing_of_contract(only: Sequence[str], missing: Mapping[str, str]) -> list[str]:
+    """Return one line for each row that had to be there and is not: those of CONTRACT, and those asked for by name."""
+    wanted = set(only) or CONTRACT
+    return [f"{name}: {reason}" for name, reason in missing.items() if name in wanted]
+
+
+def find(name: str) -> Benchmark:
+    """Return the registered benchmark. Raises ModuleNotFoundError where its module, or one that it needs, is missing."""
     module, function = BENCHMARKS[name].split(":")
-    try:
-        found: Benchmark = getattr(importlib.import_module(module), function)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        return None
+    found: Benchmark = getattr(importlib.import_module(module), function)
     return found

@@ -1,0 +1,163 @@
+"""Which cause came first: orders what went wrong by time and by what explains what, and says what to do about it.
+
+A starved computer shows as four faults: the loop is late, so set-points stop, so the board's dead man acts, and poses are
+stale when the loop is back. Only the first has a remedy; the others are listed after it. Page, log, report and terminal
+use this one function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+# An explanation came at most so long before what it explains: a rig that was late a minute ago is not late now.
+EXPLAINS_FOR_NS = 5_000_000_000
+# ... or was noticed so much later: lateness and the board's counters are reported twice a second.
+NOTICED_WITHIN_NS = 600_000_000
+
+
+class Rule(NamedTuple):
+    """What a cause is called, what to do about it, and which causes explain it."""
+
+    says: str
+    remedy: str
+    explained_by: tuple[str, ...] = ()
+
+
+# Ordered as things are reached: the computer, the line to the board, the board, the sensors, the force.
+RULES: dict[str, Rule] = {
+    "operator_stop": Rule("The operator stopped the rig.", "Disarm and arm again when ready."),
+    "loop_late": Rule(
+        "The control loop was late: the computer was too busy.",
+        "Close other programs, and give the loop real-time priority; `seldinger latency-check` shows how late it wakes.",
+    ),
+    "board_reset": Rule(
+        "The stepper board was reset.", "Check the board's supply and its USB cable, then home the axes.", ("operator_stop",)
+    ),
+    "board_silent": Rule(
+        "The stepper board sent no status.", "Check cable and power of the board, then clear.", ("loop_late", "board_reset")
+    ),
+    "underrun": Rule(
+        "The board ran out of set-points while moving.",
+        "Raise [board] setpoint_lead_s, or make the computer less busy.",
+        ("loop_late", "board_silent", "board_reset"),
+    ),
+    "deadman": Rule(
+        "The board's dead man stopped the axes: no set-points came.",
+        "Check the cable of the board and the load of the computer, then clear.",
+        ("loop_late", "underrun", "board_silent", "board_reset"),
+    ),
+    "board_fault": Rule(
+        "The stepper board latched a fault.",
+        "Look the fault up in docs/devices.md, remove it, then clear.",
+        ("loop_late", "board_reset", "operator_stop"),
+    ),
+    "steps_lost": Rule(
+        "Encoder and steps disagree.",
+        "Look for a jam or a loose encoder plug, clear, and home the axes.",
+        ("board_reset", "board_fault", "over_force"),
+    ),
+    "pose_rejected": Rule(
+        "A pose was not finite, out of the workspace or too fast.",
+        "Look for metal or a field near the tracker's generator.",
+        ("loop_late",),
+    ),
+    "poses_wild": Rule(
+        "Three poses in a row were rejected.", "Check the tracker and its tools.", ("loop_late", "pose_rejected")
+    ),
+    "pose_stale": Rule(
+        "No fresh pose came from the tracker.",
+        "Check the tracker's cable, and that the tip is in its field.",
+        ("loop_late", "poses_wild"),
+    ),
+    "pose_lost": Rule(
+        "No pose came for longer than the limit.",
+        "Check the tracker's cable, and that the tip is in its field, then clear.",
+        ("loop_late", "poses_wild", "pose_stale"),
+    ),
+    "force_rejected": Rule(
+        "A force reading was not finite or out of the sensor's range.", "Check the force sensor's cable.", ("loop_late",)
+    ),
+    "force_stale": Rule(
+        "No fresh force came in contact.", "Check the force sensor and its network.", ("loop_late", "force_rejected")
+    ),
+    "force_lost": Rule(
+        "No force came for longer than the limit in contact.",
+        "Check the force sensor and its network, then clear.",
+        ("loop_late", "force_rejected", "force_stale"),
+    ),
+    "force_handover": Rule(
+        "The force sensor is silent, frozen or off: the estimate closes the loop.",
+        "Check the force sensor.",
+        ("force_rejected", "force_stale", "force_lost"),
+    ),
+    "force_disagrees": Rule(
+        "Force sensor and estimate disagree.",
+        "Zero the force sensor in free space; if it still differs, check its mounting and the catheter's stiffness.",
+        ("force_rejected", "force_stale", "steps_lost"),
+    ),
+    "over_force": Rule(
+        "The contact force went above the limit.",
+        "Take the catheter off the tissue, then clear.",
+        ("loop_late", "steps_lost", "force_disagrees", "force_handover"),
+    ),
+}
+_UNKNOWN = Rule("", "See the log for what came before it.")
+_RANK = {cause: rank for rank, cause in enumerate(RULES)}
+
+
+class Observation(NamedTuple):
+    """A cause when it was first noticed; `words` are its own where the rule has none, or add a detail."""
+
+    cause: str
+    at_ns: int
+    words: str = ""
+
+
+class FirstCause(NamedTuple):
+    """The headline: what came first and its remedy; then what followed from it, and what came beside it, in time."""
+
+    cause: str
+    at_ns: int
+    says: str
+    remedy: str
+    followed: tuple[Observation, ...]
+
+
+def first_cause(observed: Iterable[Observation]) -> FirstCause | None:
+    """Return the first cause of all that was observed, None where nothing was.
+
+    Args:
+        observed: In any order; of a cause that is there twice the earlier counts.
+
+    Returns:
+        Of the causes that no other observed cause explains the earliest; at the same time, the one nearer to the start
+        of RULES. If each is explained by another, the earliest.
+    """
+    earliest: dict[str, Observation] = {}
+    for item in observed:
+        if item.cause not in earliest or item.at_ns < earliest[item.cause].at_ns:
+            earliest[item.cause] = item
+    ordered = sorted(earliest.values(), key=lambda item: (item.at_ns, _RANK.get(item.cause, len(_RANK))))
+    if not ordered:
+        return None
+    roots = [item for item in ordered if not any(_explains(earliest[by], item) for by in _explanations(item, earliest))]
+    first = (roots or ordered)[0]
+    rule = RULES.get(first.cause, _UNKNOWN)
+    says = rule.says or first.words
+    if rule.says and first.words and first.words != rule.says:
+        says = f"{rule.says.removesuffix('.')} ({first.words})."
+    return FirstCause(first.cause, first.at_ns, says, rule.remedy, tuple(item for item in ordered if item != first))
+
+
+def _explanations(item: Observation, earliest: dict[str, Observation]) -> list[str]:
+    return [cause for cause in RULES.get(item.cause, _UNKNOWN).explained_by if cause in earliest]
+
+
+def _explains(by: Observation, item: Observation) -> bool:
+    return -NOTICED_WITHIN_NS <= item.at_ns - by.at_ns <= EXPLAINS_FOR_NS
+
+
+def in_words(item: Observation) -> str:
+    """Return an observed cause as one sentence."""
+    return RULES.get(item.cause, _UNKNOWN).says or item.words
