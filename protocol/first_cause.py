@@ -47,15 +47,17 @@ RULES: dict[str, Rule] = {
         "Check the cable of the board and the load of the computer, then clear.",
         ("loop_late", "underrun", "board_silent", "board_reset"),
     ),
+    "estop": Rule("The emergency stop opened.", "Close the emergency stop when it is safe, then clear."),
+    "limit": Rule("A limit switch opened.", "Move the stage off the switch by hand, clear, and home the axis."),
     "board_fault": Rule(
         "The stepper board latched a fault.",
         "Look the fault up in docs/devices.md, remove it, then clear.",
-        ("loop_late", "board_reset", "operator_stop"),
+        ("loop_late", "deadman", "estop", "limit", "board_reset", "operator_stop"),
     ),
     "steps_lost": Rule(
         "Encoder and steps disagree.",
         "Look for a jam or a loose encoder plug, clear, and home the axes.",
-        ("board_reset", "board_fault", "over_force"),
+        ("board_reset", "limit", "board_fault", "over_force"),
     ),
     "pose_rejected": Rule(
         "A pose was not finite, out of the workspace or too fast.",

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from host.recordings.cause_watch import CauseWatch
 from protocol.enums import BoardState
+from protocol.first_cause import in_words
 
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
@@ -38,6 +40,7 @@ class Picture:
         self._estimate_rows: deque[list[float | None]] = deque(maxlen=WAITING)
         self._kept: dict[str, deque[list[float | None]]] = {name: deque(maxlen=KEPT) for name in ("rows", "estimates")}
         self._heard = 0
+        self._causes = CauseWatch()
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._log_new = False
         self.now_ns = 0
@@ -45,6 +48,7 @@ class Picture:
     def clear(self) -> None:
         """Forget all messages, for a jump in time."""
         self._newest.clear()
+        self._causes = CauseWatch()
         self._log.clear()
         for rows in (self._force_rows, self._estimate_rows, *self._kept.values()):
             rows.clear()
@@ -55,6 +59,7 @@ class Picture:
         if topic.startswith("pose/") and body.get("position_m") is None:
             return  # not seen this time: the one before stands until it is old
         self._newest[topic] = body
+        self._causes.take(topic, body)
         if topic == "state":
             self.now_ns = body["stamp_ns"]
             # Before the first pose the loop's prediction is where it was switched on: nothing that is known.
@@ -134,6 +139,7 @@ class Picture:
             "mode": state.get("mode", ""),
             "action": state.get("safety_action", ""),
             "causes": causes_of(state.get("cause", "")),
+            "first": self._first(state),
             "force_N": _rounded(state.get("force_N"), 4),
             "target_force_N": state.get("target_force_N"),
             "pose_age_ms": _rounded(_ms(state.get("pose_age_ns")), 1),
@@ -149,6 +155,14 @@ class Picture:
         if self._log_new:
             frame["log"], self._log_new = list(self._log), False
         return frame
+
+    def _first(self, state: Body) -> dict[str, Any] | None:
+        """The first cause of what stands, its remedy, and what followed; None while nothing holds the rig back."""
+        first = self._causes.first()
+        if first is None or state.get("safety_action", "none") in ("none", "warn"):
+            return None
+        followed = [in_words(item) for item in first.followed]
+        return {"says": first.says, "remedy": first.remedy, "followed": followed}
 
     def _drawn(self) -> dict[str, Any]:
         """The scene with numbers short enough to be sent thirty times a second: 10 um, 0.1 mN."""

@@ -56,7 +56,7 @@ def demo_result(recording: Recording, run: Run, report: Path) -> dict[str, Any]:
         },
         "recording": str(recording.path),
         "report": str(report),
-        "force_mean_last_10_s_N": summary.force_mean_last_10_s_N,
+        "force_mean_N": summary.force_mean_N,
         "worst_safety_action": summary.worst_action,
         "verdict": verdict_of(summary).level,
         "interrupted": run.interrupted,
@@ -80,8 +80,10 @@ def print_summary(result: dict[str, Any], run: Run, console: Console | None = No
     verdict = verdict_of(summary)
     colour = {"good": "green", "fair": "yellow", "bad": "red"}[verdict.level]
     console.print(f"\n[bold {colour}]{verdict.sentence}[/]", markup=True)
-    for remark in verdict.remarks:
-        console.print(f"  {remark}", markup=False)
+    if verdict.remedy:
+        console.print(f"  {verdict.remedy}", markup=False)
+    for remark in verdict.followed or verdict.remarks:
+        console.print(f"  {remark}", markup=False, style="dim" if verdict.followed else None)
     for note in run.outcome.notes:
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if run.interrupted:
@@ -96,9 +98,9 @@ def _table(result: dict[str, Any], summary: RunSummary) -> Table:
     firmware, ticks = result["firmware"], summary.ticks
     rows = [
         (
-            "mean force, last 10 s",
-            quantity(result["force_mean_last_10_s_N"], "N", 3),
-            f"set-point {quantity(result['target_force_N'], 'N', 2)}",
+            "mean force",
+            quantity(result["force_mean_N"], "N", 3),
+            f"after 3 s of settling; set-point {quantity(result['target_force_N'], 'N', 2)}",
         ),
         ("RMS force error", quantity(result["force_rms_error_N"], "N", 3), "after 3 s of settling"),
         ("peak force", quantity(result["force_peak_N"], "N", 3), f"limit {quantity(summary.force_limit_N, 'N', 2)}"),

@@ -10,7 +10,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from host.recordings.recording import Recording
 from host.report.run_figures import RunFigures
-from host.report.run_summary import RunSummary, summarize
+from host.report.run_summary import SETTLE_S, RunSummary, summarize
+from protocol.first_cause import in_words
 
 # Keeps a number and its unit on one line.
 NBSP = "\u00a0"
@@ -18,11 +19,16 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 class Verdict(NamedTuple):
-    """`level` good, fair or bad; one sentence; and what else must be known, sentence by sentence."""
+    """`level` good, fair or bad; one sentence; and what else must be known, sentence by sentence.
+
+    Of a failed run the sentence ends in the first cause: `remedy` is what to do about it, `followed` what came after it.
+    """
 
     level: str
     sentence: str
     remarks: tuple[str, ...]
+    remedy: str = ""
+    followed: tuple[str, ...] = ()
 
 
 class Line(NamedTuple):
@@ -82,25 +88,38 @@ def lateness_of(summary: RunSummary) -> str:
 
 
 def verdict_of(summary: RunSummary) -> Verdict:
-    """What to say first. Good: the force was kept and nothing intervened. Bad: no contact, a stop or a board fault."""
+    """Judge a run. Good: the force was kept and nothing intervened. Bad: no contact, a stop or a board fault."""
     remarks = _remarks(summary)
     stopped = summary.worst_action in ("retract", "stop") or bool(summary.board.faults)
     if summary.contact is None or summary.contact_seconds == 0:
         sentence = f"No contact in {summary.duration_s:.0f} s."
-        return Verdict("bad" if stopped or summary.target_force_N > 0 else "fair", sentence, remarks)
+        level = "bad" if stopped or summary.target_force_N > 0 else "fair"
+        return _with_first_cause(Verdict(level, sentence, remarks), summary)
     held = f"The wall was touched for {quantity(summary.contact_seconds, 's', 1)}"
+    if stopped:
+        return _with_first_cause(Verdict("bad", f"{held}, then the run was stopped.", remarks), summary)
     if not math.isfinite(summary.target_force_N):
-        return Verdict("bad" if stopped else "fair", held + "; no force was requested.", remarks)
+        return Verdict("fair", held + "; no force was requested.", remarks)
+    settled = summary.contact.seconds > SETTLE_S
     sentence = (
-        f"Mean force {quantity(summary.force_mean_last_10_s_N, 'N', 3)} over the last "
-        f"{quantity(min(10.0, summary.contact.seconds), 's', 0)} of contact (set\N{NON-BREAKING HYPHEN}point "
-        f"{quantity(summary.target_force_N, 'N', 2)}), "
+        f"Mean force {quantity(summary.force_mean_N, 'N', 3)} "
+        + ("after settling" if settled else "in contact")
+        + f" (set\N{NON-BREAKING HYPHEN}point {quantity(summary.target_force_N, 'N', 2)}), "
         f"RMS error {quantity(summary.force_rms_error_N * 1e3, 'mN', 0)}."
     )
-    if stopped:
-        return Verdict("bad", f"{held}, then the run was stopped.", remarks)
     clean = summary.force_kept and not remarks
     return Verdict("good" if clean else "fair", sentence, remarks)
+
+
+def _with_first_cause(verdict: Verdict, summary: RunSummary) -> Verdict:
+    """Return a failed run's verdict with its first cause, remedy and what followed."""
+    first = summary.first
+    if verdict.level != "bad" or first is None or first.cause == "operator_stop":
+        return verdict
+    followed = tuple(
+        f"{(item.at_ns - first.at_ns) * 1e-6:+.0f} ms: {in_words(item)}".replace("-", "\u2212") for item in first.followed
+    )
+    return verdict._replace(sentence=f"{verdict.sentence} {first.says}", remedy=first.remedy, followed=followed)
 
 
 def _remarks(summary: RunSummary) -> tuple[str, ...]:
@@ -109,7 +128,7 @@ def _remarks(summary: RunSummary) -> tuple[str, ...]:
     said = [
         (summary.truncated, "The recording ended early or is damaged; the figures are those of its readable part."),
         (
-            not summary.force_kept and math.isfinite(summary.force_mean_last_10_s_N),
+            not summary.force_kept and math.isfinite(summary.force_mean_N),
             "The mean force differs from the set-point by more than a tenth.",
         ),
         (
@@ -139,8 +158,8 @@ def lines_of(summary: RunSummary) -> list[Line]:
     limit = quantity(summary.force_limit_N, "N", 2)
     lines = [
         Line(
-            "Mean force, last 10 s",
-            quantity(summary.force_mean_last_10_s_N, "N", 3),
+            "Mean force",
+            quantity(summary.force_mean_N, "N", 3),
             f"set-point {quantity(summary.target_force_N, 'N', 2)}",
         ),
         Line("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),

@@ -6,16 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from host.recordings.cause_watch import CauseWatch
 from host.recordings.recording import Recording
 from protocol.enums import SafetyAction
+from protocol.first_cause import FirstCause
 from protocol.topics import HISTOGRAM_BUCKETS
 
 Array = np.ndarray
 # A measured force above this is contact; below it is the sensor's noise.
 TOUCH_N = 0.01
-# The contact's first seconds are settling and stay out of the RMS errors (not out of the peak).
+# The contact's first seconds are settling: they stay out of the mean and of the RMS errors, not out of the peak.
 SETTLE_S = 3.0
-LAST_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class RunSummary:
     direction: Array
     target_force_N: float
     force_limit_N: float
-    force_mean_last_10_s_N: float
+    force_mean_N: float
     force_rms_error_N: float
     force_peak_N: float
     tip_rms_error_m: float
@@ -99,6 +100,7 @@ class RunSummary:
     lost: dict[str, int]
     truncated: bool
     virtual: bool
+    first: FirstCause | None = None
 
     @property
     def worst_action(self) -> str:
@@ -107,8 +109,8 @@ class RunSummary:
 
     @property
     def force_kept(self) -> bool:
-        """The mean of the last seconds of contact is within a tenth of the target."""
-        return abs(self.force_mean_last_10_s_N - self.target_force_N) <= 0.1 * self.target_force_N
+        """The mean after settling is within a tenth of the target."""
+        return abs(self.force_mean_N - self.target_force_N) <= 0.1 * self.target_force_N
 
 
 def stack(table: dict[str, Array], *names: str) -> Array:
@@ -155,7 +157,7 @@ def summarize(recording: Recording) -> RunSummary:
         direction=direction,
         target_force_N=target_N,
         force_limit_N=float(recording.configuration.get("safety", {}).get("over_force_N", float("nan"))),
-        force_mean_last_10_s_N=pressing[0],
+        force_mean_N=pressing[0],
         force_rms_error_N=pressing[1],
         force_peak_N=pressing[2],
         contact_seconds=pressing[3],
@@ -169,7 +171,18 @@ def summarize(recording: Recording) -> RunSummary:
         lost=_lost(recording),
         truncated=recording.truncated or recording.damaged_chunks > 0,
         virtual=recording.run.get("clock") == "virtual",
+        first=_first_cause(recording),
     )
+
+
+def _first_cause(recording: Recording) -> FirstCause | None:
+    """What went wrong first since the rig was last armed, from the messages in the order of their time."""
+    watch = CauseWatch()
+    bodies = {topic: list(recording.messages(topic)) for topic in ("loop", "board", "state")}
+    merged = sorted(((body["stamp_ns"], topic, index) for topic, some in bodies.items() for index, body in enumerate(some)))
+    for _, topic, index in merged:
+        watch.take(topic, {name: value for name, value in bodies[topic][index].items() if value is not None})
+    return watch.first()
 
 
 def _direction(state: dict[str, Array], otherwise: Array) -> Array:
@@ -198,7 +211,7 @@ def _rms(values: Array) -> float:
 def _force_figures(
     force: dict[str, Array] | None, contact: Span | None, direction: Array, target_N: float
 ) -> tuple[float, float, float, float]:
-    """(mean of the last seconds, RMS error after settling, peak of the whole run, seconds of touch)."""
+    """(mean and RMS error after settling, peak of the whole run, seconds of touch)."""
     if force is None:
         return float("nan"), float("nan"), float("nan"), 0.0
     vectors, stamp_ns = stack(force, "fx_N", "fy_N", "fz_N"), force["stamp_ns"]
@@ -206,13 +219,11 @@ def _force_figures(
     peak_N = float(np.linalg.norm(vectors, axis=1).max())
     if contact is None:
         return float("nan"), float("nan"), peak_N, 0.0
-    last = Span(max(contact.start_ns, contact.end_ns - round(LAST_S * 1e9)), contact.end_ns, "")
     settled = within(stamp_ns, contact, SETTLE_S)
-    in_last = pressing_N[within(stamp_ns, last)]
     steps_s = np.diff(stamp_ns, append=stamp_ns[-1]) * 1e-9
     touching = within(stamp_ns, contact) & (pressing_N > TOUCH_N)
     return (
-        float(in_last.mean()) if len(in_last) else float("nan"),
+        float(pressing_N[settled].mean()) if settled.any() else float("nan"),
         _rms(pressing_N[settled] - target_N),
         peak_N,
         float(np.minimum(steps_s, 0.1)[touching].sum()),

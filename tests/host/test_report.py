@@ -20,6 +20,7 @@ from rich.console import Console
 
 from host.recordings.header import RecordingHeader
 from host.recordings.recording import Recording
+from host.recordings.rig_picture import Picture
 from host.recordings.writer import RecordingWriter
 from host.report.demo_summary import demo_result, print_summary
 from host.report.run_report import lateness_of, render, verdict_of, write_report
@@ -39,6 +40,7 @@ from protocol.topics import (
     RigState,
     Stage,
 )
+from realtime.control import safety
 
 MS = 1_000_000
 CONFIGURATION = {
@@ -62,6 +64,8 @@ class Story:
     crc_errors: int = 0
     estimate_off_N: float = 0.02
     log: str = "hello"
+    gap_ns: int = 0
+    fault_from_ms: int = 0
     contact: bool = True
     fields: dict[str, Any] = field(default_factory=dict)
 
@@ -147,6 +151,7 @@ class Story:
                 loop_hz=1000.0,
                 ticks=20000,
                 missed_ticks=0,
+                longest_gap_ns=self.gap_ns if time_ns >= 10_000 * MS else 0,
                 tick_p50_us=20.0,
                 tick_p99_us=30.0,
                 tick_p999_us=40.0,
@@ -160,7 +165,7 @@ class Story:
                 stamp_ns=time_ns,
                 mcu_time_us=0,
                 state=2,
-                fault=self.fault,
+                fault=self.fault if time_ns >= self.fault_from_ms * MS else 0,
                 inputs=0,
                 queue_depth=2,
                 last_setpoint=1,
@@ -201,7 +206,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_figures_are_those_that_went_in(good: Recording) -> None:
     summary = summarize(good)
     assert summary.target_force_N == 0.2 and summary.force_limit_N == 0.5
-    assert summary.force_mean_last_10_s_N == pytest.approx(0.2, abs=1e-4)
+    assert summary.force_mean_N == pytest.approx(0.2, abs=1e-4)
     assert summary.force_rms_error_N == pytest.approx(0.03, abs=1e-4)
     assert summary.force_peak_N == pytest.approx(0.23)
     assert summary.tip_rms_error_m == pytest.approx(0.001)
@@ -240,6 +245,34 @@ def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_pat
     verdict = verdict_of(summarize(story.write(tmp_path / "a.mcap")))
     assert verdict.level == level
     assert says in " ".join([verdict.sentence, *verdict.remarks])
+
+
+def starved(tmp_path: Path) -> Recording:
+    """A run that a busy computer ended: the loop was late, the dead man acted, poses were stale when it was back."""
+    causes = {name: sentence for name, _, _, sentence in safety.CAUSES}
+    words = "; ".join(causes[name] for name in ("board_fault", "pose_lost", "pose_stale"))
+    return Story(action="stop", cause=words, fault=1, fault_from_ms=10_000, gap_ns=180 * MS).write(tmp_path / "starved.mcap")
+
+
+def test_a_starved_computer_is_the_headline_and_its_symptoms_are_folded(tmp_path: Path) -> None:
+    recording = starved(tmp_path)
+    verdict = verdict_of(summarize(recording))
+    assert "The control loop was late" in verdict.sentence and "no set-point for 180 ms" in verdict.sentence
+    assert "real-time priority" in verdict.remedy and "tracker" not in verdict.sentence + verdict.remedy
+    assert any("dead man" in line for line in verdict.followed) and any("pose" in line for line in verdict.followed)
+    page = render(recording)
+    assert page.index("real-time priority") < page.index("<details")
+    assert page.index('<details class="rest"') < page.index("<figure>")
+
+
+def test_the_page_tells_the_same_first_cause(tmp_path: Path) -> None:
+    recording, picture = starved(tmp_path), Picture(CONFIGURATION, {})
+    came = [(body["stamp_ns"], topic, body) for topic in ("loop", "board", "state") for body in recording.messages(topic)]
+    for stamp_ns, topic, body in sorted(came, key=lambda item: item[:2]):
+        if stamp_ns < 10_500 * MS:
+            picture.hear(topic, {name: value for name, value in body.items() if value is not None})
+    first = picture.frame()["first"]
+    assert first["says"] in verdict_of(summarize(recording)).sentence and first["followed"]
 
 
 def test_missing_messages_are_counted(tmp_path: Path) -> None:

@@ -36,7 +36,9 @@ export function showSafety(frame, live) {
   set("mode", silent ? "–" : MODES[frame.mode] || frame.mode || "–");
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;
   set("force", force);
-  const said = frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No fault.";
+  const first = frame.first;
+  const story = first && [first.says, first.remedy, ...(first.followed.length ? [`Then: ${first.followed.join(" ")}`] : [])].join("\n");
+  const said = story || frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No fault.";
   set("cause", !silent ? said : frame.silent_s === null ? "No message of the rig yet. Check that it runs, with the endpoints of this rig file."
     : `No message of the rig for ${frame.silent_s.toFixed(0)} s. The values shown are old.`);
 }
