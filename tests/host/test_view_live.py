@@ -99,7 +99,7 @@ def publish_until_seen(there: Session, view: LiveRig) -> dict[str, Any]:
         for topic, message in messages.items():
             publishers[topic].put(message(stamp_ns=rig_time[0], **contents[topic]))
         frame.update(view.frame())
-        return bool(frame["scene"]["shape"] and frame["estimates"] and frame["scene"]["force"])
+        return bool(frame["scene"]["shape"] and frame["estimates"] and frame["scene"]["force"] and frame["mode"])
 
     until(seen, "the view to hear what is published")
     return frame

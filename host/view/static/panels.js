@@ -3,8 +3,8 @@
 const ACTIONS = {none: "No fault", warn: "Warning", hold: "Holding", retract: "Retracting", stop: "Stopped"};
 const MODES = {disarmed: "Disarmed", hold: "Holding", position: "Moving", approach: "Approach", contact: "Contact",
   retract: "Retract", stopped: "Stopped"};
-const IDLE = {disarmed: "No fault. The stages do not move until the rig is armed.",
-  hold: "No fault. Armed and holding."};
+const IDLE = {disarmed: "The stages do not move until the rig is armed.",
+  hold: "Armed and holding."};
 
 const element = id => document.getElementById(id);
 
@@ -38,7 +38,7 @@ export function showSafety(frame, live) {
   set("force", force);
   const first = frame.first;
   const story = first && [first.says, first.remedy, ...(first.followed.length ? [`Then: ${first.followed.join(" ")}`] : [])].join("\n");
-  const said = story || frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No fault.";
+  const said = story || frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No safety cause is active.";
   set("cause", !silent ? said : frame.silent_s === null ? "No message of the rig yet. Check that it runs, with the endpoints of this rig file."
     : `No message of the rig for ${frame.silent_s.toFixed(0)} s. The values shown are old.`);
 }
