@@ -1,7 +1,12 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
 PYTHON ?= python3
+SHELL  := bash
 VENV   := .venv
 BIN    := $(VENV)/bin
+PIP     = $(BIN)/python -m pip --disable-pip-version-check
+# A line a package as it is collected, drawn over itself on a terminal.
+PIP_PROGRESS = if [ -t 2 ]; then sed -un 's/^Collecting \([^ ]*\).*/\r\x1b[K  \1/p;s/^Installing.*/\r\x1b[K  installing\n/p' | tr -d '\n' >&2; \
+  echo >&2; else grep --line-buffered ^Installing >&2 || true; fi
 BOARD  ?= auto
 TEST_ARGS ?= -n 2 --dist loadfile
 INPUTS ?= 10000000
@@ -11,7 +16,10 @@ SEED   ?= 1
 DEBIAN_PYTHON := python3-venv
 DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
 
-.PHONY: demo test setup board-tools lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files soak clean
+# Prints, on standard error, which step of the set-up begins.
+step = echo "seldinger: set-up, step $(1)" >&2
+
+.PHONY: demo test quick setup board-tools packages warm format-check lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -19,7 +27,13 @@ demo: setup
 test: setup
 	@$(BIN)/python -m pytest $(TEST_ARGS)
 
-setup: $(VENV)/.ready board-tools
+# What a change needs before it is committed: no test that takes long, or needs the AVR tool chain, recordings or a browser.
+quick: setup
+	@$(BIN)/python -m pytest $(TEST_ARGS) -m "not slow and not avr and not data and not browser"
+
+setup: packages board-tools $(VENV)/.warm
+
+packages: $(VENV)/.ready
 
 # Apt is used when root or when sudo asks for no password; else one line names what is missing.
 define apt_install
@@ -32,16 +46,27 @@ endef
 
 $(VENV)/.ready: pyproject.toml
 	@mkdir -p build
+	@$(call step,1 of 4: Python environment $(VENV))
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "seldinger: found $$($(PYTHON) --version), wanted Python 3.11 or newer" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(call apt_install,$(DEBIAN_PYTHON)); }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo "seldinger: installing the package into $(VENV)" >&2
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]" 2>build/pip.log || { cat build/pip.log >&2; exit 1; }
+	@$(call step,2 of 4: packages (some minutes the first time))
+	@$(PIP) install --editable ".[dev]" 2>build/pip.log | $(PIP_PROGRESS); test $${PIPESTATUS[0]} = 0 || { cat build/pip.log >&2; exit 1; }
 	@touch $@
 
+# Kernels are compiled at set-up; after an edit each command compiles what it needs, and says so.
+$(VENV)/.warm: $(VENV)/.ready | board-tools
+	@$(call step,4 of 4: kernels)
+	@$(BIN)/seldinger warm || echo "seldinger: the parts named above compile their kernels when they are first used" >&2
+	@touch $@
+
+warm: packages
+	@$(BIN)/seldinger warm
+
 # The simulated board needs a C compiler; the AVR tool chain is wanted, and its absence is said, not fatal.
-board-tools:
+board-tools: | $(VENV)/.ready
 	@mkdir -p build
+	@test -e $(VENV)/.warm || $(call step,3 of 4: compiler and simulator of the stepper board)
 	@if [ "$(BOARD)" = native ] && command -v gcc >/dev/null; then :; \
 	elif command -v avr-gcc >/dev/null && command -v gcc >/dev/null && [ -e /usr/include/simavr/sim_avr.h ] && [ -e /usr/include/libelf.h ]; then :; \
 	else $(call apt_install,$(DEBIAN_BOARD)) || { command -v gcc >/dev/null && [ "$(BOARD)" != avr ] \
@@ -81,6 +106,9 @@ fuzz-files: setup
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md
+
+format-check: $(VENV)/.ready
+	@$(BIN)/ruff format --check .
 
 lint: $(VENV)/.ready
 	@$(BIN)/ruff check .

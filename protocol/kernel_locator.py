@@ -8,7 +8,10 @@ from typing import Any
 
 from numba.core.caching import _CacheLocator
 
+from protocol import compile_notice
 from protocol.kernel_cache import PACKAGES, ROOT, folder_of
+
+compile_notice.listen()
 
 
 class KernelLocator(_CacheLocator):  # type: ignore[misc]

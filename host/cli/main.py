@@ -12,6 +12,7 @@ from types import FrameType
 import typer
 
 from host.cli.extras import missing_extra
+from protocol import compile_notice
 from protocol.errors import InputError
 
 # command -> (module, function, one line for the overview)
@@ -56,8 +57,13 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "view": ("host.cli.view", "view", "Show the running rig on a page: shape, force, safety; arm, hold, stop."),
     "play": ("host.cli.play", "play", "Show a recording on the same page, with the windows of its diagnosis."),
     "export": ("host.cli.export", "export", "Write a recording's topics as parquet or csv tables."),
+    "warm": ("host.cli.warm", "warm", "Compile every kernel that a command needs, on all cores."),
     "latency-check": ("host.cli.latency_check", "latency_check", "Measure how punctual the loop is on this machine."),
 }
+
+COMPILES = (
+    "seldinger: compiling kernels, which takes up to some minutes; `seldinger warm` compiles all of them once, on all cores"
+)
 
 
 def build(argv: list[str]) -> typer.Typer:
@@ -154,6 +160,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
     argv = sys.argv[1:]
+    compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
         build(argv)()
     except BrokenPipeError:  # the reader of the output has closed it, as `head` does

@@ -30,6 +30,7 @@ class SineCurve:
     r_square: float
 
     def __call__(self, x: Array | float) -> Array:
+        """Return the curve at `x`, of the same shape."""
         a1, b1, c1, a2, b2, c2 = self.parameters
         return np.asarray(a1 * np.sin(b1 * np.asarray(x) + c1) + a2 * np.sin(b2 * np.asarray(x) + c2))
 

@@ -47,6 +47,7 @@ class Guard:
         self._origins = {b"http://" + host for host in self._hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or refuse it with status 403 or by closing the web socket."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from host.commissioning.characterization import record_simulated, standard_sweeps
-from host.commissioning.rig_sweeps import duration_s, in_words
+from host.commissioning.rig_sweeps import duration_s, describe
 from host.recordings.recording import Recording
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message
@@ -151,7 +151,7 @@ def test_a_rig_that_is_pressed_on_does_not_begin(rig: Rig) -> None:
 
 def test_what_will_move_is_said_before(rig: Rig) -> None:
     sweeps = standard_sweeps(rig)
-    words = in_words(sweeps)
+    words = describe(sweeps)
     assert "knob -95 to 95 deg" in words and "roll -60 to 60 deg" in words
     assert duration_s(SHORT) == pytest.approx(0.6 + 0.5 + SHORT[0].seconds)
     assert duration_s(sweeps) > sum(sweep.seconds for sweep in sweeps)

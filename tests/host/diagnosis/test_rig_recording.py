@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from host.cli.diagnose import diagnose, nominal_path
-from host.diagnosis.model.nominal import read_nominal
+from host.cli.diagnose import diagnose
+from host.diagnosis.model.nominal import nominal_path, read_nominal
 from host.diagnosis.model.rig_recording import knob_gain, rig_of, rig_rows, staleness
 from host.diagnosis.models import build
 from host.run.demo import DemoSettings, run_lockstep

@@ -1,0 +1,40 @@
+"""Say that a kernel is being compiled: a command that is silent for a minute looks broken.
+
+Numba's event comes only where neither memory nor the cache on disk has the kernel. `kernel_locator`, which numba loads with
+the first cached kernel, starts to listen; so a process without kernels never imports numba for this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+_callback: Callable[[], None] | None = None
+
+
+def on_first(callback: Callable[[], None]) -> None:
+    """Call `callback` once, when this process compiles its first kernel. To be called before numba is imported."""
+    global _callback
+    _callback = callback
+
+
+def listen() -> None:
+    """Start to listen to numba's compiler, if somebody wants to know. Called when numba is there."""
+    if _callback is None:
+        return
+    from numba.core import event
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        """Calls back at the first event."""
+
+        def on_start(self, event: Any) -> None:
+            """A kernel starts to be compiled."""
+            global _callback
+            callback, _callback = _callback, None
+            if callback is not None:
+                callback()
+
+        def on_end(self, event: Any) -> None:
+            """Nothing to do."""
+
+    event.register("numba:compile", Listener())
