@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from host.commissioning.characterization import record_simulated, standard_sweeps
-from host.commissioning.rig_sweeps import duration_s, describe
+from host.commissioning.rig_sweeps import describe, duration_s
 from host.recordings.recording import Recording
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message

@@ -25,7 +25,7 @@ def recorded(folder: Path, *effects: str, hold_s: float = 8.0) -> Path:
 
 
 def verdict_of(folder: Path, *files: Path) -> dict[str, Any]:
-    diagnose([str(f) for f in files], "rig", str(folder / "verdict.json"), quiet=True)
+    diagnose([str(f) for f in files], "rig", out=folder, quiet=True)
     found: dict[str, Any] = json.loads((folder / "verdict.json").read_text())
     return found
 
