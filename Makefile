@@ -14,12 +14,12 @@ FILES  ?= 100000
 SEED   ?= 1
 
 DEBIAN_PYTHON := python3-venv
-DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev
+DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsimavr-dev libelf-dev avrdude
 
 # Prints, on standard error, which step of the set-up begins.
 step = echo "seldinger: set-up, step $(1)" >&2
 
-.PHONY: demo test quick setup board-tools packages warm format-check lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files soak clean
+.PHONY: demo test quick setup board-tools packages warm format-check lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -103,6 +103,10 @@ fuzz: setup
 # Crafted recordings read by every reader of them; those that broke one stay in build/crafted_recordings and are read again.
 fuzz-files: setup
 	@$(BIN)/python -m tests.host.crafted_recordings $(FILES) $(SEED)
+
+# The firmware's arithmetic for all inputs (firmware/proof/prove.c); needs Debian's frama-c-base.
+proof:
+	@$(MAKE) -s -C firmware proof
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md

@@ -134,13 +134,20 @@ class ForceSensor(_Section):
 
 
 class Pins(_Section):
-    """A port each of the board's processor for outputs, encoders and switches (protocol/board_pins.py)."""
+    """A port each of the board's processor for outputs, encoders and switches, and the polarities of the signals.
+
+    `normally_open` names switches (protocol/board_pins.py, SWITCHES); all others are normally closed. `keep_enabled`
+    leaves the drives powered on a fault, until they are disarmed: for a vertical axis, which would fall.
+    """
 
     mcu: Literal["atmega2560", "atmega328p"] = "atmega2560"
     outputs: str
     output_shift: Annotated[int, Field(ge=0, le=7)]
     encoders: str
     switches: str
+    enable_active: Literal["low", "high"] = "low"
+    normally_open: tuple[str, ...] = ()
+    keep_enabled: bool = False
 
     @model_validator(mode="before")
     @classmethod
@@ -150,10 +157,18 @@ class Pins(_Section):
 
     @model_validator(mode="after")
     def _free(self) -> Pins:
-        problem = board_pins.problem_of(**self.model_dump())
+        problem = board_pins.problem_of(**self.ports(), normally_open=self.normally_open)
         if problem:
             raise ValueError(problem)
         return self
+
+    def ports(self) -> dict[str, Any]:
+        """The pins without the polarities: the arguments of `board_pins.signals`."""
+        return self.model_dump(include={"mcu", "outputs", "output_shift", "encoders", "switches"})
+
+    def build(self) -> board_pins.Build:
+        """Where and with what variables the firmware is built for these pins."""
+        return board_pins.build_of(board_pins.definitions(**self.model_dump()))
 
 
 class Board(_Section):

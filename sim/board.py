@@ -12,6 +12,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from protocol.board_pins import Build, build_of
+
 FIRMWARE_DIR = Path(__file__).resolve().parent.parent / "firmware"
 BUILD_DIR = FIRMWARE_DIR / "build"
 KINDS = ("avr", "native", "auto")
@@ -21,12 +23,13 @@ CYCLES_PER_US = CPU_HZ // 1_000_000
 STEP_TIMER_CYCLES = CPU_HZ // 20_000
 
 _REQUEST = struct.Struct("<cBHIQ3i")
-_REPLY = struct.Struct("<QQQQIIIIII")
+_REPLY = struct.Struct("<QQQQIIIIIIII")
 _EDGE = np.dtype([("cycle", "<u8"), ("axis", "i1"), ("sign", "i1")])
 _SIMAVR_HEADERS = (Path("/usr/include/simavr/sim_avr.h"), Path("/usr/local/include/simavr/sim_avr.h"))
 
 
-_built: set[str] = set()  # kinds that this process has seen up to date
+_built: set[str] = set()  # programs that this process has seen up to date
+USUAL_BUILD = build_of([])
 
 
 class CpuStats(NamedTuple):
@@ -50,6 +53,8 @@ class BoardSlice(NamedTuple):
     edge_cycle: np.ndarray  # (n,) i8, processor cycles since the child started
     cpu: CpuStats
     uart_cycle: np.ndarray  # (len(uart_out),) i8, cycle at which each byte had left whole
+    enabled: bool  # at the end of the slice the enable line powers the drives
+    enable_changes: int  # of that line since the child started
 
     def timed_frames(self) -> Iterator[tuple[bytes, int]]:
         """uart_out in pieces that each end with a frame's delimiter (or the slice), and when they had left, in us.
@@ -62,6 +67,40 @@ class BoardSlice(NamedTuple):
             if end > start:
                 yield self.uart_out[start:end], -(-int(self.uart_cycle[end - 1]) // CYCLES_PER_US)
             start = end
+
+
+def slice_of(reply: bytes) -> BoardSlice:
+    """The slice in one reply of the board's program (reply_t in sim/board_src/lockstep.h and what follows it)."""
+    (
+        cycle,
+        isr_cycles,
+        isr_count,
+        idle_cycles,
+        isr_max,
+        starts,
+        rx_lost,
+        stack_free,
+        enabled,
+        enable_changes,
+        n_uart,
+        n_edges,
+    ) = _REPLY.unpack_from(reply)
+    body = reply[_REPLY.size :]
+    edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
+    cycles = edges["cycle"].astype(np.int64)
+    mean = isr_cycles / isr_count if isr_count else 0.0
+    cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
+    return BoardSlice(
+        body[:n_uart],
+        cycles // CYCLES_PER_US,
+        edges["axis"].copy(),
+        edges["sign"].copy(),
+        cycles,
+        cpu,
+        np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64),
+        bool(enabled),
+        enable_changes,
+    )
 
 
 class BoardUnavailable(RuntimeError):
@@ -94,27 +133,28 @@ def resolve_kind(kind: str) -> str:
     return "native"
 
 
-def ensure_built(kind: str) -> Path:
+def ensure_built(kind: str, build: Build = USUAL_BUILD) -> Path:
     """Builds the board's program (and for avr the firmware's ELF files) where they are stale; returns the program.
 
-    kind: "avr", "native" or "auto". Raises BoardUnavailable with one line when a tool is missing or make fails.
+    kind: "avr", "native" or "auto". build: with other pins or polarities than the usual ones.
+    Raises BoardUnavailable with one line when a tool is missing or make fails.
     """
     kind = resolve_kind(kind)
     missing = _missing_tools(kind)
     if missing:
         raise BoardUnavailable(f"board {kind}: found no {', no '.join(missing)}; install it, or choose board native")
-    program = BUILD_DIR / f"{kind}_board"
-    if kind in _built and program.exists():
+    program = FIRMWARE_DIR / build.folder / f"{kind}_board"
+    if str(program) in _built and program.exists():
         return program
     BUILD_DIR.mkdir(parents=True, exist_ok=True)
     with open(BUILD_DIR / ".lock", "w", encoding="ascii") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        command = ["make", "--silent", "-C", str(FIRMWARE_DIR), f"{kind}-board"]
+        command = ["make", "--silent", "-C", str(FIRMWARE_DIR), f"{kind}-board", *build.variables]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         said = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]
         raise BoardUnavailable(f"board {kind}: `make -C firmware {kind}-board` failed: {said[0]}")
-    _built.add(kind)
+    _built.add(str(program))
     return program
 
 
@@ -122,18 +162,19 @@ class Board:
     """A simulated board. Time is microseconds since this object was made; it goes on through resets.
 
     kind: "avr" runs the ELF in simavr, "native" the same core compiled for the host, "auto" the better one there is.
-    mcu: of MCUS, for avr. Deterministic: the same calls give the same bytes and the same edges to the cycle.
+    mcu: of MCUS, for avr. build: of the firmware, with other pins or polarities than the usual ones.
+    Deterministic: the same calls give the same bytes and the same edges to the cycle.
     Raises BoardUnavailable when it cannot be built, ValueError for a wrong kind or mcu.
     """
 
-    def __init__(self, kind: str = "auto", mcu: str = "atmega2560") -> None:
+    def __init__(self, kind: str = "auto", mcu: str = "atmega2560", build: Build = USUAL_BUILD) -> None:
         if mcu not in MCUS:
             raise ValueError(f"mcu: found {mcu!r}, wanted one of {', '.join(MCUS)}")
         self.kind = resolve_kind(kind)
         self.mcu = mcu
-        program = [str(ensure_built(self.kind))]
+        program = [str(ensure_built(self.kind, build))]
         if self.kind == "avr":
-            program += [mcu, str(BUILD_DIR / f"seldinger-{mcu}.elf")]
+            program += [mcu, str(FIRMWARE_DIR / build.folder / f"seldinger-{mcu}.elf")]
         self.time_us = 0
         self._child: subprocess.Popen[bytes] = subprocess.Popen(
             program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
@@ -154,7 +195,8 @@ class Board:
 
         until_us: board time, not before the last. uart_in: bytes that start on the line at the beginning of the
         slice (at 500 kbaud; what does not fit goes on into the next). limit_bits: bit 2*axis for the lower end,
-        2*axis+1 for the upper; set is open. estop: True is open. encoder_counts: (3,) counts reached evenly by the
+        2*axis+1 for the upper; set is hit. estop: True is hit. Each becomes the level that a switch of the polarity
+        built in gives. encoder_counts: (3,) counts reached evenly by the
         end of the slice; the first call places the encoders there without motion.
         Raises ValueError for a time in the past, BoardUnavailable when the child has died.
         """
@@ -202,19 +244,12 @@ class Board:
     def _call(self, request: bytes) -> BoardSlice:
         try:
             os.write(self._to_child, request)
-            head = _REPLY.unpack(self._read(_REPLY.size))
-            cycle, isr_cycles, isr_count, idle_cycles, isr_max, starts, rx_lost, stack_free, n_uart, n_edges = head
+            head = self._read(_REPLY.size)
+            n_uart, n_edges = _REPLY.unpack(head)[-2:]
             body = self._read(9 * n_uart + n_edges * _EDGE.itemsize)
         except (OSError, struct.error) as error:
             raise BoardUnavailable(f"board {self.kind}: the child process {self.pid} died ({error})") from error
-        edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
-        uart_cycle = np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64)
-        cycles = edges["cycle"].astype(np.int64)
-        mean = isr_cycles / isr_count if isr_count else 0.0
-        cpu = CpuStats(isr_max, mean, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
-        return BoardSlice(
-            body[:n_uart], cycles // CYCLES_PER_US, edges["axis"].copy(), edges["sign"].copy(), cycles, cpu, uart_cycle
-        )
+        return slice_of(head + body)
 
     def _read(self, n: int) -> bytes:
         parts = []

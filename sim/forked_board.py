@@ -9,19 +9,16 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-import numpy as np
-
 from sim.board import (
     _EDGE,
     _REPLY,
     BUILD_DIR,
-    CYCLES_PER_US,
     FIRMWARE_DIR,
     Board,
     BoardSlice,
     BoardUnavailable,
-    CpuStats,
     resolve_kind,
+    slice_of,
 )
 
 BOARD_SRC = Path(__file__).parent / "board_src"
@@ -47,22 +44,7 @@ class LibraryBoard(Board):
         answer = ctypes.c_void_p()
         length = self._native_call(request, ctypes.byref(answer))
         assert answer.value is not None
-        data = ctypes.string_at(answer.value, length)
-        head = _REPLY.unpack_from(data)
-        cycle, _, _, idle_cycles, isr_max, starts, rx_lost, stack_free, n_uart, n_edges = head
-        body = data[_REPLY.size :]
-        edges = np.frombuffer(body, _EDGE, n_edges, 9 * n_uart)
-        cycles = edges["cycle"].astype(np.int64)
-        cpu = CpuStats(isr_max, 0.0, idle_cycles / cycle if cycle else 0.0, starts, rx_lost, stack_free)
-        return BoardSlice(
-            body[:n_uart],
-            cycles // CYCLES_PER_US,
-            edges["axis"].copy(),
-            edges["sign"].copy(),
-            cycles,
-            cpu,
-            np.frombuffer(body, "<u8", n_uart, n_uart).astype(np.int64),
-        )
+        return slice_of(ctypes.string_at(answer.value, length))
 
     def after_fork(self) -> None:
         """Nothing to do: the copy has the state."""

@@ -34,6 +34,14 @@
 #define USART0_UDRE_vect USART_UDRE_vect
 #endif
 
+#define ENABLE_BESIDE BOARD(ENABLE_BESIDE_SWITCHES)
+#define ENABLE_INVERT (BOARD_ENABLE_ACTIVE_LOW ? OUTPUT_ENABLE : 0U)
+#if BOARD(SHARED_LIMITS)
+#define OPEN_LINES BOARD_SHARED_LINES(BOARD_NORMALLY_OPEN)
+#else
+#define OPEN_LINES BOARD_NORMALLY_OPEN
+#endif
+
 static uint8_t outputs; /* what the next tick puts on the pins */
 static uint8_t reset_flags __attribute__((section(".noinit")));
 
@@ -60,12 +68,29 @@ static uint16_t count_boot(void) {
     return count;
 }
 
+/* Levels before directions: the enable line never has the level that powers the drives. */
 static void start_pins(void) {
-    PORT_OF(SWITCHES) = BOARD_SWITCH_MASK; /* pull-ups */
+    uint8_t beside = ENABLE_BESIDE ? _BV(BOARD_ENABLE_PIN_BESIDE) : 0;
+    PORT_OF(SWITCHES) = (uint8_t)(BOARD_SWITCH_MASK | (BOARD_ENABLE_ACTIVE_LOW ? beside : 0)); /* pull-ups */
+    DDR_OF(SWITCHES) = beside;
     PORT_OF(ENCODERS) = BOARD_ENCODER_MASK;
-    PORT_OF(OUTPUTS) = 0;
+    PORT_OF(OUTPUTS) = (uint8_t)((ENABLE_INVERT & BOARD_OUTPUT_MASK) << OUTPUT_SHIFT);
     DDR_OF(OUTPUTS) = (uint8_t)(BOARD_OUTPUT_MASK << OUTPUT_SHIFT);
 }
+
+static inline void write_outputs(uint8_t lines) {
+    PORT_OF(OUTPUTS) = (uint8_t)(((lines ^ ENABLE_INVERT) & BOARD_OUTPUT_MASK) << OUTPUT_SHIFT);
+}
+
+#if ENABLE_BESIDE
+/* One instruction each, so that the pull-ups beside it are not touched. */
+static inline void write_enable_beside(uint8_t lines) {
+    if ((lines ^ ENABLE_INVERT) & OUTPUT_ENABLE)
+        PORT_OF(SWITCHES) |= _BV(BOARD_ENABLE_PIN_BESIDE);
+    else
+        PORT_OF(SWITCHES) &= (uint8_t)~_BV(BOARD_ENABLE_PIN_BESIDE);
+}
+#endif
 
 static void start_uart(void) {
     UCSR0A = _BV(U2X0); /* before the divisor: simavr times the line when that is written */
@@ -92,7 +117,8 @@ void firmware_setup(void) {
     TIMSK0 = 0; /* the Arduino core's millis() would disturb the step timer */
     start_pins();
     boot_t facts = {.boot_count = count_boot(), .reset_cause = reset_cause(), .mcu = BOARD_MCU};
-    controller_start(&facts, BOARD(SHARED_LIMITS), encoder_lines());
+    wiring_t wiring = {.shared_limits = BOARD(SHARED_LIMITS), .keep_enabled = BOARD_KEEP_ENABLED};
+    controller_start(&facts, &wiring, encoder_lines());
     start_uart();
     start_timer();
     set_sleep_mode(SLEEP_MODE_IDLE);
@@ -111,10 +137,10 @@ void firmware_loop(void) {
 uint8_t port_read_switches(void) {
 #if BOARD(SHARED_LIMITS)
     static const uint8_t BOTH_ENDS[8] = {0x00, 0x03, 0x0C, 0x0F, 0x30, 0x33, 0x3C, 0x3F};
-    uint8_t lines = PIN_OF(SWITCHES) & BOARD_SWITCH_MASK;
+    uint8_t lines = (PIN_OF(SWITCHES) & BOARD_SWITCH_MASK) ^ OPEN_LINES;
     return (uint8_t)(BOTH_ENDS[lines & 7] | (lines & 8 ? _BV(INPUT_BIT_ESTOP) : 0));
 #else
-    return PIN_OF(SWITCHES) & BOARD_SWITCH_MASK;
+    return (PIN_OF(SWITCHES) & BOARD_SWITCH_MASK) ^ OPEN_LINES;
 #endif
 }
 
@@ -122,9 +148,15 @@ void port_start_transmitter(void) { UCSR0B |= _BV(UDRIE0); }
 
 /* Steps leave first, so that their edges do not depend on the work that follows; they end with it, 8 us or later. */
 ISR(TIMER1_COMPA_vect) {
-    PORT_OF(OUTPUTS) = (uint8_t)(outputs << OUTPUT_SHIFT);
+    write_outputs(outputs);
+#if ENABLE_BESIDE
+    uint8_t before = outputs;
     outputs = controller_tick(encoder_lines());
-    PORT_OF(OUTPUTS) = (uint8_t)((outputs & (uint8_t)~OUTPUT_STEP_MASK) << OUTPUT_SHIFT);
+    if ((outputs ^ before) & OUTPUT_ENABLE) write_enable_beside(outputs);
+#else
+    outputs = controller_tick(encoder_lines());
+#endif
+    write_outputs(outputs & (uint8_t)~OUTPUT_STEP_MASK);
 }
 
 ISR(USART0_RX_vect) {

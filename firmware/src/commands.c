@@ -78,10 +78,11 @@ static uint8_t arm(const frame_arm_t *frame) {
 
 static uint8_t set_position(const frame_set_position_t *frame) {
     if (safety.state != STATE_DISARMED) return RESULT_BAD_STATE;
-    if (frame->axis >= AXIS_COUNT) return RESULT_BAD_VALUE;
+    int32_t steps = frame->position_steps;
+    if (frame->axis >= AXIS_COUNT || steps < -TRAVEL_MAX || steps > TRAVEL_MAX) return RESULT_BAD_VALUE;
     port_lock_t lock = port_lock();
-    motion_rename_position(frame->axis, frame->position_steps);
-    quadrature_set(frame->axis, frame->position_steps);
+    motion_rename_position(frame->axis, steps);
+    quadrature_set(frame->axis, steps);
     port_unlock(lock);
     return RESULT_OK;
 }

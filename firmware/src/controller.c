@@ -18,7 +18,7 @@ static uint8_t fault_of_reset(uint8_t cause) {
     return cause == RESET_CAUSE_BROWNOUT ? FAULT_BROWNOUT : FAULT_NONE;
 }
 
-void controller_start(const boot_t *facts, bool shared_limits, uint8_t encoder_bits) {
+void controller_start(const boot_t *facts, const wiring_t *wiring, uint8_t encoder_bits) {
     board_clock = (board_clock_t){0};
     status_due_us = 0;
     link_start();
@@ -26,7 +26,7 @@ void controller_start(const boot_t *facts, bool shared_limits, uint8_t encoder_b
     motion_start();
     quadrature = (quadrature_t){0};
     quadrature_start(encoder_bits);
-    safety_start(fault_of_reset(facts->reset_cause), shared_limits);
+    safety_start(fault_of_reset(facts->reset_cause), wiring);
     commands_start(facts);
 }
 
@@ -55,7 +55,7 @@ uint8_t controller_tick(uint8_t encoder_bits) {
     uint8_t steps = motion_tick();
     take_slot(slot);
     uint8_t outputs = (uint8_t)(steps | (uint8_t)(motion.direction_bits << OUTPUT_DIRECTION_SHIFT));
-    return safety.state == STATE_DISARMED ? outputs : (uint8_t)(outputs | OUTPUT_ENABLE);
+    return safety.enabled ? (uint8_t)(outputs | OUTPUT_ENABLE) : outputs;
 }
 
 bool controller_poll(void) {

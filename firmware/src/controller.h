@@ -6,14 +6,14 @@
 #include <stdint.h>
 
 #include "commands.h"
+#include "safety.h"
 
 /* Output lines in the result of controller_tick(). */
 #define OUTPUT_STEP_MASK 0x07U      /* bit an axis: a step is due */
 #define OUTPUT_DIRECTION_SHIFT 3    /* bit an axis: 1 is backwards */
-#define OUTPUT_ENABLE 0x40U         /* drives powered */
+#define OUTPUT_ENABLE 0x40U         /* the drives are to be powered, whatever the level on the pin */
 
-/* `shared_limits`: the board has one limit input an axis, wired to both of its switches. */
-void controller_start(const boot_t *facts, bool shared_limits, uint8_t encoder_bits);
+void controller_start(const boot_t *facts, const wiring_t *wiring, uint8_t encoder_bits);
 
 /* Interrupt, every TICK_US. Encoder lines: A, B of axis 0, then 1, then 2.
  * Returns the outputs for the next tick, so that edges leave at the interrupt's entry without jitter. */

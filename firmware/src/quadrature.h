@@ -25,14 +25,19 @@ static inline void quadrature_update(uint8_t bits) {
     if (bits != quadrature.last_bits) quadrature_update_changed(bits);
 }
 
+/* Counts wrap: an encoder may turn one way for ever. */
+static inline int32_t quadrature_sum(int32_t count, int8_t fresh) { return (int32_t)((uint32_t)count + (uint32_t)fresh); }
+
 /* Interrupt, once a ms and axis: moves the fresh counts over. */
 static inline void quadrature_fold(uint8_t axis) {
-    quadrature.count[axis] += quadrature.fresh[axis];
+    quadrature.count[axis] = quadrature_sum(quadrature.count[axis], quadrature.fresh[axis]);
     quadrature.fresh[axis] = 0;
 }
 
 /* With the interrupts locked. */
-static inline int32_t quadrature_count(uint8_t axis) { return quadrature.count[axis] + quadrature.fresh[axis]; }
+static inline int32_t quadrature_count(uint8_t axis) {
+    return quadrature_sum(quadrature.count[axis], quadrature.fresh[axis]);
+}
 
 static inline void quadrature_set(uint8_t axis, int32_t count) {
     quadrature.count[axis] = count;

@@ -10,11 +10,14 @@
 
 safety_t safety;
 
-void safety_start(uint8_t fault, bool shared_limits) {
+/* The drives are powered and set-points are accepted: the dead man runs. */
+static inline bool armed(void) { return safety.state == STATE_ARMED || safety.state == STATE_RUNNING; }
+
+void safety_start(uint8_t fault, const wiring_t *wiring) {
     safety = (safety_t){0};
     safety.fault = fault;
     safety.state = fault == FAULT_NONE ? STATE_DISARMED : STATE_FAULT;
-    safety.shared_limits = shared_limits;
+    safety.wiring = *wiring;
 }
 
 void safety_trip(uint8_t fault) {
@@ -36,6 +39,8 @@ uint8_t safety_arm(void) {
     port_lock_t lock = port_lock();
     if (safety.state == STATE_DISARMED) {
         safety.state = STATE_ARMED;
+        safety.enabled = true;
+        safety.fed_tick = motion.tick;
         safety.deadman_age_ms = 0;
         result = RESULT_OK;
     }
@@ -46,10 +51,11 @@ uint8_t safety_arm(void) {
 uint8_t safety_disarm(void) {
     uint8_t result = RESULT_BAD_STATE;
     port_lock_t lock = port_lock();
-    if (safety.state == STATE_ARMED || safety.state == STATE_RUNNING) {
+    if (armed()) {
         safety.state = STATE_STOPPING;
         motion_stop();
     }
+    if (safety.state == STATE_DISARMED) safety.enabled = false; /* kept on a fault that was cleared since */
     if (safety.state != STATE_FAULT) result = RESULT_OK;
     port_unlock(lock);
     return result;
@@ -88,7 +94,7 @@ void safety_watch_switches(uint8_t raw) {
     uint8_t settled = (uint8_t)~(raw ^ safety.raw_inputs);
     safety.raw_inputs = raw;
     uint8_t opened = raw & settled & (uint8_t)~safety.inputs;
-    if (safety.shared_limits) {
+    if (safety.wiring.shared_limits) {
         /* An end already told by its twin stays as it is. */
         uint8_t twins = (uint8_t)((safety.inputs & 0x15U) << 1 | (safety.inputs & 0x2AU) >> 1);
         opened &= (uint8_t)~twins;
@@ -108,12 +114,14 @@ void safety_watch_setpoints(void) {
         motion.ran_dry = false;
         if (safety.state == STATE_RUNNING) safety.underruns++;
     }
-    if (safety.state != STATE_RUNNING) return;
+    if (!armed()) return;
     if ((uint16_t)(motion.tick - safety.fed_tick) >= DEADMAN_TICKS) safety_trip(FAULT_DEADMAN);
 }
 
 void safety_settle(void) {
-    if (safety.state == STATE_RUNNING && safety.deadman_age_ms < 255) safety.deadman_age_ms++;
-    if (safety.state == STATE_STOPPING && motion.mode == MOTION_HOLD)
-        safety.state = safety.fault == FAULT_NONE ? STATE_DISARMED : STATE_FAULT;
+    if (armed() && safety.deadman_age_ms < 255) safety.deadman_age_ms++;
+    if (safety.state != STATE_STOPPING || motion.mode != MOTION_HOLD) return;
+    bool fault = safety.fault != FAULT_NONE;
+    safety.state = fault ? STATE_FAULT : STATE_DISARMED;
+    safety.enabled = fault && safety.wiring.keep_enabled;
 }

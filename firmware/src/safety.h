@@ -7,12 +7,19 @@
 
 #include "frames.h"
 
+/* What the core has to know of the wiring. */
+typedef struct {
+    bool shared_limits; /* one switch input an axis: the direction of travel tells which end it is */
+    bool keep_enabled;  /* the drives stay enabled on a fault, until DISARM: a vertical axis does not fall */
+} wiring_t;
+
 typedef struct {
     volatile uint8_t state; /* STATE_... */
     volatile uint8_t fault; /* FAULT_..., the first one since it was last cleared */
     volatile uint8_t inputs; /* debounced switches, a set bit is open */
     uint8_t raw_inputs;
-    bool shared_limits;    /* one switch input an axis: the direction of travel tells which end it is */
+    volatile bool enabled; /* the drives are to be powered */
+    wiring_t wiring;
     uint16_t fed_tick;     /* tick of the last accepted set-point */
     uint8_t deadman_age_ms;
     uint16_t underruns;
@@ -21,7 +28,7 @@ typedef struct {
 extern safety_t safety;
 
 /* `fault` other than FAULT_NONE: the board starts in FAULT (it was reset by its watchdog or a brown-out). */
-void safety_start(uint8_t fault, bool shared_limits);
+void safety_start(uint8_t fault, const wiring_t *wiring);
 
 /* With the interrupts locked. */
 void safety_trip(uint8_t fault);

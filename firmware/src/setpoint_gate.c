@@ -6,9 +6,9 @@
 #include "port.h"
 #include "safety.h"
 
-#define TRAVEL_MAX 1000000000L           /* keeps differences of positions within 32 bits */
 #define LATE_TICKS TICKS_PER_MS          /* a late set-point gets one control period */
 #define LEAST_TICKS (TICKS_PER_MS / 2)   /* the step and tick grids make speeds over less meaningless */
+#define MOST_TICKS 255                   /* of one segment, in 8 bits; the horizon is shorter */
 #define STOP_MS (STOP_US / 1000)
 
 gate_t gate;
@@ -17,9 +17,11 @@ gate_t gate;
 typedef struct {
     uint32_t time_us;
     uint16_t tick, end_tick; /* now, and where the plan ends */
+    uint8_t ticks;           /* from there to the new set-point: LEAST_TICKS to MOST_TICKS */
     bool at_rest;            /* no set-point in execution or waiting: the plan ends now */
     uint8_t waiting, state, inputs;
-    int16_t speed_q15[AXIS_COUNT]; /* at the end of the new segment */
+    int32_t end[AXIS_COUNT];       /* of the new segment: position */
+    int16_t speed_q15[AXIS_COUNT]; /* and speed */
 } plan_t;
 
 void gate_start(void) { gate = (gate_t){0}; }
@@ -30,13 +32,11 @@ bool gate_configured(void) {
     return true;
 }
 
-static bool within_travel(int32_t steps) { return steps >= -TRAVEL_MAX && steps <= TRAVEL_MAX; }
-
 uint8_t gate_configure(const frame_configure_t *limits) {
     uint32_t speed = limits->max_speed_steps_per_s, accel = limits->max_accel_steps_per_s2;
+    int32_t soft_min = limits->soft_min_steps, soft_max = limits->soft_max_steps;
     if (limits->axis >= AXIS_COUNT || speed < 1 || speed >= TIMER_HZ) return RESULT_BAD_VALUE;
-    if (!within_travel(limits->soft_min_steps) || !within_travel(limits->soft_max_steps)) return RESULT_BAD_VALUE;
-    if (limits->soft_min_steps > limits->soft_max_steps) return RESULT_BAD_VALUE;
+    if (soft_min < -TRAVEL_MAX || soft_max > TRAVEL_MAX || soft_min > soft_max) return RESULT_BAD_VALUE;
     /* Must be able to stop within STOP_US; 2 % of slack for limits that were rounded to whole steps. */
     if (accel > 40000000UL || accel * 51 / 1000 * STOP_MS < speed * 50) return RESULT_BAD_VALUE;
     uint32_t speed_q16 = (speed << 16) / TIMER_HZ;
@@ -46,8 +46,8 @@ uint8_t gate_configure(const frame_configure_t *limits) {
     if (ramp_q16 > 0xFFFF) ramp_q16 = 0xFFFF;
     axis_limits_t *axis = &gate.axis[limits->axis];
     axis->speed_q16 = (uint16_t)speed_q16;
-    axis->soft_min = limits->soft_min_steps;
-    axis->soft_max = limits->soft_max_steps;
+    axis->soft_min = soft_min;
+    axis->soft_max = soft_max;
     axis->configured = true;
     motion_set_limits(limits->axis, (uint16_t)speed_q16, (uint16_t)ramp_q16);
     return RESULT_OK;
@@ -78,28 +78,26 @@ static void snapshot(plan_t *plan) {
 static inline uint16_t to_ticks(uint16_t us) { return (uint16_t)((uint32_t)us * 5243U >> 18); }
 
 /* Chooses the tick at which the set-point is reached; returns why it cannot be. */
-static uint8_t check_time(const frame_setpoint_t *setpoint, const plan_t *plan, segment_t *segment) {
+static uint8_t check_time(const frame_setpoint_t *setpoint, plan_t *plan) {
     int32_t ahead_us = (int32_t)(setpoint->execute_us - plan->time_us);
     if (ahead_us > (int32_t)HORIZON_US) return REJECT_HORIZON;
     if (ahead_us + (int32_t)setpoint->expiry_us < 0) return REJECT_EXPIRED;
     if (ahead_us > 0) {
-        segment->end_tick = (uint16_t)(plan->tick + to_ticks((uint16_t)ahead_us));
-        if ((int16_t)(segment->end_tick - plan->end_tick) >= (int16_t)LEAST_TICKS) return REJECT_NONE;
+        uint16_t ticks = (uint16_t)(plan->tick + to_ticks((uint16_t)ahead_us) - plan->end_tick);
+        if (ticks >= LEAST_TICKS && ticks <= MOST_TICKS) {
+            plan->ticks = (uint8_t)ticks;
+            return REJECT_NONE;
+        }
         if (!plan->at_rest) return REJECT_ORDER;
     }
-    segment->end_tick = (uint16_t)(plan->end_tick + LATE_TICKS);
     gate.late++;
     return REJECT_NONE;
 }
 
-static uint8_t check_travel(const frame_setpoint_t *setpoint, uint8_t inputs, uint8_t index) {
-    const axis_limits_t *axis = &gate.axis[index];
-    int32_t wanted = setpoint->position_steps[index];
-    if (wanted < axis->soft_min || wanted > axis->soft_max) return REJECT_SOFT_LIMIT;
+/* Whether a switch stands open at the end of the travel that the axis would move towards. */
+static bool towards_open_switch(int32_t delta, uint8_t inputs, uint8_t index) {
     uint8_t low = (uint8_t)(1U << (2 * index));
-    if (wanted < gate.planned[index] && (inputs & low)) return REJECT_LIMIT_SWITCH;
-    if (wanted > gate.planned[index] && (inputs & (low << 1))) return REJECT_LIMIT_SWITCH;
-    return REJECT_NONE;
+    return (delta < 0 && (inputs & low)) || (delta > 0 && (inputs & (low << 1)));
 }
 
 /* The speed from which a ramp may have to start. It follows the set-points no faster than the axis accelerates (and a
@@ -121,19 +119,20 @@ static uint16_t follow_speed(uint8_t index, int32_t delta, uint16_t rate_q16, ui
 
 /* The step grid and the tick grid each allow for one count more than the limit. */
 static uint8_t check_axes(const frame_setpoint_t *setpoint, plan_t *plan, segment_t *segment) {
-    uint8_t ticks = (uint8_t)(segment->end_tick - plan->end_tick);
+    uint8_t ticks = plan->ticks;
     uint16_t per_step_q16 = ticks == TICKS_PER_MS ? 0xFFFFU / TICKS_PER_MS : (uint16_t)(0xFFFFU / ticks);
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
-        uint8_t reject = check_travel(setpoint, plan->inputs, i);
-        if (reject) return reject;
         int32_t wanted = setpoint->position_steps[i];
-        int32_t delta = wanted - gate.planned[i];
+        if (wanted < gate.axis[i].soft_min || wanted > gate.axis[i].soft_max) return REJECT_SOFT_LIMIT;
+        int32_t delta = wanted - gate.planned[i]; /* both within the travel, so within 32 bits */
+        if (towards_open_switch(delta, plan->inputs, i)) return REJECT_LIMIT_SWITCH;
         uint32_t distance = (uint32_t)(delta < 0 ? -delta : delta);
         uint16_t most = (uint16_t)(((uint32_t)gate.axis[i].speed_q16 * (uint16_t)(ticks + 1)) >> 16) + 1;
-        if (distance > most) return REJECT_SPEED;
+        if (distance > most || distance > ticks) return REJECT_SPEED; /* an axis makes at most one step a tick */
         uint16_t rate_q16 = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
         segment->rate_q16[i] = follow_speed(i, delta, rate_q16, ticks, &plan->speed_q15[i]);
         segment->target[i] = (uint16_t)wanted;
+        plan->end[i] = wanted;
     }
     return REJECT_NONE;
 }
@@ -151,26 +150,27 @@ static uint8_t commit(void) {
     return reject;
 }
 
-static void remember(const frame_setpoint_t *setpoint, const plan_t *plan) {
-    gate.last_number = setpoint->number;
+static void remember(uint16_t number, const plan_t *plan) {
+    gate.last_number = number;
     gate.have_number = true;
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
-        gate.planned[i] = setpoint->position_steps[i];
+        gate.planned[i] = plan->end[i];
         gate.speed_q15[i] = plan->speed_q15[i];
     }
 }
 
 static uint8_t judge(const frame_setpoint_t *setpoint) {
-    plan_t plan;
+    plan_t plan = {.ticks = LATE_TICKS};
     segment_t *segment = motion_free_slot();
     snapshot(&plan);
     if (plan.state != STATE_ARMED && plan.state != STATE_RUNNING) return REJECT_STATE;
     if (gate.have_number && (int16_t)(setpoint->number - gate.last_number) <= 0) return REJECT_ORDER;
     if (plan.waiting >= QUEUE_CAPACITY) return REJECT_OVERFLOW;
-    uint8_t reject = check_time(setpoint, &plan, segment);
+    uint8_t reject = check_time(setpoint, &plan);
+    segment->end_tick = (uint16_t)(plan.end_tick + plan.ticks);
     if (!reject) reject = check_axes(setpoint, &plan, segment);
     if (!reject) reject = commit();
-    if (!reject) remember(setpoint, &plan);
+    if (!reject) remember(setpoint->number, &plan);
     return reject;
 }
 

@@ -7,6 +7,8 @@
 
 #include "frames.h"
 
+#define TRAVEL_MAX 1000000000L /* steps, to either side of 0: keeps the difference of two positions within 32 bits */
+
 typedef struct {
     bool configured;
     uint16_t speed_q16; /* steps per tick */

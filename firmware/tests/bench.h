@@ -48,6 +48,7 @@ typedef struct {
     uint16_t number;
     int64_t steps[AXIS_COUNT]; /* edges, with their sign */
     uint32_t last_edge_us;
+    bool enabled;        /* the enable line as the last tick left it */
     uint8_t last_result; /* of the last ACK */
     frame_status_t status;
     uint32_t frames_out;
@@ -87,6 +88,7 @@ static inline void read_out(void) {
 
 static inline void tick(void) {
     uint8_t out = controller_tick(bench.encoder_bits);
+    bench.enabled = out & OUTPUT_ENABLE;
     for (unsigned axis = 0; axis < AXIS_COUNT; axis++) {
         if (!(out >> axis & 1U)) continue;
         bench.steps[axis] += out >> (OUTPUT_DIRECTION_SHIFT + axis) & 1U ? -1 : 1;
@@ -135,11 +137,15 @@ static inline void send_setpoint(uint16_t number, int32_t ahead_us, uint16_t exp
     while (controller_poll()) {}
 }
 
-static inline void power_up(uint8_t reset_cause, bool shared_limits) {
+static inline void power_up_wired(uint8_t reset_cause, wiring_t wiring) {
     boot_t facts = {.boot_count = 7, .reset_cause = reset_cause, .mcu = MCU_NATIVE};
     bench = (bench_t){0};
-    controller_start(&facts, shared_limits, 0);
+    controller_start(&facts, &wiring, 0);
     for (uint8_t byte; link_next_byte(&byte);) {}
+}
+
+static inline void power_up(uint8_t reset_cause, bool shared_limits) {
+    power_up_wired(reset_cause, (wiring_t){.shared_limits = shared_limits});
 }
 
 static inline void hello(void) {

@@ -98,6 +98,102 @@ static void deadman_latches(void) {
     CHECK_EQUAL(arm(), RESULT_OK);
 }
 
+/* A host that arms and then sends nothing: the dead man runs from ARM on. */
+static void deadman_runs_from_arming(void) {
+    bring_up();
+    run_ms(29);
+    CHECK_EQUAL(safety.state, STATE_ARMED);
+    CHECK(safety.deadman_age_ms >= 28);
+    run_ms(2);
+    CHECK_EQUAL(safety.fault, FAULT_DEADMAN);
+    run_ms(2);
+    CHECK_EQUAL(safety.state, STATE_FAULT);
+    CHECK(!bench.enabled);
+}
+
+/* Positions beyond the travel are no names for a place: differences to them leave 32 bits. */
+static void positions_beyond_the_travel(void) {
+    static const int32_t BAD[] = {INT32_MAX, INT32_MIN, 1000000001, -1000000001};
+    power_up(RESET_CAUSE_POWER, false);
+    hello();
+    configure_all();
+    for (unsigned i = 0; i < sizeof BAD / sizeof BAD[0]; i++) {
+        frame_set_position_t frame = {0, BAD[i]};
+        CHECK_EQUAL(command(FRAME_SET_POSITION, &frame, sizeof frame), RESULT_BAD_VALUE);
+        CHECK_EQUAL(motion_position(0), 0);
+    }
+    frame_set_position_t edge = {0, -1000000000};
+    CHECK_EQUAL(command(FRAME_SET_POSITION, &edge, sizeof edge), RESULT_OK);
+    frame_configure_t far = LIMITS[0];
+    far.soft_min_steps = -1000000000, far.soft_max_steps = 1000000000;
+    CHECK_EQUAL(command(FRAME_CONFIGURE, &far, sizeof far), RESULT_OK);
+    CHECK_EQUAL(arm(), RESULT_OK);
+    CHECK_EQUAL(reject_of(1, 1000, 0, 1000000000, 0, 0), REJECT_SPEED);
+    CHECK_EQUAL(reject_of(2, 1000, 0, -999999990, 0, 0), REJECT_NONE);
+    run_ms(3);
+    CHECK_EQUAL(motion_position(0), -999999990);
+}
+
+/* An axis makes at most one step a tick: what asks for more is refused, or its steps would be owed for ever. */
+static void no_more_than_one_step_a_tick(void) {
+    power_up(RESET_CAUSE_POWER, false);
+    hello();
+    configure_all();
+    frame_configure_t fast = LIMITS[0];
+    fast.max_speed_steps_per_s = TIMER_HZ - 1, fast.max_accel_steps_per_s2 = 2000000;
+    CHECK_EQUAL(command(FRAME_CONFIGURE, &fast, sizeof fast), RESULT_OK);
+    CHECK_EQUAL(arm(), RESULT_OK);
+    CHECK_EQUAL(reject_of(1, 1000, 0, 21, 0, 0), REJECT_SPEED);
+    CHECK_EQUAL(reject_of(2, 1000, 0, 20, 0, 0), REJECT_NONE);
+    CHECK_EQUAL(reject_of(3, 2000, 0, 41, 0, 0), REJECT_SPEED);
+    CHECK_EQUAL(reject_of(4, 2000, 0, 40, 0, 0), REJECT_NONE);
+    CHECK_EQUAL(reject_of(5, 3000, 0, 40, 0, 0), REJECT_NONE);
+    run_ms(5);
+    CHECK_EQUAL(motion_position(0), 40);
+}
+
+/* The drives are powered from ARM until the axes rest; on a fault too where the wiring says so, then until DISARM. */
+static void enable_line(bool keep) {
+    power_up_wired(RESET_CAUSE_POWER, (wiring_t){.keep_enabled = keep});
+    run_ms(2);
+    CHECK(!bench.enabled);
+    hello();
+    configure_all();
+    CHECK_EQUAL(arm(), RESULT_OK);
+    int32_t position[AXIS_COUNT] = {0};
+    cruise_ms(20, position, (const int32_t[]){10, 0, 0});
+    CHECK(bench.enabled);
+    bench.switches = 1U << INPUT_BIT_ESTOP;
+    run_ms(5);
+    CHECK_EQUAL(safety.state, STATE_STOPPING);
+    CHECK(bench.enabled); /* it decelerates under power */
+    run_ms(60);
+    CHECK_EQUAL(safety.state, STATE_FAULT);
+    CHECK_EQUAL(bench.enabled, keep);
+    bench.switches = 0;
+    run_ms(5);
+    CHECK_EQUAL(clear_fault(FAULT_ESTOP), RESULT_OK);
+    run_ms(5);
+    CHECK_EQUAL(bench.enabled, keep);
+    CHECK_EQUAL(command(FRAME_DISARM, NULL, 0), RESULT_OK);
+    run_ms(2);
+    CHECK(!bench.enabled);
+    CHECK_EQUAL(arm(), RESULT_OK);
+    run_ms(1);
+    CHECK(bench.enabled);
+    command(FRAME_DISARM, NULL, 0);
+    run_ms(3);
+    CHECK(!bench.enabled);
+    bench.switches = 1U << INPUT_BIT_ESTOP; /* of a board that is not armed */
+    run_ms(5);
+    CHECK_EQUAL(safety.state, STATE_FAULT);
+    CHECK(!bench.enabled);
+    power_up_wired(RESET_CAUSE_WATCHDOG, (wiring_t){.keep_enabled = keep});
+    run_ms(2);
+    CHECK_EQUAL(safety.state, STATE_FAULT);
+    CHECK(!bench.enabled);
+}
+
 static void the_first_fault_stays(void) {
     bring_up();
     send_setpoint(1, 1000, 0, ORIGIN);
@@ -160,6 +256,7 @@ static void glitch_is_not_a_switch(void) {
     bring_up();
     for (unsigned i = 0; i < 200; i++) {
         bench.switches = i % 3 ? 0 : 0x7F; /* single samples */
+        send_setpoint((uint16_t)(i + 1), 1000, 0, ORIGIN);
         run_ms(1);
     }
     CHECK_EQUAL(safety.fault, FAULT_NONE);
@@ -225,6 +322,11 @@ int main(void) {
     wrapping_clock();
     configuration();
     deadman_latches();
+    deadman_runs_from_arming();
+    positions_beyond_the_travel();
+    no_more_than_one_step_a_tick();
+    enable_line(false);
+    enable_line(true);
     the_first_fault_stays();
     stranger_in_the_session();
     deadman_wants_valid_setpoints();

@@ -25,8 +25,8 @@ def flash(
     from host.commissioning.firmware_flash import avrdude_command, built, check_avrdude, check_port, pins_of, write_firmware
 
     pins = pins_of(load_rig(rig), mcu)
-    check_avrdude()
     if not dry_run:
+        check_avrdude()
         check_port(port)
     if image is not None and not image.is_file():
         raise InputError("--image", str(image), "an ELF file of the firmware")

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from protocol.board_pins import definitions
 from protocol.errors import InputError
 from protocol.rig_file import Pins, Rig
 from sim.board import FIRMWARE_DIR
@@ -91,12 +90,9 @@ def built(pins: Pins) -> Path:
     for tool in ("make", "avr-gcc"):
         if shutil.which(tool) is None:
             raise InputError(tool, "no such program", "the AVR tool chain (Debian: gcc-avr avr-libc make), or --image FILE")
-    folder, options = "build", list[str]()
-    if pins != Pins.model_validate({"mcu": pins.mcu}):
-        folder = f"build/pins-{pins.outputs}{pins.output_shift}{pins.encoders}{pins.switches}"
-        options = [f"BUILD={folder}", f"PINS={' '.join(definitions(**pins.model_dump()))}"]
-    target = f"{folder}/seldinger-{pins.mcu}.elf"
-    command = ["make", "--silent", "-C", str(FIRMWARE_DIR), target, *options]
+    build = pins.build()
+    target = f"{build.folder}/seldinger-{pins.mcu}.elf"
+    command = ["make", "--silent", "-C", str(FIRMWARE_DIR), target, *build.variables]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         errors = [line for line in result.stderr.splitlines() if "error" in line.lower()] or ["make failed"]

@@ -33,16 +33,18 @@ typedef struct {
     const char *name;
     char outputs, encoders, switches;
     unsigned output_shift;
-    bool shared_limits;
+    bool shared_limits, enable_beside_switches;
     uint8_t step_vector; /* TIMER1_COMPA */
     uint16_t mcusr;      /* data address */
 } mcu_t;
 
 static const mcu_t MCUS[] = {
     {"atmega2560", LETTER(ATMEGA2560_OUTPUTS), LETTER(ATMEGA2560_ENCODERS), LETTER(ATMEGA2560_SWITCHES),
-     ATMEGA2560_OUTPUT_SHIFT, ATMEGA2560_SHARED_LIMITS, 17, 0x54},
+     ATMEGA2560_OUTPUT_SHIFT, ATMEGA2560_SHARED_LIMITS,
+     ATMEGA2560_ENABLE_BESIDE_SWITCHES, 17, 0x54},
     {"atmega328p", LETTER(ATMEGA328P_OUTPUTS), LETTER(ATMEGA328P_ENCODERS), LETTER(ATMEGA328P_SWITCHES),
-     ATMEGA328P_OUTPUT_SHIFT, ATMEGA328P_SHARED_LIMITS, 11, 0x54},
+     ATMEGA328P_OUTPUT_SHIFT, ATMEGA328P_SHARED_LIMITS,
+     ATMEGA328P_ENABLE_BESIDE_SWITCHES, 11, 0x54},
 };
 enum { PORF = 1, EXTRF = 2 };
 
@@ -65,6 +67,7 @@ static struct {
     uint64_t base_cycle, reset_cycle; /* some versions of simavr start their count anew with each reset */
     bool was_reset;
     uint8_t outputs;
+    uint8_t enable_port, enable_direction; /* registers of the port that carries the enable line */
     uint8_t encoder_lines, switches; /* on the pins */
     encoders_t encoders;
     rx_line_t rx_line;
@@ -212,14 +215,46 @@ static void outputs_written(struct avr_irq_t *irq, uint32_t value, void *param) 
     board.outputs = outputs;
 }
 
-/* Shared inputs are both ends of an axis in series: open when either is. */
+/* As a driver sees the line. While the pin is an input, a pull resistor holds it at the level that is off. */
+static bool enabled(void) {
+    unsigned pin = board.mcu->enable_beside_switches ? BOARD_ENABLE_PIN_BESIDE : BOARD_ENABLE_BIT + board.mcu->output_shift;
+    bool driven = board.enable_direction >> pin & 1U, high = board.enable_port >> pin & 1U;
+    return driven && high != BOARD_ENABLE_ACTIVE_LOW;
+}
+
+static struct avr_irq_t *enable_irqs(void) {
+    char port = board.mcu->enable_beside_switches ? board.mcu->switches : board.mcu->outputs;
+    return avr_io_getirq(board.avr, AVR_IOCTL_IOPORT_GETIRQ(port), 0);
+}
+
+static void watch_enable(uint8_t *reg, uint8_t value) {
+    bool before = board.count.enabled;
+    *reg = value;
+    board.count.enabled = enabled();
+    board.count.enable_changes += board.count.enabled != before;
+}
+
+static void enable_port_written(struct avr_irq_t *irq, uint32_t value, void *param) {
+    (void)irq;
+    (void)param;
+    watch_enable(&board.enable_port, (uint8_t)value);
+}
+
+static void enable_direction_written(struct avr_irq_t *irq, uint32_t value, void *param) {
+    (void)irq;
+    (void)param;
+    watch_enable(&board.enable_direction, (uint8_t)value);
+}
+
+/* Levels of the switches' lines. Shared inputs are both ends of an axis: in series where they are normally closed. */
 static uint8_t switch_lines(const request_t *request) {
     uint8_t limits = request->limits & 0x3FU;
-    if (!board.mcu->shared_limits) return (uint8_t)(limits | (request->estop ? 1U << INPUT_BIT_ESTOP : 0U));
+    uint8_t hit = (uint8_t)(limits | (request->estop ? 1U << INPUT_BIT_ESTOP : 0U));
+    if (!board.mcu->shared_limits) return hit ^ BOARD_NORMALLY_OPEN;
     uint8_t lines = request->estop ? 1U << AXES : 0U;
     for (unsigned axis = 0; axis < AXES; axis++)
         if (limits >> (2 * axis) & 3U) lines |= (uint8_t)(1U << axis);
-    return lines;
+    return lines ^ BOARD_SHARED_LINES(BOARD_NORMALLY_OPEN);
 }
 
 /* --- processor -------------------------------------------------------------------------------------------------- */
@@ -248,6 +283,10 @@ static void on_reset(avr_t *avr) {
     board.receiver = (receiver_t){0};
     board.transmitter = (transmitter_t){0};
     board.outputs = 0;
+    /* The pins are inputs again. simavr does not say so, and passes on only values that differ from the last. */
+    struct avr_irq_t *pins = enable_irqs();
+    avr_raise_irq(pins + IOPORT_IRQ_DIRECTION_ALL, 0);
+    avr_raise_irq(pins + IOPORT_IRQ_REG_PORT, 0);
     if (board.frozen) memcpy(avr->flash + board.frozen_pc, &board.frozen_code, sizeof board.frozen_code);
     board.frozen = false;
     board.count.starts++;
@@ -280,8 +319,9 @@ static void after_reset(void) {
     board.avr->run_cycle_limit = CYCLES_LIMIT;
     stop_level_polling();
     uint8_t encoder_lines = board.encoder_lines, switches = board.switches;
-    board.encoder_lines = (uint8_t)~encoder_lines;
-    board.switches = (uint8_t)~switches;
+    /* To the other level and back: simavr passes on only levels that differ from the last. */
+    drive(board.mcu->encoders, &board.encoder_lines, (uint8_t)~encoder_lines);
+    drive(board.mcu->switches, &board.switches, (uint8_t)~switches);
     drive(board.mcu->encoders, &board.encoder_lines, encoder_lines);
     drive(board.mcu->switches, &board.switches, switches);
     uint64_t next = board.encoders.next_cycle;
@@ -357,6 +397,8 @@ static void quiet(avr_t *avr, const int level, const char *format, va_list argum
 static void watch(void) {
     avr_irq_register_notify(avr_io_getirq(board.avr, AVR_IOCTL_IOPORT_GETIRQ(board.mcu->outputs), IOPORT_IRQ_REG_PORT),
                             outputs_written, NULL);
+    avr_irq_register_notify(enable_irqs() + IOPORT_IRQ_REG_PORT, enable_port_written, NULL);
+    avr_irq_register_notify(enable_irqs() + IOPORT_IRQ_DIRECTION_ALL, enable_direction_written, NULL);
     avr_int_table_t *table = &board.avr->interrupts;
     for (int i = 0; i < table->vector_count; i++)
         if (table->vector[i]->vector == board.mcu->step_vector)

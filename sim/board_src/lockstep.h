@@ -25,8 +25,8 @@ enum {
 
 typedef struct __attribute__((packed)) {
     uint8_t op;
-    uint8_t estop; /* 1: open */
-    uint16_t limits; /* bit 2*axis: lower end, 2*axis+1: upper end; 1: open */
+    uint8_t estop; /* 1: hit, whatever level the switch then gives */
+    uint16_t limits; /* bit 2*axis: lower end, 2*axis+1: upper end; 1: hit */
     uint32_t uart_bytes; /* follow this struct */
     uint64_t until_us; /* since the child started */
     int32_t encoder[AXES]; /* counts to be reached when the slice ends */
@@ -40,6 +40,8 @@ typedef struct __attribute__((packed)) {
     uint32_t starts; /* of the processor */
     uint32_t rx_lost; /* bytes the receiver had no room for */
     uint32_t stack_free; /* bytes between the variables and the deepest stack so far; native: 0 */
+    uint32_t enabled; /* 1: the enable line powers the drives; a pin that is not driven does not (pull resistor) */
+    uint32_t enable_changes; /* since the child started */
     uint32_t uart_bytes, edges; /* follow: the bytes, the u64 cycle each had left whole, then the edges */
 } reply_t;
 

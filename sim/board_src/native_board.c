@@ -2,6 +2,7 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "board.h"
 #include "controller.h"
 #include "frames.h"
 #include "link.h"
@@ -16,6 +17,7 @@ typedef struct {
     uint16_t boot_count;
     uint32_t starts;
     uint8_t outputs;     /* computed by the last tick, leave with the next one */
+    uint32_t enable_changes;
     uint8_t switches;
     bool started;
     encoders_t encoders;
@@ -31,9 +33,13 @@ void port_start_transmitter(void) {}
 
 uint8_t port_read_switches(void) { return board.switches; }
 
+static bool enabled(void) { return board.outputs & OUTPUT_ENABLE; }
+
 static void start(uint8_t cause) {
+    wiring_t wiring = {.shared_limits = false, .keep_enabled = BOARD_KEEP_ENABLED};
     boot_t facts = {.boot_count = ++board.boot_count, .reset_cause = cause, .mcu = MCU_NATIVE};
-    controller_start(&facts, false, encoders_lines(&board.encoders));
+    controller_start(&facts, &wiring, encoders_lines(&board.encoders));
+    board.enable_changes += enabled();
     board.outputs = 0;
     board.frozen_until = 0;
     board.tx_busy = false;
@@ -72,7 +78,9 @@ static void tick(produce_t *produce) {
         if (board.outputs & (1U << axis))
             produce_edge(produce, board.cycle, axis, board.outputs >> (OUTPUT_DIRECTION_SHIFT + axis) & 1U);
     receive(board.cycle);
+    bool before = enabled();
     board.outputs = controller_tick(encoders_lines(&board.encoders));
+    board.enable_changes += enabled() != before;
     while (controller_poll()) {}
     transmit(board.cycle, produce);
 }
@@ -101,6 +109,11 @@ static void serve(const request_t *request, const buffer_t *uart, produce_t *pro
     }
 }
 
+static reply_t counts(void) {
+    return (reply_t){.cycle = board.cycle, .starts = board.starts, .idle_cycles = board.cycle,
+                     .enabled = enabled(), .enable_changes = board.enable_changes};
+}
+
 int main(void) {
     lockstep_open();
     static request_t request;
@@ -108,7 +121,7 @@ int main(void) {
     static produce_t produce;
     while (request_read(&request, &uart)) {
         serve(&request, &uart, &produce);
-        reply_t reply = {.cycle = board.cycle, .starts = board.starts, .idle_cycles = board.cycle};
+        reply_t reply = counts();
         if (!reply_write(&reply, &produce)) return 1;
     }
     return 0;

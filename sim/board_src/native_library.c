@@ -13,8 +13,9 @@ size_t native_call(const uint8_t *asked, const uint8_t **answer) {
     uart.used = out.used = 0;
     buffer_add(&uart, asked + sizeof request, request.uart_bytes);
     serve(&request, &uart, &produce);
-    reply_t reply = {.cycle = board.cycle, .starts = board.starts, .idle_cycles = board.cycle,
-                     .uart_bytes = (uint32_t)produce.uart.used, .edges = (uint32_t)(produce.edges.used / sizeof(edge_t))};
+    reply_t reply = counts();
+    reply.uart_bytes = (uint32_t)produce.uart.used;
+    reply.edges = (uint32_t)(produce.edges.used / sizeof(edge_t));
     buffer_add(&out, &reply, sizeof reply);
     buffer_add(&out, produce.uart.data, produce.uart.used);
     buffer_add(&out, produce.uart_cycles.data, produce.uart_cycles.used);

@@ -111,6 +111,12 @@ def pins(**changed: object) -> dict[str, Any]:
         ({"switches": "Z"}, "board.pins.switches: found port 'Z', wanted one of A, B, C, F, K, L of the atmega2560"),
         ({"output_shift": 2}, "board.pins.outputs: found pin PA8, which the atmega2560 has not free"),
         ({"mcu": "atmega328p", "outputs": "D", "switches": "B", "output_shift": 1}, "found pin PD1, which the atmega328p"),
+        ({"normally_open": ["knob"]}, "board.pins.normally_open: found 'knob', wanted names of insertion_min"),
+        (
+            {"mcu": "atmega328p", "outputs": "D", "output_shift": 2, "switches": "B", "normally_open": ["roll_max"]},
+            "found roll_max without roll_min, wanted both or neither: on the Arduino Uno or Nano they share one input",
+        ),
+        ({"enable_active": "up"}, "board.pins.enable_active: found 'up', wanted"),
         ({"output_shift": 8}, "board.pins.output_shift: found 8, wanted at most 7"),
     ],
 )
@@ -129,6 +135,9 @@ def test_without_pins_in_the_file_the_usual_ones_of_its_processor_are_taken() ->
         "-DATMEGA328P_OUTPUT_SHIFT=2",
         "-DATMEGA328P_ENCODERS=C",
         "-DATMEGA328P_SWITCHES=B",
+        "-DBOARD_ENABLE_ACTIVE_LOW=1",
+        "-DBOARD_NORMALLY_OPEN=0",
+        "-DBOARD_KEEP_ENABLED=0",
     ]
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from protocol.board_pins import Build
 from realtime.drivers.stepper_board import AxisLimits, BoardStatus, EventKind, LinkPhase, StepperBoardLink
-from sim.board import Board, BoardSlice
+from sim.board import USUAL_BUILD, Board, BoardSlice
 
 LIMITS = (
     AxisLimits(16_000, 640_000, -(10**6), 10**6),
@@ -29,8 +30,8 @@ EVERY_BOARD = (
 class BoardRig:
     """Runs a Board in slices of 1 ms with a StepperBoardLink on its UART."""
 
-    def __init__(self, kind: str, mcu: str = "atmega2560") -> None:
-        self.board = Board(kind, mcu)
+    def __init__(self, kind: str, mcu: str = "atmega2560", build: Build = USUAL_BUILD) -> None:
+        self.board = Board(kind, mcu, build)
         self.link = StepperBoardLink(LIMITS)
         self.time_us = 0
         self.position = np.zeros(3, np.int64)  # by the edges
