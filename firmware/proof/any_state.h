@@ -23,6 +23,8 @@ static volatile uint8_t switches_now;
 #define FARTHEST (TRAVEL_MAX + 2000L)
 #define PLANNED_FARTHEST (FARTHEST + 128L) /* and the steps of the last ms, in 8 bits */
 
+#define AHEAD_MOST (2 * STEP_Q16) /* a step, and what the speed limit makes of one tick */
+
 #define ANY(variable) Frama_C_make_unknown((char *)&(variable), sizeof(variable))
 #define ANY_BOOL() ((bool)Frama_C_interval(0, 1))
 
@@ -60,7 +62,9 @@ static void any_gate(void) {
         axis->soft_max = Frama_C_long_interval(-TRAVEL_MAX, TRAVEL_MAX);
         gate.planned[i] = Frama_C_long_interval(-PLANNED_FARTHEST, PLANNED_FARTHEST);
         gate.speed_q15[i] = (int16_t)Frama_C_interval(-32767, 32767);
+        gate.ahead_q16[i] = (uint32_t)Frama_C_unsigned_long_interval(0, AHEAD_MOST);
     }
+    ANY(gate.counted_tick);
     ANY(gate.last_number);
     gate.have_number = ANY_BOOL();
     ANY(gate.last_reject);

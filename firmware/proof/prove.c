@@ -16,6 +16,7 @@ static void check_gate(void) {
         //@ assert soft_limits_within_travel: -TRAVEL_MAX <= gate.axis[i].soft_min <= TRAVEL_MAX;
         //@ assert soft_limits_within_travel: -TRAVEL_MAX <= gate.axis[i].soft_max <= TRAVEL_MAX;
         //@ assert plan_within_travel: -PLANNED_FARTHEST <= gate.planned[i] <= PLANNED_FARTHEST;
+        //@ assert speed_account_in_range: gate.ahead_q16[i] <= AHEAD_MOST;
         //@ assert speed_in_range: -32767 <= gate.speed_q15[i] <= 32767;
     }
 }

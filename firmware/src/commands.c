@@ -81,7 +81,7 @@ static uint8_t set_position(const frame_set_position_t *frame) {
     int32_t steps = frame->position_steps;
     if (frame->axis >= AXIS_COUNT || steps < -TRAVEL_MAX || steps > TRAVEL_MAX) return RESULT_BAD_VALUE;
     port_lock_t lock = port_lock();
-    motion_rename_position(frame->axis, steps);
+    gate_rename_position(frame->axis, steps);
     quadrature_set(frame->axis, steps);
     port_unlock(lock);
     return RESULT_OK;

@@ -9,6 +9,8 @@
 #define LATE_TICKS TICKS_PER_MS          /* a late set-point gets one control period */
 #define LEAST_TICKS (TICKS_PER_MS / 2)   /* the step and tick grids make speeds over less meaningless */
 #define MOST_TICKS 255                   /* of one segment, in 8 bits; the horizon is shorter */
+#define MOST_COUNTED 4000                /* steps and ticks of one account: a ramp is shorter */
+#define STEP_Q16 0x10000UL
 #define STOP_MS (STOP_US / 1000)
 
 gate_t gate;
@@ -20,8 +22,9 @@ typedef struct {
     uint8_t ticks;           /* from there to the new set-point: LEAST_TICKS to MOST_TICKS */
     bool at_rest;            /* no set-point in execution or waiting: the plan ends now */
     uint8_t waiting, state, inputs;
-    int32_t end[AXIS_COUNT];       /* of the new segment: position */
-    int16_t speed_q15[AXIS_COUNT]; /* and speed */
+    int32_t end[AXIS_COUNT];       /* of the new segment: position, */
+    int16_t speed_q15[AXIS_COUNT]; /* speed */
+    uint32_t ahead_q16[AXIS_COUNT]; /* and account of the speed */
 } plan_t;
 
 void gate_start(void) { gate = (gate_t){0}; }
@@ -55,7 +58,37 @@ uint8_t gate_configure(const frame_configure_t *limits) {
 
 void gate_rearm(void) { gate.have_number = false; }
 
+void gate_rename_position(uint8_t axis, int32_t steps) {
+    motion_rename_position(axis, steps);
+    gate.planned[axis] = steps;
+}
+
+static inline uint16_t at_most(uint32_t value, uint16_t most) { return value < most ? (uint16_t)value : most; }
+
+/* The account of an axis after so many steps in so many ticks, each at most MOST_COUNTED. The limit is 1/64 more than
+ * configured: the resonator of a board is off by up to 0.5 %, and the limit was rounded down to 1/65536 step a tick. */
+static uint32_t account(uint32_t ahead_q16, uint16_t speed_q16, uint16_t steps, uint16_t ticks) {
+    uint32_t allowed_q16 = ((uint32_t)speed_q16 + 1) * ticks;
+    uint32_t used_q16 = ahead_q16 + ((uint32_t)steps << 16);
+    allowed_q16 += allowed_q16 >> 6;
+    return used_q16 > allowed_q16 ? used_q16 - allowed_q16 : 0;
+}
+
+/* At rest the plan starts from where the axes are: a ramp may have moved them since the last account. */
+static void plan_from(const int32_t position[AXIS_COUNT], uint16_t tick) {
+    uint16_t ticks = at_most((uint16_t)(tick - gate.counted_tick), MOST_COUNTED);
+    gate.counted_tick = tick;
+    for (uint8_t i = 0; i < AXIS_COUNT; i++) {
+        int32_t moved = position[i] - gate.planned[i];
+        uint16_t steps = at_most((uint32_t)(moved < 0 ? -moved : moved), MOST_COUNTED);
+        uint32_t ahead_q16 = account(gate.ahead_q16[i], gate.axis[i].speed_q16, steps, ticks);
+        gate.ahead_q16[i] = ahead_q16 < STEP_Q16 ? ahead_q16 : STEP_Q16;
+        gate.planned[i] = position[i];
+    }
+}
+
 static void snapshot(plan_t *plan) {
+    int32_t position[AXIS_COUNT] = {0};
     port_lock_t lock = port_lock();
     plan->time_us = clock_locked_us();
     plan->tick = motion.tick;
@@ -67,11 +100,12 @@ static void snapshot(plan_t *plan) {
     if (plan->at_rest) {
         plan->end_tick = motion.tick;
         for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) {
-            gate.planned[axis] = motion_position(axis);
+            position[axis] = motion_position(axis);
             gate.speed_q15[axis] = motion_ramp_speed_q15(axis);
         }
     }
     port_unlock(lock);
+    if (plan->at_rest) plan_from(position, plan->tick);
 }
 
 /* us / TICK_US without a division, exact up to HORIZON_US. */
@@ -117,7 +151,8 @@ static uint16_t follow_speed(uint8_t index, int32_t delta, uint16_t rate_q16, ui
     return (uint16_t)(speed < 0 ? -2 * speed : 2 * speed);
 }
 
-/* The step grid and the tick grid each allow for one count more than the limit. */
+/* The step grid and the tick grid each allow for one count more than the limit; the account of the speed keeps short
+ * segments from adding these up. */
 static uint8_t check_axes(const frame_setpoint_t *setpoint, plan_t *plan, segment_t *segment) {
     uint8_t ticks = plan->ticks;
     uint16_t per_step_q16 = ticks == TICKS_PER_MS ? 0xFFFFU / TICKS_PER_MS : (uint16_t)(0xFFFFU / ticks);
@@ -127,8 +162,11 @@ static uint8_t check_axes(const frame_setpoint_t *setpoint, plan_t *plan, segmen
         int32_t delta = wanted - gate.planned[i]; /* both within the travel, so within 32 bits */
         if (towards_open_switch(delta, plan->inputs, i)) return REJECT_LIMIT_SWITCH;
         uint32_t distance = (uint32_t)(delta < 0 ? -delta : delta);
-        uint16_t most = (uint16_t)(((uint32_t)gate.axis[i].speed_q16 * (uint16_t)(ticks + 1)) >> 16) + 1;
-        if (distance > most || distance > ticks) return REJECT_SPEED; /* an axis makes at most one step a tick */
+        if (distance > ticks) return REJECT_SPEED; /* an axis makes at most one step a tick */
+        uint16_t speed_q16 = gate.axis[i].speed_q16;
+        uint32_t ahead_q16 = account(gate.ahead_q16[i], speed_q16, (uint16_t)distance, ticks);
+        if (ahead_q16 > STEP_Q16 + speed_q16) return REJECT_SPEED;
+        plan->ahead_q16[i] = ahead_q16;
         uint16_t rate_q16 = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
         segment->rate_q16[i] = follow_speed(i, delta, rate_q16, ticks, &plan->speed_q15[i]);
         segment->target[i] = (uint16_t)wanted;
@@ -156,7 +194,9 @@ static void remember(uint16_t number, const plan_t *plan) {
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
         gate.planned[i] = plan->end[i];
         gate.speed_q15[i] = plan->speed_q15[i];
+        gate.ahead_q16[i] = plan->ahead_q16[i];
     }
+    gate.counted_tick = (uint16_t)(plan->end_tick + plan->ticks);
 }
 
 static uint8_t judge(const frame_setpoint_t *setpoint) {

@@ -19,6 +19,8 @@ typedef struct {
     axis_limits_t axis[AXIS_COUNT];
     int32_t planned[AXIS_COUNT];   /* where the last accepted set-point ends */
     int16_t speed_q15[AXIS_COUNT]; /* and with what speed, steps per tick */
+    uint32_t ahead_q16[AXIS_COUNT]; /* steps that the plan is ahead of what the speed limit allows */
+    uint16_t counted_tick;          /* until here the speed is accounted for */
     uint16_t last_number;
     bool have_number;
     uint8_t last_reject;
@@ -31,6 +33,8 @@ void gate_start(void);
 bool gate_configured(void);
 /* Sets the limits of one axis; returns a RESULT_.... */
 uint8_t gate_configure(const frame_configure_t *limits);
+/* Renames the present position of one axis at rest, within TRAVEL_MAX. With the interrupts locked. */
+void gate_rename_position(uint8_t axis, int32_t steps);
 /* Forgets the numbers seen: the next set-point starts a new count. */
 void gate_rearm(void);
 /* Queues the set-point, or refuses and counts it. */

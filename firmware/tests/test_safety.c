@@ -17,7 +17,7 @@ static void refused_setpoints(void) {
     CHECK_EQUAL(reject_of(11, 900, 0, 0, 0, 0), REJECT_ORDER); /* before the last one's time */
     CHECK_EQUAL(reject_of(12, (int32_t)HORIZON_US + 50, 0, 0, 0, 0), REJECT_HORIZON);
     CHECK_EQUAL(reject_of(13, -1000, 900, 0, 0, 0), REJECT_EXPIRED);
-    CHECK_EQUAL(reject_of(14, 2000, 0, 18, 0, 0), REJECT_SPEED); /* 16 steps/ms, one tick and one step of slack */
+    CHECK_EQUAL(reject_of(14, 2000, 0, 19, 0, 0), REJECT_SPEED); /* 16.25 steps/ms, one tick and one step of slack */
     CHECK_EQUAL(reject_of(15, 2000, 0, 0, 0, -15), REJECT_SPEED);
     CHECK_EQUAL(reject_of(16, 2000, 0, INT32_MAX, 0, 0), REJECT_SOFT_LIMIT);
     CHECK_EQUAL(reject_of(17, 2000, 0, 0, INT32_MIN, 0), REJECT_SOFT_LIMIT);
