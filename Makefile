@@ -98,6 +98,7 @@ faults: setup
 
 fuzz: setup
 	@$(MAKE) -s -C firmware/fuzz run INPUTS=$(INPUTS) >build/fuzz.json && cat build/fuzz.json
+	@$(MAKE) -s -C firmware/fuzz frames SEQUENCES=$(INPUTS)
 	@$(BIN)/python -m host.studies.reliability_page docs/reliability.md <build/fuzz.json
 
 # Crafted recordings read by every reader of them; those that broke one stay in build/crafted_recordings and are read again.
