@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 
-from protocol.rig_file import Rig
-from protocol.serial_frames import Fault
+from host.commissioning.board_inputs import input_lines, input_problems
+from protocol.rig_file import Pins, Rig
+from protocol.serial_frames import Fault, Mcu
 from realtime.core.board_intake import axis_limits
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
@@ -42,11 +43,29 @@ def check_board(rig: Rig, port: str, seconds: float) -> DeviceReport:
     link = StepperBoardLink(axis_limits(rig))
     try:
         _read_board(link, transport, seconds, report)
+        _name_inputs(rig.board.pins, link, report)
     except OSError as error:
         report.problems.append(f"the port went away: {error}")
     finally:
         transport.close()
     return report
+
+
+def _name_inputs(pins: Pins, link: StepperBoardLink, report: DeviceReport) -> None:
+    """Report every switch input, also of a board that did not come as far as READY: an open e-stop keeps it from there."""
+    if link.status is None:
+        return
+    report.figures["inputs"] = f"{link.status.inputs:07b}"
+    report.figures |= {line.name: str(line) for line in input_lines(pins, link.status.inputs)}
+    report.problems += input_problems(pins, link.status.inputs)
+    if (
+        link.identity is not None
+        and Mcu(link.identity.mcu) is not Mcu.NATIVE
+        and Mcu(link.identity.mcu).name.lower() != pins.mcu
+    ):
+        report.problems.append(
+            f"board.pins.mcu: found {pins.mcu}, wanted {Mcu(link.identity.mcu).name.lower()}, the processor that answered"
+        )
 
 
 def _read_board(link: StepperBoardLink, transport: Transport, seconds: float, report: DeviceReport) -> None:
@@ -93,11 +112,8 @@ def _judge_board(link: StepperBoardLink, report: DeviceReport, rate_hz: float, f
         "clock_drift": link.clock.drift,
         "fault": FAULT_ADVICE[Fault(status.fault)],
         "encoder_errors": status.encoder_errors,
-        "inputs": f"{status.inputs:07b}",
     }
     if rate_hz < 0.98 * STATUS_HZ:
         report.problems.append(f"{rate_hz:.0f} status frames a second, wanted {STATUS_HZ:g}")
     if damaged:
         report.problems.append(f"{damaged} damaged frames: cable, shield, speed of the port")
-    if status.inputs & 0x40:
-        report.problems.append("the emergency stop is open")

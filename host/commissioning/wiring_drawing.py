@@ -42,7 +42,7 @@ def _wire(y: float, signal: Signal, terminal: str) -> list[str]:
     return [
         _text(LEFT - 10, y, name, "", "end"),
         f'<line x1="{LEFT}" y1="{middle}" x2="{RIGHT}" y2="{middle}" stroke="{colour}" stroke-width="2"/>',
-        f'<circle cx="{LEFT}" cy="{middle}" r="3" fill="{colour}"/><circle cx="{RIGHT}" cy="{middle}" r="3" fill="{colour}"/>',
+        *(f'<circle cx="{x}" cy="{middle}" r="3" fill="{colour}"/>' for x in (LEFT, RIGHT)),
         _text((LEFT + RIGHT) / 2, middle - 3, signal.name, f'fill="{colour}" font-size="11"', "middle"),
         _text(RIGHT + 10, y, terminal),
     ]

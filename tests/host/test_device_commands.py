@@ -14,10 +14,13 @@ from typer.testing import CliRunner
 from host.cli.check_device import check_device
 from host.cli.flash import flash
 from host.commissioning import firmware_flash as flash_module
+from host.commissioning.board_inputs import input_lines, input_problems
 from host.commissioning.firmware_flash import avrdude_command, built
+from host.commissioning.wiring_drawing import drawings
 from protocol.board_pins import definitions
 from protocol.errors import InputError
-from protocol.rig_file import load_rig, parse_rig, problems_of, read_rig_data
+from protocol.rig_file import Pins, load_rig, parse_rig, problems_of, read_rig_data
+from protocol.serial_frames import InputBit
 from sim.board import BUILD_DIR
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S, until
@@ -61,6 +64,34 @@ def real_problems(report: Any) -> list[str]:
 def test_the_simulated_board_is_brought_up_and_read(ports: dict[str, Any]) -> None:
     report = told_of_a_good_one("board", "--port", ports["board"])
     assert report["figures"]["timer_hz"] == 20000 and report["figures"]["status_hz"] > 0
+
+
+def test_every_input_of_the_board_is_named_with_what_it_means(ports: dict[str, Any]) -> None:
+    figures = told_of_a_good_one("board", "--port", ports["board"])["figures"]
+    assert figures["limit insertion min"] == "D49: not hit (contact closed); at rest: not hit (contact closed)"
+    assert figures["estop"].startswith("D43: ") and len([name for name in figures if name.startswith("limit ")]) == 6
+
+
+def test_inputs_are_read_by_the_polarity_in_the_rig_file() -> None:
+    usual = Pins.model_validate({})
+    assert input_problems(usual, 0) == [] and input_problems(usual, 1 << InputBit.LIMIT_1_MIN) == []
+    (problem,) = input_problems(usual, 1 << InputBit.ESTOP)
+    assert problem == "the emergency stop (D43) is open: pressed, or its wire is broken"
+    (problem,) = input_problems(usual, 0b1100)
+    assert problem.startswith("both ends of roll (D47 and D46) are hit") and "connect D47 and D46 to GND" in problem
+    mixed = Pins.model_validate({"normally_open": ["estop", "knob_max"]})
+    (estop,) = (line for line in input_lines(mixed, 1 << InputBit.ESTOP) if line.name == "estop")
+    assert str(estop) == "D43: HIT (contact closed); at rest: not hit (contact open)"
+    uno = Pins.model_validate({"mcu": "atmega328p"})
+    assert [line.name for line in input_lines(uno, 0)] == ["limits insertion", "limits roll", "limits knob", "estop"]
+    assert [line.hit for line in input_lines(uno, 0b100)] == [False, True, False, False]
+
+
+@pytest.mark.parametrize("name", drawings())
+def test_the_drawings_in_the_documents_are_those_of_the_pin_table(name: str) -> None:
+    drawn = Path(__file__).parents[2] / "docs" / "pictures" / name
+    wanted = "the output of `python -m host.commissioning.wiring_drawing`"
+    assert drawn.read_text(encoding="utf-8") == drawings()[name], f"{name}: wanted {wanted}"
 
 
 def test_the_simulated_tracker_is_brought_up_and_read(ports: dict[str, Any]) -> None:
