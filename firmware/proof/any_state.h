@@ -58,10 +58,13 @@ static void any_gate(void) {
         axis_limits_t *axis = &gate.axis[i];
         axis->configured = ANY_BOOL();
         ANY(axis->speed_q16);
+        ANY(axis->mean_q16);
+        proposal.end[i] = gate.planned[i] = Frama_C_long_interval(-PLANNED_FARTHEST, PLANNED_FARTHEST);
+        proposal.ahead_q16[i] = (uint32_t)Frama_C_unsigned_long_interval(0, AHEAD_MOST);
         axis->soft_min = Frama_C_long_interval(-TRAVEL_MAX, TRAVEL_MAX);
         axis->soft_max = Frama_C_long_interval(-TRAVEL_MAX, TRAVEL_MAX);
         gate.planned[i] = Frama_C_long_interval(-PLANNED_FARTHEST, PLANNED_FARTHEST);
-        gate.speed_q15[i] = (int16_t)Frama_C_interval(-32767, 32767);
+        proposal.speed_q15[i] = gate.speed_q15[i] = (int16_t)Frama_C_interval(-32767, 32767);
         gate.ahead_q16[i] = (uint32_t)Frama_C_unsigned_long_interval(0, AHEAD_MOST);
     }
     ANY(gate.counted_tick);

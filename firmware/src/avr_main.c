@@ -42,7 +42,7 @@
 #define OPEN_LINES BOARD_NORMALLY_OPEN
 #endif
 
-static uint8_t outputs; /* what the next tick puts on the pins */
+static uint8_t outputs; /* what the next tick puts on the outputs' port */
 static uint8_t reset_flags __attribute__((section(".noinit")));
 
 /* Before main: the watchdog that reset us is still on, with its shortest time. */
@@ -78,8 +78,9 @@ static void start_pins(void) {
     DDR_OF(OUTPUTS) = (uint8_t)(BOARD_OUTPUT_MASK << OUTPUT_SHIFT);
 }
 
-static inline void write_outputs(uint8_t lines) {
-    PORT_OF(OUTPUTS) = (uint8_t)(((lines ^ ENABLE_INVERT) & BOARD_OUTPUT_MASK) << OUTPUT_SHIFT);
+/* The value of the outputs' port. */
+static inline uint8_t port_value(uint8_t lines) {
+    return (uint8_t)((uint8_t)((lines ^ ENABLE_INVERT) & BOARD_OUTPUT_MASK) << OUTPUT_SHIFT);
 }
 
 #if ENABLE_BESIDE
@@ -119,6 +120,7 @@ void firmware_setup(void) {
     boot_t facts = {.boot_count = count_boot(), .reset_cause = reset_cause(), .mcu = BOARD_MCU};
     wiring_t wiring = {.shared_limits = BOARD(SHARED_LIMITS), .keep_enabled = BOARD_KEEP_ENABLED};
     controller_start(&facts, &wiring, encoder_lines());
+    outputs = port_value(0);
     start_uart();
     start_timer();
     set_sleep_mode(SLEEP_MODE_IDLE);
@@ -148,15 +150,15 @@ void port_start_transmitter(void) { UCSR0B |= _BV(UDRIE0); }
 
 /* Steps leave first, so that their edges do not depend on the work that follows; they end with it, 8 us or later. */
 ISR(TIMER1_COMPA_vect) {
-    write_outputs(outputs);
+    PORT_OF(OUTPUTS) = outputs;
+    uint8_t lines = controller_tick(encoder_lines());
+    outputs = port_value(lines);
+    PORT_OF(OUTPUTS) = outputs & (uint8_t)~(OUTPUT_STEP_MASK << OUTPUT_SHIFT);
 #if ENABLE_BESIDE
-    uint8_t before = outputs;
-    outputs = controller_tick(encoder_lines());
-    if ((outputs ^ before) & OUTPUT_ENABLE) write_enable_beside(outputs);
-#else
-    outputs = controller_tick(encoder_lines());
+    static uint8_t written;
+    if ((lines ^ written) & OUTPUT_ENABLE) write_enable_beside(lines);
+    written = lines;
 #endif
-    write_outputs(outputs & (uint8_t)~OUTPUT_STEP_MASK);
 }
 
 ISR(USART0_RX_vect) {

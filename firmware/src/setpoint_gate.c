@@ -27,6 +27,8 @@ typedef struct {
     uint32_t ahead_q16[AXIS_COUNT]; /* and account of the speed */
 } plan_t;
 
+static plan_t proposal; /* not on the stack: its address is known to the compiler */
+
 void gate_start(void) { gate = (gate_t){0}; }
 
 bool gate_configured(void) {
@@ -49,6 +51,9 @@ uint8_t gate_configure(const frame_configure_t *limits) {
     if (ramp_q16 > 0xFFFF) ramp_q16 = 0xFFFF;
     axis_limits_t *axis = &gate.axis[limits->axis];
     axis->speed_q16 = (uint16_t)speed_q16;
+    /* Of many set-points: 1/64 more. A board's resonator is off by up to 0.5 %, and speed_q16 was rounded down. */
+    uint32_t mean_q16 = speed_q16 + (speed_q16 >> 6) + 1;
+    axis->mean_q16 = mean_q16 > 0xFFFF ? 0xFFFF : (uint16_t)mean_q16;
     axis->soft_min = soft_min;
     axis->soft_max = soft_max;
     axis->configured = true;
@@ -65,30 +70,27 @@ void gate_rename_position(uint8_t axis, int32_t steps) {
 
 static inline uint16_t at_most(uint32_t value, uint16_t most) { return value < most ? (uint16_t)value : most; }
 
-/* The account of an axis after so many steps in so many ticks, each at most MOST_COUNTED. The limit is 1/64 more than
- * configured: the resonator of a board is off by up to 0.5 %, and the limit was rounded down to 1/65536 step a tick. */
-static uint32_t account(uint32_t ahead_q16, uint16_t speed_q16, uint16_t steps, uint16_t ticks) {
-    uint32_t allowed_q16 = ((uint32_t)speed_q16 + 1) * ticks;
+/* The account of an axis after so many steps in so many ticks, each at most MOST_COUNTED. */
+static inline uint32_t account(uint32_t ahead_q16, uint16_t mean_q16, uint16_t steps, uint16_t ticks) {
+    uint32_t allowed_q16 = (uint32_t)mean_q16 * ticks;
     uint32_t used_q16 = ahead_q16 + ((uint32_t)steps << 16);
-    allowed_q16 += allowed_q16 >> 6;
     return used_q16 > allowed_q16 ? used_q16 - allowed_q16 : 0;
 }
 
 /* At rest the plan starts from where the axes are: a ramp may have moved them since the last account. */
-static void plan_from(const int32_t position[AXIS_COUNT], uint16_t tick) {
-    uint16_t ticks = at_most((uint16_t)(tick - gate.counted_tick), MOST_COUNTED);
-    gate.counted_tick = tick;
+static void plan_from(const plan_t *rest) {
+    uint16_t ticks = at_most((uint16_t)(rest->tick - gate.counted_tick), MOST_COUNTED);
+    gate.counted_tick = rest->tick;
     for (uint8_t i = 0; i < AXIS_COUNT; i++) {
-        int32_t moved = position[i] - gate.planned[i];
+        int32_t moved = rest->end[i] - gate.planned[i];
         uint16_t steps = at_most((uint32_t)(moved < 0 ? -moved : moved), MOST_COUNTED);
-        uint32_t ahead_q16 = account(gate.ahead_q16[i], gate.axis[i].speed_q16, steps, ticks);
+        uint32_t ahead_q16 = account(gate.ahead_q16[i], gate.axis[i].mean_q16, steps, ticks);
         gate.ahead_q16[i] = ahead_q16 < STEP_Q16 ? ahead_q16 : STEP_Q16;
-        gate.planned[i] = position[i];
+        gate.planned[i] = rest->end[i];
     }
 }
 
 static void snapshot(plan_t *plan) {
-    int32_t position[AXIS_COUNT] = {0};
     port_lock_t lock = port_lock();
     plan->time_us = clock_locked_us();
     plan->tick = motion.tick;
@@ -100,12 +102,12 @@ static void snapshot(plan_t *plan) {
     if (plan->at_rest) {
         plan->end_tick = motion.tick;
         for (uint8_t axis = 0; axis < AXIS_COUNT; axis++) {
-            position[axis] = motion_position(axis);
+            plan->end[axis] = motion_position(axis);
             gate.speed_q15[axis] = motion_ramp_speed_q15(axis);
         }
     }
     port_unlock(lock);
-    if (plan->at_rest) plan_from(position, plan->tick);
+    if (plan->at_rest) plan_from(plan);
 }
 
 /* us / TICK_US without a division, exact up to HORIZON_US. */
@@ -163,9 +165,8 @@ static uint8_t check_axes(const frame_setpoint_t *setpoint, plan_t *plan, segmen
         if (towards_open_switch(delta, plan->inputs, i)) return REJECT_LIMIT_SWITCH;
         uint32_t distance = (uint32_t)(delta < 0 ? -delta : delta);
         if (distance > ticks) return REJECT_SPEED; /* an axis makes at most one step a tick */
-        uint16_t speed_q16 = gate.axis[i].speed_q16;
-        uint32_t ahead_q16 = account(gate.ahead_q16[i], speed_q16, (uint16_t)distance, ticks);
-        if (ahead_q16 > STEP_Q16 + speed_q16) return REJECT_SPEED;
+        uint32_t ahead_q16 = account(gate.ahead_q16[i], gate.axis[i].mean_q16, (uint16_t)distance, ticks);
+        if (ahead_q16 > STEP_Q16 + gate.axis[i].speed_q16) return REJECT_SPEED;
         plan->ahead_q16[i] = ahead_q16;
         uint16_t rate_q16 = distance >= ticks ? 0xFFFF : (uint16_t)((uint16_t)distance * per_step_q16);
         segment->rate_q16[i] = follow_speed(i, delta, rate_q16, ticks, &plan->speed_q15[i]);
@@ -200,17 +201,17 @@ static void remember(uint16_t number, const plan_t *plan) {
 }
 
 static uint8_t judge(const frame_setpoint_t *setpoint) {
-    plan_t plan = {.ticks = LATE_TICKS};
+    proposal.ticks = LATE_TICKS;
     segment_t *segment = motion_free_slot();
-    snapshot(&plan);
-    if (plan.state != STATE_ARMED && plan.state != STATE_RUNNING) return REJECT_STATE;
+    snapshot(&proposal);
+    if (proposal.state != STATE_ARMED && proposal.state != STATE_RUNNING) return REJECT_STATE;
     if (gate.have_number && (int16_t)(setpoint->number - gate.last_number) <= 0) return REJECT_ORDER;
-    if (plan.waiting >= QUEUE_CAPACITY) return REJECT_OVERFLOW;
-    uint8_t reject = check_time(setpoint, &plan);
-    segment->end_tick = (uint16_t)(plan.end_tick + plan.ticks);
-    if (!reject) reject = check_axes(setpoint, &plan, segment);
+    if (proposal.waiting >= QUEUE_CAPACITY) return REJECT_OVERFLOW;
+    uint8_t reject = check_time(setpoint, &proposal);
+    segment->end_tick = (uint16_t)(proposal.end_tick + proposal.ticks);
+    if (!reject) reject = check_axes(setpoint, &proposal, segment);
     if (!reject) reject = commit();
-    if (!reject) remember(setpoint->number, &plan);
+    if (!reject) remember(setpoint->number, &proposal);
     return reject;
 }
 

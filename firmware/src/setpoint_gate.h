@@ -12,6 +12,7 @@
 typedef struct {
     bool configured;
     uint16_t speed_q16; /* steps per tick */
+    uint16_t mean_q16;  /* the same, of many set-points */
     int32_t soft_min, soft_max;
 } axis_limits_t;
 

@@ -30,8 +30,9 @@ static uint8_t offer(unsigned ticks, int32_t position) {
 
 /* Steps that `speed`, and 1/64 more, makes in the ticks, one tick and one step more, and never more than one a tick. */
 static int32_t farthest(uint32_t speed, unsigned ticks) {
-    uint64_t speed_q16 = (speed << 16) / TIMER_HZ, allowed_q16 = (speed_q16 + 1) * ticks;
-    int32_t steps = (int32_t)((allowed_q16 + (allowed_q16 >> 6) + speed_q16) >> 16) + 1;
+    uint64_t speed_q16 = (speed << 16) / TIMER_HZ, mean_q16 = speed_q16 + speed_q16 / 64 + 1;
+    uint64_t allowed_q16 = (mean_q16 > 0xFFFF ? 0xFFFF : mean_q16) * ticks;
+    int32_t steps = (int32_t)((allowed_q16 + speed_q16) >> 16) + 1;
     return steps < (int32_t)ticks ? steps : (int32_t)ticks;
 }
 
@@ -49,7 +50,8 @@ static void every_speed(void) {
     static const unsigned TICKS[] = {10, 11, 20, 127, 128, 240};
     for (uint32_t speed = 1; speed < TIMER_HZ; speed++) {
         if (speed % 2000 == 1) prepare(speed, -1000, 1000);
-        gate.axis[0].speed_q16 = (uint16_t)((speed << 16) / TIMER_HZ);
+        frame_configure_t limits = {0, speed, speed * 40 < 1000 ? 1000 : speed * 40, -1000, 1000};
+        CHECK_EQUAL(gate_configure(&limits), RESULT_OK);
         for (unsigned i = 0; i < sizeof TICKS / sizeof TICKS[0]; i++) check_speed(speed, TICKS[i]);
     }
 }
