@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from protocol.board_pins import SWITCHES
+from protocol.enums import BoardState
 from protocol.rig_file import Pins
-from protocol.serial_frames import Fault, InputBit, State
+from protocol.serial_frames import Fault, InputBit
 from sim.board import BUILD_DIR, Board
 from tests.sim.board_rig import BoardRig
 
@@ -23,7 +24,7 @@ def trip(rig: BoardRig) -> None:
     """Press the emergency stop of an armed board and wait for the fault."""
     rig.inputs["estop"] = True
     rig.run_ms(60)
-    assert (rig.status.state, rig.status.fault) == (State.FAULT, Fault.ESTOP)
+    assert (rig.status.state, rig.status.fault) == (BoardState.FAULT, Fault.ESTOP)
 
 
 POLARITIES = [
@@ -50,7 +51,7 @@ def test_the_drives_are_powered_from_arm_to_rest_only(kind: str, pins: dict[str,
     rig.arm()
     assert rig.last.enabled
     rig.run_ms(10, rig.link.disarm())
-    assert rig.status.state == State.DISARMED and not rig.last.enabled
+    assert rig.status.state == BoardState.DISARMED and not rig.last.enabled
     rig.arm()
     trip(rig)
     assert not rig.last.enabled and rig.last.enable_changes == 4
@@ -86,7 +87,7 @@ def test_a_vertical_axis_stays_powered_on_a_fault_until_it_is_disarmed(mcu: str)
     rig.inputs["estop"] = False
     rig.run_ms(5)
     rig.run_ms(5, rig.link.clear_fault(Fault.ESTOP))
-    assert rig.status.state == State.DISARMED and rig.last.enabled
+    assert rig.status.state == BoardState.DISARMED and rig.last.enabled
     rig.run_ms(5, rig.link.disarm())
     assert not rig.last.enabled
     rig.close()
