@@ -115,6 +115,11 @@ soak: setup
 format-check: $(VENV)/.ready
 	@$(BIN)/ruff format --check .
 
+# Wheel, empty environment, examples of docs/api.md. Downloads the dependencies.
+.PHONY: wheel-test
+wheel-test: $(VENV)/.ready
+	@$(BIN)/python -m tests.seldinger.wheel_check
+
 lint: $(VENV)/.ready
 	@$(BIN)/ruff check .
 

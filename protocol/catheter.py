@@ -55,7 +55,7 @@ class ConstitutiveParameters:
 
 @dataclass(frozen=True)
 class Catheter:
-    """One catheter type. A parameter group is None where it was not identified."""
+    """One type of catheter. A group of parameters is None where it has not been identified."""
 
     name: str
     distal_length_m: float
@@ -101,10 +101,24 @@ def shipped_catheters() -> list[str]:
 
 
 def load_catheter(name_or_path: str | Path) -> Catheter:
-    """The catheter of a shipped name, or of a TOML file.
+    """Read a catheter's parameters.
 
-    Arguments: `name_or_path`, a name of `shipped_catheters()` or a path that ends in .toml.
-    Raises: InputError for an unknown name, an unreadable file, an unknown or missing key, a value out of its range.
+    Parameters:
+        name_or_path: the name of a catheter that ships (livewire, steerocath_t, thermocool_sf, blazer_prime_xp), or the
+            path of a .toml file. Lengths in m, stiffness in N m2.
+
+    Returns:
+        Catheter: `distal_length_m`, `diameter_m`, `pull_wire_offset_m`, and the parameters of the models: `pcar`,
+        `cosserat`, `constitutive`, each None where they have not been identified.
+
+    Raises:
+        InputError: an unknown name, an unreadable file, an unknown or missing key, or a value out of its range; names it.
+
+    Source:
+        Thesis, Tables 2.1 and 3.2, for the catheters that ship; each file says where its values come from.
+
+    Examples:
+        >>> load_catheter("livewire").distal_length_m  # doctest: +SKIP
     """
     text = str(name_or_path)
     shipped = shipped_catheters()

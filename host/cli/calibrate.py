@@ -33,19 +33,15 @@ def calibrate(
     [{"offset_m": 0.0, "position_m": [0.1145, -0.0283]}, ...]}, ...]}, offset_m back from the tip, SI; or a CSV of one row a
     marker headed recording,insertion_m,curvature_per_m,force_x_N,force_y_N,offset_m,x_m,y_m (spatial: and force_z_N, z_m).
     """
-    from host.identification.catheter_calibration import (
-        CalibrationRequest,
-        calibrate_catheter,
-        calibrated_toml,
-        calibration_report,
-    )
+    from host.identification.catheter_calibration import calibrate as run
+    from host.identification.catheter_calibration import calibrated_toml, calibration_report
 
     if out is not None:
         if out.suffix != ".toml":
             raise InputError("out", str(out), "a .toml file in a folder that exists")
         writable_file("out", out)
     groups = tuple(part.strip() for part in fit.split(",") if part.strip())
-    found = calibrate_catheter(CalibrationRequest(shapes, catheter, model, groups, loss, method, leave_one_out))
+    found = run(shapes, catheter, model=model, fit=groups, loss=loss, method=method, leave_one_out=leave_one_out)
     report = calibration_report(found)
     if out is not None:
         out.write_text(calibrated_toml(found, name or out.stem), encoding="utf-8")
@@ -58,7 +54,7 @@ def calibrate(
 
 def _print_for_people(report: dict[str, Any]) -> None:
     for name, p in report["parameters"].items():
-        note = "" if p["told"] else "   not determined by the data"
+        note = "" if p["determined"] else "   not determined by the data"
         print(f"{name:>14} = {p['value']:.6g} {p['unit']}   95 %: {p['ci95'][0]:.6g} to {p['ci95'][1]:.6g}{note}")
     print(
         f"markers: rms {report['rms_m'] * 1e3:.3f} mm, largest {report['max_m'] * 1e3:.3f} mm, "
@@ -69,7 +65,7 @@ def _print_for_people(report: dict[str, Any]) -> None:
             f"{search['method']:>14}: objective {search['objective']:.6f}, {search['evaluations']} evaluations, "
             f"{search['seconds'] * 1e3:.0f} ms{'' if search['converged'] else ', not converged'}"
         )
-    for direction in report["identifiability"]["untold"]:
+    for direction in report["identifiability"]["undetermined"]:
         mix = ", ".join(f"{weight:+.2f} {name}" for name, weight in direction["combination"].items())
         print(f"not determined by the data: {mix} (relative standard deviation {direction['relative_std']:.2g})")
     if report["leave_one_out"]:

@@ -1,6 +1,6 @@
 """Stiffness tracked during a run (8.1.2) from the catheter's own free moments, with a detector of sudden change.
 
-A tip pose in contact depends on force and stiffness only through their quotient, so contact cannot tell them apart.
+A tip pose in contact depends on force and stiffness only through their quotient, so poses in contact do not determine both.
 Out of contact the shaft is a circular arc whatever its stiffness, and its curvature is tension times offset over EI: each
 free pose compares the curvature that the actuation should give with the one that is there. In contact the stiffness
 is held, so the force estimate is never pushed by the adaptation.
@@ -32,10 +32,10 @@ class AdaptationConfig:
     first_std: float = 0.05  # of log stiffness before anything was seen
     actuation_std: float = 0.01  # relative, of the curvature that the actuation should give
     curvature_exponent: float = 1.0  # curvature ~ stiffness^-exponent: 1 for a given tension, less for a given wire
-    least_curvature_per_m: float = 5.0  # a straighter shaft tells nothing
+    least_curvature_per_m: float = 5.0  # a straighter shaft does not determine the stiffness
     free_chi_square: float = 13.8  # of two degrees of freedom: one free pose in a thousand is taken for contact
     memory_samples: float = 20.0  # of the mean residual that finds a light, lasting contact
-    settle_samples: int = 10  # free poses in a row before they are believed
+    settle_samples: int = 10  # free poses in a row before they are used
     confirm_samples: int = 5  # a free pose counts only when so many after it are free as well
     largest_innovation: float = 3.0  # in standard deviations: what is further out counts as this
     change_drift: float = 0.5  # of the two-sided cumulative sum, in standard deviations
@@ -101,7 +101,8 @@ class StiffnessTracker:
 
     def _free_curvature(self, insertion_m: float, start: float, pose: Array) -> tuple[float, float, Array]:
         """Curvature of the unloaded arc nearest to the pose, its standard deviation, and the whitened residual across
-        it (2,), standard normal when free."""
+        it (2,), standard normal when free.
+        """
         curvature = start
         for _ in range(FIT_STEPS):
             arcs = arcs_of(self._catheter, insertion_m, curvature)

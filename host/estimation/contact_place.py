@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from host.estimation.sensor_noise import (
     checked_quaternion,
     chi_square_limit,
 )
-from host.estimation.spatial import GATE, LARGEST_FORCE_N, ODD_DEVIATIONS, WEAK_STD_N, ForceEstimate
+from host.estimation.spatial import GATE, LARGEST_FORCE_N, ODD_DEVIATIONS, WEAK_STD_N
 from host.estimation.spatial_residuals import section_tangents
 from host.mechanics import sections
 from host.mechanics.rod import finite, rod_record
@@ -32,6 +33,21 @@ MOST_ITERATIONS = 40
 Model = Callable[[Array], tuple[Array, Array]]
 
 
+@dataclass(frozen=True)
+class ContactEstimate:
+    """A force somewhere along the catheter, and where it acts."""
+
+    force_N: Array  # (3,) tip frame
+    covariance_N2: Array  # (3, 3)
+    converged: bool
+    residual: float  # dimensionless, as in `SpatialEstimate`
+    chi_square: float
+    degrees_of_freedom: int
+    warnings: tuple[str, ...]
+    contact_offset_m: float  # where the force acts, back from the tip
+    contact_offset_std_m: float
+
+
 def estimate_contact(
     catheter: Catheter,
     insertion_m: float,
@@ -39,7 +55,7 @@ def estimate_contact(
     sensors: Sequence[PoseSensor],
     *,
     largest_force_N: float = LARGEST_FORCE_N,
-) -> ForceEstimate:
+) -> ContactEstimate:
     """One force anywhere on the exposed catheter, from the absolute poses of two or more sensors (three to be sure).
 
     Arguments: insertion_m, curvature_per_m as in `solve_cosserat`; sensors, poses in the base frame of zero roll.
@@ -171,14 +187,14 @@ def _descend(model: Model, start: Array, free: int, longest: float, largest: flo
 
 def _report(
     model: Model, x: Array, cost: float, rod: Array, length: float, offsets: Array, positions: Array, quaternions: Array
-) -> ForceEstimate:
+) -> ContactEstimate:
     _, A = model(x)
     information = A.T @ A + np.diag([1e-2, 1e-2, 1e-2, 1.0 / (rod[6] + rod[7]) ** 2])
     joint = np.linalg.inv(information)
     _, bend = beyond_contact(rod, float(x[3]), 0.0)
     T = rotation_matrix(bend).T
     covariance = (T @ joint[:3, :3] @ T.T).astype(np.float64)
-    values, directions = np.linalg.eigh(covariance)
+    values = np.linalg.eigvalsh(covariance)
     freedom = max(6 * len(offsets) - 4, 0)
     converged = bool(cost <= GATE**2 * 6 * len(offsets) and np.all(np.isfinite(x)))
     z, _ = _residual(rod, offsets, positions, quaternions, x)
@@ -193,19 +209,4 @@ def _report(
     if weakest > WEAK_STD_N:
         notes.append(f"weakly observed: one component of the force is only known to +-{weakest:.2g} N")
     force = T @ x[:3]
-    return ForceEstimate(
-        force,
-        "tip",
-        covariance,
-        converged,
-        residual,
-        MOST_ITERATIONS,
-        cost,
-        freedom,
-        tuple(notes),
-        directions[:, -1],
-        weakest,
-        force[None, :].copy(),
-        float(x[3]),
-        place_std,
-    )
+    return ContactEstimate(force, covariance, converged, residual, cost, freedom, tuple(notes), float(x[3]), place_std)

@@ -27,7 +27,7 @@ class Actuation(NamedTuple):
     stamp_ns: int
 
 
-class ForceEstimate(NamedTuple):
+class TipForce(NamedTuple):
     """force_N (3,) of the tip on the tissue and covariance_N2 (3, 3), base frame; stamp_ns is the pose's.
 
     A pose that no force explains is not an error: `converged` is false, and `residual` says how far off it is.
@@ -43,6 +43,6 @@ class ForceEstimate(NamedTuple):
 class Estimator(Protocol):
     """Called once for each tip pose; may keep the branch it is on between calls, nothing else."""
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force that explains `pose_tip` (and `pose_shaft`, where it was seen) at that actuation."""
         ...

@@ -6,9 +6,7 @@ is the maximum-likelihood one, weighted by the sensor's covariance; `two_stage` 
 
 from __future__ import annotations
 
-import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,15 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from host.estimation import planar_kernels as kernels
-from host.mechanics.pcar import NO_DRAG, Arcs, arcs_of
-from host.mechanics.pcar_kernels import ROWS
+from host.estimation.sensor_noise import SurfacePrior
+from host.mechanics.pcar import Arcs, arcs_of
+from host.mechanics.pcar_kernels import ROWS, Shaft
+from host.mechanics.rod import column
+from host.mechanics.threads import in_threads
 from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
 POSITION_STD_m, ANGLE_STD_rad = 0.29e-3, math.radians(0.2)  # Aurora's precision, per axis
 CONVERGED_CHI_SQUARE = 36.0  # six standard deviations of the one direction that no force explains
 WEAK_STD_N = 0.02  # beyond this a direction of the force is called weakly observed
+CASES_PER_THREAD = 16  # fewer are done before a thread has started
 UNSEEN_STD_N = 10.0  # stands for "not observed at all" in a covariance
 
 
@@ -38,19 +41,8 @@ DEFAULT_WEIGHT = np.diag(1.0 / np.diag(DEFAULT_COVARIANCE))
 
 
 @dataclass(frozen=True)
-class SurfacePrior:
-    """A frictionless-like surface: the force is along its normal but for a tangential part of that standard deviation.
-
-    normal: (2,), base frame, either sense; tangential_std_N: how far the force may lean off it.
-    """
-
-    normal: ArrayLike
-    tangential_std_N: float
-
-
-@dataclass(frozen=True)
 class PlanarEstimate:
-    """Force on the tip, how sure, and whether to believe it."""
+    """Force on the tip in the base frame, its covariance, and whether a force explains the pose."""
 
     force_N: Array  # (2,) base frame
     covariance_N2: Array  # (2, 2)
@@ -70,9 +62,9 @@ def _prior_vector(prior: SurfacePrior | None) -> Array:
     normal = np.asarray(prior.normal, dtype=float)
     size = float(np.hypot(*normal)) if normal.shape == (2,) else 0.0
     if not (math.isfinite(size) and size > 0.0):
-        raise ValueError(f"normal: found {prior.normal!r}, wanted two finite numbers, not both zero")
+        raise InputError("prior.normal", str(prior.normal), "two finite numbers, not both zero")
     if not prior.tangential_std_N > 0.0:
-        raise ValueError(f"tangential_std_N: found {prior.tangential_std_N}, wanted a positive force")
+        raise InputError("prior.tangential_std_N", prior.tangential_std_N, "a positive force in N")
     tangent = np.array([-normal[1], normal[0]]) / size
     information = np.outer(tangent, tangent) / prior.tangential_std_N**2
     return np.array([0.0, 0.0, information[0, 0], information[0, 1], information[1, 1]])
@@ -83,9 +75,9 @@ def _checked_covariance(covariance: ArrayLike | None) -> tuple[Array, Array]:
         return DEFAULT_COVARIANCE, DEFAULT_WEIGHT
     matrix = np.ascontiguousarray(covariance, dtype=float)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
-        raise ValueError("covariance: wanted a symmetric 3 x 3 matrix of finite numbers")
+        raise InputError("covariance", str(covariance), "a symmetric 3 x 3 matrix of finite numbers")
     if not np.linalg.eigvalsh(matrix).min() > 0.0:
-        raise ValueError("covariance: found an eigenvalue that is not positive, wanted a positive definite matrix")
+        raise InputError("covariance", str(covariance), "a positive definite matrix")
     return matrix, np.linalg.inv(matrix)
 
 
@@ -113,25 +105,24 @@ def estimate(
     Arguments: `arcs` outside the sheath; `pose` (3,) x (m), y (m), angle (rad); `covariance` (3, 3) of the pose, by
     default that of the tracker's data sheet; `previous`, a warm start (the last estimate of a stream), from which the
     branch is continued; `thorough`: try every start even where the first explains the pose.
-    Result: `PlanarEstimate`. Raises: ValueError. Source: chapter 4, with covariance and weights added.
+    Result: `PlanarEstimate`. Raises: InputError. Source: chapter 4, with covariance and weights added.
     """
     measured = np.ascontiguousarray(pose, dtype=float)
     if measured.shape != (3,) or not np.isfinite(measured).all():
-        raise ValueError(f"pose: found {pose!r}, wanted three finite numbers: x (m), y (m), angle (rad)")
+        raise InputError("pose", str(pose), "three finite numbers: x (m), y (m), angle (rad)")
     matrix, weight = _checked_covariance(covariance)
     prior_vector = _prior_vector(prior)
     work, row = np.empty((ROWS, arcs.length_m.size)), np.empty(kernels.COLUMNS)
-    model = (arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m, NO_DRAG)
+    pose_measured = kernels.Measurement(measured, matrix, weight, prior_vector)
     if previous is not None and previous.curvature_per_m.size == arcs.length_m.size:
         kappa = previous.curvature_per_m.copy()
-        kernels.likelihood(
-            *model, measured, weight, prior_vector, kappa, previous.force_N[0], previous.force_N[1], work, row
-        )
+        start = (float(previous.force_N[0]), float(previous.force_N[1]))
+        kernels.likelihood(arcs.shaft, pose_measured, start, kappa, work, row)
         if row[kernels.ENDED] == 1.0 and row[kernels.CHI_SQUARE] < CONVERGED_CHI_SQUARE:
             return _result(arcs, kappa, row)
     kappa = np.empty(arcs.length_m.size)
     enough = 0.0 if thorough else kernels.SECOND_START_CHI_SQUARE
-    kernels.estimate_cold(*model, measured, matrix, weight, prior_vector, enough, kappa, work, row)
+    kernels.estimate_cold(arcs.shaft, pose_measured, enough, kappa, work, row)
     return _result(arcs, kappa, row)
 
 
@@ -179,7 +170,7 @@ class PlanarTracker:
         self._previous: PlanarEstimate | None = None
 
     def update(self, insertion_m: float, curvature_per_m: float, pose: ArrayLike) -> PlanarEstimate:
-        """The force at the next sample. Arguments as in `arcs_of` and `estimate`. Raises: ValueError."""
+        """The force at the next sample. Arguments as in `arcs_of` and `estimate`. Raises: InputError."""
         arcs = arcs_of(self._catheter, insertion_m, curvature_per_m, self._longest_arc_m)
         found = estimate(arcs, pose, self._covariance, self._prior, self._previous)
         self._previous = found if found.converged else None
@@ -201,54 +192,41 @@ def estimate_recording(
     curvature_per_m: ArrayLike,
     pose: ArrayLike,
     covariance: ArrayLike | None = None,
-    threads: int = 2,
+    workers: int | None = None,
 ) -> RecordingEstimate:
     """Independent-batch mode: every sample from its own unloaded shape, in parallel.
 
     Arguments: `insertion_m`, `curvature_per_m` (N,) or scalar; `pose` (N, 3) x, y, angle; `covariance` (3, 3) of each
-    pose; `threads` that share the samples. A pose with NaN gives a sample that is not converged. Raises: ValueError.
+    pose; `workers`, threads that share the samples, by default one for each core. A pose with NaN gives a sample that is
+    not converged. Raises: InputError.
     """
     measured = np.ascontiguousarray(pose, dtype=float)
     if measured.ndim != 2 or measured.shape[1] != 3:
-        raise ValueError(f"pose: found shape {measured.shape}, wanted (N, 3)")
+        raise InputError("pose", f"shape {measured.shape}", "(N, 3)")
     matrix, weight = _checked_covariance(covariance)
     count = measured.shape[0]
-    insertion = np.broadcast_to(np.asarray(insertion_m, dtype=float), (count,))
-    curvature = np.broadcast_to(np.asarray(curvature_per_m, dtype=float), (count,))
-    if not (np.isfinite(insertion).all() and np.isfinite(curvature).all()):
-        raise ValueError("insertion_m, curvature_per_m: found NaN or infinity, wanted finite numbers")
+    insertion = column("insertion_m", insertion_m, count, "a finite length in m")
+    curvature = column("curvature_per_m", curvature_per_m, count, "a finite curvature in 1/m")
     template = arcs_of(catheter, 0.0, 0.0)
     length = _lengths(catheter, insertion)
     unloaded = np.where(template.distal, curvature[:, None], 0.0)
     kappa, rows = np.empty_like(length), np.empty((count, kernels.COLUMNS))
 
     def run(part: slice) -> None:
-        kernels.estimate_many(
-            length[part],
-            template.EI_N_m2,
-            template.cubic_stiffening_m2,
-            unloaded[part],
-            NO_DRAG,
-            measured[part],
-            matrix,
-            weight,
-            np.zeros((1, 5)),
-            kappa[part],
-            rows[part],
-        )
+        shafts = Shaft(length[part], template.EI_N_m2, template.cubic_stiffening_m2, unloaded[part])
+        poses = kernels.Measurement(measured[part], matrix, weight, np.zeros((1, 5)))
+        kernels.estimate_many(shafts, poses, kappa[part], rows[part])
 
-    edges = np.linspace(0, count, 8 * max(1, threads) + 1).astype(int)
-    parts = [slice(a, b) for a, b in itertools.pairwise(edges) if b > a]
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(pool.map(run, parts))
+    in_threads(run, count, workers, CASES_PER_THREAD)
     return _recording_result(rows, length.sum(axis=1))
 
 
 def _lengths(catheter: Catheter, insertion_m: Array) -> Array:
     if catheter.pcar is None:
-        raise ValueError(f"catheter: found {catheter.name} without planar parameters, wanted one with [pcar]")
+        raise InputError("catheter", catheter.name, "a catheter with a [pcar] table: its planar stiffness is not known")
     if not (insertion_m > -catheter.distal_length_m).all():
-        raise ValueError(f"insertion_m: found {insertion_m.min()}, wanted more than -{catheter.distal_length_m}, the shaft")
+        wanted = f"more than -{catheter.distal_length_m}, the length of the shaft"
+        raise InputError("insertion_m", float(insertion_m.min()), wanted)
     full = np.array(catheter.pcar.distal_arcs_m)
     before = np.concatenate([[0.0], np.cumsum(full)[:-1]])
     inside = np.maximum(0.0, -insertion_m)[:, None]
@@ -275,14 +253,6 @@ def two_stage(arcs: Arcs, pose: ArrayLike) -> tuple[Array, bool]:
     noise it differs from the maximum-likelihood estimate; kept for comparison.
     """
     work, kappa = np.empty((ROWS, arcs.length_m.size)), np.empty(arcs.length_m.size)
-    converged, fx, fy = kernels.two_stage(
-        arcs.length_m,
-        arcs.EI_N_m2,
-        arcs.cubic_stiffening_m2,
-        arcs.unloaded_curvature_per_m,
-        np.ascontiguousarray(pose, dtype=float),
-        tip_covariance(),
-        kappa,
-        work,
-    )
+    measured = np.ascontiguousarray(pose, dtype=float)
+    converged, fx, fy = kernels.two_stage(arcs.shaft, measured, tip_covariance(), kappa, work)
     return np.array([fx, fy]), bool(converged)

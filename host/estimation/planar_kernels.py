@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from host.mechanics import pcar_kernels as kernels
+from host.mechanics.pcar_kernels import Load, Shaft
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,15 @@ SECOND_START_CHI_SQUARE = 6.0  # of one degree of freedom
 SCAN_DIRECTIONS, SCAN_FORCES_N, SCAN_BEST = 12, (0.08, 0.25), 3
 
 
+class Measurement(NamedTuple):
+    """One measured pose of the tip, or N with a first axis of N in `pose` and `prior`."""
+
+    pose: Array  # (3,) x, y (m), angle (rad)
+    covariance: Array  # (3, 3) of the pose
+    weight: Array  # (3, 3), its inverse
+    prior: Array  # (5,): force (N), then its information xx, xy, yy (1/N^2); zeros for none
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, float]:
     """Solution of the symmetric positive 3 x 3 system (a: xx, xy, xz, yy, yz, zz) by Cholesky; NaN where singular."""
@@ -51,7 +62,7 @@ def solve3(a: Array, b0: float, b1: float, b2: float) -> tuple[float, float, flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def least_energy_curvatures(
-    length: Array, EI: Array, kappa0: Array, pose: Array, covariance: Array, tolerance: float, kappa: Array, work: Array
+    shaft: Shaft, pose: Array, covariance: Array, tolerance: float, kappa: Array, work: Array
 ) -> tuple[bool, int]:
     """Curvatures that reach the tip pose with the least bending energy, from the unloaded shape. Writes `kappa`.
 
@@ -59,13 +70,13 @@ def least_energy_curvatures(
     than three arcs cannot meet it. Result: converged, evaluations. Source: (4.3); with three arcs the energy has no
     say and this is Newton's method on (2.12)-(2.14).
     """
-    n = length.size
-    none = np.zeros((0, 2))
+    length, EI, kappa0 = shaft.length, shaft.EI, shaft.kappa0
+    n, free = length.size, Load(0.0, 0.0, np.zeros((0, 2)))
     normal = np.empty(6)
     for i in range(n):
         kappa[i] = kappa0[i]
     for count in range(1, CURVATURE_STEPS + 1):
-        x, y, angle = kernels.evaluate(length, kappa, 0.0, 0.0, none, 0.0, work)
+        x, y, angle = kernels.evaluate(length, kappa, free, 0.0, work)
         kernels.arms(work)
         e0, e1, e2 = pose[0] - x, pose[1] - y, pose[2] - angle
         normal[0], normal[1], normal[2] = covariance[0, 0], covariance[0, 1], covariance[0, 2]
@@ -103,14 +114,13 @@ def least_energy_curvatures(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def force_by_statics(
-    length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array
-) -> tuple[float, float]:
+def force_by_statics(shaft: Shaft, kappa: Array, work: Array) -> tuple[float, float]:
     """Force that best explains `kappa`, each arc's moment weighted by its compliance (least energy of the misfit).
 
     Result: Fx, Fy (N). Source: (4.4), linear least squares of (2.8).
     """
-    kernels.evaluate(length, kappa, 0.0, 0.0, np.zeros((0, 2)), 0.0, work)
+    length, EI, cubic, kappa0 = shaft.length, shaft.EI, shaft.cubic, shaft.kappa0
+    kernels.evaluate(length, kappa, Load(0.0, 0.0, np.zeros((0, 2))), 0.0, work)
     kernels.arms(work)
     xx = xy = yy = bx = by = 0.0
     for i in range(length.size):
@@ -132,37 +142,24 @@ def force_by_statics(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def two_stage(
-    length: Array, EI: Array, cubic: Array, kappa0: Array, pose: Array, covariance: Array, kappa: Array, work: Array
-) -> tuple[bool, float, float]:
+def two_stage(shaft: Shaft, pose: Array, covariance: Array, kappa: Array, work: Array) -> tuple[bool, float, float]:
     """The thesis' estimate: curvatures from the pose (4.3), then force from the curvatures (4.4).
 
     Result: converged, Fx, Fy (N); writes `kappa`.
     """
-    converged, _ = least_energy_curvatures(length, EI, kappa0, pose, covariance, EXACT_TOLERANCE_rad, kappa, work)
-    fx, fy = force_by_statics(length, EI, cubic, kappa0, kappa, work)
+    converged, _ = least_energy_curvatures(shaft, pose, covariance, EXACT_TOLERANCE_rad, kappa, work)
+    fx, fy = force_by_statics(shaft, kappa, work)
     return converged, fx, fy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sensitivities(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    kappa: Array,
-    fx: float,
-    fy: float,
-    drag: Array,
-    pose: Array,
-    work: Array,
-    out: Array,
-) -> None:
+def sensitivities(shaft: Shaft, external: Load, pose: Array, kappa: Array, work: Array, out: Array) -> None:
     """Linearization at (`kappa`, force), in equilibrium or not: `out` gets 6 of d(pose)/d(force) row by row, then the
     pose's error after the shape has been corrected to equilibrium (3). Leaves the steps in work[STEP, ARM_X, ARM_Y].
     """
-    x, y, angle = kernels.evaluate(length, kappa, fx, fy, drag, 1.0, work)
-    kernels.newton_step(length, EI, cubic, kappa0, kappa, work)
+    length = shaft.length
+    x, y, angle = kernels.evaluate(length, kappa, external, 1.0, work)
+    kernels.newton_step(shaft, kappa, work)
     kernels.arms(work)
     for i in range(length.size):
         j0, j1 = -work[kernels.ARM_Y, i], work[kernels.ARM_X, i]
@@ -188,8 +185,9 @@ def sensitivities(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: float, row: Array) -> tuple[float, float]:
-    """Information of the force into `row`, chi square too. Result: gradient. `prior`: force (2), information (3)."""
+def normal_equations(out: Array, measured: Measurement, fx: float, fy: float, row: Array) -> tuple[float, float]:
+    """Information of the force into `row`, chi square too. Result: gradient."""
+    weight, prior = measured.weight, measured.prior
     gx = gy = xx = xy = yy = chi = 0.0
     for k in range(3):
         wx = wy = we = 0.0
@@ -211,31 +209,19 @@ def normal_equations(out: Array, weight: Array, prior: Array, fx: float, fy: flo
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def likelihood(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    drag: Array,
-    pose: Array,
-    weight: Array,
-    prior: Array,
-    kappa: Array,
-    fx: float,
-    fy: float,
-    work: Array,
-    row: Array,
+    shaft: Shaft, measured: Measurement, start: tuple[float, float], kappa: Array, work: Array, row: Array
 ) -> None:
-    """Maximum-likelihood force from start (`kappa`, fx, fy): Gauss-Newton on shape and force together.
+    """Maximum-likelihood force from the start (`kappa` and the force `start`): Gauss-Newton on shape and force together.
 
-    Arguments: `weight` (3, 3), inverse covariance of the pose; `prior` (5,): force, then its information xx, xy, yy.
     Writes `kappa` and `row` (COLUMNS,).
     """
-    out = np.empty(9)
+    out, length, none = np.empty(9), shaft.length, np.zeros((0, 2))
+    fx, fy = start
     row[ENDED] = 0.0
     dx = dy = 0.0
     for count in range(1, LIKELIHOOD_STEPS + 1):
-        sensitivities(length, EI, cubic, kappa0, kappa, fx, fy, drag, pose, work, out)
-        gx, gy = normal_equations(out, weight, prior, fx, fy, row)
+        sensitivities(shaft, Load(fx, fy, none), measured.pose, kappa, work, out)
+        gx, gy = normal_equations(out, measured, fx, fy, row)
         # the floor belongs to a force of 1 kN: it only keeps a direction that the pose cannot see from dividing by 0
         xx, yy = row[INFO_XX] + 1e-6, row[INFO_YY] + 1e-6
         determinant = xx * yy - row[INFO_XY] ** 2
@@ -267,38 +253,22 @@ def likelihood(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def estimate_cold(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    drag: Array,
-    pose: Array,
-    covariance: Array,
-    weight: Array,
-    prior: Array,
-    enough: float,
-    kappa: Array,
-    work: Array,
-    row: Array,
-) -> None:
+def estimate_cold(shaft: Shaft, measured: Measurement, enough: float, kappa: Array, work: Array, row: Array) -> None:
     """Maximum likelihood from the unloaded shape; other starts where that does not end or does not explain the pose.
 
-    Arguments as in `likelihood`, `covariance` (3, 3) of the pose, and `enough`, the chi square below which no other
-    start is tried. Writes `kappa` and `row` of the best.
+    Arguments: `enough`, the chi square below which no other start is tried. Writes `kappa` and `row` of the best.
     """
-    kappa[:] = kappa0
-    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, kappa, 0.0, 0.0, work, row)
+    kappa[:] = shaft.kappa0
+    likelihood(shaft, measured, (0.0, 0.0), kappa, work, row)
     if row[ENDED] == 1.0 and row[CHI_SQUARE] < enough:
         return
     other, second = np.empty(kappa.size), np.empty(COLUMNS)
-    least_energy_curvatures(length, EI, kappa0, pose, covariance, CURVATURE_TOLERANCE_rad, other, work)
-    fx, fy = force_by_statics(length, EI, cubic, kappa0, other, work)
-    likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, fx, fy, work, second)
+    least_energy_curvatures(shaft, measured.pose, measured.covariance, CURVATURE_TOLERANCE_rad, other, work)
+    likelihood(shaft, measured, force_by_statics(shaft, other, work), other, work, second)
     keep_better(other, second, kappa, row)
     if row[ENDED] == 1.0 and row[CHI_SQUARE] < enough:
         return
-    scan(length, EI, cubic, kappa0, drag, pose, weight, prior, other, work, second, kappa, row)
+    scan(shaft, measured, kappa, work, row)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -310,77 +280,43 @@ def keep_better(other: Array, second: Array, kappa: Array, row: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def scan(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    drag: Array,
-    pose: Array,
-    weight: Array,
-    prior: Array,
-    other: Array,
-    work: Array,
-    second: Array,
-    kappa: Array,
-    row: Array,
-) -> None:
+def scan(shaft: Shaft, measured: Measurement, kappa: Array, work: Array, row: Array) -> None:
     """The last resort: solves the statics for forces all around, and starts from those nearest to the pose."""
-    count = SCAN_DIRECTIONS * len(SCAN_FORCES_N)
+    count, none = SCAN_DIRECTIONS * len(SCAN_FORCES_N), np.zeros((0, 2))
     miss, shapes = np.full(count, np.inf), np.empty((count, kappa.size))
-    forces = np.empty((count, 2))
+    forces, other, second = np.empty((count, 2)), np.empty(kappa.size), np.empty(COLUMNS)
     for k in range(count):
         angle = 2.0 * math.pi * (k % SCAN_DIRECTIONS) / SCAN_DIRECTIONS
         size = SCAN_FORCES_N[k // SCAN_DIRECTIONS]
         forces[k, 0], forces[k, 1] = size * math.cos(angle), size * math.sin(angle)
-        status, _, _ = kernels.load_path(length, EI, cubic, kappa0, forces[k, 0], forces[k, 1], drag, shapes[k], work)
+        external = Load(forces[k, 0], forces[k, 1], none)
+        status, _, _ = kernels.load_path(shaft, external, shapes[k], work)
         if status == kernels.CONVERGED:
-            x, y, turn = kernels.evaluate(length, shapes[k], 0.0, 0.0, drag, 0.0, work)
-            error = pose - np.array([x, y, turn])
+            x, y, turn = kernels.evaluate(shaft.length, shapes[k], external, 0.0, work)
+            error = measured.pose - np.array([x, y, turn])
             miss[k] = 0.0
             for i in range(3):
                 for j in range(3):
-                    miss[k] += error[i] * weight[i, j] * error[j]
+                    miss[k] += error[i] * measured.weight[i, j] * error[j]
     order = np.argsort(miss)
     for k in order[:SCAN_BEST]:
         other[:] = shapes[k]
-        likelihood(length, EI, cubic, kappa0, drag, pose, weight, prior, other, forces[k, 0], forces[k, 1], work, second)
+        likelihood(shaft, measured, (forces[k, 0], forces[k, 1]), other, work, second)
         keep_better(other, second, kappa, row)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def estimate_many(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    drag: Array,
-    pose: Array,
-    covariance: Array,
-    weight: Array,
-    prior: Array,
-    kappa: Array,
-    rows: Array,
-) -> None:
+def estimate_many(shafts: Shaft, measured: Measurement, kappa: Array, rows: Array) -> None:
     """`estimate_cold` for N independent samples: `length`, `kappa0`, `kappa` (N, n), `pose` (N, 3), `prior` (N, 5) or
-    (1, 5) for all, `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording."""
-    work = np.empty((kernels.ROWS, length.shape[1]))
-    for i in range(length.shape[0]):
-        if not math.isfinite(pose[i, 0] + pose[i, 1] + pose[i, 2]):
+    (1, 5) for all, `rows` (N, COLUMNS). Releases the interpreter's lock, so that threads may share a recording.
+    """
+    work = np.empty((kernels.ROWS, shafts.length.shape[1]))
+    for i in range(shafts.length.shape[0]):
+        pose = measured.pose[i]
+        if not math.isfinite(pose[0] + pose[1] + pose[2]):
             rows[i] = math.nan
             continue
-        estimate_cold(
-            length[i],
-            EI,
-            cubic,
-            kappa0[i],
-            drag,
-            pose[i],
-            covariance,
-            weight,
-            prior[i % prior.shape[0]],
-            SECOND_START_CHI_SQUARE,
-            kappa[i],
-            work,
-            rows[i],
-        )
+        shaft = Shaft(shafts.length[i], shafts.EI, shafts.cubic, shafts.kappa0[i])
+        prior = measured.prior[i if measured.prior.shape[0] > 1 else 0]
+        one = Measurement(pose, measured.covariance, measured.weight, prior)
+        estimate_cold(shaft, one, SECOND_START_CHI_SQUARE, kappa[i], work, rows[i])

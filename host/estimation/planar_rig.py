@@ -1,7 +1,7 @@
 """The running rig's planar estimator: both tracked poses, projected by roll, with play in insertion and curvature.
 
 An error of 1 mm in the insertion would read as 0.1 N, so insertion and curvature are estimated along with the force,
-held by how well the transmission is known; the second sensor tells them apart from the force.
+held by how well the transmission is known; the second sensor separates them from the force.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.interface import Actuation, Estimator, ForceEstimate, PoseReading
+from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
 from protocol.catheter import Catheter, load_catheter
@@ -92,7 +92,7 @@ class PlanarRigEstimator:
             Knowledge(lateral_force_N=0.05),
         )
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
         values = [*pose_tip.position_m, *pose_tip.quaternion_wxyz, *actuation[:3]]
         if not np.isfinite(values).all():
@@ -113,7 +113,7 @@ class PlanarRigEstimator:
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
         covariance = axes @ fit.covariance[:2, :2] @ axes.T
         covariance += self._known.out_of_plane_force_N**2 * np.outer(normal, normal)
-        return ForceEstimate(
+        return TipForce(
             -axes @ fit.parameters[:2], 0.5 * (covariance + covariance.T), converged, fit.residual, pose_tip.stamp_ns
         )
 

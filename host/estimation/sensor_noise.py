@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from host.estimation.spatial_kernels import UNIT_TOLERANCE
 from host.mechanics.rod import finite
 from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix
 from protocol.errors import InputError
@@ -17,11 +20,9 @@ Array = NDArray[np.float64]
 
 POSITION_STD_m = 0.29e-3  # NDI Aurora, per axis
 ORIENTATION_STD_rad = math.radians(0.2)
-UNIT_TOLERANCE = 1e-3
 
 
-@dataclass(frozen=True)
-class PoseSensor:
+class PoseSensor(NamedTuple):
     """One measured pose; the covariances may be left out, then they are the tracker's data sheet."""
 
     offset_m: float  # arc length back from the tip
@@ -29,6 +30,18 @@ class PoseSensor:
     quaternion_wxyz: ArrayLike  # (4,) sensor frame -> base frame
     position_covariance_m2: ArrayLike | None = None  # (3, 3) base frame
     orientation_covariance_rad2: ArrayLike | None = None  # (3, 3) sensor frame
+
+
+@dataclass(frozen=True)
+class SurfacePrior:
+    """A surface with little friction: the force is along its normal, except for a tangential part.
+
+    normal: (3,) in the base frame, (2,) for the planar model, either sense; tangential_std_N: standard deviation of the
+    force along the surface.
+    """
+
+    normal: ArrayLike
+    tangential_std_N: float
 
 
 def checked_covariance(key: str, value: ArrayLike | None, std: float) -> Array:
@@ -77,6 +90,7 @@ def whitening(covariance: Array) -> Array:
     return np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
+@lru_cache(maxsize=64)
 def chi_square_limit(degrees_of_freedom: int, deviations: float) -> float:
     """Chi square that noise exceeds as rarely as a normal number exceeds so many deviations (Wilson and Hilferty)."""
     if degrees_of_freedom <= 0:

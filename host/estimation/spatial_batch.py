@@ -2,75 +2,53 @@
 
 from __future__ import annotations
 
-import itertools
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from host.estimation.sensor_noise import (
-    UNIT_TOLERANCE,
-    ORIENTATION_STD_rad,
-    POSITION_STD_m,
-    chi_square_limit,
-    residual_covariance,
-    whitening,
+from host.estimation.sensor_noise import UNIT_TOLERANCE, ORIENTATION_STD_rad, POSITION_STD_m
+from host.estimation.spatial import LARGEST_FORCE_N, equal_sensors, start_grid
+from host.estimation.spatial_kernels import (
+    QUICK,
+    PoseSample,
+    Scratch,
+    Search,
+    Sensors,
+    best_of,
+    covariance_of,
+    estimate,
+    new_scratch,
+    sample_of,
+    unweighted,
 )
-from host.estimation.spatial import FAIR_DEVIATIONS, GATE, LARGEST_FORCE_N, LARGEST_STD_N, start_grid
-from host.estimation.spatial_kernels import QUICK, Problem, Scratch, best_of, estimate, new_scratch, unweighted
-from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
-from host.mechanics.rod import finite, rod_record
-from host.mechanics.small_matrices import inverse3
+from host.estimation.spatial_residuals import SENSORS_OF_CASE
+from host.mechanics.rod import finite, rod_record, rod_records
+from host.mechanics.threads import core_count, in_threads
 from protocol.catheter import Catheter
 from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
 FEW_STARTS = slice(0, 26)  # of the grid: one size of force, so that a bad sample costs a few milliseconds at most
+CASES_PER_THREAD = 16  # fewer are done before a thread has started
 NO_PRIOR = np.zeros((0, 3))
 
 
-@dataclass(frozen=True)
-class BatchEstimate:
+class BatchEstimate(NamedTuple):
     """Forces of n samples in the tip frame; where `converged` is False no force explains the poses."""
 
     force_N: Array  # (n, 3)
     covariance_N2: Array  # (n, 3, 3)
     converged: NDArray[np.bool_]  # (n,)
-    residual: Array  # (n,) dimensionless, as in `ForceEstimate`
+    residual: Array  # (n,) dimensionless, as in `SpatialEstimate`
     chi_square: Array  # (n,)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def problem_of(
-    rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, prior: Array
-) -> Problem:
-    """`Problem` of one sample, compiled (see `spatial.pose_problem`)."""
-    total = rod[6] + rod[7]
-    stations, inside = np.minimum(offsets, total), np.maximum(offsets - total, 0.0)
-    cut = rod
-    if case >= 5 and prior.shape[0] == 0:
-        cut = rod.copy()
-        last = stations[stations.shape[0] - 1]
-        cut[6] = min(rod[6], last)
-        cut[7] = max(0.0, last - rod[6])
-    return Problem(cut, rod, stations, inside, case, positions, quaternions, W, QUICK, prior)
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
 def estimate_next(
-    p: Problem,
-    length_m: float,
-    largest_N: float,
-    starts: Array,
-    fair: float,
-    believable: float,
-    known: bool,
-    x: Array,
-    covariance: Array,
-    s: Scratch,
+    p: PoseSample, limits: Search, length_m: float, known: bool, x: Array, covariance: Array, s: Scratch
 ) -> tuple[bool, float, float]:
     """One sample, from the last force x (3,) if that is `known`, else from none. Returns (converged, residual, cost).
 
@@ -78,59 +56,36 @@ def estimate_next(
     """
     settled, cost = False, 0.0
     if known:
-        settled, cost, _ = estimate(p, largest_N, x, s)
-    if not settled or cost > fair:
+        settled, cost, _ = estimate(p, limits.largest_N, x, s)
+    if not settled or cost > limits.fair:
         x[:] = 0.0
-        settled, cost, _ = best_of(p, largest_N, starts, fair, x, s)
-    for i in range(3):
-        for j in range(3):
-            s.A[i, j] = s.information[i, j] + (1.0 / LARGEST_STD_N**2 if i == j else 0.0)
-    inverse3(s.A[:3], covariance)
-    return settled and cost <= believable, unweighted(p.case, length_m, s), cost
+        settled, cost, _ = best_of(p, limits.largest_N, limits.starts, limits.fair, x, s)
+    covariance_of(s, covariance)
+    return settled and cost <= limits.acceptable, unweighted(p.case, length_m, s), cost
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def estimate_rows(
     rods: Array,
-    offsets: Array,
-    case: int,
+    sensors: Sensors,
     positions: Array,
     quaternions: Array,
-    W: Array,
-    length_m: float,
-    largest_N: float,
-    starts: Array,
-    fair: float,
-    believable: float,
+    limits: Search,
     ordered: bool,
-    force: Array,
-    covariance: Array,
-    converged: NDArray[np.bool_],
-    residual: Array,
-    cost: Array,
+    out: BatchEstimate,
 ) -> None:
-    """Samples one after the other: rods (n, 9), positions (n, k, 3), quaternions (n, k, 4); results written."""
-    s, x = new_scratch(offsets.shape[0]), np.zeros(3)
+    """Samples one after the other: rods (n, 9), positions (n, k, 3), quaternions (n, k, 4); `out` is written."""
+    s, x = new_scratch(sensors.offsets.shape[0]), np.zeros(3)
     known = False
     for i in range(rods.shape[0]):
-        p = problem_of(rods[i], offsets, case, positions[i], quaternions[i], W, NO_PRIOR)
-        converged[i], residual[i], cost[i] = estimate_next(
-            p, length_m, largest_N, starts, fair, believable, known, x, covariance[i], s
+        p = sample_of(
+            rods[i], sensors.offsets, sensors.case, positions[i], quaternions[i], sensors.whitening, QUICK, NO_PRIOR
         )
-        force[i] = x
-        known = ordered and converged[i]
-
-
-def _weights(case: int, position_std_m: float, orientation_std_rad: float) -> tuple[Array, float, float]:
-    """Whitening for equal, isotropic sensors, and the costs that are fair and believable."""
-    for key, value in (("position_std_m", position_std_m), ("orientation_std_rad", orientation_std_rad)):
-        if not float(finite(key, value, (), "a number above 0")) > 0.0:
-            raise InputError(key, value, "a number above 0")
-    count, rows = int(SENSORS_OF_CASE[case]), int(ROWS_OF_CASE[case])
-    unit = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-    stds = (position_std_m, orientation_std_rad)
-    C = residual_covariance(case, unit, *([std**2 * np.eye(3)] * count for std in stds))
-    return whitening(C), chi_square_limit(max(rows - 3, 0), FAIR_DEVIATIONS), GATE**2 * rows
+        out.converged[i], out.residual[i], out.chi_square[i] = estimate_next(
+            p, limits, sensors.length_m, known, x, out.covariance_N2[i], s
+        )
+        out.force_N[i] = x
+        known = ordered and out.converged[i]
 
 
 def _checked_offsets(case: int, offsets_m: ArrayLike) -> Array:
@@ -153,7 +108,7 @@ def _checked_poses(offsets: Array, positions_m: ArrayLike, quaternions_wxyz: Arr
     return positions, q / norms[:, :, None]
 
 
-def estimate_batch(
+def estimate_batch(  # noqa: PLR0913 - keyword arguments of a public function, each documented
     catheter: Catheter,
     insertion_m: ArrayLike,
     curvature_per_m: ArrayLike,
@@ -165,50 +120,40 @@ def estimate_batch(
     position_std_m: float = POSITION_STD_m,
     orientation_std_rad: float = ORIENTATION_STD_rad,
     ordered: bool = False,
-    workers: int = 2,
+    workers: int | None = None,
     largest_force_N: float = LARGEST_FORCE_N,
 ) -> BatchEstimate:
-    """Tip forces of a recording, spread over threads.
+    """Estimate the tip forces of a recording, spread over threads.
 
     Arguments: insertion_m, curvature_per_m (n,) or scalars; case 1 to 6; offsets_m (k,) of the sensors the case uses;
     positions_m (n, k, 3), quaternions_wxyz (n, k, 4) in the base frame of zero roll; isotropic noise per axis;
     ordered: neighbours are neighbours in time, so each starts from the one before (needed for cases 1, 3, 5);
-    workers: threads. Raises: InputError naming the key.
+    workers: threads, by default one for each core. Raises: InputError naming the key.
     """
     offsets = _checked_offsets(case, offsets_m)
     n = len(np.asarray(positions_m))
-    d, k0 = np.broadcast_to(insertion_m, n), np.broadcast_to(curvature_per_m, n)
-    actuation, which = np.unique(np.column_stack([d, k0]), axis=0, return_inverse=True)
-    rods = np.array([rod_record(catheter, *row) for row in actuation]).reshape(-1, 9)[which.ravel()]
+    rods = rod_records(catheter, insertion_m, curvature_per_m, n)
     positions, quaternions = _checked_poses(offsets, positions_m, quaternions_wxyz, n)
-    W, fair, believable = _weights(case, position_std_m, orientation_std_rad)
+    W, fair, acceptable = equal_sensors(case, position_std_m, orientation_std_rad)
     out = BatchEstimate(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n, dtype=np.bool_), np.zeros(n), np.zeros(n))
-    starts = start_grid(largest_force_N)[FEW_STARTS]
+    sensors = Sensors(case, offsets, W, catheter.distal_length_m)
+    limits = Search(largest_force_N, start_grid(largest_force_N)[FEW_STARTS], fair, acceptable)
 
     def work(part: slice) -> None:
-        estimate_rows(
-            rods[part],
-            offsets,
-            case,
-            positions[part],
-            quaternions[part],
-            W,
-            catheter.distal_length_m,
-            largest_force_N,
-            starts,
-            fair,
-            believable,
-            ordered,
+        rows = BatchEstimate(
             out.force_N[part],
             out.covariance_N2[part],
             out.converged[part],
             out.residual[part],
             out.chi_square[part],
         )
+        estimate_rows(rods[part], sensors, positions[part], quaternions[part], limits, ordered, rows)
 
-    edges = np.linspace(0, n, max(1, workers) + 1).astype(int)
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        list(pool.map(work, [slice(a, b) for a, b in itertools.pairwise(edges)]))
+    if ordered:  # neighbours in time stay together: one part for each thread
+        threads = core_count() if workers is None else max(1, workers)
+        in_threads(work, n, threads, least=-(-n // threads))
+    else:
+        in_threads(work, n, workers, CASES_PER_THREAD)
     return out
 
 
@@ -227,8 +172,9 @@ class ForceTracker:
     ) -> None:
         """Arguments as in `estimate_batch`. Raises: InputError naming the key."""
         self.catheter, self.case, self.offsets_m = catheter, case, _checked_offsets(case, offsets_m)
-        self._W, self._fair, self._believable = _weights(case, position_std_m, orientation_std_rad)
-        self._largest, self._starts = largest_force_N, start_grid(largest_force_N)[FEW_STARTS]
+        W, fair, acceptable = equal_sensors(case, position_std_m, orientation_std_rad)
+        self._sensors = Sensors(case, self.offsets_m, W, catheter.distal_length_m)
+        self._limits = Search(largest_force_N, start_grid(largest_force_N)[FEW_STARTS], fair, acceptable)
         self._scratch, self._force, self._known = new_scratch(len(self.offsets_m)), np.zeros(3), False
 
     def forget(self) -> None:
@@ -243,19 +189,10 @@ class ForceTracker:
         positions, quaternions = _checked_poses(
             self.offsets_m, np.asarray(positions_m)[None], np.asarray(quaternions_wxyz)[None], 1
         )
-        p = problem_of(rod, self.offsets_m, self.case, positions[0], quaternions[0], self._W, NO_PRIOR)
+        p = sample_of(rod, self.offsets_m, self.case, positions[0], quaternions[0], self._sensors.whitening, QUICK, NO_PRIOR)
         covariance = np.empty((3, 3))
         converged, residual, cost = estimate_next(
-            p,
-            self.catheter.distal_length_m,
-            self._largest,
-            self._starts,
-            self._fair,
-            self._believable,
-            self._known,
-            self._force,
-            covariance,
-            self._scratch,
+            p, self._limits, self.catheter.distal_length_m, self._known, self._force, covariance, self._scratch
         )
         self._known = converged
         return BatchEstimate(

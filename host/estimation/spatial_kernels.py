@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, residuals
+from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, PoseSample, residuals
 from host.mechanics.base_force import solve_cold
 from host.mechanics.branch import CONVERGED
 from host.mechanics.cosserat_kernels import (
@@ -22,6 +22,7 @@ from host.mechanics.cosserat_kernels import (
     WORK,
     sweep,
 )
+from host.mechanics.equilibrium import roll_quaternion, roll_vector
 from host.mechanics.small_matrices import apply3, inverse3
 from host.mechanics.tip_shooting import NO_STATIONS, broyden, length3, load_number, newton_matrix, scale_to
 
@@ -38,22 +39,30 @@ LARGEST_DAMPING = 1e9
 LONGEST_STEP = 6.0  # load number of the longest step: a longer one leaps over the hills between two answers
 LARGEST_REFINEMENT_N = 0.2
 NEGLIGIBLE = 1e-5  # weighted cost, far below noise, that explains the poses even where the force still creeps
+UNIT_TOLERANCE = 1e-3  # by which a measured quaternion may differ from unit length
+LARGEST_STD_N = 10.0  # stands in a covariance for a direction about which the poses say nothing
+# Layout of what `estimate_sample` leaves: force, covariance, then the residual of the thesis.
+COVARIANCE, RESIDUAL, FOUND = 3, 12, 13
+BAD_INPUT = -1
 SAME = 1e-2  # squared distance over its variance below which two forces are one
 
 
-class Problem(NamedTuple):
-    """One sample: what was measured, where, and how sure."""
+class Sensors(NamedTuple):
+    """What is the same for all samples of one set of sensors."""
 
-    rod: Array  # (9,) record of the rod, cut off behind the last sensor in cases 5 and 6 without a prior
-    whole_rod: Array  # (9,) the same, never cut off
-    stations: Array  # (k,) arc lengths of the sensors back from the tip, ascending, exposed
-    inside: Array  # (k,) how far each is inside the straight sheath, m
     case: int
-    positions: Array  # (k, 3) base frame, m
-    quaternions: Array  # (k, 4)
-    whitening: Array  # (m, m) lower triangular: inverse root of the residuals' covariance
-    bend: float  # of the fine sweeps: QUICK or CAREFUL
-    prior: Array  # (2, 3) directions across the surface's normal over their standard deviation (1/N), or (0, 3)
+    offsets: Array  # (k,) arc lengths back from the tip, m
+    whitening: Array  # (m, m), see `PoseSample`
+    length_m: float  # of the distal shaft, which scales the thesis' residual
+
+
+class Search(NamedTuple):
+    """How far one estimate searches."""
+
+    largest_N: float  # no force above it is considered
+    starts: Array  # (n, 3) forces to start from where the first try fails
+    fair: float  # weighted cost that ends the search for a better force
+    acceptable: float  # weighted cost above which no force explains the poses
 
 
 class Scratch(NamedTuple):
@@ -94,10 +103,10 @@ def new_scratch(sensors: int) -> Scratch:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cost_at(p: Problem, x: Array, bend: float, tangents: bool, s: Scratch) -> float:
+def cost_at(p: PoseSample, x: Array, bend: float, tangents: bool, s: Scratch) -> float:
     """|W (measured - modelled)|^2 at the force x (3,) in N; fills s.raw, s.z and, with `tangents`, s.raw_A, s.A."""
     sweep(p.rod, x, p.stations, bend, ALL_TANGENTS if tangents else POSE, s.rows, s.sweep)
-    residuals(p.case, s.rows, p.inside, p.positions, p.quaternions, tangents, s.raw, s.raw_A, s.residual)
+    residuals(p, s.rows, tangents, s.raw, s.raw_A, s.residual)
     m, cost = ROWS_OF_CASE[p.case], 0.0
     for i in range(m):
         z = a0 = a1 = a2 = 0.0
@@ -121,7 +130,7 @@ def cost_at(p: Problem, x: Array, bend: float, tangents: bool, s: Scratch) -> fl
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cost_on_branch(p: Problem, force: Array, s: Scratch) -> float:
+def cost_on_branch(p: PoseSample, force: Array, s: Scratch) -> float:
     """`cost_at` with tangents by a force (3,) in the base frame, of the equilibrium that grows from the unloaded shape.
 
     Leaves the force as the tip sees it in s.vectors[3]; 1e300 where the branch folds back. The pose is a far smoother
@@ -176,9 +185,9 @@ def damped_step(damping: float, s: Scratch) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def descend(
-    p: Problem, largest_N: float, bend: float, close: float, close_N: float, x: Array, s: Scratch
+    p: PoseSample, largest_N: float, bend: float, close: float, close_N: float, x: Array, s: Scratch
 ) -> tuple[bool, float, int]:
-    """x (3,), in place, until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
+    """Move x (3,) until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
 
     A step that does not lower the cost is damped; forces above `largest_N` are not entered. x is the force in the tip
     frame, or with bend = ON_BRANCH the force in the base frame (`cost_on_branch`).
@@ -214,13 +223,13 @@ def descend(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def goal_of(p: Problem) -> float:
+def goal_of(p: PoseSample) -> float:
     """Expected error of the force, N, at which the search stops."""
     return GOAL_N if p.bend >= QUICK else CAREFUL_GOAL_N
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refine(p: Problem, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def refine(p: PoseSample, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """Fine phase: Broyden steps of x (3,), in place, from the kept sensitivities. Returns (settled, cost, sweeps).
 
     Stops where the error left, guessed from how fast the steps shrink, is below `goal_of`; the residuals s.raw and s.z
@@ -276,10 +285,10 @@ def unweighted(case: int, length_m: float, s: Scratch) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def estimate(p: PoseSample, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """From the guess x (3,), in place, to the force that explains the sample best nearby. (settled, cost, sweeps).
 
-    Where the chord steps do not shrink (poses that hardly tell the force, or a force beyond `largest_N`, which is
+    Where the chord steps do not shrink (poses that hardly determine the force, or a force beyond `largest_N`, which is
     brought back to it first), fine damped steps go on in their place, so that the cost is always that of x itself.
     """
     settled, cost, sweeps = descend(p, largest_N, COARSE, CLOSE, CLOSE_N, x, s)
@@ -295,10 +304,10 @@ def estimate(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def search(p: Problem, largest_N: float, starts: Array, believable: float, found: Array, s: Scratch) -> tuple[int, int]:
+def search(p: PoseSample, largest_N: float, starts: Array, acceptable: float, found: Array, s: Scratch) -> tuple[int, int]:
     """Forces that explain the sample, from the starts (n, 3) and on the unloaded branch: found (k, 3). (count, sweeps).
 
-    A force counts where its cost is below `believable` and the poses tell it from those found before; k are kept.
+    A force counts where its cost is below `acceptable` and it differs from those before by more than noise; k are kept.
     """
     count = sweeps = 0
     x, apart = np.empty(3), np.empty(3)
@@ -309,7 +318,7 @@ def search(p: Problem, largest_N: float, starts: Array, believable: float, found
             x[:] = starts[i]
             settled, cost, used = estimate(p, largest_N, x, s)
         sweeps += used
-        if not settled or not cost <= believable or count == found.shape[0]:
+        if not settled or not cost <= acceptable or count == found.shape[0]:
             continue
         new = True
         for j in range(count):
@@ -327,7 +336,7 @@ def search(p: Problem, largest_N: float, starts: Array, believable: float, found
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate_on_branch(p: Problem, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def estimate_on_branch(p: PoseSample, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """`estimate` among the equilibria that grow from the unloaded shape, from no force; x (3,) written, tip frame.
 
     Slower by the equilibria it solves, but it arrives where the tip-frame force is too sensitive to search for.
@@ -342,7 +351,7 @@ def estimate_on_branch(p: Problem, largest_N: float, x: Array, s: Scratch) -> tu
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def best_of(p: Problem, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def best_of(p: PoseSample, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """From x (3,) and, while the cost stays above `fair`, from the starts (n, 3) and on the unloaded branch.
 
     The branch is tried after the first 26 starts: it is the surer way, but as dear as all of them. Returns (settled,
@@ -366,3 +375,68 @@ def best_of(p: Problem, largest_N: float, starts: Array, fair: float, x: Array, 
                 return True, cost, sweeps
     _, cost, used = estimate(p, largest_N, x, s)
     return settled, cost, sweeps + used
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_of(
+    rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, bend: float, prior: Array
+) -> PoseSample:
+    """`PoseSample` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
+    total = rod[6] + rod[7]
+    stations, inside = np.minimum(offsets, total), np.maximum(offsets - total, 0.0)
+    used = rod
+    if case >= 5 and prior.shape[0] == 0:
+        used = rod.copy()
+        last = stations[stations.shape[0] - 1]
+        used[6] = min(rod[6], last)
+        used[7] = max(0.0, last - rod[6])
+    return PoseSample(used, rod, stations, inside, case, positions, quaternions, W, bend, prior)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def covariance_of(s: Scratch, covariance: Array) -> None:
+    """Set covariance (3, 3), N^2, of the force found, from the information that the poses carry."""
+    for i in range(3):
+        for j in range(3):
+            s.A[i, j] = s.information[i, j] + (1.0 / LARGEST_STD_N**2 if i == j else 0.0)
+    inverse3(s.A[:3], covariance)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def poses_are_bad(offsets: Array, poses: Array) -> bool:
+    """Whether an offset or a pose (k, 7) is not finite, out of order or not of unit length; quaternions are normalized."""
+    for i in range(poses.shape[0]):
+        bad = not offsets[i] >= 0.0 or (i > 0 and not offsets[i] > offsets[i - 1])
+        for j in range(7):
+            bad = bad or not math.isfinite(poses[i, j])
+        norm = math.sqrt(poses[i, 3] ** 2 + poses[i, 4] ** 2 + poses[i, 5] ** 2 + poses[i, 6] ** 2)
+        if bad or not math.isfinite(offsets[i]) or not abs(norm - 1.0) <= UNIT_TOLERANCE:
+            return True
+        for j in range(3, 7):
+            poses[i, j] /= norm
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def estimate_sample(
+    rod: Array, sensors: Sensors, poses: Array, roll_rad: float, limits: Search, found: Array
+) -> tuple[int, float, int]:
+    """One sample from unchecked poses (k, 7) to force, covariance, residual. Returns (settled or BAD_INPUT, cost, sweeps).
+
+    Arguments: found (13,), layout above; its first three numbers are the guess to start from. Poses are changed: their
+    quaternions are normalized.
+    """
+    offsets = sensors.offsets
+    if poses_are_bad(offsets, poses):
+        return BAD_INPUT, 0.0, 0
+    k = offsets.shape[0]
+    positions, quaternions = np.empty((k, 3)), np.empty((k, 4))
+    for i in range(k):
+        roll_vector(-roll_rad, poses[i, :3], positions[i])
+        roll_quaternion(-roll_rad, poses[i, 3:], quaternions[i])
+    p = sample_of(rod, offsets, sensors.case, positions, quaternions, sensors.whitening, CAREFUL, np.zeros((0, 3)))
+    s, x = new_scratch(k), found[:COVARIANCE]
+    settled, cost, sweeps = best_of(p, limits.largest_N, limits.starts, limits.fair, x, s)
+    covariance_of(s, found[COVARIANCE:RESIDUAL].reshape((3, 3)))
+    found[RESIDUAL] = unweighted(sensors.case, sensors.length_m, s)
+    return 1 if settled else 0, cost, sweeps

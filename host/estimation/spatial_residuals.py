@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -16,9 +18,24 @@ MOST_ROWS = 11  # nine of case 4 and two of a surface prior
 SCRATCH = 45  # see `_views`
 
 
+class PoseSample(NamedTuple):
+    """One sample: the measured poses, where the sensors are, and the noise."""
+
+    rod: Array  # (9,) record of the rod, cut off behind the last sensor in cases 5 and 6 without a prior
+    whole_rod: Array  # (9,) the same, never cut off
+    stations: Array  # (k,) arc lengths of the sensors back from the tip, ascending, exposed
+    inside: Array  # (k,) how far each is inside the straight sheath, m
+    case: int
+    positions: Array  # (k, 3) base frame, m
+    quaternions: Array  # (k, 4)
+    whitening: Array  # (m, m) lower triangular: inverse root of the residuals' covariance
+    bend: float  # of the fine sweeps: QUICK or CAREFUL
+    prior: Array  # (2, 3) directions across the surface's normal over their standard deviation (1/N), or (0, 3)
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def quaternion_error(q_measured: Array, q_model: Array, error: Array) -> float:
-    """error (3,) = twice the vector part of conj(model) measured; returns its scalar part. (5.5), put right.
+    """Set error (3,) = twice the vector part of conj(model) measured; returns its scalar part. (5.5), put right.
 
     In the model's own frame; for small angles the rotation vector. The sign is chosen so that the turn is the short one.
     """
@@ -49,7 +66,7 @@ def section(base: Array, row: Array, inside_m: float, r: Array, q: Array, R: Arr
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def section_tangents(base: Array, row: Array, R: Array, turn: Array, move: Array) -> None:
-    """turn (3, 3), move (3, 3): the section's turn (its own frame) and motion (base frame) by the force's components."""
+    """Set turn (3, 3), move (3, 3): the section's turn (its own frame) and motion (base frame) by the force's components."""
     for c in range(3):
         for i in range(3):
             turn[i, c] = row[36 + 4 * i + c] - R[0, i] * base[36 + c] - R[1, i] * base[40 + c] - R[2, i] * base[44 + c]
@@ -86,35 +103,25 @@ def _views(scratch: Array) -> tuple[Array, Array, Array, Array, Array, Array, Ar
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def residuals(
-    case: int,
-    rows: Array,
-    inside: Array,
-    positions: Array,
-    quaternions: Array,
-    tangents: bool,
-    z: Array,
-    A: Array,
-    scratch: Array,
-) -> None:
-    """z (m,) = measured minus modelled, A (m, 3) = the model's sensitivity to the tip-frame force (if `tangents`).
+def residuals(p: PoseSample, rows: Array, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
+    """Set z (m,) = measured minus modelled, A (m, 3) = the model's sensitivity to the tip-frame force (if `tangents`).
 
-    Arguments: rows (k + 1, 48) of a sweep, sensors then base; inside (k,) m into the sheath; positions (k, 3) and
-    quaternions (k, 4) measured, base frame; scratch (45,). Rows of z, per case:
+    Arguments: rows (k + 1, 48) of a sweep, sensors then base; scratch (45,). Rows of z, per case:
     1 position of sensor 0; 2 and its orientation; 3 position of 1 relative to 0; 4 and both orientations;
     5 orientation of 1 relative to 0; 6 and of 2 relative to 0. Orientation errors in the sensor's frame, those of
     cases 5 and 6 in the frame of sensor 0, so that the noise of sensor 0 is the same in both.
     """
+    case, positions, quaternions = p.case, p.positions, p.quaternions
     if case >= 5:
         for j in range(1, 3 if case == 6 else 2):
-            _relative_turn(rows[0], rows[j], quaternions[0], quaternions[j], 3 * (j - 1), tangents, z, A, scratch)
+            _relative_turn(p, rows, j, tangents, z, A, scratch)
         return
     r, error, q, R, turn, move, _ = _views(scratch)
     base = rows[rows.shape[0] - 1]
     for i in range(3):
         z[i] = positions[0, i] if case <= 2 else positions[1, i] - positions[0, i]
     for j in range(2 if case >= 3 else 1):
-        section(base, rows[j], inside[j], r, q, R)
+        section(base, rows[j], p.inside[j], r, q, R)
         sign = -1.0 if case >= 3 and j == 0 else 1.0
         for i in range(3):
             z[i] -= sign * r[i]
@@ -133,10 +140,9 @@ def residuals(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _relative_turn(
-    row0: Array, row: Array, q0: Array, q: Array, at: int, tangents: bool, z: Array, A: Array, scratch: Array
-) -> None:
-    """z[at:at+3] = error of the orientation relative to sensor 0, in its frame; A its sensitivity."""
+def _relative_turn(p: PoseSample, rows: Array, j: int, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
+    """Set three rows of z = error of the orientation of sensor j relative to sensor 0, in its frame; A its sensitivity."""
+    row0, row, q0, q, at = rows[0], rows[j], p.quaternions[0], p.quaternions[j], 3 * (j - 1)
     _, error, conj, R, turn, _, model = _views(scratch)
     measured = scratch[41:45]
     conj[0], conj[1], conj[2], conj[3] = row0[6], -row0[7], -row0[8], -row0[9]

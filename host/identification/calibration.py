@@ -8,30 +8,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from host.identification.parameters import CatheterParameter
 from host.identification.robust_fit import Fit, Objective, ShapeModel, gauss_newton, nelder_mead, noise_scale
+from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
-UNTOLD_STD = 0.5  # relative standard deviation beyond which the data are said not to tell a parameter
+UNDETERMINED_STD = 0.5  # relative standard deviation beyond which a parameter counts as not determined by the data
 NOTHING_KNOWN_STD = 10.0  # relative standard deviation that stands for "nothing is known"
 ROUNDS = 4  # of scale and fit in turns
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """One parameter with its 95 % interval; `told` is False where the data do not determine it."""
+    """One parameter with its 95 % interval; `determined` is False where the data leave it open."""
 
     name: str
     unit: str
     value: float
     low: float
     high: float
-    told: bool
+    determined: bool
 
 
 @dataclass(frozen=True)
-class UntoldDirection:
-    """A combination of parameters that the data do not tell: moving along it hardly moves a marker."""
+class UndeterminedDirection:
+    """A combination of parameters that the data leave open: a change along it hardly moves a marker."""
 
     combination: dict[str, float]  # unit vector in relative parameters
     relative_std: float
@@ -49,8 +52,9 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All that calibration finds out."""
+    """The calibrated catheter, its parameters with intervals, and how well they explain the recordings."""
 
+    catheter: Catheter  # the start catheter with the fitted values
     x: Array
     parameters: list[FittedParameter]
     fits: list[Fit]  # on the same objective
@@ -59,26 +63,24 @@ class Calibration:
     max_m: float
     outliers: list[tuple[int, int]]  # (recording, marker) beyond four standard deviations
     singular_values: Array  # of the scaled sensitivities, largest first
-    untold: list[UntoldDirection]
+    undetermined: list[UndeterminedDirection]
     left_out: list[LeftOut]
+    recordings: int  # how many were fitted
 
 
 def calibrate_model(
-    model: ShapeModel,
-    names: list[tuple[str, str, bool]],
-    loss: str = "huber",
-    method: str = "gauss-newton",
-    leave_one_out: bool = True,
+    model: ShapeModel, loss: str = "huber", method: str = "gauss-newton", leave_one_out: bool = True
 ) -> Calibration:
-    """Fits `model` to its recordings.
+    """Fit `model` to its recordings.
 
-    Arguments: `names`, (name, unit, logarithmic) of each parameter; `loss`, a key of `LOSSES`; `method`, gauss-newton,
-    nelder-mead or both (the answer is then that of Gauss-Newton). Result: `Calibration`. Source: 2.3.1 and (2.20),
-    with robust loss, exact sensitivities and statistics added. Raises: ValueError where the start has no equilibrium.
+    Arguments: `loss`, a key of `LOSSES`; `method`, gauss-newton, nelder-mead or both (the answer is then that of
+    Gauss-Newton). Result: `Calibration`. Source: 2.3.1 and (2.20), with robust loss, exact sensitivities and
+    statistics added. Raises: InputError where the start has no equilibrium.
     """
     x = model.start()
     if not math.isfinite(Objective(model, loss, 1.0)(x)):
-        raise ValueError("catheter: found start values under which a recorded load has no equilibrium, wanted stiffer ones")
+        found = "start values under which a recorded load has no equilibrium"
+        raise InputError("catheter", found, "stiffer ones")
     objective = Objective(model, loss, noise_scale(model, x))
     search = nelder_mead if method == "nelder-mead" else gauss_newton
     fit = search(objective, x)
@@ -92,19 +94,34 @@ def calibrate_model(
     if method == "both":
         fits = [search(objective, x) for search in (gauss_newton, nelder_mead)]
         fit = fits[0]
-    parameters, singular, untold = _confidence(model, objective, fit.x, names)
+    parameters, singular, undetermined = _confidence(model, objective, fit.x)
     rms, largest, outliers = _errors(model, fit.x, objective.noise_m)
     left_out = _leave_one_out(model, objective, fit.x) if leave_one_out and len(model.recordings) > 1 else []
-    return Calibration(fit.x, parameters, fits, objective.noise_m, rms, largest, outliers, singular, untold, left_out)
+    catheter = model.catheter_at(fit.x)
+    assert catheter is not None  # the fit's own values have an equilibrium
+    return Calibration(
+        catheter,
+        fit.x,
+        parameters,
+        fits,
+        objective.noise_m,
+        rms,
+        largest,
+        outliers,
+        singular,
+        undetermined,
+        left_out,
+        len(model.recordings),
+    )
 
 
 def _confidence(
-    model: ShapeModel, objective: Objective, x: Array, names: list[tuple[str, str, bool]]
-) -> tuple[list[FittedParameter], Array, list[UntoldDirection]]:
-    """Intervals from the sandwich over recordings (the markers of one shape err together), and what is not told."""
+    model: ShapeModel, objective: Objective, x: Array
+) -> tuple[list[FittedParameter], Array, list[UndeterminedDirection]]:
+    """Intervals from the sandwich over recordings (the markers of one shape err together), and undetermined directions."""
     from scipy.stats import t as student
 
-    linear = objective.linearize(x)
+    names, linear = model.parameters, objective.linearize(x)
     assert linear is not None
     _, _, matrix, parts = linear
     scale = model.scale()
@@ -120,23 +137,25 @@ def _confidence(
     variance = np.maximum(np.diag(sandwich), np.diag(inverse))
     quantile = float(student.ppf(0.975, max(count - size, 1))) if count > 1 else 12.7
     relative = np.sqrt(np.diag(inverse)) / scale
-    fitted = [_interval(names[i], x[i], math.sqrt(variance[i]) * quantile, relative[i] < UNTOLD_STD) for i in range(size)]
-    untold = [
-        UntoldDirection(
-            {names[i][0]: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
+    fitted = [
+        _interval(names[i], x[i], math.sqrt(variance[i]) * quantile, relative[i] < UNDETERMINED_STD) for i in range(size)
+    ]
+    undetermined = [
+        UndeterminedDirection(
+            {names[i].name: float(vectors[i, k]) for i in range(size) if abs(vectors[i, k]) > 0.1},
             float(1.0 / math.sqrt(known[k])),
         )
         for k in range(size)
-        if 1.0 / math.sqrt(known[k]) > UNTOLD_STD
+        if 1.0 / math.sqrt(known[k]) > UNDETERMINED_STD
     ]
-    return fitted, np.sqrt(values[::-1]), untold
+    return fitted, np.sqrt(values[::-1]), undetermined
 
 
-def _interval(name: tuple[str, str, bool], x: float, half: float, told: bool) -> FittedParameter:
+def _interval(of: CatheterParameter, x: float, half: float, determined: bool) -> FittedParameter:
     low, high = x - half, x + half
-    if name[2]:
+    if of.logarithmic:
         x, low, high = (math.exp(min(max(value, -700.0), 700.0)) for value in (x, low, high))
-    return FittedParameter(name[0], name[1], float(x), float(low), float(high), bool(told))
+    return FittedParameter(of.name, of.unit, float(x), float(low), float(high), bool(determined))
 
 
 def _errors(model: ShapeModel, x: Array, noise_m: float) -> tuple[float, float, list[tuple[int, int]]]:

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class CatheterParameter:
     """One number that is fitted; a logarithmic one is searched by its logarithm, which keeps it positive."""
 
     name: str
@@ -27,7 +27,7 @@ class Parameter:
 class ParametricModel:
     """What the planar and the spatial model share: parameters and the check of the recordings."""
 
-    def __init__(self, catheter: Catheter, recordings: list[RecordedShape], parameters: list[Parameter]) -> None:
+    def __init__(self, catheter: Catheter, recordings: list[RecordedShape], parameters: list[CatheterParameter]) -> None:
         self.catheter, self.recordings, self.parameters = catheter, recordings, parameters
         for index, recording in enumerate(recordings):
             outside = catheter.distal_length_m + recording.insertion_m
@@ -67,7 +67,7 @@ def curvature_name(nominal_per_m: float) -> str:
     return f"kappa0[{nominal_per_m:g}]"
 
 
-def curvature_parameters(recordings: list[RecordedShape]) -> list[Parameter]:
+def curvature_parameters(recordings: list[RecordedShape]) -> list[CatheterParameter]:
     """One unloaded curvature for each nominal curvature among the recordings."""
     nominal = sorted({recording.curvature_per_m for recording in recordings})
-    return [Parameter(curvature_name(value), "1/m", value, False) for value in nominal]
+    return [CatheterParameter(curvature_name(value), "1/m", value, False) for value in nominal]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.identification import planar_sensitivities as sensitivities
-from host.identification.parameters import Parameter, ParametricModel, curvature_name, curvature_parameters
+from host.identification.parameters import CatheterParameter, ParametricModel, curvature_name, curvature_parameters
 from host.identification.recorded_shapes import RecordedShape
 from host.mechanics import pcar_kernels as kernels
 from host.mechanics.pcar import NO_DRAG, Arcs, arcs_of
@@ -21,7 +21,8 @@ GROUPS = ("stiffness", "lengths", "curvature")
 
 class PlanarModel(ParametricModel):
     """Predicts marker positions from parameters: log EI of each arc, lengths of the distal arcs but the last, and the
-    unloaded curvature of each group of recordings with the same nominal curvature."""
+    unloaded curvature of each group of recordings with the same nominal curvature.
+    """
 
     def __init__(self, catheter: Catheter, recordings: list[RecordedShape], fit: tuple[str, ...]) -> None:
         if catheter.pcar is None:
@@ -30,9 +31,11 @@ class PlanarModel(ParametricModel):
         self.arc_count = len(self.pcar.EI_N_m2)
         found = []
         if "stiffness" in fit:
-            found += [Parameter(f"EI{i + 1}", "N m2", value, True) for i, value in enumerate(self.pcar.EI_N_m2)]
+            found += [CatheterParameter(f"EI{i + 1}", "N m2", value, True) for i, value in enumerate(self.pcar.EI_N_m2)]
         if "lengths" in fit:
-            found += [Parameter(f"l{i + 2}", "m", value, False) for i, value in enumerate(self.pcar.distal_arcs_m[:-1])]
+            found += [
+                CatheterParameter(f"l{i + 2}", "m", value, False) for i, value in enumerate(self.pcar.distal_arcs_m[:-1])
+            ]
         if "curvature" in fit:
             found += curvature_parameters(recordings)
         super().__init__(catheter, recordings, found)
@@ -49,7 +52,8 @@ class PlanarModel(ParametricModel):
 
     def predict(self, x: Array, index: int, jacobian: bool = False) -> tuple[Array, Array] | None:
         """Markers of recording `index` (m, 2) and, if asked, their derivatives by `x` (m, 2, p); None where the load
-        has no equilibrium on its branch."""
+        has no equilibrium on its branch.
+        """
         catheter = self.catheter_at(x)
         if catheter is None:
             return None
@@ -57,57 +61,28 @@ class PlanarModel(ParametricModel):
         arcs = arcs_of(catheter, recording.insertion_m, self.curvature(self.values(x), recording))
         n = arcs.length_m.size
         work, kappa = np.empty((kernels.ROWS, n)), np.empty(n)
-        status, _, _ = kernels.load_path(
-            arcs.length_m,
-            arcs.EI_N_m2,
-            arcs.cubic_stiffening_m2,
-            arcs.unloaded_curvature_per_m,
-            recording.force_N[0],
-            recording.force_N[1],
-            NO_DRAG,
-            kappa,
-            work,
-        )
+        external = kernels.Load(float(recording.force_N[0]), float(recording.force_N[1]), NO_DRAG)
+        status, _, _ = kernels.load_path(arcs.shaft, external, kappa, work)
         if status != kernels.CONVERGED:
             return None
-        node, turn = np.empty(n + 1, dtype=complex), np.empty(n + 1, dtype=complex)
-        sensitivities.nodes_of(arcs.length_m, kappa, node, turn)
+        shape = sensitivities.shape_of(arcs.length_m, kappa)
         station = np.maximum(0.0, arcs.total_length_m - recording.offset_m)
         position = np.empty((station.size, 2))
-        sensitivities.marker_positions(arcs.length_m, kappa, station, node, turn, position)
-        derivatives = self._derivatives(x, arcs, recording, kappa, node, turn, station, work) if jacobian else np.empty(0)
+        sensitivities.marker_positions(shape, station, position)
+        derivatives = self._derivatives(x, arcs, recording, shape, station) if jacobian else np.empty(0)
         return position, derivatives
 
     def _derivatives(
-        self,
-        x: Array,
-        arcs: Arcs,
-        recording: RecordedShape,
-        kappa: Array,
-        node: NDArray[np.complex128],
-        turn: NDArray[np.complex128],
-        station: Array,
-        work: Array,
+        self, x: Array, arcs: Arcs, recording: RecordedShape, shape: sensitivities.Shape, station: Array
     ) -> Array:
         n = arcs.length_m.size
         length_by = self._length_by(arcs, recording)
         q = length_by.shape[1]
         response, every = np.empty((n, n + q + 1)), np.empty((station.size, 2, n + q + 1))
-        sensitivities.curvature_response(
-            arcs.length_m,
-            arcs.EI_N_m2,
-            arcs.cubic_stiffening_m2,
-            arcs.unloaded_curvature_per_m,
-            arcs.distal,
-            recording.force_N,
-            length_by,
-            kappa,
-            node,
-            turn,
-            work,
-            response,
-        )
-        sensitivities.marker_jacobian(arcs.length_m, kappa, station, length_by, response, node, turn, every)
+        external = kernels.Load(float(recording.force_N[0]), float(recording.force_N[1]), NO_DRAG)
+        work = np.empty((kernels.ROWS, n))
+        sensitivities.curvature_response(arcs.shaft, external, arcs.distal, length_by, shape, work, response)
+        sensitivities.marker_jacobian(shape, station, length_by, response, every)
         columns = []
         values = self.values(x)
         for parameter in self.parameters:

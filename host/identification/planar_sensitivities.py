@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from host.mechanics import pcar_kernels as kernels
 from host.mechanics.arc_integrals import phi
+from host.mechanics.pcar_kernels import Load, Shaft
 
 Array = NDArray[np.float64]
 
 
+class Shape(NamedTuple):
+    """Arcs laid out in the plane, x + iy."""
+
+    length: Array  # (n,) m
+    kappa: Array  # (n,) 1/m
+    node: NDArray[np.complex128]  # (n + 1,) ends of the arcs, m
+    turn: NDArray[np.complex128]  # (n + 1,) directions there, exp(i angle)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def nodes_of(length: Array, kappa: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128]) -> None:
-    """Positions x + iy of the arcs' ends into `node` (n + 1,), directions exp(i angle) into `turn` (n + 1,)."""
+def shape_of(length: Array, kappa: Array) -> Shape:
+    """Lay out the arcs of these lengths (m) and curvatures (1/m), each (n,), from the sheath's exit."""
+    n = length.size
+    node, turn = np.empty(n + 1, dtype=np.complex128), np.empty(n + 1, dtype=np.complex128)
     node[0], turn[0] = 0.0 + 0.0j, 1.0 + 0.0j
     for i in range(length.size):
         re0, im0, _, _, _, _, cosine, sine = phi(kappa[i] * length[i])
         node[i + 1] = node[i] + length[i] * turn[i] * complex(re0, im0)
         turn[i + 1] = turn[i] * complex(cosine, sine)
+    return Shape(length, kappa, node, turn)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -38,28 +53,25 @@ def station_of(length: Array, station: float) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def curvature_response(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
+    shaft: Shaft,
+    external: Load,
     distal: NDArray[np.bool_],
-    force: Array,
     length_by: Array,
-    kappa: Array,
-    node: NDArray[np.complex128],
-    turn: NDArray[np.complex128],
+    shape: Shape,
     work: Array,
     response: Array,
 ) -> None:
-    """d kappa / d parameters, (n, n + q + 1), at the equilibrium `kappa` under the tip `force`.
+    """Differentiate the curvatures of the equilibrium `shape` by the parameters: `response` (n, n + q + 1), written.
 
     Parameters: EI of each arc (n), the q length parameters whose columns are `length_by` (n, q), the unloaded
     curvature of the `distal` arcs (1). Source: the static equations (2.8), differentiated.
     """
     n, q = length_by.shape
-    kernels.evaluate(length, kappa, force[0], force[1], np.zeros((0, 2)), 1.0, work)
-    kernels.factorize(length, EI, cubic, kappa0, kappa, work)
-    conjugate = complex(force[0], -force[1])
+    length, EI, cubic, kappa0 = shaft.length, shaft.EI, shaft.cubic, shaft.kappa0
+    kappa, node, turn = shape.kappa, shape.node, shape.turn
+    kernels.evaluate(length, kappa, external, 1.0, work)
+    kernels.factorize(shaft, kappa, work)
+    conjugate = complex(external.force_x, -external.force_y)
     tip = node[n]
     for p in range(n + q + 1):
         for i in range(n):
@@ -92,10 +104,9 @@ def curvature_response(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_positions(
-    length: Array, kappa: Array, station: Array, node: NDArray[np.complex128], turn: NDArray[np.complex128], position: Array
-) -> None:
-    """Positions (m, 2) of the points at arc lengths `station` (m,) from the base; `node`, `turn` from `nodes_of`."""
+def marker_positions(shape: Shape, station: Array, position: Array) -> None:
+    """Positions (m, 2), written, of the points at arc lengths `station` (m,) from the base."""
+    length, kappa, node, turn = shape.length, shape.kappa, shape.node, shape.turn
     for j in range(station.size):
         arc, part = station_of(length, station[j])
         re0, im0, _, _, _, _, _, _ = phi(kappa[arc] * part)
@@ -104,17 +115,9 @@ def marker_positions(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_jacobian(
-    length: Array,
-    kappa: Array,
-    station: Array,
-    length_by: Array,
-    response: Array,
-    node: NDArray[np.complex128],
-    turn: NDArray[np.complex128],
-    jacobian: Array,
-) -> None:
+def marker_jacobian(shape: Shape, station: Array, length_by: Array, response: Array, jacobian: Array) -> None:
     """Derivatives (m, 2, n + q + 1) of the marker positions; arguments as above. The markers stay at their arc length."""
+    length, kappa, node, turn = shape.length, shape.kappa, shape.node, shape.turn
     n, q = length_by.shape
     for j in range(station.size):
         arc, part = station_of(length, station[j])

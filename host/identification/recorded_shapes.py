@@ -65,6 +65,11 @@ def read_recorded_shapes(source: str, dimensions: int) -> list[RecordedShape]:
     Arguments: `dimensions`, 2 for the planar model, 3 for the spatial one. Raises: InputError, naming key or line.
     """
     data = _table(source, dimensions) if source.lower().endswith(".csv") else read_json(source)
+    return checked_shapes(data, dimensions)
+
+
+def checked_shapes(data: Any, dimensions: int) -> list[RecordedShape]:
+    """The recordings in `data`, laid out as the JSON file. Arguments, errors: `read_recorded_shapes`."""
     checked = validate(_File, data)
     for i, recording in enumerate(checked.recordings):
         if len(recording.force_N) != dimensions:

@@ -11,7 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from host.identification.parameters import CatheterParameter
 from host.identification.recorded_shapes import RecordedShape
+from protocol.catheter import Catheter
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,11 @@ class ShapeModel(Protocol):
     """What a catheter model offers to the fit."""
 
     recordings: list[RecordedShape]
+    parameters: list[CatheterParameter]
+
+    def catheter_at(self, x: Array) -> Catheter | None:
+        """The catheter with parameters `x`; None where they are out of bounds."""
+        ...
 
     def start(self) -> Array:
         """First parameters."""

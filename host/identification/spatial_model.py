@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.identification.parameters import Parameter, ParametricModel, curvature_parameters
+from host.identification.parameters import CatheterParameter, ParametricModel, curvature_parameters
 from host.identification.recorded_shapes import RecordedShape
 from host.mechanics.cosserat import CosseratSolution, solve_cosserat
 from protocol.catheter import Catheter, CosseratParameters
@@ -33,7 +33,7 @@ class SpatialModel(ParametricModel):
             raise InputError("catheter", catheter.name, "a start catheter with [cosserat] parameters")
         self.rod = catheter.cosserat
         names = (BENDING if "stiffness" in fit else ()) + (TORSION if "torsion" in fit else ())
-        found = [Parameter(name, "N m2", getattr(self.rod, name), True) for name in names]
+        found = [CatheterParameter(name, "N m2", getattr(self.rod, name), True) for name in names]
         if "curvature" in fit:
             found += curvature_parameters(recordings)
         super().__init__(catheter, recordings, found)
@@ -51,7 +51,8 @@ class SpatialModel(ParametricModel):
 
     def predict(self, x: Array, index: int, jacobian: bool = False) -> tuple[Array, Array] | None:
         """Markers of recording `index` (m, 3) and, if asked, their derivatives by `x` (m, 3, p); None where the load
-        has no equilibrium on its branch."""
+        has no equilibrium on its branch.
+        """
         here = self._solve(x, index, None)
         if here is None:
             return None

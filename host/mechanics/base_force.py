@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from host.mechanics import multiple_shooting as ms
-from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, follow, newton
+from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, Nodes, follow, newton
 from host.mechanics.cosserat_kernels import BODY_LENGTH, COARSE, FINE, POSE, ROW, SHAFT_LENGTH, sweep
 from host.mechanics.rotations import conjugate, quaternion_product, turn_back
 from host.mechanics.segments import cut, lay_loads
@@ -17,6 +17,7 @@ from host.mechanics.tip_shooting import (
     NO_STATIONS,
     QUICK_BELOW,
     UNIQUE_BELOW,
+    Room,
     correct_once,
     length3,
     load_number,
@@ -49,10 +50,10 @@ def solve_cold(
         return CONVERGED, 1.0, 1, 0, 0
     used = 0
     if load_number(rod, size) <= QUICK_BELOW:
-        Gi = np.empty((3, 3))
-        found, used, steps = quick_branch(rod, force, x, Gi, out[:1], work)
+        room = Room(np.empty((3, 3)), np.empty((4, 3)), out, work)
+        found, used, steps = quick_branch(rod, force, x, room)
         if found:
-            miss, more = polish(rod, force, stations, bend, x, Gi, 10.0 * LANDED, goal, np.empty((4, 3)), out, work)
+            miss, more = polish(rod, force, stations, bend, x, 10.0 * LANDED, goal, room)
             used += more
             if miss < goal and unstable_modes(rod, x, work) == 0:
                 return CONVERGED, 1.0, used, steps, 0
@@ -77,11 +78,11 @@ def solve_warm(
         unloaded_direction(rod, force, x)
     if load_number(rod, size) > WARM_BELOW:
         return False, 0
-    Gi, scratch = np.empty((3, 3)), np.empty((4, 3))
-    miss, determinant = correct_once(rod, force, COARSE, x, Gi, scratch, out[:1], work)
+    room = Room(np.empty((3, 3)), np.empty((4, 3)), out, work)
+    miss, determinant = correct_once(rod, force, COARSE, x, room)
     if not (miss < WARM_TRUST and determinant > 0.0):
         return False, 1
-    miss, sweeps = polish(rod, force, stations, bend, x, Gi, max(0.2 * miss, LANDED), goal, scratch, out, work)
+    miss, sweeps = polish(rod, force, stations, bend, x, max(0.2 * miss, LANDED), goal, room)
     return miss < goal, sweeps + 1
 
 
@@ -100,36 +101,36 @@ def robust_branch(
     lay_loads(segments, force, np.zeros(3), NO_STATIONS, NO_FORCES, ms.N_START)
     lay_loads(segments, force, np.zeros(3), NO_STATIONS, NO_FORCES, ms.DN_START)
     n = segments.shape[0]
-    Q, M, slope = np.empty((n + 1, 4)), np.empty((n + 1, 3)), np.empty((n + 1, 6))
+    nodes, slope = Nodes(np.empty((n + 1, 4)), np.empty((n + 1, 3))), np.empty((n + 1, 6))
     first = min(1.0, UNIQUE_BELOW / load_number(rod, size))
-    status, load, passes, steps, unstable = follow(segments, Q, M, first, COARSE, LARGEST_GUESS_ERROR)
+    status, load, passes, steps, unstable = follow(segments, nodes, first, COARSE, LARGEST_GUESS_ERROR)
     if status != CONVERGED:
         return status, load, passes, steps, unstable
     work = np.zeros(ms.WORK)
-    ok, _, more, unstable = newton(segments, 1.0, Q, M, bend, 1e-9, LARGEST_GUESS_ERROR, slope, work)
+    ok, _, more, unstable = newton(segments, 1.0, nodes, bend, 1e-9, LARGEST_GUESS_ERROR, slope, work)
     if not ok:
         return FOLD, load, passes + more, steps, unstable
     positions = np.empty((n + 1, 3))
-    lay_out(segments, 1.0, Q, M, bend, positions, work)
-    turn_back(Q[n], force, x)
+    lay_out(segments, 1.0, nodes, bend, positions, work)
+    turn_back(nodes.Q[n], force, x)
     where = total - np.append(stations, total)
-    rows_from_nodes(segments, Q, positions, force, where, out)
+    rows_from_nodes(segments, nodes.Q, positions, force, where, out)
     return CONVERGED, 1.0, passes + more, steps, unstable
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def lay_out(segments: Array, load: float, Q: Array, M: Array, bend: float, positions: Array, work: Array) -> None:
-    """positions (n + 1, 3) of the nodes in the base frame, m."""
+def lay_out(segments: Array, load: float, nodes: Nodes, bend: float, positions: Array, work: Array) -> None:
+    """Work out the positions (n + 1, 3) of the nodes in the base frame, m."""
     work[7:10] = 0.0
     positions[0] = 0.0
     for i in range(segments.shape[0]):
-        ms.cross_segment(segments[i], load, Q[i], M[i], bend, ms.STATE, work)
+        ms.cross_segment(segments[i], load, nodes.Q[i], nodes.M[i], bend, ms.STATE, work)
         positions[i + 1] = work[7:10]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def rows_from_nodes(segments: Array, Q: Array, positions: Array, force: Array, where: Array, out: Array) -> None:
-    """out (k, 48): pose rows, as a tip sweep would leave them, of the nodes nearest to the arc lengths where (k,)."""
+    """Set out (k, 48) to pose rows, as a tip sweep would leave them, of the nodes nearest to the arc lengths where (k,)."""
     n = segments.shape[0]
     for j in range(where.shape[0]):
         node, here, best = 0, 0.0, abs(where[j])

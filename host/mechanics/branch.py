@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -18,10 +20,17 @@ LARGEST_GUESS_ERROR = 0.15  # rad: a prediction further off than this is not tru
 MAX_PASSES = 3000
 
 
+class Nodes(NamedTuple):
+    """The rod's state at the ends of its segments."""
+
+    Q: Array  # (n + 1, 4) orientations
+    M: Array  # (n + 1, 3) moments, N m
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def unloaded_nodes(segments: Array, Q: Array, M: Array) -> None:
-    """Q (n + 1, 4), M (n + 1, 3) of the rod without load: straight where k0 = 0, an arc about e1 elsewhere."""
-    angle = 0.0
+def unload(segments: Array, nodes: Nodes) -> None:
+    """Set the nodes to the rod without load: straight where k0 = 0, an arc about e1 elsewhere."""
+    Q, M, angle = nodes.Q, nodes.M, 0.0
     for i in range(segments.shape[0] + 1):
         Q[i, 0], Q[i, 1], Q[i, 2], Q[i, 3] = np.cos(0.5 * angle), np.sin(0.5 * angle), 0.0, 0.0
         M[i, 0] = M[i, 1] = M[i, 2] = 0.0
@@ -30,8 +39,9 @@ def unloaded_nodes(segments: Array, Q: Array, M: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def move_nodes(Q: Array, M: Array, step: Array, scale: float) -> None:
-    """Nodes moved in place by scale * step (n + 1, 6); the tip's moment stays zero."""
+def move_nodes(nodes: Nodes, step: Array, scale: float) -> None:
+    """Move the nodes by scale * step (n + 1, 6); the tip's moment stays zero."""
+    Q, M = nodes.Q, nodes.M
     last = Q.shape[0] - 1
     for i in range(last + 1):
         Q[i] = quaternion_product(Q[i], quaternion_of_vector(scale * step[i, :3]))
@@ -53,8 +63,7 @@ def size_of(step: Array) -> float:
 def newton(
     segments: Array,
     load: float,
-    Q: Array,
-    M: Array,
+    nodes: Nodes,
     bend: float,
     tolerance: float,
     trust: float,
@@ -70,8 +79,8 @@ def newton(
     first = before = 0.0
     unstable = 0
     for iteration in range(8):
-        linearize(segments, load, Q, M, bend, phi, gap, work)
-        unstable = correct(Q, phi, gap, step, by_load, gain)
+        linearize(segments, load, nodes.Q, nodes.M, bend, phi, gap, work)
+        unstable = correct(nodes.Q, phi, gap, step, by_load, gain)
         size = size_of(step)
         if iteration == 0:
             first = size
@@ -79,7 +88,7 @@ def newton(
                 return False, size, 1, unstable
         elif not size < max(0.3 * before, tolerance):
             return False, first, iteration + 1, unstable
-        move_nodes(Q, M, step, 1.0)
+        move_nodes(nodes, step, 1.0)
         if size < tolerance:
             return True, first, iteration + 1, unstable
         before = size
@@ -87,12 +96,10 @@ def newton(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow(
-    segments: Array, Q: Array, M: Array, first_step: float, bend: float, trust: float
-) -> tuple[int, float, int, int, int]:
+def follow(segments: Array, nodes: Nodes, first_step: float, bend: float, trust: float) -> tuple[int, float, int, int, int]:
     """Nodes carried along the branch from no load to full load. Returns (status, load, passes, load steps, unstable).
 
-    Arguments: segments (n, 18) with lane 6 = the full load; Q (n + 1, 4), M (n + 1, 3), written; first_step: share
+    Arguments: segments (n, 18) with lane 6 = the full load; nodes (n + 1), written; first_step: share
     of the load to begin with; bend: see `cosserat_kernels`; trust: LARGEST_GUESS_ERROR, or less for a closer watch.
     Where the number of unstable modes changes, the step must be small and the prediction good before it is accepted:
     there another branch crosses, and a long step could end on it.
@@ -100,25 +107,25 @@ def follow(
     n = segments.shape[0]
     work = np.zeros(ms.WORK)
     slope, old_slope, step = np.zeros((n + 1, 6)), np.zeros((n + 1, 6)), np.zeros((n + 1, 6))
-    unloaded_nodes(segments, Q, M)
-    _, _, passes, unstable = newton(segments, 0.0, Q, M, bend, 1e-6, 1.0, slope, work)
+    unload(segments, nodes)
+    _, _, passes, unstable = newton(segments, 0.0, nodes, bend, 1e-6, 1.0, slope, work)
     load, h, old_h, steps = 0.0, first_step, 0.0, 0
-    Q1, M1 = Q.copy(), M.copy()
+    ahead = Nodes(nodes.Q.copy(), nodes.M.copy())
     while load < 1.0:
         h = min(h, 1.0 - load)
         if load + h > 1.0 - 1e-9:
             h = 1.0 - load
         ratio = 0.5 * h / old_h if old_h > 0.0 else 0.0
         step[:] = (1.0 + ratio) * slope - ratio * old_slope
-        Q1[:], M1[:] = Q, M
-        move_nodes(Q1, M1, step, h)
+        ahead.Q[:], ahead.M[:] = nodes.Q, nodes.M
+        move_nodes(ahead, step, h)
         new_slope = np.zeros((n + 1, 6))
-        ok, error, used, modes = newton(segments, load + h, Q1, M1, bend, 1e-4, trust, new_slope, work)
+        ok, error, used, modes = newton(segments, load + h, ahead, bend, 1e-4, trust, new_slope, work)
         passes += used
         if ok and modes != unstable and (h > 1e-3 or error > 0.02 * h * size_of(slope)):
             ok = h < 4.0 * SMALLEST_LOAD_STEP and error < 0.05
         if ok:
-            Q[:], M[:] = Q1, M1
+            nodes.Q[:], nodes.M[:] = ahead.Q, ahead.M
             old_slope[:], slope[:] = slope, new_slope
             load, old_h, unstable, steps = load + h, h, modes, steps + 1
             h *= min(3.0, max(0.5, (0.3 * trust / max(error, 1e-9)) ** (1.0 / 3.0)))

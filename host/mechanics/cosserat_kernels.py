@@ -38,7 +38,9 @@ NO_LANE = np.zeros(4)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
-def _rates(y: Array, c1: float, c2: float, c3: float, k0: float, lane: Array, width: int, k: Array, at: int) -> None:
+def _rates(  # noqa: PLR0913 - scalars, so that the compiler keeps them in registers
+    y: Array, c1: float, c2: float, c3: float, k0: float, lane: Array, width: int, k: Array, at: int
+) -> None:
     """k[at:at+width] = derivative of the row y by sigma. c: compliances; lane (4,): d k0 by the four lanes."""
     r1, r2, r3, n1, n2, n3 = y[0], y[1], y[2], y[3], y[4], y[5]
     u1 = c1 * (n2 * r3 - n3 * r2) + k0

@@ -59,8 +59,10 @@ def place(segments: Array, u: Array, R: Array, r: Array, R_end: Array, r_end: Ar
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def work_of_force(segments: Array, R: Array, r: Array, tip: Array, force: Array, slope: Array, curve: Array) -> None:
-    """slope (3 n,), curve (3 n, 3 n): first and second change of force . tip by the curvatures.
+def work_of_force(  # noqa: C901 - one loop over the points of a segment; cut in two it would need nine arguments
+    segments: Array, R: Array, r: Array, tip: Array, force: Array, slope: Array, curve: Array
+) -> None:
+    """Set slope (3 n,), curve (3 n, 3 n): first and second change of force . tip by the curvatures.
 
     A turn alpha of everything beyond s moves the tip by alpha x (tip - r(s)), and a turn beta further out at t adds
     alpha x (beta x p), p = tip - r(t): force . that = alpha' [p force' - (force . p) 1] beta.
@@ -120,7 +122,7 @@ def factorize(H: Array) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def back_substitute(H: Array, b: Array) -> None:
-    """b (m,) = solution of the system that `factorize` left in H."""
+    """Set b (m,) = solution of the system that `factorize` left in H."""
     m = H.shape[0]
     for i in range(m):
         for k in range(i):
@@ -179,7 +181,7 @@ def newton(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def load_up(segments: Array, force: Array, first_step: float, u: Array) -> tuple[bool, float, int, int]:
-    """u (n, 3) along the branch from the unloaded shape to full load. (converged, load reached, passes, unstable)."""
+    """Carry u (n, 3) along the branch from the unloaded shape to full load. (converged, load reached, passes, unstable)."""
     n = segments.shape[0]
     rate, trial, new_rate = np.zeros((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
     u[:] = 0.0

@@ -15,10 +15,13 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar_kernels as kernels
+from host.mechanics.rod import finite, number
 from protocol.catheter import Catheter
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 NO_DRAG: Array = np.zeros((0, 2))
+UNLOADED = kernels.Load(0.0, 0.0, NO_DRAG)
 
 
 class Status(Enum):
@@ -39,6 +42,11 @@ class Arcs:
     cubic_stiffening_m2: Array
     distal: NDArray[np.bool_]  # arcs of the distal shaft, which the pull-wire bends
     length_by_insertion: Array  # d length / d insertion: not zero only for the parts of the arc at the exit
+
+    @property
+    def shaft(self) -> kernels.Shaft:
+        """The same as the kernels take it."""
+        return kernels.Shaft(self.length_m, self.EI_N_m2, self.cubic_stiffening_m2, self.unloaded_curvature_per_m)
 
     @property
     def total_length_m(self) -> float:
@@ -69,16 +77,16 @@ def arcs_of(catheter: Catheter, insertion_m: float, curvature_per_m: float, long
 
     Arguments: `insertion_m`, length of body outside the sheath; negative: that much of the distal shaft is inside.
     `curvature_per_m`, unloaded curvature of the distal shaft. Arcs longer than `longest_arc_m` are cut into equal
-    parts, which bends the model towards the continuous rod. Raises: ValueError. Source: (2.6), Table 2.1.
+    parts, which bends the model towards the continuous rod. Raises: InputError. Source: (2.6), Table 2.1.
     """
     if catheter.pcar is None:
-        raise ValueError(f"catheter: found {catheter.name} without planar parameters, wanted one with [pcar]")
-    if not -catheter.distal_length_m < insertion_m < math.inf:
-        raise ValueError(f"insertion_m: found {insertion_m}, wanted more than -{catheter.distal_length_m}, the shaft")
-    if not math.isfinite(curvature_per_m):
-        raise ValueError(f"curvature_per_m: found {curvature_per_m}, wanted a finite number")
+        raise InputError("catheter", catheter.name, "a catheter with a [pcar] table: its planar stiffness is not known")
+    insertion_m = number("insertion_m", insertion_m, "a finite length in m")
+    curvature_per_m = number("curvature_per_m", curvature_per_m, "a finite curvature in 1/m")
+    if not -catheter.distal_length_m < insertion_m:
+        raise InputError("insertion_m", insertion_m, f"more than -{catheter.distal_length_m}, the length of the shaft")
     if not longest_arc_m > 0.0:
-        raise ValueError(f"longest_arc_m: found {longest_arc_m}, wanted a positive length")
+        raise InputError("longest_arc_m", longest_arc_m, "a positive length in m")
     inside = max(0.0, -insertion_m)
     length: list[float] = []
     origin: list[int] = []
@@ -102,10 +110,7 @@ def arcs_of(catheter: Catheter, insertion_m: float, curvature_per_m: float, long
 
 
 def _force(force_N: ArrayLike) -> Array:
-    force = np.asarray(force_N, dtype=float)
-    if force.shape != (2,) or not np.isfinite(force).all():
-        raise ValueError(f"force_N: found {force_N!r}, wanted two finite numbers")
-    return force
+    return finite("force_N", force_N, (2,), "two finite numbers in N")
 
 
 def _drag(arcs: Arcs, drag_N_per_m: ArrayLike | None) -> Array:
@@ -113,8 +118,13 @@ def _drag(arcs: Arcs, drag_N_per_m: ArrayLike | None) -> Array:
         return NO_DRAG
     drag = np.ascontiguousarray(np.broadcast_to(np.asarray(drag_N_per_m, dtype=float), (arcs.length_m.size, 2)))
     if not np.isfinite(drag).all():
-        raise ValueError("drag_N_per_m: found NaN or infinity, wanted finite numbers")
+        raise InputError("drag_N_per_m", "NaN or infinity", "finite numbers in N/m")
     return drag
+
+
+def _load(force_N: ArrayLike, arcs: Arcs, drag_N_per_m: ArrayLike | None) -> kernels.Load:
+    force = _force(force_N)
+    return kernels.Load(float(force[0]), float(force[1]), _drag(arcs, drag_N_per_m))
 
 
 def solve(arcs: Arcs, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None) -> Equilibrium:
@@ -122,61 +132,45 @@ def solve(arcs: Arcs, force_N: ArrayLike, drag_N_per_m: ArrayLike | None = None)
 
     Arguments: `force_N` (2,) in the base frame; `drag_N_per_m` (2,) or (n, 2), force per length on each arc.
     Both grow together from zero. Result: `Equilibrium`; where the branch folds back, `converged` is False and the
-    shape is the last one reached. Raises: ValueError. Source: (2.8), with the mean moment of each arc.
+    shape is the last one reached. Raises: InputError. Source: (2.8), with the mean moment of each arc.
     """
-    force, drag = _force(force_N), _drag(arcs, drag_N_per_m)
-    work = np.empty((kernels.ROWS, arcs.length_m.size))
-    kappa = np.empty(arcs.length_m.size)
-    status, evaluations, share = kernels.load_path(
-        arcs.length_m,
-        arcs.EI_N_m2,
-        arcs.cubic_stiffening_m2,
-        arcs.unloaded_curvature_per_m,
-        force[0],
-        force[1],
-        drag,
-        kappa,
-        work,
-    )
-    x, y, angle = kernels.evaluate(arcs.length_m, kappa, force[0], force[1], drag, share, work)
-    negative = kernels.factorize(
-        arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m, kappa, work
-    )
+    external, shaft = _load(force_N, arcs, drag_N_per_m), arcs.shaft
+    work, kappa = np.empty((kernels.ROWS, arcs.length_m.size)), np.empty(arcs.length_m.size)
+    status, evaluations, share = kernels.load_path(shaft, external, kappa, work)
+    x, y, angle = kernels.evaluate(arcs.length_m, kappa, external, share, work)
+    negative = kernels.factorize(shaft, kappa, work)
     return Equilibrium(kappa, np.array([x, y]), angle, Status(status), negative == 0, evaluations, share)
+
+
+# Layout of a row that `solve_many` writes.
+TIP_X, TIP_Y, TIP_ANGLE, LOAD_SHARE, UNSTABLE, STATUS, FOUND = range(7)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve_many(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force: Array,
-    drag: Array,
-    kappa: Array,
-    pose: Array,
-    status: Array,
+    length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, drag: Array, kappa: Array, found: Array
 ) -> None:
     """Array form of `solve`: N cases of n arcs, all arguments plain arrays, nothing is checked.
 
     Arguments: `length`, `kappa0` (N, n); `EI`, `cubic` (n,); `force` (N, 2); `drag` (n, 2) or (0, 2). Results, written
-    in place: `kappa` (N, n); `pose` (N, 3) tip x, y (m) and angle (rad); `status` (N,), 0 where converged.
+    in place: `kappa` (N, n); `found` (N, 6): tip x, y (m) and angle (rad), load share, negative pivots, status.
     """
     work = np.empty((kernels.ROWS, length.shape[1]))
     for i in range(length.shape[0]):
-        status[i], _, share = kernels.load_path(
-            length[i], EI, cubic, kappa0[i], force[i, 0], force[i, 1], drag, kappa[i], work
-        )
-        pose[i, 0], pose[i, 1], pose[i, 2] = kernels.evaluate(
-            length[i], kappa[i], force[i, 0], force[i, 1], drag, share, work
-        )
+        shaft = kernels.Shaft(length[i], EI, cubic, kappa0[i])
+        external = kernels.Load(force[i, 0], force[i, 1], drag)
+        status, _, share = kernels.load_path(shaft, external, kappa[i], work)
+        x, y, angle = kernels.evaluate(length[i], kappa[i], external, share, work)
+        found[i, TIP_X], found[i, TIP_Y], found[i, TIP_ANGLE], found[i, LOAD_SHARE] = x, y, angle, share
+        found[i, UNSTABLE] = kernels.factorize(shaft, kappa[i], work)
+        found[i, STATUS] = status
 
 
 def shortened(arcs: Arcs, station_m: float) -> Arcs:
-    """The arcs up to arc length `station_m` from the sheath's exit; those beyond have length zero. Raises ValueError."""
+    """The arcs up to arc length `station_m` from the sheath's exit; those beyond have length zero. Raises InputError."""
     ends = np.cumsum(arcs.length_m)
     if not 0.0 <= station_m <= ends[-1] * (1.0 + 1e-12):
-        raise ValueError(f"station_m: found {station_m}, wanted 0 to {float(ends[-1])}")
+        raise InputError("station_m", station_m, f"0 to {float(ends[-1])}")
     return replace(arcs, length_m=np.clip(station_m - (ends - arcs.length_m), 0.0, arcs.length_m))
 
 
@@ -184,7 +178,7 @@ def point_at(arcs: Arcs, curvature_per_m: ArrayLike, station_m: float) -> tuple[
     """Position (2,) (m) and angle (rad) at arc length `station_m` from the sheath's exit, (2.2)-(2.4)."""
     length = shortened(arcs, station_m).length_m
     work = np.empty((kernels.ROWS, length.size))
-    x, y, angle = kernels.evaluate(length, np.asarray(curvature_per_m, dtype=float), 0.0, 0.0, NO_DRAG, 0.0, work)
+    x, y, angle = kernels.evaluate(length, np.asarray(curvature_per_m, dtype=float), UNLOADED, 0.0, work)
     return np.array([x, y]), angle
 
 
@@ -197,7 +191,7 @@ def shape(arcs: Arcs, curvature_per_m: ArrayLike, points: int = 101) -> Array:
 def _evaluated(arcs: Arcs, curvature_per_m: ArrayLike, force: Array, drag: Array) -> tuple[Array, Array]:
     work = np.empty((kernels.ROWS, arcs.length_m.size))
     kappa = np.asarray(curvature_per_m, dtype=float)
-    kernels.evaluate(arcs.length_m, kappa, force[0], force[1], drag, 1.0, work)
+    kernels.evaluate(arcs.length_m, kappa, kernels.Load(float(force[0]), float(force[1]), drag), 1.0, work)
     kernels.arms(work)
     return kappa, work
 
@@ -233,7 +227,7 @@ def static_residual(
 
 
 def static_jacobian(arcs: Arcs, curvature_per_m: ArrayLike) -> Array:
-    """dP / d(Fx, Fy), (n, 2), m2: the first two rows of the kinematic Jacobian, transposed. Source: (2.17)."""
+    """Differentiate P by (Fx, Fy), (n, 2), m2: the first two rows of the kinematic Jacobian, transposed. Source: (2.17)."""
     return kinematic_jacobian(arcs, curvature_per_m)[:2].T
 
 

@@ -1,13 +1,14 @@
 """Statics of tangent circular arcs as compiled kernels: evaluation, tangent, and the branch from the unloaded shape.
 
 Symbols: arc i of n has length l, stiffness EI, curvature kappa, unloaded curvature kappa0 and turns by u = kappa l.
-Virtual work (2.8), divided by the arc's length, says that the arc's elastic moment equals the mean of the external
+Virtual work (2.8), divided by the arc's length: the arc's elastic moment equals the mean of the external
 moment over it; in this form an arc may be straight, and may have no length at all.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -35,17 +36,32 @@ EVALUATION_LIMIT = 400
 SYMMETRIC_rad = 1e-13  # no moment at all: a straight arc under axial load, stable or not
 
 
+class Shaft(NamedTuple):
+    """The arcs outside the sheath, each array (n,), proximal first."""
+
+    length: Array  # m
+    EI: Array  # N m2
+    cubic: Array  # m2: stiffening with the square of the change of curvature
+    kappa0: Array  # 1/m, unloaded
+
+
+class Load(NamedTuple):
+    """The external load, base frame."""
+
+    force_x: float  # N, at the tip
+    force_y: float
+    drag: Array  # (n, 2) force per length on each arc, N/m; (0, 2) for none
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def evaluate(
-    length: Array, kappa: Array, force_x: float, force_y: float, drag: Array, load: float, work: Array
-) -> tuple[float, float, float]:
+def evaluate(length: Array, kappa: Array, external: Load, load: float, work: Array) -> tuple[float, float, float]:
     """Moments and their derivatives at curvatures `kappa` under `load` times the external load.
 
-    Arguments: `length`, `kappa` (n,); tip force (N); `drag` (n, 2) force per length (N/m), or (0, 2) for none.
+    Arguments: `length`, `kappa` (n,), the arcs' lengths (m) and curvatures (1/m).
     Fills in `work`: the mean external moment of each arc (N m), the coupling of an arc with those before it and its
     own second derivative (both N m2 per m of arc). Result: tip x, y (m), tip angle (rad).
     """
-    n = length.size
+    n, drag = length.size, external.drag
     loaded_along = drag.shape[0] == n
     cosine, sine, x, y, angle = 1.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
@@ -65,7 +81,7 @@ def evaluate(
         cosine, sine = cosine * turn_cos - sine * turn_sin, cosine * turn_sin + sine * turn_cos
     # Backwards: P is the conjugate of the force beyond the arc, T its complex moment about the arc's end
     # (real part: work-like, imaginary part: minus the moment).
-    P_x, P_y = load * force_x, -load * force_y
+    P_x, P_y = load * external.force_x, -load * external.force_y
     T_x, T_y = 0.0, 0.0
     for j in range(n):
         i = n - 1 - j
@@ -105,12 +121,13 @@ def arms(work: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def factorize(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array) -> int:
+def factorize(shaft: Shaft, kappa: Array, work: Array) -> int:
     """Pivots of the tangent stiffness (second variation of the energy), in O(n): returns how many are not positive.
 
     The tangent is EI' - l d2W, where d2W / (l_i l_k) is COUPLING of the later arc; eliminating an arc keeps this
     form, with COUPLING_max(i,k) + alpha COUPLING_i COUPLING_k.
     """
+    length, EI, cubic, kappa0 = shaft.length, shaft.EI, shaft.cubic, shaft.kappa0
     negative = 0
     alpha = 0.0
     for i in range(length.size):
@@ -146,9 +163,10 @@ def back_substitute(length: Array, work: Array, row: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Array, work: Array) -> tuple[int, float]:
+def newton_step(shaft: Shaft, kappa: Array, work: Array) -> tuple[int, float]:
     """Newton's step into work[STEP] after `evaluate`. Result: pivots that are not positive, turning of the step."""
-    negative = factorize(length, EI, cubic, kappa0, kappa, work)
+    length, EI, cubic, kappa0 = shaft.length, shaft.EI, shaft.cubic, shaft.kappa0
+    negative = factorize(shaft, kappa, work)
     for i in range(length.size):
         delta = kappa[i] - kappa0[i]
         work[STEP, i] = work[MOMENT, i] - EI[i] * delta * (1.0 + cubic[i] * delta * delta)
@@ -161,27 +179,23 @@ def newton_step(length: Array, EI: Array, cubic: Array, kappa0: Array, kappa: Ar
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def correct(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force_x: float,
-    force_y: float,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     load: float,
     tolerance: float,
     first: float,
     kappa: Array,
     work: Array,
 ) -> tuple[bool, int, float, float]:
-    """Newton at fixed `load` from `kappa` (changed in place), refusing whatever smells of another branch.
+    """Newton at fixed `load` from `kappa` (changed in place); gives up where the steps could lead to another branch.
 
     Result: accepted, evaluations, the turning of the first step, the worst contraction.
     """
+    length = shaft.length
     previous, worst, start = 0.0, 0.0, 0.0
     for count in range(1, 12):
-        evaluate(length, kappa, force_x, force_y, drag, load, work)
-        negative, turning = newton_step(length, EI, cubic, kappa0, kappa, work)
+        evaluate(shaft.length, kappa, external, load, work)
+        negative, turning = newton_step(shaft, kappa, work)
         if not turning <= first:
             return False, count, turning, worst
         if negative > 0 and turning > SYMMETRIC_rad:
@@ -202,24 +216,21 @@ def correct(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def tangent(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force_x: float,
-    force_y: float,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     load: float,
     kappa: Array,
     work: Array,
 ) -> tuple[int, float, float, float]:
-    """d kappa / d load into work[TANGENT], residual step into work[STEP]. Result: pivots not positive, squared turning
-    of the tangent, its product with the residual step, turning of the residual step."""
-    evaluate(length, kappa, force_x, force_y, drag, load, work)
+    """Put d kappa / d load into work[TANGENT], residual step into work[STEP]. Result: pivots not positive, squared turning
+    of the tangent, its product with the residual step, turning of the residual step.
+    """
+    length = shaft.length
+    evaluate(shaft.length, kappa, external, load, work)
     inverse = 1.0 / load if load > 0.0 else 0.0
     for i in range(length.size):
         work[TANGENT, i] = work[MOMENT, i] * inverse
-    negative, turning = newton_step(length, EI, cubic, kappa0, kappa, work)
+    negative, turning = newton_step(shaft, kappa, work)
     back_substitute(length, work, TANGENT)
     square = product = 0.0
     for i in range(length.size):
@@ -230,31 +241,29 @@ def tangent(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def arc_length_path(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force_x: float,
-    force_y: float,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     evaluations: int,
     kappa: Array,
     work: Array,
 ) -> tuple[int, int, float]:
-    """Follows the branch anew by arc length in (turning of the arcs, load), so that a sharp turn is passed and a fold is
-    told from it: on the branch the second variation stays positive up to the fold. Arguments and result: `load_path`.
+    """Follow the branch from its start by arc length in (turning of the arcs, load).
+
+    This passes a sharp turn of the branch and recognizes a fold: the second variation stays positive up to the fold.
+    Arguments and result: `load_path`.
     """
+    length, kappa0 = shaft.length, shaft.kappa0
     n = length.size
     load, before, step = 1e-6, -1.0, 0.1
     for i in range(n):
         kappa[i] = kappa0[i]
     while evaluations < EVALUATION_LIMIT and step > SMALLEST_ARC_STEP:
-        negative, square, _, _ = tangent(length, EI, cubic, kappa0, force_x, force_y, drag, load, kappa, work)
+        negative, square, _, _ = tangent(shaft, external, load, kappa, work)
         evaluations += 1
         if negative > 0:
             if before < 0.0 or turned_back(length, work):
                 return FOLD, evaluations, load
-            load = restore(before, kappa, work)  # landed beside the branch
+            load = restore(before, kappa, work)  # the step ended on another branch
             before, step = -1.0, step * 0.4
             continue
         advance = step / math.sqrt(square + 1.0)
@@ -265,15 +274,11 @@ def arc_length_path(
             kappa[i] += advance * work[TANGENT, i]
         before = load
         if load + advance >= 1.0:
-            accepted, count, _, worst = correct(
-                length, EI, cubic, kappa0, force_x, force_y, drag, 1.0, FINAL_TOLERANCE_rad, step, kappa, work
-            )
+            accepted, count, _, worst = correct(shaft, external, 1.0, FINAL_TOLERANCE_rad, step, kappa, work)
             if accepted:
                 return CONVERGED, evaluations + count, 1.0
         else:
-            accepted, count, load, worst = correct_on_arc(
-                length, EI, cubic, kappa0, force_x, force_y, drag, load + advance, step, kappa, work
-            )
+            accepted, count, load, worst = correct_on_arc(shaft, external, load + advance, step, kappa, work)
         evaluations += count
         if accepted:
             step *= 1.5 if worst < 0.1 else 1.0
@@ -302,13 +307,8 @@ def turned_back(length: Array, work: Array) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def correct_on_arc(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force_x: float,
-    force_y: float,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     load: float,
     step: float,
     kappa: Array,
@@ -318,9 +318,10 @@ def correct_on_arc(
 
     Result: accepted, evaluations, load, worst contraction.
     """
+    length = shaft.length
     previous, worst = 0.0, 0.0
     for count in range(1, 9):
-        _, _, _, _ = tangent(length, EI, cubic, kappa0, force_x, force_y, drag, load, kappa, work)
+        _, _, _, _ = tangent(shaft, external, load, kappa, work)
         along, slope = 0.0, 1.0
         for i in range(length.size):
             weight = length[i] * length[i] * work[ARM_X, i]
@@ -348,13 +349,8 @@ def correct_on_arc(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def load_path(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force_x: float,
-    force_y: float,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     kappa: Array,
     work: Array,
 ) -> tuple[int, int, float]:
@@ -362,10 +358,11 @@ def load_path(
 
     Result: status (CONVERGED, FOLD, NOT_CONVERGED), evaluations, share of the load that was reached.
     """
+    length, EI, kappa0 = shaft.length, shaft.EI, shaft.kappa0
     n = length.size
     for i in range(n):
         kappa[i] = kappa0[i]
-    evaluate(length, kappa, force_x, force_y, drag, 1.0, work)
+    evaluate(shaft.length, kappa, external, 1.0, work)
     turning = 0.0
     for i in range(n):
         turning += length[i] * abs(work[MOMENT, i]) / EI[i]
@@ -376,9 +373,7 @@ def load_path(
         for i in range(n):
             work[TRIAL, i] = kappa[i]
         tolerance = FINAL_TOLERANCE_rad if target == 1.0 else PATH_TOLERANCE_rad
-        accepted, count, _, worst = correct(
-            length, EI, cubic, kappa0, force_x, force_y, drag, target, tolerance, LARGEST_STEP_rad, kappa, work
-        )
+        accepted, count, _, worst = correct(shaft, external, target, tolerance, LARGEST_STEP_rad, kappa, work)
         evaluations += count
         if accepted:
             if target == 1.0:
@@ -390,5 +385,5 @@ def load_path(
             kappa[i] = work[TRIAL, i]
         step *= 0.4
         if step < SMALLEST_LOAD_STEP:
-            return arc_length_path(length, EI, cubic, kappa0, force_x, force_y, drag, evaluations, kappa, work)
+            return arc_length_path(shaft, external, evaluations, kappa, work)
     return NOT_CONVERGED, evaluations, load

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar_kernels as kernels
 from host.mechanics.pcar import NO_DRAG, Arcs, Equilibrium, Status
+from host.mechanics.pcar_kernels import Load, Shaft
+from protocol.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -27,21 +30,29 @@ class PuncturedEquilibrium:
     reaction_N: Array  # (2,) base frame
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_reaction(
-    length: Array, arc: int, part: float, reaction: Array, kappa: Array, work: Array, short: Array, short_work: Array
-) -> tuple[float, float]:
-    """Adds the reaction's moments to `work` after `evaluate`; leaves the held point's levers in `short_work`.
+class Hole(NamedTuple):
+    """The held point of the catheter, and room for the arcs up to it."""
 
-    Arguments: the point lies `part` (m) into arc `arc`; `short` is room for the lengths up to it. The rows of the
-    point's own arc are scaled by part / length, as only that share of the arc feels the reaction.
+    arc: int  # in which the point lies
+    part: float  # how far into it, m
+    point: Array  # (2,) where it is held, m
+    short: Array  # (arc + 1,) lengths of the arcs up to the point
+    short_work: Array  # (ROWS, arc + 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_reaction(length: Array, hole: Hole, reaction: Array, kappa: Array, work: Array) -> tuple[float, float]:
+    """Add the reaction's moments to `work` after `evaluate`; leaves the held point's levers in `hole.short_work`.
+
+    The rows of the point's own arc are scaled by part / length, as only that share of the arc feels the reaction.
     Result: the point's position (m).
     """
+    arc, part, short, short_work = hole.arc, hole.part, hole.short, hole.short_work
     for i in range(arc):
         short[i] = length[i]
     short[arc] = part
-    count = arc + 1
-    x, y, _ = kernels.evaluate(short[:count], kappa[:count], reaction[0], reaction[1], np.zeros((0, 2)), 1.0, short_work)
+    count, held = arc + 1, Load(reaction[0], reaction[1], np.zeros((0, 2)))
+    x, y, _ = kernels.evaluate(short[:count], kappa[:count], held, 1.0, short_work)
     kernels.arms(short_work)
     share = part / length[arc]
     for i in range(count):
@@ -56,22 +67,14 @@ def add_reaction(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def constrained_step(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force: Array,
-    drag: Array,
+    shaft: Shaft,
+    external: Load,
     load: float,
-    arc: int,
-    part: float,
-    point: Array,
+    hole: Hole,
     compliance: float,
     kappa: Array,
     reaction: Array,
     work: Array,
-    short: Array,
-    short_work: Array,
 ) -> tuple[int, float, float, float]:
     """One Newton step of shape and reaction together; the step of `kappa` is left in work[STEP].
 
@@ -79,9 +82,10 @@ def constrained_step(
     variation within the constraint (0 when stable, -1 when the point cannot be moved both ways), turning of the step
     (rad), step of the reaction (2) in N.
     """
-    kernels.evaluate(length, kappa, force[0], force[1], drag, load, work)
-    x, y = add_reaction(length, arc, part, reaction, kappa, work, short, short_work)
-    negative, _ = kernels.newton_step(length, EI, cubic, kappa0, kappa, work)
+    length, arc, point, short_work = shaft.length, hole.arc, hole.point, hole.short_work
+    kernels.evaluate(length, kappa, external, load, work)
+    x, y = add_reaction(length, hole, reaction, kappa, work)
+    negative, _ = kernels.newton_step(shaft, kappa, work)
     for i in range(length.size):
         inside = i <= arc
         work[kernels.ARM_X, i] = -short_work[kernels.ARM_Y, i] if inside else 0.0
@@ -114,29 +118,18 @@ def constrained_step(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def constrained_path(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    force: Array,
-    drag: Array,
-    arc: int,
-    part: float,
-    point: Array,
-    kappa: Array,
-    reaction: Array,
-    work: Array,
+    shaft: Shaft, external: Load, hole: Hole, kappa: Array, reaction: Array, work: Array
 ) -> tuple[int, int, float, int]:
     """From the loaded free shape to the held one: the hole is a spring that stiffens without bound.
 
     Where the free shape has no equilibrium at full load, the load grows together with the spring. Writes `kappa`
     and `reaction` (2,). Result: status, evaluations, share reached, negative directions.
     """
-    short, short_work = np.empty(arc + 1), np.empty((kernels.ROWS, arc + 1))
-    status, evaluations, _ = kernels.load_path(length, EI, cubic, kappa0, force[0], force[1], drag, kappa, work)
+    length, EI, arc, part = shaft.length, shaft.EI, hole.arc, hole.part
+    status, evaluations, _ = kernels.load_path(shaft, external, kappa, work)
     free = status == kernels.CONVERGED
     if not free:
-        kappa[:] = kappa0
+        kappa[:] = shaft.kappa0
     kept, kept_reaction = kappa.copy(), np.zeros(2)
     reaction[:] = 0.0
     bending = 0.0
@@ -150,24 +143,8 @@ def constrained_path(
         load = 1.0 if free else goal
         previous, accepted = 0.0, False
         for count in range(12):
-            negative, turning, d_x, d_y = constrained_step(
-                length,
-                EI,
-                cubic,
-                kappa0,
-                force,
-                drag,
-                load,
-                arc,
-                part,
-                point,
-                scale * (1.0 - goal) / goal,
-                kappa,
-                reaction,
-                work,
-                short,
-                short_work,
-            )
+            compliance = scale * (1.0 - goal) / goal
+            negative, turning, d_x, d_y = constrained_step(shaft, external, load, hole, compliance, kappa, reaction, work)
             evaluations += 1
             too_far = not turning <= kernels.LARGEST_STEP_rad
             slow = count > 0 and previous > 1e-7 and turning > kernels.CONTRACTION * previous
@@ -198,22 +175,20 @@ def solve_through_puncture(
 
     Arguments: `force_N` (2,) at the tip; `station_m` from the sheath's exit, with at least two arcs from the exit up
     to it; `point_m` (2,) base frame; `drag_N_per_m` (2,) or (n, 2). Result: the equilibrium reached from the free
-    shape as the hole stiffens from nothing to rigid. Raises: ValueError. Source: (2.19), (2.8) with the
+    shape as the hole stiffens from nothing to rigid. Raises: InputError. Source: (2.19), (2.8) with the
     reaction as Lagrange multiplier.
     """
     force, point = np.asarray(force_N, dtype=float), np.asarray(point_m, dtype=float)
     if force.shape != (2,) or point.shape != (2,) or not np.isfinite([*force, *point]).all():
-        raise ValueError(f"force_N, point_m: found {force_N!r}, {point_m!r}, wanted two finite numbers each")
+        raise InputError("force_N, point_m", f"{force_N!r}, {point_m!r}", "two finite numbers each")
     out = arcs.length_m > 0.0
     length, ends = arcs.length_m[out], np.cumsum(arcs.length_m[out])
     if not 0.0 < station_m <= ends[-1] or not math.isfinite(station_m):
-        raise ValueError(f"station_m: found {station_m}, wanted more than 0, up to {float(ends[-1])}")
+        raise InputError("station_m", station_m, f"more than 0, up to {float(ends[-1])}")
     arc = int(np.searchsorted(ends, station_m))
     if arc == 0:
-        raise ValueError(
-            f"station_m: found {station_m} in the first arc, which cannot give way to a puncture in both "
-            f"directions; wanted more than {float(ends[0])}, or more arcs"
-        )
+        wanted = f"more than {float(ends[0])}, or more arcs: the first arc alone cannot give way in both directions"
+        raise InputError("station_m", station_m, wanted)
     drag = (
         NO_DRAG
         if drag_N_per_m is None
@@ -221,11 +196,11 @@ def solve_through_puncture(
     )
     part = min(station_m - (ends[arc] - length[arc]), length[arc])
     kappa, reaction, work = np.empty(length.size), np.empty(2), np.empty((kernels.ROWS, length.size))
-    parameters = (length, arcs.EI_N_m2[out], arcs.cubic_stiffening_m2[out], arcs.unloaded_curvature_per_m[out])
-    status, evaluations, share, negative = constrained_path(
-        *parameters, force, drag, arc, part, point, kappa, reaction, work
-    )
-    x, y, angle = kernels.evaluate(length, kappa, force[0], force[1], drag, share, work)
+    shaft = Shaft(length, arcs.EI_N_m2[out], arcs.cubic_stiffening_m2[out], arcs.unloaded_curvature_per_m[out])
+    external = Load(float(force[0]), float(force[1]), drag)
+    hole = Hole(arc, float(part), point, np.empty(arc + 1), np.empty((kernels.ROWS, arc + 1)))
+    status, evaluations, share, negative = constrained_path(shaft, external, hole, kappa, reaction, work)
+    x, y, angle = kernels.evaluate(length, kappa, external, share, work)
     every = arcs.unloaded_curvature_per_m.copy()
     every[out] = kappa
     found = Equilibrium(every, np.array([x, y]), angle, Status(status), negative == 0, evaluations, share)

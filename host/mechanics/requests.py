@@ -112,13 +112,8 @@ def solve_request(request: PcarSolve | CosseratSolve, with_picture: bool) -> tup
     return _planar(request, with_picture) if isinstance(request, PcarSolve) else _spatial(request, with_picture)
 
 
-def _not_converged(found: Any) -> dict[str, Any]:
-    return {
-        "converged": False,
-        "reason": found.status.name.lower(),
-        "load_reached": found.load_share,
-        "iterations": found.iterations,
-    }
+def _not_converged(reason: str, load_reached: float, iterations: int) -> dict[str, Any]:
+    return {"converged": False, "reason": reason, "load_reached": load_reached, "iterations": iterations}
 
 
 def _planar(request: PcarSolve, with_picture: bool) -> tuple[dict[str, Any], ShapePicture | None]:
@@ -129,7 +124,7 @@ def _planar(request: PcarSolve, with_picture: bool) -> tuple[dict[str, Any], Sha
     total = arcs.total_length_m
     found = pcar.solve(arcs, request.force_N)
     if not found.converged:
-        return _not_converged(found), None
+        return _not_converged(found.status.name.lower(), found.load_share, found.iterations), None
     # inside the sheath the catheter is straight
     stations = [
         pcar.point_at(arcs, found.curvature_per_m, total - back) if back <= total else (np.array([total - back, 0.0]), 0.0)
@@ -166,7 +161,7 @@ def _spatial(request: CosseratSolve, with_picture: bool) -> tuple[dict[str, Any]
     stations_m = np.concatenate([request.stations_m, drawn])
     found = solve_cosserat(*actuation, request.force_N, request.force_frame, request.tendon_tension_N, stations_m)
     if not found.converged:
-        return _not_converged(found), None
+        return _not_converged(found.reason, found.load_reached, found.iterations), None
     count = len(request.stations_m)
     picture = None
     if with_picture:

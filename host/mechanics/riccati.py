@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def linearize(segments: Array, load: float, Q: Array, M: Array, bend: float, phi: Array, gap: Array, work: Array) -> None:
-    """phi (n, 6 or 9, 8): change of each segment's end by its start, load and k0; gap (n, 6): end minus the next node.
+    """Set phi (n, 6 or 9, 8): change of each segment's end by its start, load and k0; gap (n, 6): end minus the next node.
 
     Arguments: segments (n, 18), Q (n + 1, 4), M (n + 1, 3); the tip's moment M[n] is zero. With nine rows phi also
     gets the change of the segment's chord, in the base frame.

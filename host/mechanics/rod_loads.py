@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import multiple_shooting as ms
 from host.mechanics.base_force import lay_out
-from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, follow, newton
+from host.mechanics.branch import CONVERGED, FOLD, LARGEST_GUESS_ERROR, Nodes, follow, newton
 from host.mechanics.cosserat_kernels import BODY_LENGTH, COARSE, EXACT, SHAFT_LENGTH
 from host.mechanics.riccati import correct, linearize
 from host.mechanics.rod import checked_force, finite
@@ -67,12 +67,12 @@ def tip_response(phi: Array, nodes: Array, lane: int, R_tip: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def jacobians(segments: Array, Q: Array, M: Array, curvature: Array, bend: float) -> tuple[Array, Array]:
+def jacobians(segments: Array, nodes: Nodes, curvature: Array, bend: float) -> tuple[Array, Array]:
     """Tip position and turn (6, 3) by the tip force, and (6, 3) by insertion, roll, curvature with the loads held.
 
     More insertion or roll moves the rod as a body and, seen from the rod, turns the loads the other way.
     """
-    n = segments.shape[0]
+    n, Q, M = segments.shape[0], nodes.Q, nodes.M
     phi, gap, gain = np.empty((n, 9, 8)), np.empty((n, 6)), np.empty((n, 3, 5))
     step, by_load, work = np.empty((n + 1, 6)), np.empty((n + 1, 6)), np.zeros(ms.WORK)
     by_force, by_actuation = np.empty((6, 3)), np.empty((6, 3))
@@ -128,21 +128,22 @@ def solve_loads(
     for column in (ms.N_START, ms.DN_START):
         lay_loads(segments, tip_force, distributed, places, forces, column)
     n = len(segments)
-    Q, M, slope, positions = np.empty((n + 1, 4)), np.empty((n + 1, 3)), np.empty((n + 1, 6)), np.empty((n + 1, 3))
+    nodes = Nodes(np.empty((n + 1, 4)), np.empty((n + 1, 3)))
+    slope, positions = np.empty((n + 1, 6)), np.empty((n + 1, 3))
     first = min(1.0, UNIQUE_BELOW / max(load_number(rod, float(size)), 1e-12))
-    status, reached, passes, steps, unstable = follow(segments, Q, M, first, COARSE, LARGEST_GUESS_ERROR)
+    status, reached, passes, steps, unstable = follow(segments, nodes, first, COARSE, LARGEST_GUESS_ERROR)
     work = np.zeros(ms.WORK)
     if status == CONVERGED:
-        done, _, more, unstable = newton(segments, 1.0, Q, M, EXACT, 1e-10, LARGEST_GUESS_ERROR, slope, work)
+        done, _, more, unstable = newton(segments, 1.0, nodes, EXACT, 1e-10, LARGEST_GUESS_ERROR, slope, work)
         passes, status = passes + more, CONVERGED if done else FOLD
     if status != CONVERGED:
         return _unknown(status, reached, passes, steps, unstable, len(arc_lengths))
-    lay_out(segments, 1.0, Q, M, EXACT, positions, work)
+    lay_out(segments, 1.0, nodes, EXACT, positions, work)
     ends = np.concatenate([[0.0], np.cumsum(segments[:, ms.LENGTH])])
-    nodes = [int(np.argmin(np.abs(ends - s))) for s in [*arc_lengths, total]]
-    curvature = segments[0, ms.C1 : ms.C1 + 3] * M[0] + np.array([segments[0, ms.K0], 0.0, 0.0])
+    asked = [int(np.argmin(np.abs(ends - s))) for s in [*arc_lengths, total]]
+    curvature = segments[0, ms.C1 : ms.C1 + 3] * nodes.M[0] + np.array([segments[0, ms.K0], 0.0, 0.0])
     carried = segments[0, ms.N_START : ms.N_START + 3].copy()
-    by_force, by_actuation = jacobians(segments, Q, M, curvature, EXACT)
+    by_force, by_actuation = jacobians(segments, nodes, curvature, EXACT)
     by_actuation[:, :2] += rigid_motion(positions[-1], curvature)
     return LoadedRod(
         status,
@@ -150,10 +151,10 @@ def solve_loads(
         passes,
         steps,
         unstable,
-        positions[nodes],
-        Q[nodes],
+        positions[asked],
+        nodes.Q[asked],
         carried,
-        M[0].copy(),
+        nodes.M[0].copy(),
         curvature,
         by_force,
         by_actuation,

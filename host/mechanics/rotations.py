@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, nogil=True)
 def product_into(p: Array, q: Array, out: Array) -> None:
-    """out (4,) = Hamilton product p q of quaternions (4,): first turn by q, then by p. out must be neither."""
+    """Set out (4,) = Hamilton product p q of quaternions (4,): first turn by q, then by p. out must be neither."""
     out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
     out[1] = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
     out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
@@ -30,7 +30,7 @@ def quaternion_product(p: Array, q: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def normalized_into(q: Array, out: Array) -> None:
-    """out (4,) = q (4,) brought to unit length; out may be q."""
+    """Set out (4,) = q (4,) brought to unit length; out may be q."""
     scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     for i in range(4):
         out[i] = scale * q[i]
@@ -105,7 +105,7 @@ def rotate(q: Array, v: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def turn_back(q: Array, v: Array, out: Array) -> None:
-    """out (3,) = vector v (3,) turned by the inverse of the unit quaternion q (4,)."""
+    """Set out (3,) = vector v (3,) turned by the inverse of the unit quaternion q (4,)."""
     R = rotation_matrix(q)
     for i in range(3):
         out[i] = R[0, i] * v[0] + R[1, i] * v[1] + R[2, i] * v[2]
@@ -126,5 +126,5 @@ def cross(a: Array, b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def skew(a: Array) -> Array:
-    """Matrix (3, 3) with skew(a) b = a x b."""
+    """Matrix S (3, 3) of the vector product: S b = a x b."""
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])

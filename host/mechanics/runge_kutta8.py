@@ -79,8 +79,10 @@ C = A.sum(axis=1)  # where in the step each stage stands
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
-def stage_state(stage: int, y: Array, h: float, k: Array, row: int, width: int, z: Array) -> None:
-    """z = state at `stage` (1 to 11) of a step of length h from y, by the rates k of the stages before it.
+def stage_state(  # noqa: C901 - one branch for each stage, so that its weights are constants of the loop
+    stage: int, y: Array, h: float, k: Array, row: int, width: int, z: Array
+) -> None:
+    """Set z = state at `stage` (1 to 11) of a step of length h from y, by the rates k of the stages before it.
 
     Arguments: y, z (at least width,); k (12 * row,), the rates of stage i at k[i * row]; only the first `width`
     entries of each take part. One loop per stage, so that the compiler keeps the weights in registers.
@@ -164,7 +166,7 @@ def stage_state(stage: int, y: Array, h: float, k: Array, row: int, width: int, 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, nogil=True)
 def finish_step(y: Array, h: float, k: Array, row: int, width: int) -> None:
-    """y (at least width,) moved in place by one step of length h, by the rates k of all 12 stages."""
+    """Move y (at least width,) by one step of length h, by the rates k of all 12 stages."""
     for w in range(width):
         y[w] += h * (
             B[0] * k[w]

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def tip_pose(row: Array, position: Array, quaternion: Array) -> None:
-    """position (3,), quaternion (4,) of the tip in the base frame, from the row (48,) at the base."""
+    """Set position (3,), quaternion (4,) of the tip in the base frame, from the row (48,) at the base."""
     for i in range(3):
         position[i] = -row[i]
     quaternion[:] = conjugate(row[6:10])
@@ -32,7 +32,7 @@ def tip_pose(row: Array, position: Array, quaternion: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def section_pose(base: Array, row: Array, inside_m: float, position: Array, quaternion: Array) -> None:
-    """position (3,), quaternion (4,) of a section in the base frame, from the rows (48,) at the base and at the section.
+    """Set position (3,), quaternion (4,) of a section in the base frame, from the rows (48,) at the base and at the section.
 
     Argument: inside_m, how far inside the straight sheath the section is; its row is then the base's.
     """
@@ -83,7 +83,7 @@ def jacobians_tip_frame(rod: Array, row: Array) -> tuple[Array, Array]:
 
 
 def jacobians_base_frame(rod: Array, row: Array) -> tuple[Array, Array]:
-    """The same with the force held in the base frame: n(base) is that force, and its tangents tell how it turns.
+    """The same with the force held in the base frame: n(base) is that force, and its tangents are those of n(base).
 
     More insertion or roll moves the rod as a body and, seen from the rod, turns the force the other way.
     """

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def inverse3(A: Array, out: Array) -> float:
-    """out (3, 3) = inverse of A (3, 3); returns the determinant. A singular A gives out = 0 and 0."""
+    """Set out (3, 3) = inverse of A (3, 3); returns the determinant. A singular A gives out = 0 and 0."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1]
     c10 = A[1, 2] * A[2, 0] - A[1, 0] * A[2, 2]
     c20 = A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0]
@@ -29,7 +29,7 @@ def inverse3(A: Array, out: Array) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def multiply3(A: Array, B: Array, out: Array) -> None:
-    """out (3, 3) = A B."""
+    """Set out (3, 3) = A B."""
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
@@ -37,7 +37,7 @@ def multiply3(A: Array, B: Array, out: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def apply3(A: Array, b: Array, out: Array) -> None:
-    """out (3,) = A b; out must not be b."""
+    """Set out (3,) = A b; out must not be b."""
     for i in range(3):
         out[i] = A[i, 0] * b[0] + A[i, 1] * b[1] + A[i, 2] * b[2]
 

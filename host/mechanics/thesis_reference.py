@@ -34,7 +34,7 @@ class Iteration(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def euler_sweep(rod: Array, force: Array, tension_N: float, elements: int, shape: Array) -> None:
-    """shape (elements + 1, 7): positions and quaternions from base to tip, for the force (3,) in the tip frame.
+    """Set shape (elements + 1, 7): positions and quaternions from base to tip, for the force (3,) in the tip frame.
 
     Arguments: rod (9,) record of `rod.rod_record`; tension_N of the tendon; the curvature k0 is part of the record.
     """
@@ -63,7 +63,7 @@ def euler_sweep(rod: Array, force: Array, tension_N: float, elements: int, shape
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _lay_out(u: Array, h: float, shape: Array) -> None:
-    """shape (elements + 1, 7) from the curvatures u (elements + 1, 3): (3.16), (3.17) by Euler, quaternion kept unit."""
+    """Set shape (elements + 1, 7) from the curvatures u (elements + 1, 3): (3.16), (3.17) by Euler, quaternion kept unit."""
     shape[0] = 0.0
     shape[0, 3] = 1.0
     for i in range(u.shape[0] - 1):

@@ -8,6 +8,7 @@ about ten; `branch.follow` takes over above, and wherever a check here fails.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,11 +32,21 @@ Array = NDArray[np.float64]
 NO_STATIONS = np.zeros(0)
 UNIQUE_BELOW = 2.0  # load number under which the equilibrium is taken as the only one (planar bound: pi^2 / 4)
 QUICK_BELOW = 25.0
-LANDED = 1e-3  # miss at which a load step counts as done: one more Newton step follows it
+NEAR = 0.03  # miss at which a load step counts as done: the Newton step that follows leaves about 1e-3
+LANDED = 1e-3  # ten times this is the largest miss, at full load, that is polished without following the branch again
 TRUST = 0.15  # share of the force by which a predicted n(base) may miss
-DRIFT = 0.3  # a corrected load step that ends further than this share of itself from its prediction is not believed
+DRIFT = 0.3  # a corrected load step that ends further than this share of itself from its prediction may be on another branch
 NEAR_SINGULAR = 0.02  # determinant of G below which a fold may be near
 PASSES = 12
+
+
+class Room(NamedTuple):
+    """Working memory of one solution."""
+
+    inverse: Array  # (3, 3) of the Newton matrix G
+    vectors: Array  # (4, 3)
+    out: Array  # (n + 1, 48) rows of the last sweep
+    work: Array  # (672,) of a sweep
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -55,7 +66,7 @@ def load_number(rod: Array, size_N: float) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def unloaded_direction(rod: Array, force: Array, out: Array) -> None:
-    """out (3,) = the base-frame force (3,) as the unloaded tip sees it."""
+    """Set out (3,) = the base-frame force (3,) as the unloaded tip sees it."""
     angle = rod[K0] * rod[SHAFT_LENGTH]
     c, s = math.cos(angle), math.sin(angle)
     out[0], out[1], out[2] = force[0], c * force[1] + s * force[2], -s * force[1] + c * force[2]
@@ -63,7 +74,7 @@ def unloaded_direction(rod: Array, force: Array, out: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def scale_to(v: Array, length: float) -> None:
-    """v (3,) brought to that length, in place."""
+    """Bring v (3,) to that length, in place."""
     factor = length / max(length3(v), 1e-300)
     for i in range(3):
         v[i] *= factor
@@ -79,22 +90,20 @@ def newton_matrix(row: Array, G: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def miss_of(row: Array, force: Array, miss: Array) -> float:
-    """miss (3,) = force minus n(base), both in the base frame; returns its share of the force."""
+    """Set miss (3,) = force minus n(base), both in the base frame; returns its share of the force."""
     for i in range(3):
         miss[i] = force[i] - row[3 + i]
     return length3(miss) / max(length3(force), 1e-300)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def correct_once(
-    rod: Array, force: Array, bend: float, x: Array, Gi: Array, scratch: Array, out: Array, work: Array
-) -> tuple[float, float]:
+def correct_once(rod: Array, force: Array, bend: float, x: Array, room: Room) -> tuple[float, float]:
     """One Newton step of the tip-frame force x (3,), in place. Returns (miss before it, determinant of G).
 
-    Arguments: force (3,) base frame; Gi (3, 3), written: inverse of G; scratch (2 or more, 3), out (1, 48), work.
+    Arguments: force (3,) base frame. Leaves the inverse of G in the room.
     """
-    sweep(rod, x, NO_STATIONS, bend, POSE_AND_FORCE_TANGENTS, out, work)
-    miss, step = scratch[0], scratch[1]
+    out, Gi, miss, step = room.out, room.inverse, room.vectors[0], room.vectors[1]
+    sweep(rod, x, NO_STATIONS, bend, POSE_AND_FORCE_TANGENTS, out, room.work)
     error = miss_of(out[0], force, miss)
     newton_matrix(out[0], Gi)
     determinant = inverse3(Gi.copy(), Gi)
@@ -107,31 +116,22 @@ def correct_once(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def polish(
-    rod: Array,
-    force: Array,
-    stations: Array,
-    bend: float,
-    x: Array,
-    Gi: Array,
-    limit: float,
-    goal: float,
-    scratch: Array,
-    out: Array,
-    work: Array,
+    rod: Array, force: Array, stations: Array, bend: float, x: Array, limit: float, goal: float, room: Room
 ) -> tuple[float, int]:
-    """x (3,) refined at full accuracy by Broyden steps from the inverse Gi (3, 3). Returns (last miss, sweeps).
+    """Refine x (3,) at full accuracy by Broyden steps from the room's inverse. Returns (last miss, sweeps).
 
-    Arguments: limit: largest first miss that is believed to be the same branch; goal: miss to reach; scratch (4, 3).
-    Leaves in out (n + 1, 48) the pose rows of the accepted x at the stations and the base.
+    Arguments: limit: largest first miss that still counts as the same branch; goal: miss to reach.
+    Leaves in room.out (n + 1, 48) the pose rows of the accepted x at the stations and the base.
     """
-    miss, step, change, spare = scratch[0], scratch[1], scratch[2], scratch[3]
+    out, Gi = room.out, room.inverse
+    miss, step, change, spare = room.vectors[0], room.vectors[1], room.vectors[2], room.vectors[3]
     size, smallest, error = length3(force), 0.5 * limit, 0.0
     last = stations.shape[0]
     for sweeps in range(1, PASSES + 1):
         if sweeps > 1:
             for i in range(3):
                 change[i] = miss[i]
-        sweep(rod, x, stations, bend, POSE, out, work)
+        sweep(rod, x, stations, bend, POSE, out, room.work)
         error = miss_of(out[last], force, miss)
         if error < goal or not error < 2.0 * smallest:
             return error, sweeps
@@ -164,7 +164,7 @@ def broyden(Gi: Array, step: Array, change: Array, scratch: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def hermite(s: float, span: float, x0: Array, d0: Array, x1: Array, d1: Array, out: Array) -> None:
-    """out (3,) = cubic through (x0, d0) at 0 and (x1, d1) at `span`, at the place s * span."""
+    """Set out (3,) = cubic through (x0, d0) at 0 and (x1, d1) at `span`, at the place s * span."""
     a, b = 2.0 * s**3 - 3.0 * s**2 + 1.0, (s**3 - 2.0 * s**2 + s) * span
     c, d = 3.0 * s**2 - 2.0 * s**3, (s**3 - s**2) * span
     for i in range(3):
@@ -172,21 +172,19 @@ def hermite(s: float, span: float, x0: Array, d0: Array, x1: Array, d1: Array, o
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def land(
-    rod: Array, goal: Array, bend: float, trust: float, x: Array, Gi: Array, scratch: Array, out: Array, work: Array
-) -> tuple[bool, float, float, int]:
-    """Newton from the prediction x (3,), in place. Returns (landed, first miss, determinant, sweeps)."""
+def land(rod: Array, goal: Array, bend: float, trust: float, x: Array, room: Room) -> tuple[bool, float, float, int]:
+    """Newton from the prediction x (3,), in place. Returns (near enough, first miss, determinant, sweeps)."""
     first, before, determinant = 0.0, 1e300, 0.0
     for sweeps in range(1, 7):
-        error, determinant = correct_once(rod, goal, bend, x, Gi, scratch, out, work)
+        error, determinant = correct_once(rod, goal, bend, x, room)
         if sweeps == 1:
             first = error
             if not error < trust:
                 return False, first, determinant, sweeps
-        elif not error < max(0.3 * before, LANDED):
+        elif not error < max(0.3 * before, NEAR):
             return False, first, determinant, sweeps
         before = error
-        if error < LANDED:
+        if error < NEAR:
             return True, first, determinant, sweeps
     return False, first, determinant, 6
 
@@ -202,15 +200,14 @@ def drifted(start: Array, guess: Array, end: Array) -> bool:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def quick_branch(rod: Array, force: Array, x: Array, Gi: Array, out: Array, work: Array) -> tuple[bool, int, int]:
-    """x (3,) = tip-frame force on the branch from the unloaded shape, to about 1e-5. Returns (found, sweeps, steps).
+def quick_branch(rod: Array, force: Array, x: Array, room: Room) -> tuple[bool, int, int]:
+    """Set x (3,) = tip-frame force on the branch from the unloaded shape, to about 1e-5. Returns (found, sweeps, steps).
 
     Gives up, for `branch.follow` to take over, where load steps keep failing or a fold may be near.
     """
     size = length3(force)
     number = load_number(rod, size)
     slope, x0, slope0, guess, end, goal = np.empty(3), np.zeros(3), np.zeros(3), np.empty(3), np.empty(3), np.empty(3)
-    scratch = np.empty((2, 3))
     x[:] = 0.0
     unloaded_direction(rod, force, slope)
     load, h, span, sweeps, steps, failures = 0.0, min(1.0, UNIQUE_BELOW / max(number, 1e-300)), 0.0, 0, 0, 0
@@ -225,11 +222,11 @@ def quick_branch(rod: Array, force: Array, x: Array, Gi: Array, out: Array, work
         scale_to(guess, (load + h) * size)
         end[:] = guess
         unique = (load + h) * number <= UNIQUE_BELOW * 1.001
-        landed, first, determinant, used = land(rod, goal, COARSE, 3.0 if unique else TRUST, end, Gi, scratch, out, work)
+        landed, first, determinant, used = land(rod, goal, COARSE, 3.0 if unique else TRUST, end, room)
         sweeps += used
         if landed and (unique or (determinant > NEAR_SINGULAR and not drifted(x, guess, end))):
             x0[:], slope0[:], x[:] = x, slope, end
-            apply3(Gi, force, slope)
+            apply3(room.inverse, force, slope)
             load, span, steps = load + h, h, steps + 1
             h *= min(3.0, max(0.5, (0.3 * TRUST / max(first, 1e-9)) ** 0.25))
         else:

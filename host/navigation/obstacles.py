@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Distances beyond this are not told apart (m).
+# Distances beyond this count as equal (m).
 FAR_M = 1.0
 
 
@@ -63,7 +63,8 @@ def load_mesh(path: Path, scale: float, chamber: bool) -> Mesh:
 
 def winding_number(mesh: Mesh, point_m: Array) -> float:
     """Turns of the surface about the point: about 1 or -1 inside, 0 outside (sum of solid angles, Van Oosterom,
-    Strackee)."""
+    Strackee).
+    """
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] - point_m for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     above = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -113,7 +114,8 @@ class Surroundings:
 
     def clearance_m(self, line_m: Array, radius_m: float) -> float:
         """Least distance (m) of a tube of `radius_m` about the polyline (n, 3) from all obstacles; zero or less:
-        touching."""
+        touching.
+        """
         self.questions += 1
         if not self.obstacles:
             return FAR_M

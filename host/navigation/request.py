@@ -84,7 +84,10 @@ class PlanRequest(Request):
 
 
 class Answer(NamedTuple):
-    """A plan: a row a period, at rest at the ends. `clearance_m`: least on the way, in addition to the catheter's radius."""
+    """A plan: one row for each period, at rest at both ends.
+
+    `clearance_m` is the smallest on the path, measured from the catheter's surface.
+    """
 
     time_s: Array
     stage: Array

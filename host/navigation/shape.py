@@ -84,8 +84,7 @@ def within(reach: Reach, joint: Array) -> bool:
 
 
 def stages_of(rig: Rig, joint: Array) -> Array:
-    """Stage positions (n, 3) (m, rad, rad) of joints (n, 3), in the middle of the backlash: which flank is control's
-    business."""
+    """Stage positions (n, 3) (m, rad, rad) of joints (n, 3), in the middle of the backlash (control chooses the flank)."""
     t = rig.transmission
     config = tick_parameters(rig)[0].kinematics
     knob = np.array([ik.knob_of_curvature(config, value) for value in joint[:, 2]])

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from host.estimation.interface import Actuation, ForceEstimate, PoseReading
+from host.estimation.interface import Actuation, PoseReading, TipForce
 from protocol.rig_file import Rig
 
 
 class NoForce:
     """Zero force, unit covariance."""
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """Always the same answer."""
-        return ForceEstimate(np.zeros(3), np.eye(3), True, 0.0, pose_tip.stamp_ns)
+        return TipForce(np.zeros(3), np.eye(3), True, 0.0, pose_tip.stamp_ns)
 
 
 def make(rig: Rig) -> NoForce:

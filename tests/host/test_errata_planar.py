@@ -128,6 +128,5 @@ def test_table_2_2_errors_of_any_marker_and_of_the_tip_are_told_apart() -> None:
     shapes = recordings(4)
     shapes[1].position_m[2] += [0.0, 0.004]  # off near the base, not at the tip
     model = PlanarModel(THERMOCOOL, shapes, ("stiffness",))
-    names = [(p.name, p.unit, p.logarithmic) for p in model.parameters]
-    left = calibrate_model(model, names).left_out[1]
+    left = calibrate_model(model).left_out[1]
     assert left.max_m > left.tip_m + 2e-3

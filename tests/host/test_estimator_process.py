@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.estimation.interface import Actuation, Estimator, ForceEstimate, PoseReading
+from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
 from host.estimation.service import EstimationService, load_estimator
 from host.recordings.recording import Recording
 from protocol.rig_file import Rig, load_rig
@@ -30,10 +30,10 @@ class Spring:
     def __init__(self) -> None:
         self.asked: list[tuple[PoseReading, PoseReading | None, Actuation]] = []
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         self.asked.append((pose_tip, pose_shaft, actuation))
         force_N = np.array([0.0, 0.0, 10.0 * (actuation.insertion_m - pose_tip.position_m[2])])
-        return ForceEstimate(force_N, 1e-4 * np.eye(3), True, 0.5, pose_tip.stamp_ns)
+        return TipForce(force_N, 1e-4 * np.eye(3), True, 0.5, pose_tip.stamp_ns)
 
 
 def make_spring(rig: Rig) -> Estimator:
@@ -44,10 +44,10 @@ def make_spring(rig: Rig) -> Estimator:
 class Broken:
     """Answers with what it is given, or raises it."""
 
-    def __init__(self, answer: ForceEstimate | Exception) -> None:
+    def __init__(self, answer: TipForce | Exception) -> None:
         self.answer = answer
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> ForceEstimate:
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer
@@ -135,16 +135,16 @@ def test_without_a_pose_and_its_actuation_nothing_is_said(messages: list[tuple[s
         ValueError("outside the model"),
         ZeroDivisionError("division by zero"),
         np.linalg.LinAlgError("singular"),
-        ForceEstimate(np.array([0.0, np.nan, 0.0]), np.eye(3), True, 0.0, 0),
-        ForceEstimate(np.zeros(3), np.full((3, 3), np.inf), True, 0.0, 0),
-        ForceEstimate(np.zeros(2), np.eye(3), True, 0.0, 0),
-        ForceEstimate(np.zeros(3), -np.eye(3), True, 0.0, 0),
-        ForceEstimate(np.zeros(3), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
-        ForceEstimate(np.zeros(3), np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
-        ForceEstimate(np.zeros(3), np.eye(3), False, 7.0, 0),
+        TipForce(np.array([0.0, np.nan, 0.0]), np.eye(3), True, 0.0, 0),
+        TipForce(np.zeros(3), np.full((3, 3), np.inf), True, 0.0, 0),
+        TipForce(np.zeros(2), np.eye(3), True, 0.0, 0),
+        TipForce(np.zeros(3), -np.eye(3), True, 0.0, 0),
+        TipForce(np.zeros(3), np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
+        TipForce(np.zeros(3), np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), True, 0.0, 0),
+        TipForce(np.zeros(3), np.eye(3), False, 7.0, 0),
     ],
 )
-def test_no_force_is_given_that_cannot_be_believed(answer: ForceEstimate | Exception) -> None:
+def test_no_force_is_given_that_cannot_be_believed(answer: TipForce | Exception) -> None:
     service = EstimationService(Broken(answer))
     said = service(pose(0), None, stage(0))
     assert said is not None and not said.converged and said.force_N is None and said.covariance_N2 is None

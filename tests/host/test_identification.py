@@ -60,7 +60,7 @@ def shapes(
 
 
 def fitted(model: PlanarModel, loss: str = "huber", method: str = "gauss-newton", leave: bool = False) -> Calibration:
-    return calibrate_model(model, [(p.name, p.unit, p.logarithmic) for p in model.parameters], loss, method, leave)
+    return calibrate_model(model, loss, method, leave)
 
 
 @pytest.mark.parametrize("insertion_m", [0.04, 0.0, -0.01, -0.025, -0.035])
@@ -79,8 +79,8 @@ def test_sensitivities_equal_high_order_differences(insertion_m: float) -> None:
 def test_noiseless_shapes_give_the_parameters_back() -> None:
     found = fitted(PlanarModel(START, shapes(15), ("stiffness", "lengths")))
     for parameter in found.parameters:
-        assert parameter.value == pytest.approx(TRUTH[parameter.name], rel=1e-9) and parameter.told
-    assert found.rms_m < 1e-12 and not found.untold and found.fits[0].converged
+        assert parameter.value == pytest.approx(TRUTH[parameter.name], rel=1e-9) and parameter.determined
+    assert found.rms_m < 1e-12 and not found.undetermined and found.fits[0].converged
 
 
 @pytest.mark.parametrize("loss", ["squares", "huber", "cauchy", "distance"])
@@ -142,15 +142,15 @@ def test_leave_one_out_is_worse_than_the_fit_and_of_the_size_of_the_noise() -> N
 
 def test_what_the_data_do_not_tell_is_said() -> None:
     unloaded = fitted(PlanarModel(START, shapes(6, 1e-4, loaded=False), EVERYTHING))
-    told = {p.name: p.told for p in unloaded.parameters}
+    told = {p.name: p.determined for p in unloaded.parameters}
     assert not any(told[name] for name in ("EI1", "EI2", "EI3", "l2"))
     assert all(value for name, value in told.items() if name.startswith("kappa0"))
-    assert {name for direction in unloaded.untold for name in direction.combination} >= {"EI1", "EI2", "EI3"}
+    assert {name for direction in unloaded.undetermined for name in direction.combination} >= {"EI1", "EI2", "EI3"}
     inside = [replace(shape, insertion_m=-0.01, offset_m=shape.offset_m * 0.4) for shape in shapes(6)]
     model = PlanarModel(START, inside, ("stiffness",))
     inside = [replace(shape, position_m=model.predict(model.start(), i)[0]) for i, shape in enumerate(inside)]  # type: ignore[index]
     body = fitted(PlanarModel(START, inside, ("stiffness",))).parameters[0]
-    assert body.name == "EI1" and not body.told  # the body was never outside the sheath
+    assert body.name == "EI1" and not body.determined  # the body was never outside the sheath
 
 
 def as_json(recordings: list[RecordedShape]) -> dict:
@@ -244,7 +244,7 @@ def test_the_command_writes_a_catheter_that_loads(tmp_path: Path, capsys: pytest
     assert made.pcar.EI_N_m2[0] == pytest.approx(report["parameters"]["EI1"]["value"])
     assert made.pcar.EI_N_m2[0] == pytest.approx(1.490e-3, rel=0.03)
     assert [search["method"] for search in report["searches"]] == ["gauss-newton", "nelder-mead"]
-    assert len(report["leave_one_out"]) == 8 and report["identifiability"]["untold"] == []
+    assert len(report["leave_one_out"]) == 8 and report["identifiability"]["undetermined"] == []
     assert "95 % intervals" in (tmp_path / "made.toml").read_text()
     calibrate(str(tmp_path / "a.json"), "thermocool_sf", leave_one_out=False)
     assert "EI1 =" in capsys.readouterr().out
@@ -290,7 +290,7 @@ def test_the_rod_is_identified_from_spatial_shapes() -> None:
     assert truth.cosserat is not None
     start = replace(truth, cosserat=replace(truth.cosserat, EI1=3e-4, EI2=3e-4, EbI1=5e-4, EbI2=5e-4))
     model = SpatialModel(start, recordings, ("stiffness",))
-    found = calibrate_model(model, [(p.name, p.unit, p.logarithmic) for p in model.parameters], leave_one_out=False)
+    found = calibrate_model(model, leave_one_out=False)
     for parameter in found.parameters:
         assert parameter.value == pytest.approx(vars(truth.cosserat)[parameter.name], rel=0.05), parameter
         assert parameter.low < vars(truth.cosserat)[parameter.name] < parameter.high

@@ -73,7 +73,7 @@ def test_array_form_equals_single_calls() -> None:
     cases = REFERENCES["random"][:50]
     arcs = [pcar.arcs_of(THERMOCOOL, case["insertion_m"], case["curvature_per_m"]) for case in cases]
     length, kappa0 = np.array([a.length_m for a in arcs]), np.array([a.unloaded_curvature_per_m for a in arcs])
-    kappa, pose, status = np.empty_like(length), np.empty((50, 3)), np.empty(50, dtype=np.int64)
+    kappa, found = np.empty_like(length), np.empty((50, pcar.FOUND))
     pcar.solve_many(
         length,
         arcs[0].EI_N_m2,
@@ -82,10 +82,9 @@ def test_array_form_equals_single_calls() -> None:
         np.array([case["force_N"] for case in cases]),
         pcar.NO_DRAG,
         kappa,
-        pose,
-        status,
+        found,
     )
-    assert (status == 0).all()
+    assert (found[:, pcar.STATUS] == 0).all() and (found[:, pcar.UNSTABLE] == 0).all()
     for i, case in enumerate(cases):
         assert np.array_equal(kappa[i], pcar.solve(arcs[i], case["force_N"]).curvature_per_m)
 

@@ -114,7 +114,7 @@ def test_recording_equals_the_loop_of_single_calls_and_survives_gaps() -> None:
         poses.append(pose_of(pcar.arcs_of(THERMOCOOL, d, k), rng.normal(size=2) * 0.08))
     table = np.array(poses) + rng.normal(size=(60, 3)) * np.sqrt(np.diag(planar.tip_covariance()))
     table[7] = np.nan
-    found = planar.estimate_recording(THERMOCOOL, insertion, curvature, table, threads=3)
+    found = planar.estimate_recording(THERMOCOOL, insertion, curvature, table, workers=3)
     assert not found.converged[7] and np.isnan(found.force_N[7]).all()
     for i in range(60):
         if i != 7:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from host.estimation import spatial_kernels as kernels
 from host.estimation.contact_place import estimate_contact
 from host.estimation.sensor_noise import ORIENTATION_STD_rad, POSITION_STD_m, chi_square_limit
-from host.estimation.spatial import LARGEST_FORCE_N, ForceEstimate, PoseSensor, SurfacePrior, estimate_cosserat, sample
+from host.estimation.spatial import LARGEST_FORCE_N, PoseSensor, SpatialEstimate, SurfacePrior, estimate_cosserat, sample
 from host.estimation.spatial_batch import ForceTracker, estimate_batch
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.cosserat import CosseratSolution, PointLoad, solve_cosserat
+from host.mechanics.rod import rod_record
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product, rotation_matrix
 from protocol.catheter import Catheter, load_catheter
 from protocol.errors import InputError
@@ -87,7 +88,7 @@ def test_sensitivities_against_differences() -> None:
     for case in range(1, 7):
         noisy = sensors_of(posed(STEEROCATH, 25.0, np.array([0.05, 0.08, -0.03])), rng)
         prior = SurfacePrior([0.0, 1.0, 1.0], 0.02)
-        p, _ = sample(STEEROCATH, INSERTION_m, 25.0, case, noisy, prior, 0.2)
+        p = sample(rod_record(STEEROCATH, INSERTION_m, 25.0), case, noisy, prior, 0.2)
         s, m = kernels.new_scratch(len(p.stations)), int(ROWS_OF_CASE[case]) + 2
         x, h = np.array([0.06, 0.05, -0.02]), 1e-4
         kernels.cost_at(p, x, 0.2, True, s)
@@ -147,7 +148,7 @@ def tried(case: int, draws: int, seed: int, thesis_weights: bool = False) -> tup
         found = posed(catheter, k0, rng.uniform(0.02, 0.12) * unit(rng), insertion=0.0)
         if not found.converged:
             continue
-        exact, _ = sample(catheter, 0.0, k0, case, sensors_of(found), None, 0.0)
+        exact = sample(rod_record(catheter, 0.0, k0), case, sensors_of(found), None, 0.0)
         s, m = kernels.new_scratch(len(exact.stations)), int(ROWS_OF_CASE[case])
         kernels.cost_at(exact, found.force_tip_N, 0.4, True, s)
         bound = np.linalg.inv(s.A[:m].T @ s.A[:m])
@@ -158,7 +159,7 @@ def tried(case: int, draws: int, seed: int, thesis_weights: bool = False) -> tup
             W = np.diag([1.0 / 0.07] * 3 + [0.5] * (m - 3))
         square = 0.0
         for _ in range(draws):
-            noisy, _ = sample(catheter, 0.0, k0, case, sensors_of(found, rng), None, 0.0)
+            noisy = sample(rod_record(catheter, 0.0, k0), case, sensors_of(found, rng), None, 0.0)
             x = found.force_tip_N.copy()
             settled, _, _ = kernels.estimate(noisy._replace(whitening=W) if thesis_weights else noisy, 1.0, x, s)
             assert settled
@@ -390,7 +391,7 @@ def test_chi_square_limits() -> None:
 # Bad input
 
 
-def attempt(**change: object) -> ForceEstimate:
+def attempt(**change: object) -> SpatialEstimate:
     good: dict = {
         "catheter": STEEROCATH,
         "insertion_m": 0.01,

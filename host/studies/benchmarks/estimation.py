@@ -18,8 +18,18 @@ from host.estimation.sensor_noise import (
     residual_covariance,
     whitening,
 )
-from host.estimation.spatial import FAIR_DEVIATIONS, LARGEST_FORCE_N, pose_problem, start_grid
-from host.estimation.spatial_kernels import QUICK, Problem, Scratch, best_of, cost_at, estimate, keep, new_scratch
+from host.estimation.spatial import FAIR_DEVIATIONS, LARGEST_FORCE_N, start_grid
+from host.estimation.spatial_kernels import (
+    QUICK,
+    PoseSample,
+    Scratch,
+    best_of,
+    cost_at,
+    estimate,
+    keep,
+    new_scratch,
+    sample_of,
+)
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product
 from host.studies.benchmarks.runner import Report, Row, Timed, alternate, row_of
@@ -36,7 +46,7 @@ NO_STARTS, NO_PRIOR = np.zeros((0, 3)), np.zeros((0, 3))
 
 
 @njit(cache=True, nogil=True)
-def _estimates(p: Problem, start: Array, starts: Array, fair: float, x: Array, s: Scratch, repeats: int) -> None:
+def _estimates(p: PoseSample, start: Array, starts: Array, fair: float, x: Array, s: Scratch, repeats: int) -> None:
     for _ in range(repeats):
         x[:] = start
         best_of(p, LARGEST_FORCE_N, starts, fair, x, s)
@@ -56,25 +66,25 @@ def unweighted(case: int) -> Array:
     return np.diag([1.0 / LENGTH_m] * positions + [0.5] * (rows - positions))
 
 
-def problem(case: int, sample: Case, positions: Array, quaternions: Array, W: Array) -> Problem:
+def problem(case: int, sample: Case, positions: Array, quaternions: Array, W: Array) -> PoseSample:
     """The sample as the kernels take it, from poses of all three sensors."""
     count = int(SENSORS_OF_CASE[case])
-    return pose_problem(
+    return sample_of(
         sample.rod,
         SENSOR_OFFSETS_m[:count],
         case,
         np.ascontiguousarray(positions[:count]),
         np.ascontiguousarray(quaternions[:count]),
         W,
-        NO_PRIOR,
         QUICK,
+        NO_PRIOR,
     )
 
 
 class Ours:
     """One sample on our side; `force` is what the last run left."""
 
-    def __init__(self, p: Problem, start: Array, fair: float) -> None:
+    def __init__(self, p: PoseSample, start: Array, fair: float) -> None:
         self.p, self.start, self.fair, self.force = p, start, fair, np.zeros(3)
         self.starts, self.scratch = start_grid(LARGEST_FORCE_N), new_scratch(len(p.stations))
 
@@ -85,7 +95,7 @@ class Ours:
 class Peer:
     """The same sample for scipy: Levenberg-Marquardt of MINPACK with differences, on our model at our accuracy."""
 
-    def __init__(self, p: Problem, start: Array) -> None:
+    def __init__(self, p: PoseSample, start: Array) -> None:
         self.p, self.start, self.force, self.scratch = p, start, np.zeros(3), new_scratch(len(p.stations))
         self.rows = int(ROWS_OF_CASE[p.case])
 

@@ -13,6 +13,7 @@ from scipy.optimize import fsolve
 from host.estimation import planar_kernels
 from host.estimation.planar import tip_covariance
 from host.mechanics import pcar, pcar_kernels
+from host.mechanics.pcar_kernels import Load, Shaft
 from host.studies.benchmarks.runner import Report, Row, alternate, row_of
 from protocol.catheter import load_catheter
 
@@ -23,31 +24,18 @@ RIGHT_m, RIGHT_N = 1e-4, 1e-3
 
 
 @njit(cache=True, nogil=True)
-def _solve(
-    length: Array, EI: Array, cubic: Array, kappa0: Array, force: Array, kappa: Array, drag: Array, work: Array, repeats: int
-) -> int:
+def _solve(shaft: Shaft, external: Load, kappa: Array, work: Array, repeats: int) -> int:
     status = 0
     for _ in range(repeats):
-        status, _, _ = pcar_kernels.load_path(length, EI, cubic, kappa0, force[0], force[1], drag, kappa, work)
+        status, _, _ = pcar_kernels.load_path(shaft, external, kappa, work)
     return status
 
 
 @njit(cache=True, nogil=True)
-def _invert(
-    length: Array,
-    EI: Array,
-    cubic: Array,
-    kappa0: Array,
-    pose: Array,
-    covariance: Array,
-    kappa: Array,
-    work: Array,
-    force: Array,
-    repeats: int,
-) -> bool:
+def _invert(shaft: Shaft, pose: Array, covariance: Array, kappa: Array, work: Array, force: Array, repeats: int) -> bool:
     done = False
     for _ in range(repeats):
-        done, force[0], force[1] = planar_kernels.two_stage(length, EI, cubic, kappa0, pose, covariance, kappa, work)
+        done, force[0], force[1] = planar_kernels.two_stage(shaft, pose, covariance, kappa, work)
     return done
 
 
@@ -65,10 +53,6 @@ def random_inputs(seed: int) -> list[tuple[pcar.Arcs, Array, pcar.Equilibrium]]:
     return inputs
 
 
-def _of(arcs: pcar.Arcs) -> tuple[Array, Array, Array, Array]:
-    return arcs.length_m, arcs.EI_N_m2, arcs.cubic_stiffening_m2, arcs.unloaded_curvature_per_m
-
-
 def _tip(arcs: pcar.Arcs, kappa: Array) -> Array:
     return pcar.shape(arcs, kappa, 2)[-1]
 
@@ -79,7 +63,11 @@ def direct(seed: int, _report: Report) -> list[Row]:
     for arcs, force, found in random_inputs(seed):
         kappa, work = np.empty_like(arcs.length_m), np.empty((pcar_kernels.ROWS, arcs.length_m.size))
         answer = np.empty_like(kappa)
-        ours.append(lambda n, a=arcs, f=force, k=kappa, w=work: _solve(*_of(a), f, k, pcar.NO_DRAG, w, n))
+        ours.append(
+            lambda n, a=arcs, f=force, k=kappa, w=work: _solve(
+                a.shaft, Load(float(f[0]), float(f[1]), pcar.NO_DRAG), k, w, n
+            )
+        )
         peers.append(
             lambda a=arcs, f=force, k=answer: np.copyto(
                 k, _quiet_fsolve(lambda x: pcar.static_residual(a, x, f), a.unloaded_curvature_per_m)
@@ -105,7 +93,7 @@ def inverse(seed: int, _report: Report) -> list[Row]:
         pose = np.array([*found.tip_position_m, found.tip_angle_rad])
         kappa, work = np.empty_like(arcs.length_m), np.empty((pcar_kernels.ROWS, arcs.length_m.size))
         answer, other = np.empty(2), np.empty(2)
-        ours.append(lambda n, a=arcs, p=pose, k=kappa, w=work, f=answer: _invert(*_of(a), p, covariance, k, w, f, n))
+        ours.append(lambda n, a=arcs, p=pose, k=kappa, w=work, f=answer: _invert(a.shaft, p, covariance, k, w, f, n))
         peers.append(lambda a=arcs, p=pose, f=other: np.copyto(f, _by_fsolve(a, p)))
         truth.append(force)
         answers.append(answer)

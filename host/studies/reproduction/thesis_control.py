@@ -102,8 +102,9 @@ def _shape(
         length[i + 1] = max(0.0, rod.distal[i] - inside)
         inside = max(0.0, inside - rod.distal[i])
         kappa0[i + 1] = curvature
-    status, _, share = kernels.load_path(length, EI, np.zeros_like(EI), kappa0, 0.0, -force_N, NO_DRAG, kappa, work)
-    x, y, _ = kernels.evaluate(length, kappa, 0.0, -force_N, NO_DRAG, share, work)
+    external = kernels.Load(0.0, -force_N, NO_DRAG)
+    status, _, share = kernels.load_path(kernels.Shaft(length, EI, np.zeros_like(EI), kappa0), external, kappa, work)
+    x, y, _ = kernels.evaluate(length, kappa, external, share, work)
     return status, x, y
 
 

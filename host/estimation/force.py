@@ -1,0 +1,187 @@
+"""The force at the tip from tracked poses: one function over both models, one sample or many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from host.estimation import planar
+from host.estimation.planar import PlanarEstimate, RecordingEstimate
+from host.estimation.sensor_noise import PoseSensor, SurfacePrior
+from host.estimation.spatial import SpatialEstimate, checked_case, estimate_cosserat
+from host.estimation.spatial_batch import BatchEstimate, estimate_batch
+from host.mechanics.pcar import arcs_of
+from protocol.catheter import Catheter
+from protocol.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@overload
+def estimate_force(
+    catheter: Catheter,
+    insertion_m: ArrayLike,
+    curvature_per_m: ArrayLike,
+    sensors: Sequence[PoseSensor | tuple[float, ArrayLike, ArrayLike]],
+    case: int,
+    *,
+    model: Literal["cosserat"] = ...,
+    previous_force_N: ArrayLike | None = ...,
+    prior: SurfacePrior | None = ...,
+    roll_rad: float = ...,
+    thorough: bool = ...,
+    ordered: bool = ...,
+    workers: int | None = ...,
+) -> SpatialEstimate | BatchEstimate: ...
+@overload
+def estimate_force(
+    catheter: Catheter,
+    insertion_m: ArrayLike,
+    curvature_per_m: ArrayLike,
+    sensors: Sequence[tuple[float, ArrayLike, ArrayLike]],
+    case: None = ...,
+    *,
+    model: Literal["pcar"],
+    prior: SurfacePrior | None = ...,
+    thorough: bool = ...,
+    workers: int | None = ...,
+) -> PlanarEstimate | RecordingEstimate: ...
+
+
+def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, each documented
+    catheter: Catheter,
+    insertion_m: Any,
+    curvature_per_m: Any,
+    sensors: Sequence[Any],
+    case: int | None = None,
+    *,
+    model: str = "cosserat",
+    previous_force_N: ArrayLike | None = None,
+    prior: SurfacePrior | None = None,
+    roll_rad: float = 0.0,
+    thorough: bool = False,
+    ordered: bool = False,
+    workers: int | None = None,
+) -> SpatialEstimate | BatchEstimate | PlanarEstimate | RecordingEstimate:
+    """Estimate the force on the tip from poses measured along the catheter.
+
+    The estimate is the force of largest likelihood: the sum of squared residuals, weighted by the sensors' noise, is
+    smallest. Its covariance is that of first order.
+
+    Parameters:
+        catheter: as `load_catheter` returns it.
+        insertion_m: length of catheter body outside the sheath, m. One number, or (n,) for n samples.
+        curvature_per_m: unloaded curvature of the distal shaft, 1/m. One number, or (n,).
+        sensors: one (offset_m, position_m, quaternion_wxyz) for each sensor, or a `PoseSensor` with covariances, from the
+            tip backwards: arc length back from the tip, m; position (3,) in the base frame, m; unit quaternion (4,),
+            scalar first, sensor frame to base frame. For n samples: positions (n, 3) and quaternions (n, 4).
+            Planar model: one (0.0, position_m (2,), angle_rad), or (0.0, (n, 2), (n,)).
+        case: which parts of the poses are used, 1 to 6: 1 position of the first sensor, 2 and its orientation, 3 position
+            of the second relative to the first, 4 and both orientations, 5 orientation of the second relative to the
+            first, 6 and of the third. Cases 1, 3 and 5 can have several answers. None for the planar model.
+        model: "cosserat", a rod in space, or "pcar", circular arcs in the bending plane.
+        previous_force_N: force (3,) of the sample before, tip frame, N: the search starts there and stays on its branch.
+        prior: the surface that the tip touches, a `SurfacePrior` (one sample only).
+        roll_rad: roll of the handle, rad (one sample only).
+        thorough: look for a better force wherever any residual is left, not only more than the noise leaves; some
+            milliseconds more (one sample only).
+        ordered: the n samples follow each other in time; each search starts from the force before.
+        workers: threads for n samples; default one for each core.
+
+    Returns:
+        SpatialEstimate for one sample: `force_N` (3,) on the tip in the tip frame, `covariance_N2` (3, 3), `converged`,
+        `residual` (dimensionless), `chi_square`, `warnings`, `solutions_N` (k, 3), ...
+        BatchEstimate for n samples: `force_N` (n, 3), `covariance_N2` (n, 3, 3), `converged` (n,), `residual` (n,).
+        PlanarEstimate or RecordingEstimate for the planar model: `force_N` (2,) or (n, 2) in the base frame, ...
+        A pose that no force explains is no error: `converged` is False.
+
+    Raises:
+        InputError: a value is not finite, out of its range or of a wrong shape; names the argument.
+
+    Source:
+        Thesis, (5.3) to (5.11) with (5.5) corrected, and chapter 4 for the planar model; weights and covariance are ours.
+
+    Examples:
+        >>> estimate_force(catheter, 0.01, 10.0, [(0.0, r0, q0), (0.03, r1, q1)], case=4).force_N  # doctest: +SKIP
+    """
+    if model == "cosserat":
+        if case is None:
+            raise InputError("case", "nothing", "1 to 6")
+        if not _many(sensors):
+            return estimate_cosserat(
+                catheter,
+                insertion_m,
+                curvature_per_m,
+                case,
+                sensors,
+                previous_force_N=previous_force_N,
+                prior=prior,
+                roll_rad=roll_rad,
+                thorough=thorough,
+            )
+        _only_one(previous_force_N=previous_force_N, prior=prior, roll_rad=roll_rad or None, thorough=thorough or None)
+        used = sensors[: checked_case(case)]
+        return estimate_batch(
+            catheter,
+            insertion_m,
+            curvature_per_m,
+            case,
+            [sensor[0] for sensor in used],
+            _stacked("position_m", [sensor[1] for sensor in used], 3),
+            _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
+            ordered=ordered,
+            workers=workers,
+        )
+    if model != "pcar":
+        raise InputError("model", model, "cosserat or pcar")
+    return _planar(catheter, insertion_m, curvature_per_m, sensors, prior, thorough, workers)
+
+
+def _many(sensors: Sequence[Any]) -> bool:
+    """Whether the first sensor has a row for each of n samples."""
+    try:
+        position = sensors[0][1]
+    except (IndexError, TypeError, KeyError):
+        raise InputError("sensors", str(sensors), "a list of (offset_m, position_m, quaternion_wxyz)") from None
+    ndim = getattr(position, "ndim", None)
+    if ndim is not None:
+        return bool(ndim == 2)
+    return isinstance(position, list | tuple) and len(position) > 0 and hasattr(position[0], "__len__")
+
+
+def _only_one(**given: object) -> None:
+    for key, value in given.items():
+        if value is not None:
+            raise InputError(key, str(value), "the default: it is for one sample")
+
+
+def _stacked(key: str, parts: list[Any], width: int) -> Array:
+    """Arrays (n, width) of k sensors as one (n, k, width). Raises InputError."""
+    arrays = [np.asarray(part, dtype=np.float64) for part in parts]
+    for index, array in enumerate(arrays):
+        if array.ndim != 2 or array.shape != (len(arrays[0]), width):
+            raise InputError(f"sensors.{index}.{key}", f"shape {array.shape}", f"({len(arrays[0])}, {width})")
+    return np.stack(arrays, axis=1)
+
+
+def _planar(
+    catheter: Catheter,
+    insertion_m: Any,
+    curvature_per_m: Any,
+    sensors: Sequence[Any],
+    prior: SurfacePrior | None,
+    thorough: bool,
+    workers: int | None,
+) -> PlanarEstimate | RecordingEstimate:
+    if len(sensors) != 1 or len(sensors[0]) != 3 or sensors[0][0] != 0.0:
+        raise InputError("sensors", str(sensors), "one (0.0, position_m, angle_rad): the planar model reads the tip's pose")
+    _, position, angle = sensors[0]
+    if not _many(sensors):
+        arcs = arcs_of(catheter, insertion_m, curvature_per_m)
+        return planar.estimate(arcs, [*np.ravel(position), angle], prior=prior, thorough=thorough)
+    _only_one(prior=prior, thorough=thorough or None)
+    pose = np.column_stack([np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)])
+    return planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)

@@ -1,0 +1,223 @@
+"""A running rig from Python: read its topics and, with the lease, command it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Any
+
+from host.run.commander import Acknowledgement, Commander
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+from protocol.topics import TOPICS, Message
+from protocol.zenoh_session import Latest, Session
+
+READABLE = tuple(name for name, topic in TOPICS.items() if topic.kind != "query")
+POLL_S = 0.002
+
+
+class CommandRefused(RuntimeError):
+    """The rig did not carry out a command. `acknowledgement` says what became of it."""
+
+    def __init__(self, action: str, acknowledgement: Acknowledgement) -> None:
+        super().__init__(f"{action}: {acknowledgement.reason}")
+        self.acknowledgement = acknowledgement
+
+
+class RigConnection:
+    """A connection to one rig; use it as a context.
+
+    Reading needs nothing. `take` takes the lease, which is kept until `release` or the end of the context; with it `arm`,
+    `goto`, `touch`, `force`, `retract`, `disarm` and `clear_fault` command the rig. `hold` and `stop` need no lease.
+    A command that the rig refuses raises CommandRefused with the rig's reason.
+    """
+
+    def __init__(self, rig: Rig, session: Session, name: str) -> None:
+        """Read and command `rig` over `session` as commander `name`."""
+        self.rig = rig
+        self._session = session
+        self._commander = Commander(session, name)
+        self._latest: dict[str, Latest] = {}
+        self._newest: dict[str, Message] = {}
+        for topic in ("state", "commander", "board"):
+            self._reader(topic)
+
+    def latest(self, topic: str) -> Message | None:
+        """Return the newest message of a topic, None where none has come since the connection or the first call.
+
+        Parameters:
+            topic: a name of docs/topics.md, for example "pose/tip" or "force/sensor".
+
+        Raises:
+            InputError: no such topic.
+        """
+        message = self._reader(topic).take()
+        if message is not None:
+            self._newest[topic] = message
+        return self._newest.get(topic)
+
+    def subscribe(self, topic: str, seconds: float) -> Iterator[Message]:
+        """Yield the messages of a topic as they come.
+
+        Parameters:
+            topic: a name of docs/topics.md. seconds: how long to listen. The newest message counts: a reader that is
+                slower than the topic misses some, and never slows the rig down.
+
+        Raises:
+            InputError: no such topic.
+        """
+        reader, end_s = self._reader(topic), time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            message = reader.take()
+            if message is None:
+                time.sleep(POLL_S)
+            else:
+                yield message
+
+    def status(self, timeout_s: float = 2.0) -> dict[str, Any]:
+        """Return what the rig says of itself.
+
+        Parameters:
+            timeout_s: how long to wait for a rig from which nothing has come yet.
+
+        Returns:
+            `connected`; `phase`, `safety_action`, `cause`, `tip_m`, `force_N`, `target_force_N` (None where unknown);
+            `holder`, who holds the lease; `board_fault`.
+        """
+        end_s = time.monotonic() + timeout_s
+        while (state := self.latest("state")) is None and time.monotonic() < end_s:
+            time.sleep(POLL_S)
+        counts, board = self.latest("commander"), self.latest("board")
+        return {
+            "connected": state is not None,
+            "phase": getattr(state, "mode", None),
+            "safety_action": getattr(state, "safety_action", None),
+            "cause": getattr(state, "cause", None),
+            "tip_m": getattr(state, "tip_m", None),
+            "force_N": getattr(state, "force_N", None),
+            "target_force_N": getattr(state, "target_force_N", None),
+            "holder": getattr(counts, "holder", None),
+            "board_fault": getattr(board, "fault_name", None),
+        }
+
+    def take(self) -> None:
+        """Take the lease, and keep it. Raises CommandRefused while another commander holds it."""
+        self._said("take", self._commander.take())
+
+    def release(self) -> None:
+        """Give the lease back. What moves goes on as commanded."""
+        self._said("release", self._commander.release())
+
+    def arm(self) -> None:
+        """Arm the board and the loop; the rig holds its position. Raises CommandRefused."""
+        self._said("arm", self._commander.arm())
+
+    def disarm(self) -> None:
+        """Disarm the board. Raises CommandRefused."""
+        self._said("disarm", self._commander.disarm())
+
+    def goto(self, position_m: Sequence[float]) -> None:
+        """Move the tip to `position_m` (3,), base frame, m. Returns at once. Raises CommandRefused."""
+        self._said("goto", self._commander.target(position_m))
+
+    def touch(self, position_m: Sequence[float], normal: Sequence[float], force_N: float) -> None:
+        """Approach the tissue and hold a force on it. Returns at once.
+
+        Parameters:
+            position_m: (3,) where the tissue is, base frame, m. normal: (3,) unit vector into the tissue, base frame.
+            force_N: contact force to hold, N.
+
+        Raises:
+            CommandRefused: the rig says why.
+        """
+        self._said("touch", self._commander.press(position_m, normal, force_N))
+
+    def force(self, force_N: float) -> None:
+        """Change the contact force, N, of the touch that goes on. Raises CommandRefused."""
+        self._said("force", self._commander.force(force_N))
+
+    def hold(self) -> None:
+        """Hold the position. Needs no lease. Raises CommandRefused."""
+        self._said("hold", self._commander.hold())
+
+    def retract(self) -> None:
+        """Move away from the tissue, then stop. Raises CommandRefused."""
+        self._said("retract", self._commander.retract())
+
+    def stop(self) -> None:
+        """Stop. Needs no lease; only disarming and arming lead out of it. Raises CommandRefused where no answer came."""
+        self._said("stop", self._commander.stop())
+
+    def clear_fault(self) -> None:
+        """Clear latched faults and leave the rig disarmed. Raises CommandRefused."""
+        self._said("clear_fault", self._commander.clear_fault())
+
+    def close(self) -> None:
+        """Give the lease back, where it is held, and close the connection."""
+        self._commander.close()
+        self._session.close()
+
+    def __enter__(self) -> RigConnection:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _reader(self, topic: str) -> Latest:
+        if topic not in READABLE:
+            raise InputError("topic", topic, "one of " + ", ".join(READABLE))
+        if topic not in self._latest:
+            self._latest[topic] = self._session.latest(topic)
+        return self._latest[topic]
+
+    @staticmethod
+    def _said(action: str, answer: Acknowledgement) -> None:
+        if not answer.accepted:
+            raise CommandRefused(action, answer)
+
+
+def connect(
+    rig: str | os.PathLike[str] | Rig,
+    name: str = "python",
+    *,
+    endpoint: str | None = None,
+    keys: str | os.PathLike[str] | None = None,
+) -> RigConnection:
+    """Connect to a running rig.
+
+    Parameters:
+        rig: the rig's file (TOML), "simulated" for the simulated rig, or a checked `Rig`.
+        name: name under which commands are given, 1 to 32 of a-z, 0-9, - and _; across machines that of the certificate.
+        endpoint: where a rig on another machine listens, `tls/HOST:PORT`; default: this machine, as the rig file says.
+        keys: folder with the certificate for `endpoint`, as `seldinger keys issue` made it.
+
+    Returns:
+        RigConnection, a context: `status()`, `latest(topic)`, `subscribe(topic, seconds)`; `take()` takes the lease, with
+        which `arm()`, `goto(...)`, `touch(...)`, `retract()` and others command the rig; `stop()` needs no lease.
+
+    Raises:
+        InputError: the rig file is not good, or `endpoint` and `keys` do not go together.
+        OSError: nobody answers at `endpoint`, or the certificate is refused.
+
+    Source:
+        Topics and roles: docs/topics.md and docs/security.md.
+
+    Examples:
+        >>> with connect("rig.toml") as rig:  # doctest: +SKIP
+        ...     print(rig.status()["phase"])
+    """
+    read = rig if isinstance(rig, Rig) else load_rig(SIMULATED_RIG if rig == "simulated" else os.fspath(rig))
+    if (endpoint is None) != (keys is None):
+        raise InputError("keys" if keys is None else "endpoint", "nothing", "endpoint and keys together, or neither")
+    try:
+        if endpoint is not None and keys is not None:
+            from pathlib import Path
+
+            session = Session.remote(read.name, endpoint, Path(keys))
+        else:
+            session = Session(read.name, [], read.zenoh.connect)
+        return RigConnection(read, session, name)
+    except ValueError as error:
+        raise InputError.from_sentence(str(error)) from None
