@@ -66,11 +66,27 @@ def rod_estimates(folder: Path) -> None:
         estimate_request(validate(CosseratEstimate, request), with_picture=False)
 
 
+def many_cases(folder: Path) -> None:
+    """Solve and estimate arrays of cases, with both models, as from Python."""
+    import numpy as np
+
+    from host.estimation import estimate_force
+    from host.mechanics import solve
+    from protocol.catheter import load_catheter
+
+    rod, arcs = load_catheter("livewire"), load_catheter("thermocool_sf")
+    shapes = solve(rod, 0.01, 10.0, np.array([[0.0, 0.01, 0.0], [0.0, 0.02, 0.0]]), stations_m=[0.0, 0.03])
+    poses = zip((0.0, 0.03), *(np.moveaxis(a, 1, 0) for a in shapes[2:4]), strict=True)
+    estimate_force(rod, 0.01, 10.0, [(s, p.copy(), q.copy()) for s, p, q in poses], 4)
+    planar = solve(arcs, 0.02, 15.0, np.array([[0.0, -0.05], [0.0, 0.05]]), model="pcar")
+    estimate_force(arcs, 0.02, 15.0, [(0.0, planar.tip_position_m, planar.tip_angle_rad)], model="pcar")
+
+
 def calibration(folder: Path) -> None:
     """Calibrate a catheter of each model from shapes that the model itself makes."""
     import json
 
-    from host.identification.catheter_calibration import CalibrationRequest, calibrate_catheter
+    from host.identification.catheter_calibration import calibrate
     from host.mechanics.requests import CosseratSolve, PcarSolve, solve_request
     from protocol.requests import plain, validate
 
@@ -89,9 +105,8 @@ def calibration(folder: Path) -> None:
             recordings.append({**shape, "force_N": load["force_N"], "markers": markers})
         shapes = folder / f"shapes_{base['model']}.json"
         shapes.write_text(json.dumps({"recordings": recordings}), encoding="utf-8")
-        calibrate_catheter(
-            CalibrationRequest(str(shapes), str(base["catheter"]), str(base["model"]), ("stiffness",), leave_one_out=False)
-        )
+        catheter, model_name = str(base["catheter"]), str(base["model"])
+        calibrate(str(shapes), catheter, model=model_name, fit=("stiffness",), leave_one_out=False)
 
 
 def simulated_rig(folder: Path) -> None:
@@ -195,6 +210,7 @@ WORKLOADS = {
     "rig": Workload("simulated rig and control tick", simulated_rig),
     "planar": Workload("planar model", planar_model, ("rig",)),
     "estimates": Workload("force from poses, cases 1 to 6", rod_estimates, ("rod",)),
+    "arrays": Workload("arrays of cases, both models", many_cases, ("estimates", "planar")),
     "loop": Workload("wall-clock loop", control_loop, ("rig",)),
     "tables": Workload("diagnosis of tables", diagnosis_of_tables),
     "processes": Workload("rig on the wall clock", rig_processes, ("loop", "planar")),
