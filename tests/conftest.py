@@ -1,10 +1,30 @@
 """Settings of the whole suite: the same examples in every run, and no deadline on the wall clock."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import settings
 
 settings.register_profile("seldinger", deadline=None, derandomize=True, print_blob=False)
 settings.load_profile("seldinger")
+
+# Files whose tests fit models to recordings or run a whole rig: longer than ten seconds each on one core. A single slow test
+# in another file has the mark itself. Every run prints its slowest tests, so that this list can be kept true.
+SLOW = {
+    "host/diagnosis": "benches experiment folded_reading live nested nominals places planted rig_recording standing",
+    "host/proof": "runner",
+    "host": "access demo estimator_process live_study reproduction reproduction_mechanics services subscribers unplugged",
+    "sim": "scenario sensor_failures rig_effects",
+}
+SLOW_FILES = {f"{folder}/test_{name}.py" for folder, names in SLOW.items() for name in names.split()}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the slow files."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.is_relative_to(here) and item.path.relative_to(here).as_posix() in SLOW_FILES:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

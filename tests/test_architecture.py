@@ -151,3 +151,10 @@ def test_the_test_sees_a_forbidden_arrow() -> None:
     text = "import host.mechanics\nfrom sim.plant import Plant\n"
     assert forbidden_arrows("realtime.control.tick", text) == {"host.mechanics", "sim.plant"}
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]
+
+
+def test_every_file_marked_slow_exists() -> None:
+    """A renamed file must not leave the list unnoticed."""
+    from tests.conftest import SLOW_FILES
+
+    assert not [name for name in SLOW_FILES if not (ROOT / "tests" / name).is_file()]

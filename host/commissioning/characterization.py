@@ -153,18 +153,18 @@ def characterize(recording: Recording, rig: Rig) -> Characterization:
         roll_runs.append(cuts.run(span, 1, _roll_rad(poses, tracker.position_noise_m, tracker.orientation_noise_rad)))
     roll, roll_backlash = _fit_roll(roll_runs, tracker.orientation_noise_rad)
     plane_rad = roll.offset.value
-    pieces: list[KnobSweep] = []
+    segments: list[KnobSweep] = []
     knob_runs: list[Run] = []
     for span in cuts.spans(2):
         poses = cuts.poses(span)
         handle_m = span.sweep["centre"][0] - 0.5 * insertion.width.value
         body_m = insertion.slope.value * handle_m + insertion.offset.value - length
-        piece = _knob_samples(poses, plane_rad, body_m, length, len(pieces))
-        run = cuts.run(span, 2, piece.curvature_per_m)
-        pieces.append(piece._replace(knob_rad=run.input_at()))
+        segment = _knob_samples(poses, plane_rad, body_m, length, len(segments))
+        run = cuts.run(span, 2, segment.curvature_per_m)
+        segments.append(segment._replace(knob_rad=run.input_at()))
         knob_runs.append(run)
     knob = fit_knob(knob_runs, tracker.orientation_noise_rad / length)
-    sweep = KnobSweep(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+    sweep = KnobSweep(*(np.concatenate(column) for column in zip(*segments, strict=True)))
     return Characterization(
         rig.catheter.name, length, insertion, roll, roll_backlash, knob, insertion_runs, tuple(roll_runs), sweep
     )

@@ -30,7 +30,7 @@ class PortNames(NamedTuple):
 
 
 def describe(sweeps: Sequence[Sweep]) -> str:
-    """What will move, how far, and for how long: to be read before it is allowed."""
+    """Describe what will move, how far and for how long, for the question whether it may."""
     parts = []
     for axis, (unit, scale) in enumerate(_UNITS):
         swing = [
@@ -66,10 +66,10 @@ def record_on_rig(
     Raises ValueError (sweeps that the stages cannot do) and OSError (a port that does not open, or is held by another
     process) before anything moves; RuntimeError where the sweeps were broken off.
     """
-    heard: list[tuple[str, Message]] = []
+    received: list[tuple[str, Message]] = []
 
     def publish(topic: str, message: Message) -> None:
-        heard.append((topic, message))
+        received.append((topic, message))
 
     loop = SweepLoop(rig, sweeps, publish)
     with (
@@ -78,10 +78,10 @@ def record_on_rig(
     ):
         try:
             with _stopping() as stop:
-                run_sweeps(loop, lines, each=_told(loop, progress), stop=stop.is_set, settings=RealtimeSettings())
+                run_sweeps(loop, lines, each=_progress_of(loop, progress), stop=stop.is_set, settings=RealtimeSettings())
         except OSError as gone:
             loop.break_off(f"board: {gone}")
-        for topic, message in heard:
+        for topic, message in received:
             recording.write(topic, message, message.stamp_ns)
         if not loop.problem and recording.failure:
             loop.problem = recording.failure
@@ -91,14 +91,14 @@ def record_on_rig(
     return path
 
 
-def _told(loop: SweepLoop, progress: Callable[[float], None]) -> Callable[[], None]:
-    told = -1.0
+def _progress_of(loop: SweepLoop, progress: Callable[[float], None]) -> Callable[[], None]:
+    reported = -1.0
 
     def each() -> None:
-        nonlocal told
-        if loop.progress != told:
-            told = loop.progress
-            progress(told)
+        nonlocal reported
+        if loop.progress != reported:
+            reported = loop.progress
+            progress(reported)
 
     return each
 

@@ -27,6 +27,7 @@ from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port, running
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.browser
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDTHS = [(1280, 800), (360, 740)]
