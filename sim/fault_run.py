@@ -12,7 +12,8 @@ from protocol.enums import BoardState, Phase, SafetyAction
 from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Log, Message
 from realtime.control import safety
-from realtime.core.lockstep import Arriving, Leaving, Publish
+from realtime.core.lines import FromRig, ToRig
+from realtime.core.lockstep import Publish
 from sim.line_noise import LineNoise
 from sim.scenario import Estimator, Scenario
 from sim.world import World
@@ -79,11 +80,11 @@ class FaultyScenario(Scenario):
         until_ns = self.world.now_ns + self.loop.period_ns + self.pause_ns
         self.pause_ns = 0
         leaving = self.noise.outgoing(self._leaving, self.world.now_ns)
-        got = Arriving()
+        got = FromRig()
         while self.world.now_ns < until_ns:
             part = self.world.exchange(min(self.world.now_ns + MS, until_ns), leaving)
-            leaving = Leaving()
-            got = Arriving(got.board + part.board, got.tracker + part.tracker, got.force + part.force)
+            leaving = ToRig()
+            got = FromRig(got.board + part.board, got.tracker + part.tracker, got.force + part.force)
             for watcher in self.watchers:
                 watcher.see_world()
         arriving = self.noise.incoming(got, until_ns)
@@ -183,7 +184,7 @@ class Watcher:
 
     def see_loop(self) -> None:
         """After each period of the loop."""
-        outputs, status = self.run.loop.outputs[0], self.run.loop.link.status
+        outputs, status = self.run.loop.outputs[0], self.run.loop.core.link.status
         new = int(outputs.cause) & ~self._causes
         if new:
             self._detected("cause: " + ", ".join(safety.names(new)))
@@ -219,17 +220,17 @@ class Watcher:
 
 def _bad_counts(run: FaultyScenario) -> dict[str, int]:
     """All counts of the drivers and of the board that only grow when something is wrong."""
-    loop = run.loop
-    counts: dict[str, Any] = {f"board.{name}": getattr(loop.link.status, name, 0) for name in _BAD_STATUS}
-    line = loop.link.decoder.counters
+    loop, sensors = run.loop, run.loop.sensors
+    counts: dict[str, Any] = {f"board.{name}": getattr(loop.core.link.status, name, 0) for name in _BAD_STATUS}
+    line = loop.core.link.decoder.counters
     counts |= {
         "line.crc_errors": line.crc_errors,
         "line.lost": line.lost,
         "line.repeated": line.repeated,
         "loop.missed_ticks": loop.missed_ticks,
     }
-    counts |= {f"tracker.{name}": value for name, value in vars(loop.tracker.counters).items() if name in _BAD_TRACKER}
-    counts |= {f"force.{name}": value for name, value in vars(loop.force_sensor.counters).items() if name in _BAD_FORCE}
+    counts |= {f"tracker.{name}": value for name, value in vars(sensors.tracker.counters).items() if name in _BAD_TRACKER}
+    counts |= {f"force.{name}": value for name, value in vars(sensors.force_sensor.counters).items() if name in _BAD_FORCE}
     return counts
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.lines import FromRig, ToRig
 from sim.sensor_faults import Fault, active, checked, strongest
 
 # bit_errors: `value` is the rate per bit of the board's line, both ways; drop, duplicate, reorder: `value` is the chance
@@ -39,22 +39,22 @@ class LineNoise:
         """One more fault. Raises ValueError for a kind that is not of FAULT_KINDS."""
         self.faults += checked([fault], FAULT_KINDS)
 
-    def outgoing(self, leaving: Leaving, now_ns: int) -> Leaving:
+    def outgoing(self, leaving: ToRig, now_ns: int) -> ToRig:
         """What of `leaving` gets through to the rig."""
         if not self.faults:
             return leaving
         board = self._line(leaving.board, now_ns, "out")
         board *= max(int(strongest(self.faults, now_ns, "flood_out")), 1)
-        return Leaving(board, leaving.tracker, leaving.tracker_line, leaving.force)
+        return ToRig(board, leaving.tracker, leaving.tracker_line, leaving.force)
 
-    def incoming(self, arriving: Arriving, now_ns: int) -> Arriving:
+    def incoming(self, arriving: FromRig, now_ns: int) -> FromRig:
         """What of `arriving` gets through to the computer."""
         if not self.faults:
             return arriving
         times = max(int(strongest(self.faults, now_ns, "flood_in")), 1)
         board = self._whole_frames(arriving.board)
         board = self._line(board, now_ns, "in") * times
-        return Arriving(board, arriving.tracker, [record for record in arriving.force for _ in range(times)])
+        return FromRig(board, arriving.tracker, [record for record in arriving.force for _ in range(times)])
 
     def _whole_frames(self, data: bytes) -> bytes:
         """Frames are handled whole: what has not ended yet waits for its end."""

@@ -12,8 +12,9 @@ import numpy as np
 from protocol.commander import Acknowledgement, Commander
 from protocol.enums import Phase
 from protocol.rig_file import Rig
-from protocol.topics import Command, ForceEstimate, Message, Reply, SimulatedTruth, encode
-from realtime.core.lockstep import Arriving, LockstepLoop, Publish
+from protocol.topics import Command, ForceEstimate, Message, Pose, Reply, SimulatedTruth, encode
+from realtime.core.lines import FromRig
+from realtime.core.lockstep import LockstepLoop, Publish
 from realtime.drivers.stepper_board import LinkPhase
 from sim.world import World
 
@@ -74,7 +75,7 @@ class Scenario:
         self._estimator, self._delay_ns = estimator, round(estimator_delay_s * 1e9)
         self._publish = publish
         self.loop = LockstepLoop(rig, force_source, self._heard)
-        self._leaving = self.loop.step(0, Arriving())
+        self._leaving = self.loop.step(0, FromRig())
         self._latest: dict[str, Message] = {}
         self._commands = 0
         self.commander = Commander(self, "scenario", clock_ns=lambda: self.loop.now_ns, new_id=self._next_id)
@@ -98,8 +99,8 @@ class Scenario:
             return
         estimate = self._estimator(message, self._latest.get("pose/shaft"), self._latest["stage"])
         if estimate is not None:
-            arrival_ns = self.loop.inputs[0].tip.arrival_ns + self._delay_ns
-            self.loop.estimate_at(_published_at(estimate, int(arrival_ns)))
+            assert isinstance(message, Pose)
+            self.loop.estimate_at(msgspec.structs.replace(estimate, published_ns=message.arrival_ns + self._delay_ns))
 
     def step(self) -> None:
         """One period of the loop."""
@@ -144,7 +145,7 @@ class Scenario:
     def ready(self) -> bool:
         """Board configured, poses and forces arriving."""
         state = self.loop.state[0]
-        return self.loop.link.phase is LinkPhase.READY and bool(state.predictor.started) and bool(state.force_seen)
+        return self.loop.core.link.phase is LinkPhase.READY and bool(state.predictor.started) and bool(state.force_seen)
 
     def arm(self) -> bool:
         """Wait for all devices, arm, and let the loop hold for a moment; False if that fails in START_TIMEOUT_S."""
@@ -207,17 +208,13 @@ class Scenario:
         self.run(0.3)
         outcome.steps_commanded = [int(steps) for steps in self.loop.outputs[0].position_steps]
         outcome.steps_on_pins = self.world.steps.tolist()
-        status = self.loop.link.status
+        status = self.loop.core.link.status
         outcome.steps_reported = [] if status is None else [int(steps) for steps in status.position_steps]
         self.command("disarm")
         self.run(0.1)
         outcome.virtual_s = self.world.now_ns * 1e-9
         outcome.digest = self.world.digest
         return outcome
-
-
-def _published_at(estimate: ForceEstimate, published_ns: int) -> ForceEstimate:
-    return msgspec.structs.replace(estimate, published_ns=published_ns)
 
 
 def _truth(world: World) -> SimulatedTruth:

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.rig_file import Rig
 from realtime.core.intake import quaternion_product, rotation
-from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.lines import FromRig, ToRig
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
 from sim.board import CPU_HZ, STEP_TIMER_CYCLES, Board, BoardSlice
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
@@ -94,7 +94,7 @@ class World:
         """Steps (3,) counted on the pins since the start."""
         return self.stages.step_counts
 
-    def exchange(self, until_ns: int, leaving: Leaving) -> Arriving:
+    def exchange(self, until_ns: int, leaving: ToRig) -> FromRig:
         """Take what the computer sent, let time run to `until_ns` in slices of 1 ms, return what arrives by then."""
         for action in leaving.tracker_line:
             self.tracker.set_line(action.baud)
@@ -108,7 +108,7 @@ class World:
             next_ns = min(self.now_ns + 1_000_000, until_ns)
             from_board += self.advance(next_ns, to_board)
             to_board = b""
-        return Arriving(from_board, self.tracker.read(until_ns), self.force_box.read(until_ns))
+        return FromRig(from_board, self.tracker.read(until_ns), self.force_box.read(until_ns))
 
     def advance(self, until_ns: int, to_board: bytes) -> bytes:
         """Let time run to `until_ns` (at most a few ms on) with bytes for the board; returns what the board sent."""

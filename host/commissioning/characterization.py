@@ -21,7 +21,7 @@ from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.rig_file import Rig, load_rig, parse_rig
 from protocol.topics import Message
-from realtime.core.lockstep import Arriving
+from realtime.core.lines import FromRig
 from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
 from sim.board import Board
 from sim.tissue import TissueConfig
@@ -125,7 +125,7 @@ def record_simulated(
             recording.write(topic, message, world.now_ns)
 
         loop = SweepLoop(rig, sweeps, publish)
-        leaving, ticks = loop.step(0, Arriving()), 0
+        leaving, ticks = loop.step(0, FromRig()), 0
         while not loop.done:
             now_ns = world.now_ns + loop.period_ns
             leaving = loop.step(now_ns, world.exchange(now_ns, leaving))

@@ -88,14 +88,14 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
 
 def _counts(scenario: Scenario, world: World, outcome: Outcome) -> dict[str, Any]:
     """What must agree and what must be zero."""
-    loop, status = scenario.loop, scenario.loop.link.status
+    loop, status = scenario.loop, scenario.loop.core.link.status
     return {
         "missed_ticks": 0,
-        "faults": list(loop.faults),
+        "faults": list(loop.core.board_errors),
         "steps_commanded": outcome.steps_commanded,
         "steps_on_pins": outcome.steps_on_pins,
         "steps_reported": outcome.steps_reported,
-        "crc_errors": 0 if status is None else status.crc_errors + loop.link.decoder.counters.crc_errors,
+        "crc_errors": 0 if status is None else status.crc_errors + loop.core.link.decoder.counters.crc_errors,
         "underruns": 0 if status is None else status.underruns,
         "edges": world.edges.tolist(),
         "digest": world.digest,

@@ -107,22 +107,22 @@ def soak(
 
 def _minutes(run: Scenario, minutes: float, result: SoakResult, progress: Callable[[float], None]) -> None:
     world, loop, begin_ns = run.world, run.loop, run.now_ns
-    offset_ns = loop.link.mcu_offset_ns(begin_ns)
+    offset_ns = loop.core.link.mcu_offset_ns(begin_ns)
     every_s = min(60.0, minutes * 60.0 / 20)
     while run.now_ns - begin_ns < minutes * 60e9 and run.phase == Phase.CONTACT:
         run.run(every_s)
-        status = loop.link.status
+        status = loop.core.link.status
         assert status is not None
         result.memory_mb.append(resident_mb())
         # Board and computer share one time here: any change of the offset between their clocks is the link's own error.
-        drifted_ns = abs(loop.link.mcu_offset_ns(run.now_ns) - offset_ns)
+        drifted_ns = abs(loop.core.link.mcu_offset_ns(run.now_ns) - offset_ns)
         result.clock_error_s = max(result.clock_error_s, drifted_ns * 1e-9)
         progress((run.now_ns - begin_ns) / (minutes * 60e9))
     if run.phase != Phase.CONTACT:
         result.problems.append(f"contact ended after {(run.now_ns - begin_ns) * 1e-9:.0f} s")
     run.command("target", "hold")
     run.run(0.3)
-    status = loop.link.status
+    status = loop.core.link.status
     assert status is not None
     commanded = [int(steps) for steps in loop.outputs[0].position_steps]
     result.steps_exact = commanded == world.steps.tolist() == list(status.position_steps)
@@ -132,13 +132,13 @@ def _minutes(run: Scenario, minutes: float, result: SoakResult, progress: Callab
         result.stack_free_bytes = world.slice.cpu.stack_free_bytes
     result.edge_jitter_s = world.edge_jitter_s
     result.counts = {
-        "crc_errors": status.crc_errors + loop.link.decoder.counters.crc_errors,
+        "crc_errors": status.crc_errors + loop.core.link.decoder.counters.crc_errors,
         "underruns": status.underruns,
         "rx_overruns": status.rx_overruns,
         "rejected": status.rejected + status.expired + status.overflows,
         "missed_ticks": loop.missed_ticks,
-        "force_lost": loop.force_sensor.counters.lost,
-        "poses_damaged": loop.tracker.counters.damaged,
+        "force_lost": loop.sensors.force_sensor.counters.lost,
+        "poses_damaged": loop.sensors.tracker.counters.damaged,
     }
 
 

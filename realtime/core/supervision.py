@@ -1,22 +1,37 @@
-"""Slow cross-checks beside the tick: lost steps or encoder, force sensor against model, model process alive."""
+"""Cross-checks that are slower than the tick: lost steps, force readings that disagree, a model process that is late."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from protocol.serial_frames import AXES
 from realtime.control import safety
 from realtime.control.records import N_AXES
 
-# Encoder and steps: the encoder follows within a status period at full speed (80 steps); more than that for this long is
-# no lag. 150 steps are 0.5 mm of insertion, 4 degrees of handle.
+Vector = NDArray[np.float64]
+
+# Encoder and steps: the encoder follows within a status period at full speed (80 steps); a larger difference that lasts
+# this long is no lag. 150 steps are 0.5 mm of insertion, 4 degrees of handle.
 STEPS_APART, STEPS_APART_NS = 150, 20_000_000
 # Sensor and model: the planar model is 0.07 N off in contact and 0.2 N noisy at 40 Hz; averaged over a second
 # 0.25 N is beyond both.
 FORCE_APART_N, FORCE_AVERAGE_S = 0.25, 1.0
-# A model process at 40 Hz that says nothing for this long, or speaks of poses older than that, is told.
+# The period of estimates; the first difference after a restart is weighted by it.
+_ESTIMATE_PERIOD_S = 0.025
+# A model process at 40 Hz that sends nothing for this long, or estimates for poses older than that, is logged.
 HOST_SILENT_NS, HOST_LATE_NS = 250_000_000, 200_000_000
+
+
+class Finding(NamedTuple):
+    """What a check found. `cause` is a bit of `realtime.control.safety`, 0 where the finding is only logged."""
+
+    cause: int
+    text: str
 
 
 class StepCheck:
@@ -24,102 +39,127 @@ class StepCheck:
 
     def __init__(self, encoder_counts_per_step: tuple[float, float, float]) -> None:
         self._ratio = np.array(encoder_counts_per_step)
-        self._apart_at_rest: np.ndarray | None = None
+        self._difference_at_rest: Vector | None = None
         self._since_ns: int | None = None
-        self.words = ""
 
     def restart(self) -> None:
-        """Takes the difference at the next status as right; for arming."""
-        self._apart_at_rest, self._since_ns, self.words = None, None, ""
+        """Take the difference at the next status as right; for arming."""
+        self._difference_at_rest, self._since_ns = None, None
 
-    def failed(self, position_steps: np.ndarray, encoder_counts: np.ndarray, now_ns: int) -> bool:
-        """Whether steps (3,) and counts (3,) have parted for good; `words` then says where and by how much."""
-        apart = np.asarray(encoder_counts) / self._ratio - np.asarray(position_steps)
-        if self._apart_at_rest is None:
-            self._apart_at_rest = apart
-        apart = np.abs(apart - self._apart_at_rest)
-        axis = int(np.argmax(apart))
-        if apart[axis] <= STEPS_APART:
+    def check(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> Finding | None:
+        """Compare steps (3,) with counts (3,); return a finding once they have differed for STEPS_APART_NS."""
+        difference = np.asarray(encoder_counts) / self._ratio - np.asarray(position_steps)
+        if self._difference_at_rest is None:
+            self._difference_at_rest = difference
+        lost = np.abs(difference - self._difference_at_rest)
+        axis = int(np.argmax(lost))
+        if lost[axis] <= STEPS_APART:
             self._since_ns = None
-            return False
+            return None
         if self._since_ns is None:
             self._since_ns = now_ns
-        self.words = f"{('insertion', 'roll', 'knob')[axis]}: encoder and steps are {apart[axis]:.0f} steps apart"
-        return now_ns - self._since_ns >= STEPS_APART_NS
+        if now_ns - self._since_ns < STEPS_APART_NS:
+            return None
+        return Finding(safety.STEPS_LOST, f"{AXES[axis]}: encoder and steps are {lost[axis]:.0f} steps apart")
 
 
 class ForceCheck:
-    """The force sensor against the model's estimate: their difference, averaged, stays within the model's error."""
+    """Two sources of one force: their difference, averaged, stays within the larger error of both.
 
-    def __init__(self) -> None:
-        self._apart_N = np.zeros(3)
+    Args:
+        first, second: names of the sources, as `Supervision.forces` gets them.
+        cause: bit of `realtime.control.safety` when they disagree.
+        apart_N: allowed length of the averaged difference (N).
+        average_s: time constant of the average (s).
+    """
+
+    def __init__(self, first: str, second: str, cause: int, apart_N: float, average_s: float) -> None:
+        self.first, self.second, self.cause = first, second, cause
+        self._apart_N, self._average_s = apart_N, average_s
+        self._difference_N = np.zeros(3)
         self._last_ns: int | None = None
 
     def restart(self) -> None:
-        """Forgets the average; for arming."""
-        self._apart_N[:] = 0.0
+        """Forget the average; for arming."""
+        self._difference_N[:] = 0.0
         self._last_ns = None
 
-    def failed(self, sensor_N: np.ndarray, estimate_N: np.ndarray, now_ns: int) -> bool:
-        """Takes in a pair of readings (3,) N in the base frame, once an estimate. NaN in either is left out."""
-        apart = np.asarray(sensor_N, float) - np.asarray(estimate_N, float)
-        if not np.all(np.isfinite(apart)):
-            return False
-        dt_s = 0.025 if self._last_ns is None else max((now_ns - self._last_ns) * 1e-9, 0.0)
+    def check(self, first_N: Vector, second_N: Vector, now_ns: int) -> Finding | None:
+        """Take in a pair of readings (3,) N in the base frame. A pair with a NaN is left out."""
+        difference_N = np.asarray(first_N, float) - np.asarray(second_N, float)
+        if not np.all(np.isfinite(difference_N)):
+            return None
+        dt_s = _ESTIMATE_PERIOD_S if self._last_ns is None else max((now_ns - self._last_ns) * 1e-9, 0.0)
         self._last_ns = now_ns
-        self._apart_N += (1.0 - math.exp(-dt_s / FORCE_AVERAGE_S)) * (apart - self._apart_N)
-        return bool(np.linalg.norm(self._apart_N) > FORCE_APART_N)
+        self._difference_N += (1.0 - math.exp(-dt_s / self._average_s)) * (difference_N - self._difference_N)
+        if not np.linalg.norm(self._difference_N) > self._apart_N:
+            return None
+        return Finding(self.cause, f"{self.first} and {self.second} are more than {self._apart_N} N apart")
 
 
 class HostCheck:
-    """Whether the model process answers, and in time. It moves nothing, so that it is told and no more."""
+    """Whether the model process answers, and in time. Its findings have no cause: they are only logged, once each."""
 
     def __init__(self) -> None:
-        self._heard_ns: int | None = None
+        self._answered_ns: int | None = None
         self._complaint = ""
 
-    def heard(self, stamp_ns: int, now_ns: int) -> str:
-        """An estimate has come; returns a sentence to tell, or nothing."""
-        self._heard_ns = now_ns
+    def answered(self, stamp_ns: int, now_ns: int) -> Finding | None:
+        """Take in an estimate for a pose of `stamp_ns` that arrived at `now_ns` (ns)."""
+        self._answered_ns = now_ns
         late = now_ns - stamp_ns > HOST_LATE_NS
-        return self._changed(
-            f"estimates are more than {HOST_LATE_NS * 1e-6:.0f} ms old: the model process is slow" if late else ""
-        )
+        limit_ms = HOST_LATE_NS * 1e-6
+        return self._new(f"estimates are more than {limit_ms:.0f} ms old: the model process is slow" if late else "")
 
-    def silent(self, now_ns: int) -> str:
-        """To be asked at every tick; returns a sentence to tell when the process has fallen silent, once."""
-        if self._heard_ns is None or now_ns - self._heard_ns <= HOST_SILENT_NS:
-            return ""
-        return self._changed(f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process is silent")
+    def overdue(self, now_ns: int) -> Finding | None:
+        """Return a finding when the last estimate is too long ago; nothing before the first estimate."""
+        if self._answered_ns is None or now_ns - self._answered_ns <= HOST_SILENT_NS:
+            return None
+        return self._new(f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process is silent")
 
-    def _changed(self, complaint: str) -> str:
-        told, self._complaint = self._complaint, complaint
-        return complaint if complaint != told else ""
+    def _new(self, complaint: str) -> Finding | None:
+        before, self._complaint = self._complaint, complaint
+        return Finding(0, complaint) if complaint and complaint != before else None
 
 
 class Supervision:
-    """The three checks together. `flags` is the bit set of failsafe causes that stand; it stays until `restart`."""
+    """All checks together. `causes` is the bit set of failsafe causes that stand; they stay until `restart`."""
 
     def __init__(self, encoder_counts_per_step: tuple[float, float, float]) -> None:
-        self.steps, self.force, self.host = StepCheck(encoder_counts_per_step), ForceCheck(), HostCheck()
-        self.flags = 0
+        self.steps, self.host = StepCheck(encoder_counts_per_step), HostCheck()
+        self.force_checks = (ForceCheck("force sensor", "model", safety.FORCE_DISAGREES, FORCE_APART_N, FORCE_AVERAGE_S),)
+        self.causes = 0
 
     def restart(self) -> None:
-        """For arming and clearing: the operator has seen what was wrong."""
+        """Forget all findings; for arming and clearing, when the operator has seen what was wrong."""
         self.steps.restart()
-        self.force.restart()
-        self.flags = 0
+        for check in self.force_checks:
+            check.restart()
+        self.causes = 0
 
-    def status(self, position_steps: np.ndarray, encoder_counts: np.ndarray, now_ns: int) -> str:
-        """A board's status while armed; returns what to log."""
-        if self.flags & safety.STEPS_LOST or not self.steps.failed(position_steps[:N_AXES], encoder_counts[:N_AXES], now_ns):
-            return ""
-        self.flags |= safety.STEPS_LOST
-        return self.steps.words
+    def status(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> Finding | None:
+        """Check a board's status while armed; steps and counts (3,). Return a new finding."""
+        if self.causes & safety.STEPS_LOST:
+            return None
+        return self._kept(self.steps.check(position_steps[:N_AXES], encoder_counts[:N_AXES], now_ns))
 
-    def estimate(self, sensor_N: np.ndarray, estimate_N: np.ndarray, now_ns: int) -> str:
-        """A converged estimate in contact; returns what to log."""
-        if self.flags & safety.FORCE_DISAGREES or not self.force.failed(sensor_N, estimate_N, now_ns):
-            return ""
-        self.flags |= safety.FORCE_DISAGREES
-        return f"force sensor and model are more than {FORCE_APART_N} N apart"
+    def forces(self, forces_N: Mapping[str, Vector], now_ns: int) -> Finding | None:
+        """Compare the sources in contact: name -> force (3,) N on the tissue, base frame. Return a new finding."""
+        found = None
+        for check in self.force_checks:
+            if not self.causes & check.cause and check.first in forces_N and check.second in forces_N:
+                found = self._kept(check.check(forces_N[check.first], forces_N[check.second], now_ns)) or found
+        return found
+
+    def host_answered(self, stamp_ns: int, now_ns: int) -> Finding | None:
+        """Take in that an estimate for a pose of `stamp_ns` arrived. Return a new finding."""
+        return self._kept(self.host.answered(stamp_ns, now_ns))
+
+    def host_overdue(self, now_ns: int) -> Finding | None:
+        """Check at every step that estimates keep coming. Return a new finding."""
+        return self._kept(self.host.overdue(now_ns))
+
+    def _kept(self, finding: Finding | None) -> Finding | None:
+        if finding is not None:
+            self.causes |= finding.cause
+        return finding

@@ -23,10 +23,9 @@ from realtime.control.records import BOARD, FORCE, POSE, STAGE_STATE, new
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, take_status
 from realtime.core.intake import Intake
-from realtime.core.lockstep import Arriving, Leaving, Publish
-from realtime.drivers.aurora import AuroraClient, AuroraConfig
-from realtime.drivers.net_ft import NetFtClient, NetFtConfig
-from realtime.drivers.net_ft_calibration import NetFtCalibration
+from realtime.core.lines import FromRig, SensorClients, ToRig
+from realtime.core.lockstep import Publish
+from realtime.drivers.aurora import PoseSample
 from realtime.drivers.stepper_board import EventKind, LinkPhase, StepperBoardLink
 
 # Between sweeps the stages move at these speeds (m/s, rad/s, rad/s), then rest.
@@ -97,25 +96,14 @@ class SweepLoop:
         self.rig, self.sweeps, self.publish = rig, list(sweeps), publish
         self.period_ns = round(1e9 / rig.control.loop_hz)
         self.link = StepperBoardLink(axis_limits(rig))
-        tracker, sensor = rig.tracker, rig.force_sensor
-        self.tracker = AuroraClient(
-            AuroraConfig(
-                tools=(tracker.tip_handle, tracker.shaft_handle), rate_hz=tracker.rate_hz, latency_s=tracker.latency_s
-            )
-        )
-        self.force_sensor = NetFtClient(
-            NetFtConfig(
-                NetFtCalibration(
-                    counts_per_N=sensor.counts_per_newton,
-                    counts_per_Nm=sensor.counts_per_newton_metre,
-                    rdt_rate_hz=sensor.rate_hz,
-                )
-            )
-        )
+        self.sensors = SensorClients(rig)
         self.current, self.finished, self.problem = -1, False, ""
         self._intake, self._stage_config = Intake(rig), tick_parameters(rig)[0].stage
         self._stage, self._board = new(STAGE_STATE)[0], new(BOARD)[0]
-        self._records = {tracker.tip_handle: ("pose/tip", new(POSE)[0]), tracker.shaft_handle: ("pose/shaft", new(POSE)[0])}
+        self._records = {
+            rig.tracker.tip_handle: ("pose/tip", new(POSE)[0]),
+            rig.tracker.shaft_handle: ("pose/shaft", new(POSE)[0]),
+        }
         self._force = new(FORCE)[0]
         self._buffer, self._number = np.zeros(BUFFER_BYTES, np.uint8), 0
         self._armed_ns, self._rest_ns, self._start_ns, self._pose_ns, self._force_ns, self._begin_ns = 0, 0, 0, 0, 0, -1
@@ -146,14 +134,17 @@ class SweepLoop:
         if not self.finished:
             self.problem = self.problem or why
 
-    def step(self, now_ns: int, arriving: Arriving) -> Leaving:
+    def step(self, now_ns: int, arriving: FromRig) -> ToRig:
         """One period: what arrived goes in, what is to be sent comes out."""
         if self._begin_ns < 0:
             self._begin_ns = self._step_ns = now_ns
         self._own_gap(now_ns)
         self._take_board(arriving.board, now_ns)
-        self._take_poses(arriving.tracker, now_ns)
-        self._take_forces(arriving.force, now_ns)
+        readings = self.sensors.feed(arriving, now_ns)
+        self._take_poses(readings.poses, now_ns)
+        for sample in readings.forces:
+            self._intake.force(self._force, sample.stamp_ns, sample.arrival_ns, sample.force_N)
+            self._force_ns = now_ns
         commands = self.link.advance(now_ns)
         if not self._armed_ns:
             commands += self._arm_when_ready(now_ns)
@@ -164,10 +155,7 @@ class SweepLoop:
         if self.done and self._armed_ns > 0:
             commands += self.link.disarm()
             self._armed_ns = -1
-        request = self.force_sensor.outgoing(now_ns)
-        return Leaving(
-            frame + commands, self.tracker.outgoing(now_ns), self.tracker.line_actions(), [request] if request else []
-        )
+        return self.sensors.outgoing(frame + commands, now_ns)
 
     def _arm_when_ready(self, now_ns: int) -> bytes:
         if self.link.phase is LinkPhase.READY and self._pose_ns and self._force_ns and self.link.status is not None:
@@ -298,8 +286,8 @@ class SweepLoop:
             ),
         )
 
-    def _take_poses(self, data: bytes, now_ns: int) -> None:
-        for sample in self.tracker.feed(data, now_ns):
+    def _take_poses(self, samples: list[PoseSample], now_ns: int) -> None:
+        for sample in samples:
             if sample.missing or sample.tool not in self._records:
                 continue
             topic, record = self._records[sample.tool]
@@ -307,10 +295,3 @@ class SweepLoop:
             if topic == "pose/tip":
                 self._pose_ns = now_ns
             self.publish(topic, telemetry.pose_message(record, sample.frame, sample.quality_m))
-
-    def _take_forces(self, datagrams: list[bytes], now_ns: int) -> None:
-        for datagram in datagrams:
-            sample = self.force_sensor.feed(datagram, now_ns)
-            if sample is not None:
-                self._intake.force(self._force, sample.stamp_ns, sample.arrival_ns, sample.force_N)
-                self._force_ns = now_ns

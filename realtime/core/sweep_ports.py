@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from protocol.rig_file import Rig
-from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.lines import FromRig, ToRig
 from realtime.core.sweep import SweepLoop
 from realtime.drivers.net_ft import RDT_PORT
 from realtime.drivers.sensor_threads import apply_line_action
@@ -31,10 +31,10 @@ _DATAGRAM = 2048
 class Ports(Protocol):
     """The lines of a rig, as bytes."""
 
-    def receive(self) -> Arriving:
+    def receive(self) -> FromRig:
         """What has come since the last call. Raises OSError when the board's line is gone."""
 
-    def send(self, leaving: Leaving) -> None:
+    def send(self, leaving: ToRig) -> None:
         """Hand over what is to be sent. Raises OSError when the board's line is gone."""
 
 
@@ -71,9 +71,9 @@ class RigPorts:
         self._opened.append(line)
         return line
 
-    def receive(self) -> Arriving:
+    def receive(self) -> FromRig:
         """What the devices have sent. A tracker or force box that is gone is silent, and the sweeps end by that."""
-        arriving = Arriving(board=self._board.read())
+        arriving = FromRig(board=self._board.read())
         try:
             arriving.tracker = self._tracker.read()
         except OSError as gone:
@@ -87,7 +87,7 @@ class RigPorts:
             self.failures["force sensor"] = str(gone)
         return arriving
 
-    def send(self, leaving: Leaving) -> None:
+    def send(self, leaving: ToRig) -> None:
         """The board first: its set-points have a time."""
         if leaving.board:
             self._board.write(leaving.board)
@@ -159,7 +159,7 @@ def run_sweeps(
     clock = clock or Clock.monotonic()
     with realtime_thread(settings), _no_collection():
         due_ns = clock.now_ns()
-        ports.send(loop.step(due_ns, Arriving()))
+        ports.send(loop.step(due_ns, FromRig()))
         while not loop.done:
             due_ns += loop.period_ns
             clock.sleep_until(due_ns)

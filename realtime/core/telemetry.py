@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 
 from protocol.enums import Phase, SafetyAction
 from protocol.topics import (
     HISTOGRAM_BUCKETS,
-    BoardCounters,
     ForceSensor,
     LoopTiming,
-    Message,
     Pose,
     RigState,
     Stage,
@@ -19,17 +18,18 @@ from protocol.topics import (
 from realtime.control import safety
 from realtime.control.inverse_kinematics import curvature_of_knob
 from realtime.loop.latency import bin_edges_ns, percentiles_us
-from realtime.loop.native_loop import WORK_BIN_NS
+from realtime.loop.loop_thread import NativeLoop
+from realtime.loop.native_loop import GAP_PLACES, LATENESS_BIN_NS, WORK_BIN_NS
 
-# Ticks (of 1 ms) between two messages of a topic.
+# Ticks (of 1 ms) between two messages of a topic; force readings between two of theirs.
 STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY, LOOP_EVERY = 4, 2, 10, 50, 500
 
 
-def stage_message(params: np.record, inputs: np.record, outputs: np.record) -> Stage:
-    """Handle commands and encoders, and the catheter's joints as the controller has them."""
+def stage_message(params: np.record, board: np.record, outputs: np.record) -> Stage:
+    """Handle commands and encoders (BOARD record), and the catheter's joints as the controller has them."""
     steps = params.stage.steps_per_unit
-    encoder = np.asarray(inputs.board.encoder_counts) / steps
-    known = inputs.board.count > 0
+    encoder = np.asarray(board.encoder_counts) / steps
+    known = board.count > 0
     return Stage(
         stamp_ns=int(outputs.now_ns),
         command_insertion_m=float(outputs.stage_unit[0]),
@@ -67,9 +67,8 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
     )
 
 
-def state_message(inputs: np.record, outputs: np.record) -> RigState:
-    """Phase, failsafe action and its cause in words, target and tip."""
-    command = inputs.command
+def state_message(command: np.record, outputs: np.record) -> RigState:
+    """Phase, failsafe action and its causes in words, target (COMMAND record) and tip."""
     pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
     return RigState(
         stamp_ns=int(outputs.now_ns),
@@ -113,4 +112,16 @@ def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -
     )
 
 
-__all__ = ["BoardCounters", "Message", "force_message", "loop_message", "pose_message", "stage_message", "state_message"]
+def wall_clock_timing(stamp_ns: int, loop_hz: float, loop: NativeLoop) -> LoopTiming:
+    """The compiled loop's timing so far: tick times, how late it woke, and its longest gap."""
+    newest = loop.snapshot()
+    late = percentiles_us(loop.lateness, LATENESS_BIN_NS)
+    return msgspec.structs.replace(
+        loop_message(stamp_ns, loop_hz, newest["missed"], loop.work),
+        lateness_p50_us=late["p50"],
+        lateness_p99_us=late["p99"],
+        lateness_p999_us=late["p999"],
+        lateness_max_us=late["max"],
+        longest_gap_ns=newest["longest_gap_ns"],
+        longest_gap_where=GAP_PLACES[newest["longest_gap_place"]],
+    )

@@ -23,7 +23,7 @@ _MAX_WAIT_S = 0.05
 # A pty carries no break; there a zero byte at a speed below the device's, which is what a break looks like, stands for it.
 _BREAK_BAUD = 300
 
-OnEvent = Callable[[DeviceEvent], None]
+OnEvent = Callable[[DeviceEvent], object]
 
 
 class SensorThread(threading.Thread):
@@ -79,7 +79,7 @@ class AuroraThread(SensorThread):
     def __init__(
         self,
         open_transport: Callable[[], Transport],
-        callback: Callable[[PoseSample], None],
+        callback: Callable[[PoseSample], object],
         config: AuroraConfig | None = None,
         on_event: OnEvent | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
@@ -125,7 +125,7 @@ class NetFtThread(SensorThread):
     def __init__(
         self,
         host: str,
-        callback: Callable[[ForceSample], None],
+        callback: Callable[[ForceSample], object],
         config: NetFtConfig,
         on_event: OnEvent | None = None,
         port: int = RDT_PORT,

@@ -29,10 +29,10 @@ _OUTPUT_FIELDS = ("valid", "number", "execute_us", "expiry_us", "position_steps"
 _COMMANDS_WAITING = 64
 
 
-def input_mailboxes(inputs_dtype: np.dtype) -> dict[str, Mailbox]:
-    """A mailbox for every structured field of `inputs_dtype`, by the field's name."""
+def input_mailboxes(inputs_dtype: np.dtype, numbered: bool = True) -> dict[str, Mailbox]:
+    """A mailbox for every structured field of `inputs_dtype`, by the field's name; `numbered` as for `Mailbox`."""
     fields: Mapping[str, Any] = np.dtype(inputs_dtype).fields or {}
-    return {name: Mailbox(field[0]) for name, field in fields.items() if field[0].names}
+    return {name: Mailbox(field[0], numbered=numbered) for name, field in fields.items() if field[0].names}
 
 
 class NativeLoop:

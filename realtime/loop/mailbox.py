@@ -146,20 +146,21 @@ class Mailbox:
     """The latest value of one structured record, from one writer to any number of readers, in any threads.
 
     Args: dtype, the record; words, int64 memory of `Mailbox.size(dtype)` words to use instead of its own (zeroed by
-    who made it; shared between processes if it is shared memory).
+    who made it; shared between processes if it is shared memory); numbered, whether publish numbers the values.
 
-    The writer fills `record[0]` and calls `publish()`. Where the record has a field `count`, publish sets it to the
-    number of values published, so that a reader that copies the record sees whether it is new.
+    The writer fills `record[0]` and calls `publish()`. Where the record has a field `count` and the mailbox is numbered,
+    publish sets it to the number of values published, so that a reader that copies the record sees whether it is new.
+    Otherwise the writer counts: a value that is published again is not taken for a new one.
     """
 
-    def __init__(self, dtype: np.dtype, words: np.ndarray | None = None) -> None:
+    def __init__(self, dtype: np.dtype, words: np.ndarray | None = None, numbered: bool = True) -> None:
         self.dtype = np.dtype(dtype)
         self.words = np.zeros(self.size(dtype), np.int64) if words is None else words
         if self.words.shape != (self.size(dtype),) or self.words.dtype != np.int64:
             raise ValueError(f"words: found {self.words.dtype} {self.words.shape}, wanted int64 ({self.size(dtype)},)")
         self.words[PAYLOAD_WORDS] = n_words(self.dtype)
         self.record, self._staged = record_with_words(self.dtype)
-        self._counted = "count" in (self.dtype.names or ())
+        self._counted = numbered and "count" in (self.dtype.names or ())
 
     @staticmethod
     def size(dtype: np.dtype) -> int:

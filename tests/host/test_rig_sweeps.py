@@ -15,7 +15,7 @@ from host.commissioning.rig_sweeps import describe, duration_s
 from host.recordings.recording import Recording
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message
-from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.lines import FromRig, ToRig
 from realtime.core.sweep import Sweep, SweepLoop
 from realtime.core.sweep_ports import RigPorts, run_sweeps
 from sim.board import Board
@@ -36,7 +36,7 @@ class WorldPorts:
 
     def __init__(self, world: World) -> None:
         self.world, self.mute = world, ""
-        self._leaving, self._arriving = Leaving(), Arriving()
+        self._leaving, self._arriving = ToRig(), FromRig()
 
     def now_ns(self) -> int:
         return self.world.now_ns
@@ -45,10 +45,10 @@ class WorldPorts:
         self._arriving = self.world.exchange(deadline_ns, self._leaving)
         return True
 
-    def send(self, leaving: Leaving) -> None:
+    def send(self, leaving: ToRig) -> None:
         self._leaving = leaving
 
-    def receive(self) -> Arriving:
+    def receive(self) -> FromRig:
         if self.mute:
             setattr(self._arriving, self.mute, [] if self.mute == "force" else b"")
         return self._arriving

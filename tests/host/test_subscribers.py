@@ -44,7 +44,7 @@ def misbehaved(kind: str, bad: BadSubscriber | None, run: Scenario) -> bool:
         bad.tend()
     if kind == "leaving":
         return bad is not None and bad.lives > 1
-    return kind != "flooding" or run.loop.gate.counts["malformed"] > 20
+    return kind != "flooding" or run.loop.core.gate.counts["malformed"] > 20
 
 
 def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:

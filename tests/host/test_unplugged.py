@@ -119,7 +119,7 @@ class Door:
         self._process = process
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        return self._process._request(command.commander, encode(command))
+        return self._process.request(command.commander, encode(command))
 
 
 @pytest.fixture
@@ -150,19 +150,19 @@ def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_c
             commander.clear_fault()
             time.sleep(0.5)
             return False
-        return until(lambda: process._phase == Phase.HOLD, patience_s=5.0)
+        return until(lambda: process.core.phase == Phase.HOLD, patience_s=5.0)
 
     until(armed_and_holding, "the rig to be armed")
     cable.unplug()
-    until(lambda: process._phase in (Phase.DISARMED, Phase.STOPPED), "the loop to notice")
-    until(lambda: not process._mailboxes["command"].record[0].armed, "the rig to be disarmed")
+    until(lambda: process.core.phase in (Phase.DISARMED, Phase.STOPPED), "the loop to notice")
+    until(lambda: not process.core.commands.armed, "the rig to be disarmed")
     assert process.alive and not commander.arm().accepted
     cable.plug()
-    until(lambda: process._link.status is not None, "the board to be found again")
-    until(lambda: process._phase == Phase.DISARMED, "the loop to say that it is disarmed")
+    until(lambda: process.core.link.status is not None, "the board to be found again")
+    until(lambda: process.core.phase == Phase.DISARMED, "the loop to say that it is disarmed")
     for _ in range(20):
         time.sleep(0.02)
-        assert process._phase == Phase.DISARMED
-    assert process._link.phase in (LinkPhase.CONFIGURE, LinkPhase.READY)
+        assert process.core.phase == Phase.DISARMED
+    assert process.core.link.phase in (LinkPhase.CONFIGURE, LinkPhase.READY)
     until(armed_and_holding, "the rig to be armed again by its operator")
     assert process.alive

@@ -33,7 +33,7 @@ class Tapped(Scenario):
         self.logs: list[Message] = []
         plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), 1)
         super().__init__(rig, World(rig, plant, board, 1), self.tell)
-        self.loop.gate._roles = roles or {}
+        self.loop.core.gate._roles = roles or {}
 
     def tell(self, topic: str, message: Message) -> None:
         if topic == "log":
@@ -163,7 +163,7 @@ def test_no_edge_moves_for_it(attack: Attack, undisturbed: Moved) -> None:
     with LibraryBoard() as board:
         run = Tapped(board, {"analysis": "reader"})
         moving(run)
-        accepted, number = run.loop.gate.counts["accepted"], 0
+        accepted, number = run.loop.core.gate.counts["accepted"], 0
 
         def strike() -> bool:
             nonlocal number
@@ -173,15 +173,15 @@ def test_no_edge_moves_for_it(attack: Attack, undisturbed: Moved) -> None:
             return False
 
         run.run(MOVE_S, strike)
-        assert number == 100 and run.loop.gate.counts["accepted"] == accepted
-        assert sum(run.loop.gate.counts.values()) == accepted + number
+        assert number == 100 and run.loop.core.gate.counts["accepted"] == accepted
+        assert sum(run.loop.core.gate.counts.values()) == accepted + number
         assert moved(run) == undisturbed
 
 
 def test_what_is_malformed_is_counted_and_logged(board: LibraryBoard) -> None:
     run = Tapped(board)
     run.loop.request("intruder", b"junk")
-    assert run.loop.gate.counts["malformed"] == 1 and run.loop.gate.state().malformed == 1
+    assert run.loop.core.gate.counts["malformed"] == 1 and run.loop.core.gate.state().malformed == 1
     assert any("intruder: request: malformed" in log.text for log in run.logs)  # type: ignore[attr-defined]
 
 

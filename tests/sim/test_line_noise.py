@@ -1,7 +1,7 @@
 """Bad cables: nothing is touched without a fault, each kind of fault does what it says, the seed decides."""
 
 from protocol.serial_codec import StreamDecoder, encode
-from realtime.core.lockstep import Arriving, Leaving
+from realtime.core.lines import FromRig, ToRig
 from sim.line_noise import LineNoise
 from sim.sensor_faults import Fault
 
@@ -15,19 +15,19 @@ def frames(count: int) -> bytes:
 def through(kind: str, value: float, data: bytes, seed: int = 1) -> tuple[bytes, LineNoise]:
     noise = LineNoise(seed)
     noise.add(Fault(kind, 0, FOREVER, value=value))
-    return noise.outgoing(Leaving(board=data), 1).board, noise
+    return noise.outgoing(ToRig(board=data), 1).board, noise
 
 
 def test_a_good_cable_passes_all_bytes_as_they_are() -> None:
-    noise, arriving, leaving = LineNoise(1), Arriving(b"\x01\x02", b"t", [b"f"]), Leaving(b"\x03")
+    noise, arriving, leaving = LineNoise(1), FromRig(b"\x01\x02", b"t", [b"f"]), ToRig(b"\x03")
     assert noise.incoming(arriving, 5) is arriving and noise.outgoing(leaving, 5) is leaving
 
 
 def test_a_fault_ends_when_it_ends() -> None:
     noise = LineNoise(1)
     noise.add(Fault("cut", 10, 20))
-    assert noise.outgoing(Leaving(board=frames(2)), 15).board == b""
-    assert noise.outgoing(Leaving(board=frames(2)), 20).board == frames(2)
+    assert noise.outgoing(ToRig(board=frames(2)), 15).board == b""
+    assert noise.outgoing(ToRig(board=frames(2)), 20).board == frames(2)
 
 
 def test_dropped_duplicated_and_swapped_frames_stay_whole() -> None:
@@ -54,7 +54,7 @@ def test_a_flood_multiplies_and_a_frame_in_parts_arrives_whole() -> None:
     noise = LineNoise(1)
     noise.add(Fault("flood_in", 0, FOREVER, value=10.0))
     data = frames(3)
-    first = noise.incoming(Arriving(board=data[:7], force=[b"r"]), 1)
-    second = noise.incoming(Arriving(board=data[7:]), 2)
+    first = noise.incoming(FromRig(board=data[:7], force=[b"r"]), 1)
+    second = noise.incoming(FromRig(board=data[7:]), 2)
     assert len(first.force) == 10
     assert first.board.count(b"\0") + second.board.count(b"\0") == 30

@@ -10,7 +10,7 @@ import pytest
 from protocol.enums import Phase
 from protocol.rig_file import load_rig
 from protocol.topics import Message
-from realtime.core.lockstep import Leaving
+from realtime.core.lines import ToRig
 from sim.board import Board
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
@@ -43,7 +43,7 @@ def test_the_tip_comes_to_the_wall_and_holds(board: Board) -> None:
     run = scenario(board, heard=heard)
     outcome = run.press(TARGET)
     assert outcome.contact and not outcome.stopped and not outcome.notes
-    status = run.loop.link.status
+    status = run.loop.core.link.status
     assert status is not None
     assert (status.crc_errors, status.underruns, status.fault) == (0, 0, 0)
     assert outcome.steps_commanded == outcome.steps_on_pins == outcome.steps_reported
@@ -97,7 +97,7 @@ def rest_after(run: Scenario, seconds: float) -> float:
     """Lets the world go on alone, without the computer; the time (s) until the last step edge."""
     begin_ns, last_ns = run.world.now_ns, run.world.now_ns
     while run.world.now_ns < begin_ns + seconds * 1e9:
-        run.world.exchange(run.world.now_ns + 1_000_000, Leaving())
+        run.world.exchange(run.world.now_ns + 1_000_000, ToRig())
         if run.world.slice is not None and len(run.world.slice.edge_cycle):
             last_ns = run.world.now_ns
     return (last_ns - begin_ns) * 1e-9
@@ -118,7 +118,7 @@ def test_a_reset_board_stops_the_loop_until_an_operator_clears_it(board: Board) 
     moved = run.world.edges.copy()
     run.run(1.0)
     assert np.array_equal(moved, run.world.edges), "nothing moves by itself after a reset"
-    assert any("reset" in fault for fault in run.loop.faults)
+    assert any("reset" in fault for fault in run.loop.core.board_errors)
 
 
 def test_the_emergency_stop_holds_everything(board: Board) -> None:
@@ -130,4 +130,4 @@ def test_the_emergency_stop_holds_everything(board: Board) -> None:
     run.world.estop = False
     run.run(1.0)
     assert np.array_equal(edges, run.world.edges)
-    assert any("ESTOP" in fault for fault in run.loop.faults)
+    assert any("ESTOP" in fault for fault in run.loop.core.board_errors)

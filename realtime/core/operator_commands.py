@@ -1,6 +1,6 @@
-"""Commands in, replies out: arms the board and the loop, sets targets, stops, clears. Nothing arms by itself.
+"""What each command does: arm the board and the loop, set targets, stop, clear. Nothing arms by itself.
 
-Who may command, and whether a command is fresh, has been judged before (`realtime.core.command_gate`).
+Whether a command may be given at all, by whom and how fresh, was checked before (`realtime.core.command_gate`).
 """
 
 from __future__ import annotations
@@ -24,27 +24,40 @@ FORCE_BOX = "net_ft"  # as the driver names it in its events
 _KINDS = {kind.label: kind for kind in CommandKind}
 
 
-class OperatorDesk:
-    """Turns commands into the tick's COMMAND record and into frames for the board (`take_frames`)."""
+class OperatorCommands:
+    """Turns commands into the tick's COMMAND record and into frames for the board.
 
-    def __init__(self, rig: Rig, record: np.record, link: StepperBoardLink, missing: Callable[[], str] = lambda: "") -> None:
-        """missing: names the devices that are not there yet, empty when all are; asked before arming."""
-        self._rig, self._record, self._link, self._missing = rig, record, link, missing
+    Args:
+        rig: the rig file.
+        record: the COMMAND record that the tick reads; its `count` rises with each command that the tick has to act on.
+        link: the link to the board.
+        silent_sensors: names the sensors that send nothing, empty when all do; asked before arming.
+    """
+
+    def __init__(
+        self, rig: Rig, record: np.record, link: StepperBoardLink, silent_sensors: Callable[[], str] = lambda: ""
+    ) -> None:
+        self._rig, self._record, self._link, self._silent_sensors = rig, record, link, silent_sensors
         self._frames: list[bytes] = []
         self._kinematics = tick_parameters(rig)[0].kinematics
         record.normal[:] = (0.0, 0.0, -1.0)
 
+    @property
+    def armed(self) -> bool:
+        """Whether the loop is to be armed."""
+        return bool(self._record.armed)
+
     def take_frames(self) -> list[bytes]:
-        """Frames to send to the board, in order."""
+        """Return the frames for the board since the last call, in order."""
         frames, self._frames = self._frames, []
         return frames
 
-    def watch(self, flags: int) -> None:
-        """Set the causes that the supervision has found: a bit set of `realtime.control.safety`, 0 for none."""
-        self._record.watch = flags
+    def set_watched_causes(self, causes: int) -> None:
+        """Hand the causes that the supervision found to the tick: a bit set of `realtime.control.safety`."""
+        self._record.watch = causes
 
-    def obey(self, command: Command, now_ns: int) -> Reply:
-        """Carry out `command` at `now_ns` or refuse it; a refused command changes nothing."""
+    def execute(self, command: Command, now_ns: int) -> Reply:
+        """Carry out `command` at `now_ns` (ns) or refuse it; a refused command changes nothing."""
         actions = {
             "arm": self._arm,
             "disarm": self._disarm,
@@ -57,9 +70,27 @@ class OperatorDesk:
         problem = actions[command.action](command)
         return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
 
-    def _set(self, kind: int) -> None:
+    def device_returned(self, device: str, force_source: ForceSource, phase: Phase) -> str:
+        """Disarm, because `device` was lost and is back. Return a line for the log, empty where nothing was armed.
+
+        A force sensor that the estimate has replaced in contact does not disarm: the loop never lost the force, and uses
+        the sensor again when both agree (`force_source.py`). force_source and phase are those of the newest tick.
+        """
+        replaced = device == FORCE_BOX and force_source is ForceSource.ESTIMATE and phase is Phase.CONTACT
+        if not self._record.armed or replaced:
+            return ""
+        self.disarm()
+        return f"{device} is back: disarmed, to be armed again"
+
+    def _set(self, kind: CommandKind) -> None:
         self._record.kind = kind
         self._record.count += 1
+
+    def disarm(self) -> None:
+        """Disarm the loop and the board."""
+        self._record.armed = 0
+        self._set(CommandKind.HOLD)
+        self._frames.append(self._link.disarm())
 
     def _arm(self, command: Command) -> str:
         if self._link.phase is not LinkPhase.READY:
@@ -68,42 +99,25 @@ class OperatorDesk:
             return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
         if self._record.armed:
             return "arm: found the rig armed, wanted disarmed"
-        missing = self._missing()
-        if missing:
-            return f"arm: found nothing from {missing}, wanted fresh readings"
+        silent = self._silent_sensors()
+        if silent:
+            return f"arm: found nothing from {silent}, wanted fresh readings"
         self._frames.append(self._link.arm())
         self._record.armed = 1
         self._set(CommandKind.HOLD)
         return ""
 
     def _disarm(self, command: Command) -> str:
-        self._rest()
+        self.disarm()
         return ""
-
-    def back(self, device: str, force_source: int, phase: int) -> str:
-        """`device` was gone and is there again: what was armed is disarmed. Returns words for the log, empty for none.
-
-        Not so for a force sensor whose place the estimate has taken in contact: the loop never lost the force, and lets the
-        sensor in again when both agree (`force_source.py`). force_source, phase: of the loop's last outputs.
-        """
-        replaced = device == FORCE_BOX and force_source == ForceSource.ESTIMATE and phase == Phase.CONTACT
-        if not self._record.armed or replaced:
-            return ""
-        self._rest()
-        return f"{device} is back: disarmed, to be armed again"
-
-    def _rest(self) -> None:
-        self._record.armed = 0
-        self._set(CommandKind.HOLD)
-        self._frames.append(self._link.disarm())
 
     def _stop(self, command: Command) -> str:
         self._set(CommandKind.STOP)
         return ""
 
     def _clear_fault(self, command: Command) -> str:
-        """Clears the loop's latched causes and the board's fault, and leaves both disarmed."""
-        self._disarm(command)
+        """Clear the loop's latched causes and the board's fault, and leave both disarmed."""
+        self.disarm()
         self._record.clear += 1
         if self._link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH):
             self._link.restart()
@@ -118,7 +132,7 @@ class OperatorDesk:
         return ""
 
     def _force(self, command: Command) -> str:
-        """Another force on the target that there is; nothing else changes."""
+        """Set another force for the present contact target; nothing else changes, so that the count stays."""
         if not self._record.armed or self._record.kind != CommandKind.CONTACT:
             return "force: found no contact asked for, wanted target contact before"
         problem = self._too_much(command)
@@ -152,9 +166,11 @@ class OperatorDesk:
         for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
             if not least <= value <= most:
                 return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
-        insertion, t = self._rig.stages.insertion, self._rig.transmission
+        insertion, transmission = self._rig.stages.insertion, self._rig.transmission
+        # Half the backlash on either side: the body may stand anywhere in it.
+        half_m = 0.5 * transmission.insertion_backlash_m
         least_m, most_m = (
-            t.insertion_at_home_m + t.insertion_slope * unit + 0.5 * side * t.insertion_backlash_m
+            transmission.insertion_at_home_m + transmission.insertion_slope * unit + side * half_m
             for unit, side in ((insertion.min_unit, -1.0), (insertion.max_unit, 1.0))
         )
         off_m = inverse_kinematics.out_of_reach_m(
@@ -162,7 +178,7 @@ class OperatorDesk:
         )
         if not off_m <= REACH_m:
             return (
-                f"target_m: found {tuple(target_m)}, wanted a point that the unloaded tip can reach: it comes no nearer "
-                f"than {off_m * 1e3:.1f} mm"
+                f"target_m: found {tuple(target_m)}, wanted a point that the unloaded tip can reach: "
+                f"it comes no nearer than {off_m * 1e3:.1f} mm"
             )
         return ""

@@ -6,7 +6,7 @@ from protocol.rig_file import Rig
 from protocol.topics import Command
 from realtime.control.records import INPUTS, new
 from realtime.core.board_intake import axis_limits
-from realtime.core.operator_desk import OperatorDesk
+from realtime.core.operator_commands import OperatorCommands
 from realtime.drivers.stepper_board import StepperBoardLink
 
 
@@ -21,10 +21,10 @@ from realtime.drivers.stepper_board import StepperBoardLink
 @pytest.mark.parametrize("target", ["position", "contact"])
 def test_a_target_out_of_reach_changes_nothing(rig: Rig, target: str, target_m: tuple, words: str) -> None:
     record = new(INPUTS)[0].command
-    desk = OperatorDesk(rig, record, StepperBoardLink(axis_limits(rig)))
+    commands = OperatorCommands(rig, record, StepperBoardLink(axis_limits(rig)))
     record.armed = 1
     before = record.tobytes()
-    reply = desk.obey(
+    reply = commands.execute(
         Command(
             stamp_ns=1,
             sequence=1,
@@ -40,8 +40,8 @@ def test_a_target_out_of_reach_changes_nothing(rig: Rig, target: str, target_m: 
         1,
     )
     assert reply.result == "refused" and words in reply.text and "\n" not in reply.text
-    assert record.tobytes() == before and not desk.take_frames()
-    good = desk.obey(
+    assert record.tobytes() == before and not commands.take_frames()
+    good = commands.execute(
         Command(
             stamp_ns=1,
             sequence=2,

@@ -1,0 +1,338 @@
+"""The realtime core: all that the realtime process does except to tick and to move bytes.
+
+Two shells drive it: `realtime.core.process` with threads and ports on the wall clock, `realtime.core.lockstep` in
+virtual time. Samples, commands and the records of past ticks go in; input records for the next tick, frames for the
+board, messages and replies come out. The core reads no clock and opens no port, so that the same inputs give the same
+outputs in both shells.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from protocol.enums import ForceSource, Phase, SafetyAction
+from protocol.rig_file import Rig
+from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply
+from realtime.control import safety
+from realtime.control.configure import tick_parameters
+from realtime.core import telemetry
+from realtime.core.board_intake import axis_limits, board_message, take_status
+from realtime.core.command_gate import CommandGate, for_the_record
+from realtime.core.intake import Intake
+from realtime.core.operator_commands import OperatorCommands
+from realtime.core.supervision import Finding, Supervision
+from realtime.drivers.aurora import PoseSample
+from realtime.drivers.device_events import DeviceEvent
+from realtime.drivers.device_events import EventKind as DeviceEventKind
+from realtime.drivers.net_ft import ForceSample
+from realtime.drivers.stepper_board import EventKind, StepperBoardLink
+
+# A longer time between two ticks than this is logged.
+LONGEST_GAP_NS = 10_000_000
+# A cause that comes and goes, as a stale pose may at every frame, is logged again after this time without it.
+CAUSE_QUIET_NS = 1_000_000_000
+_BOARD_ERRORS = (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
+_DEVICE_LEVELS = {DeviceEventKind.LOST: "warning", DeviceEventKind.WARNING: "warning", DeviceEventKind.ERROR: "error"}
+
+
+class Request(NamedTuple):
+    """What commander `name` asked, as the bytes that came on its key."""
+
+    name: str
+    payload: bytes
+
+
+class Tick(NamedTuple):
+    """A tick that has run: its number, counted from the start of the loop, and its OUTPUTS record."""
+
+    number: int
+    outputs: np.record
+
+
+@dataclass
+class Arrived:
+    """What has arrived since the last step. Each field may be empty.
+
+    Attributes:
+        ticks: ticks that have run since the last step, in order.
+        board: bytes from the stepper board.
+        board_lost: why the board's port is gone; empty while it is there.
+        poses, forces, device_events: what the sensor drivers handed over.
+        estimates: messages of the model process.
+        requests: what commanders asked.
+        log_lines: what the shell itself has to say; published as they are.
+        loop_runs: whether the loop ticks; while it does not, only a stop is accepted.
+    """
+
+    ticks: Sequence[Tick] = ()
+    board: bytes = b""
+    board_lost: str = ""
+    poses: Sequence[PoseSample] = ()
+    forces: Sequence[ForceSample] = ()
+    device_events: Sequence[DeviceEvent] = ()
+    estimates: Sequence[ForceEstimate] = ()
+    requests: Sequence[Request] = ()
+    log_lines: Sequence[Log] = ()
+    loop_runs: bool = True
+
+
+@dataclass
+class Leaving:
+    """What leaves after a step.
+
+    Attributes:
+        changed: names of the input records that were filled, for the shell to hand to the tick.
+        frames: bytes for the board, in order; the tick's set-points are not among them.
+        messages: (topic, message) to publish, in order; log lines are messages of the topic `log`.
+        replies: one for each request; None where the sender floods and gets none.
+    """
+
+    changed: set[str] = field(default_factory=set)
+    frames: list[bytes] = field(default_factory=list)
+    messages: list[tuple[str, Message]] = field(default_factory=list)
+    replies: list[Reply | None] = field(default_factory=list)
+
+    def log(self, stamp_ns: int, level: str, source: str, text: str) -> None:
+        """Add a log line."""
+        self.messages.append(("log", Log(stamp_ns=stamp_ns, level=level, source=source, text=text[:500])))
+
+
+class RigCore:
+    """Turns what arrived into what leaves, one `step` at a time. Not for two threads at once.
+
+    Args:
+        rig: the rig file.
+        records: the tick's input records by field name of INPUTS (tip, shaft, sensor, estimate, board, command); the core
+            fills them, the shell hands them to the tick.
+        timing: returns the loop's timing for a message with the stamp (ns) that it is given; the shell measures it.
+        force_source: which force closes the loop, `sensor` or `estimate`.
+        new_lease: makes the secret of a lease.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        records: Mapping[str, np.record],
+        timing: Callable[[int], LoopTiming],
+        force_source: str = "sensor",
+        new_lease: Callable[[], str] = lambda: secrets.token_hex(16),
+    ) -> None:
+        self.rig, self.params = rig, tick_parameters(rig, force_source)
+        self.now_ns = 0
+        # Of the newest tick.
+        self.phase, self.force_source = Phase.DISARMED, ForceSource(int(self.params[0].force_source))
+        self.board_errors: list[str] = []
+        self.link = StepperBoardLink(axis_limits(rig))
+        self.commands = OperatorCommands(rig, records["command"], self.link, self._silent_sensors)
+        self.gate = CommandGate(
+            lambda: self.now_ns, self._execute, roles=rig.access.roles if rig.access else {}, new_lease=new_lease
+        )
+        ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
+        self.supervision = Supervision((ratios[0], ratios[1], ratios[2]))
+        self._records, self._timing, self._intake = records, timing, Intake(rig)
+        self._leaving, self._loop_runs = Leaving(), True
+        self._first = True
+        self._tick_ns = 0
+        self._cause_seen_ns: dict[int, int] = {}
+
+    def step(self, now_ns: int, arrived: Arrived) -> Leaving:
+        """Take in what has arrived by `now_ns` (the rig's clock, ns) and return what leaves.
+
+        Past ticks come first: everything below is judged by the phase that the loop is in now.
+        """
+        self.now_ns, self._loop_runs = now_ns, arrived.loop_runs
+        leaving = self._leaving = Leaving()
+        if self._first:  # the tick starts with the normal that stands in the command record
+            leaving.changed.add("command")
+            self._first = False
+        leaving.messages += [("log", line) for line in arrived.log_lines]
+        for tick in arrived.ticks:
+            self._take_tick(tick)
+        self._take_board(arrived.board, arrived.board_lost)
+        self._take_poses(arrived.poses)
+        self._take_forces(arrived.forces)
+        for event in arrived.device_events:
+            self._take_device_event(event)
+        for estimate in arrived.estimates:
+            self._take_estimate(estimate)
+        self._report(self.supervision.host_overdue(now_ns))
+        for request in arrived.requests:
+            self._take_request(request)
+        bring_up = self.link.advance(now_ns)
+        if bring_up:
+            leaving.frames.append(bring_up)
+        return leaving
+
+    def shut_down(self) -> Leaving:
+        """Disarm the loop and the board, for the end of the process."""
+        self._leaving = Leaving()
+        self.commands.disarm()
+        self._command_changed()
+        return self._leaving
+
+    def _log(self, level: str, source: str, text: str) -> None:
+        self._leaving.log(self.now_ns, level, source, text)
+
+    def _publish(self, topic: str, message: Message) -> None:
+        self._leaving.messages.append((topic, message))
+
+    # --- ticks that have run: telemetry, gaps, causes ---
+
+    def _take_tick(self, tick: Tick) -> None:
+        outputs, number = tick.outputs, tick.number
+        self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
+        tick_ns = int(outputs.now_ns)
+        self._watch_gap(tick_ns)
+        self._log_new_causes(int(outputs.cause), int(outputs.action), tick_ns)
+        if number % telemetry.STAGE_EVERY == 0:
+            self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs))
+        if number % telemetry.STATE_EVERY == 0:
+            self._publish("state", telemetry.state_message(self._records["command"], outputs))
+        if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
+            self._publish("board", board_message(self.link, tick_ns))
+        if number % telemetry.LOOP_EVERY == 0:
+            self._publish("loop", self._timing(tick_ns))
+            self._publish("commander", self.gate.state())
+
+    def _watch_gap(self, tick_ns: int) -> None:
+        gap_ns = tick_ns - self._tick_ns
+        if self._tick_ns and not 0 < gap_ns <= LONGEST_GAP_NS:
+            text = (
+                f"the computer stood still, or its clock jumped: {gap_ns * 1e-6:.1f} ms between two ticks, "
+                f"wanted {self.params[0].period_s * 1e3:g} ms"
+            )
+            self._leaving.log(tick_ns, "warning", "realtime", text)
+        self._tick_ns = tick_ns
+
+    def _log_new_causes(self, causes: int, action: int, tick_ns: int) -> None:
+        """Log a cause that makes the loop hold, retract or stop, when it appears."""
+        new = 0
+        while causes:
+            bit = causes & -causes
+            causes ^= bit
+            seen_ns = self._cause_seen_ns.get(bit)
+            self._cause_seen_ns[bit] = tick_ns
+            if seen_ns is None or not 0 <= tick_ns - seen_ns <= CAUSE_QUIET_NS:
+                new |= bit
+        if new and safety.action_of(new) >= SafetyAction.HOLD:
+            text = "; ".join(safety.in_words(new))
+            self._leaving.log(tick_ns, "warning", "safety", f"{SafetyAction(action).label}: {text}")
+
+    # --- devices ---
+
+    def _take_board(self, data: bytes, lost: str) -> None:
+        board = self._records["board"]
+        for event in self.link.feed(data, self.now_ns):
+            if event.kind is EventKind.STATUS:
+                take_status(board, self.link, self.now_ns)
+                self._leaving.changed.add("board")
+                if self.phase is not Phase.DISARMED and board.ready:
+                    self._report(self.supervision.status(board.position_steps, board.encoder_counts, self.now_ns))
+                continue
+            if event.kind in _BOARD_ERRORS:
+                self.board_errors.append(event.message)
+            self._log("error" if event.kind in _BOARD_ERRORS else "info", "board", event.message)
+        if lost:
+            self._log("error", "board", lost)
+            self._disarm_after_return("board")
+            self.link.unplugged()
+
+    def _take_poses(self, samples: Sequence[PoseSample]) -> None:
+        tracker = self.rig.tracker
+        names = {tracker.tip_handle: "tip", tracker.shaft_handle: "shaft"}
+        for sample in samples:
+            name = names.get(sample.tool)
+            if sample.missing or name is None:
+                continue
+            record = self._records[name]
+            self._intake.pose(record, sample.stamp_ns, sample.arrival_ns, sample.position_m, sample.quaternion_wxyz)
+            self._leaving.changed.add(name)
+            self._publish(f"pose/{name}", telemetry.pose_message(record, sample.frame, sample.quality_m))
+
+    def _take_forces(self, samples: Sequence[ForceSample]) -> None:
+        record = self._records["sensor"]
+        for sample in samples:
+            self._intake.force(record, sample.stamp_ns, sample.arrival_ns, sample.force_N)
+            self._leaving.changed.add("sensor")
+            if record.count % telemetry.FORCE_EVERY == 0:
+                self._publish("force/sensor", telemetry.force_message(record, sample.status))
+
+    def _take_device_event(self, event: DeviceEvent) -> None:
+        self._leaving.log(event.stamp_ns, _DEVICE_LEVELS.get(event.kind, "info"), event.device, event.text)
+        if event.kind is DeviceEventKind.RECONNECTED:
+            self._disarm_after_return(event.device)
+
+    def _disarm_after_return(self, device: str) -> None:
+        """Disarm a rig whose `device` was lost and is back."""
+        text = self.commands.device_returned(device, self.force_source, self.phase)
+        if text:
+            self._command_changed()
+            self._log("warning", device, text)
+
+    def _silent_sensors(self) -> str:
+        """Return the sensors that the loop needs and that have sent nothing for longer than the failsafe allows."""
+        limit_ns = round(self.rig.safety.stop_after_s * 1e9)
+        by_sensor = self.params[0].force_source == ForceSource.SENSOR
+        force, name = ("sensor", "the force sensor") if by_sensor else ("estimate", "the model process")
+        needed = {"tip": "the tracker (tip)", force: name}
+        return ", ".join(
+            words
+            for field_name, words in needed.items()
+            if self._records[field_name].count == 0 or self.now_ns - self._records[field_name].arrival_ns > limit_ns
+        )
+
+    # --- the model process, cross-checks ---
+
+    def _take_estimate(self, estimate: ForceEstimate) -> None:
+        self._report(self.supervision.host_answered(estimate.stamp_ns, self.now_ns))
+        if not estimate.converged or estimate.force_N is None or estimate.covariance_N2 is None:
+            return
+        record = self._records["estimate"]
+        covariance_N2 = np.array(estimate.covariance_N2).reshape(3, 3)
+        self._intake.estimate(record, estimate.stamp_ns, self.now_ns, np.array(estimate.force_N), covariance_N2)
+        self._leaving.changed.add("estimate")
+        if self.phase is Phase.CONTACT:
+            forces_N = {"force sensor": self._records["sensor"].force_N, "model": record.force_N}
+            self._report(self.supervision.forces(forces_N, self.now_ns))
+
+    def _report(self, finding: Finding | None) -> None:
+        """Hand a finding of the supervision to the tick, and log it."""
+        if finding is None:
+            return
+        if finding.cause:
+            self.commands.set_watched_causes(self.supervision.causes)
+            self._leaving.changed.add("command")
+        self._log("warning", "supervision", finding.text)
+
+    # --- commanders ---
+
+    def _take_request(self, request: Request) -> None:
+        command, reply = self.gate.answer(request.name, request.payload)
+        for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
+            self._publish(topic, message)
+        line = self.gate.in_words(request.name, command, reply)
+        if line:
+            self._log("info" if reply is not None and reply.result == "accepted" else "warning", "commander", line)
+        self._leaving.replies.append(reply)
+
+    def _execute(self, command: Command, now_ns: int) -> Reply:
+        """Carry out a command that the gate has let through."""
+        if command.action != "stop" and not self._loop_runs:
+            text = f"{command.action}: found the loop not running yet, wanted it to: it is being compiled"
+            return Reply(stamp_ns=now_ns, id=command.id, result="refused", text=text)
+        reply = self.commands.execute(command, now_ns)
+        if reply.result == "accepted":
+            if command.action in ("arm", "clear_fault"):
+                self.supervision.restart()
+                self.commands.set_watched_causes(self.supervision.causes)
+            self._command_changed()
+        return reply
+
+    def _command_changed(self) -> None:
+        self._leaving.changed.add("command")
+        self._leaving.frames += self.commands.take_frames()
