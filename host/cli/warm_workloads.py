@@ -76,8 +76,9 @@ def many_cases(folder: Path) -> None:
 
     rod, arcs = load_catheter("livewire"), load_catheter("thermocool_sf")
     shapes = solve(rod, 0.01, 10.0, np.array([[0.0, 0.01, 0.0], [0.0, 0.02, 0.0]]), stations_m=[0.0, 0.03])
-    poses = zip((0.0, 0.03), *(np.moveaxis(a, 1, 0) for a in shapes[2:4]), strict=True)
-    estimate_force(rod, 0.01, 10.0, [(s, p.copy(), q.copy()) for s, p, q in poses], 4)
+    positions, quaternions = shapes.station_positions_m, shapes.station_quaternions_wxyz
+    sensors = [(offset, positions[:, i], quaternions[:, i]) for i, offset in enumerate((0.0, 0.03))]
+    estimate_force(rod, 0.01, 10.0, sensors, 4)
     planar = solve(arcs, 0.02, 15.0, np.array([[0.0, -0.05], [0.0, 0.05]]), model="pcar")
     estimate_force(arcs, 0.02, 15.0, [(0.0, planar.tip_position_m, planar.tip_angle_rad)], model="pcar")
 
