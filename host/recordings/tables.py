@@ -19,10 +19,7 @@ class RecordingTables:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the MCAP file `path`. Raises InputError where it cannot be read or is no recording."""
-        try:
-            self._recording = Recording(os.fspath(path))
-        except ValueError as error:
-            raise InputError.from_sentence(str(error)) from None
+        self._recording = Recording(os.fspath(path))
 
     @property
     def topics(self) -> dict[str, int]:
@@ -77,7 +74,7 @@ class RecordingTables:
         columns = self._recording.table(topic)
         stamps = columns.get("stamp_ns", columns["recorded_ns"])
         time_s = (stamps - self._recording.span_ns[0]).astype(np.float64) * 1e-9
-        return pandas.DataFrame(columns, index=pandas.Index(time_s, name="time_s"))
+        return pandas.DataFrame(dict(columns), index=pandas.Index(time_s, name="time_s"))
 
     def _check(self, topic: str) -> None:
         if topic not in self._recording.topics:

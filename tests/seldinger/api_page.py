@@ -30,7 +30,7 @@ def examples() -> dict[str, str]:
 
 def write_recording(folder: Path) -> Path:
     """The file `run.mcap` that the page's example reads: a second of a force sensor on the simulated rig."""
-    from host.recordings.recording import RecordingWriter, header_of
+    from host.recordings import RecordingWriter, header_of
     from protocol.rig_file import SIMULATED_RIG, load_rig
     from protocol.topics import ForceSensor
 
