@@ -19,7 +19,7 @@ DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsima
 # Prints, on standard error, which step of the set-up begins.
 step = echo "seldinger: set-up, step $(1)" >&2
 
-.PHONY: demo test quick setup board-tools packages warm format-check lint types nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof soak clean
+.PHONY: demo test quick setup board-tools packages warm format-check lint types lock lock-check audit nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -44,14 +44,15 @@ else echo "seldinger: installing $(1)" >&2; \
   || { echo "seldinger: apt could not install: $(1) (see build/apt.log)" >&2; false; }; fi
 endef
 
-$(VENV)/.ready: pyproject.toml
+$(VENV)/.ready: pyproject.toml requirements/dev.txt
 	@mkdir -p build
 	@$(call step,1 of 4: Python environment $(VENV))
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "seldinger: found $$($(PYTHON) --version), wanted Python 3.11 or newer" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { $(call apt_install,$(DEBIAN_PYTHON)); }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(call step,2 of 4: packages (some minutes the first time))
-	@$(PIP) install --editable ".[dev]" 2>build/pip.log | $(PIP_PROGRESS); test $${PIPESTATUS[0]} = 0 || { cat build/pip.log >&2; exit 1; }
+	@$(PIP) install --require-hashes --requirement requirements/dev.txt 2>build/pip.log | $(PIP_PROGRESS); test $${PIPESTATUS[0]} = 0 || { cat build/pip.log >&2; exit 1; }
+	@$(PIP) install --quiet --no-deps --editable . 2>build/pip.log || { cat build/pip.log >&2; exit 1; }
 	@touch $@
 
 # Kernels are compiled at set-up; after an edit each command compiles what it needs, and says so.
@@ -125,6 +126,21 @@ lint: $(VENV)/.ready
 
 types: $(VENV)/.ready
 	@$(BIN)/mypy
+
+# Versions and hashes of all packages that `make setup` installs, for every platform; made again after an edit of pyproject.toml.
+LOCK = uv pip compile pyproject.toml --extra dev --generate-hashes --universal --python-version 3.11 --no-header --quiet
+lock: $(VENV)/.ready
+	@$(BIN)/$(LOCK) --output-file requirements/dev.txt
+
+# The lock file satisfies pyproject.toml: resolving again with the locked versions preferred changes nothing.
+lock-check: $(VENV)/.ready
+	@mkdir -p build && cp requirements/dev.txt build/dev.txt
+	@$(BIN)/$(LOCK) --output-file build/dev.txt
+	@diff --brief requirements/dev.txt build/dev.txt || { echo "seldinger: requirements/dev.txt does not fit pyproject.toml; run make lock" >&2; exit 1; }
+
+# Known weaknesses of the locked packages.
+audit: $(VENV)/.ready
+	@$(BIN)/pip-audit --require-hashes --disable-pip --requirement requirements/dev.txt
 
 clean:
 	@rm -rf build runs
