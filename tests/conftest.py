@@ -11,6 +11,7 @@ settings.load_profile("seldinger")
 # Files whose tests fit models to recordings or run a whole rig: longer than ten seconds each on one core. A single slow test
 # in another file has the mark itself. Every run prints its slowest tests, so that this list can be kept true.
 SLOW = {
+    "firmware": "proof",
     "host/diagnosis": "benches experiment folded_reading live nested nominals places planted rig_recording standing",
     "host/proof": "runner",
     "host": "access demo estimator_process live_study reproduction reproduction_mechanics services subscribers unplugged",
