@@ -13,7 +13,9 @@ EXTRAS: dict[str, tuple[str, str]] = {
     "uvicorn": ("uvicorn", "view"),
     "websockets": ("websockets", "view"),
     "pyarrow": ("pyarrow", "tables"),
+    "pandas": ("pandas", "tables"),
     "distributed": ("distributed", "cluster"),
+    "mujoco": ("mujoco", "mujoco"),
     "pysindy": ("pysindy", "baselines"),
     "nidaqmx": ("nidaqmx", "daq"),
 }
