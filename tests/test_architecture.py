@@ -35,10 +35,25 @@ ROOMS: dict[str, set[str]] = {
     "host.report": {"protocol", "host.recordings"},
     "host.security": {"protocol"},
     "host.commissioning": {*BELOW_HOST, *MODELS, "host.recordings", "host.report"},
-    "host.diagnosis": {"protocol", *MODELS, "host.recordings", "host.report", "host.commissioning"},
     "host.run": {*BELOW_HOST, *MODELS, "host.recordings", "host.report", "host.commissioning", "host.navigation"},
     "host.view": {"protocol", "host.mechanics", "host.recordings", "host.run"},
 }
+BELOW_DIAGNOSIS = {"protocol", *MODELS, "host.recordings", "host.report", "host.commissioning"}
+DIAGNOSIS = [  # bottom up: each may import those above it in this list
+    "host.diagnosis.model",
+    "host.diagnosis.effects",
+    "host.diagnosis.estimation",
+    "host.diagnosis.models",
+    "host.diagnosis.symbolic",
+    "host.diagnosis.selection",
+    "host.diagnosis.design",
+    "host.diagnosis.live",
+    "host.diagnosis.pipeline",
+    "host.diagnosis.report",
+    "host.diagnosis",
+]
+for place, name in enumerate(DIAGNOSIS):
+    ROOMS[name] = {*BELOW_DIAGNOSIS, *DIAGNOSIS[:place]}
 PRODUCT = {room for room in ROOMS if room.startswith("host.")}
 ROOMS["seldinger"] = {"protocol", *PRODUCT}
 ROOMS["host.studies"] = {*BELOW_HOST, *PRODUCT, "seldinger"}

@@ -78,13 +78,16 @@ def _watch(rig: str | None, json: bool) -> None:
 def summary(verdict: dict[str, Any]) -> list[str]:
     """The verdict as lines for people."""
     fit = verdict["fit"]
-    lines = [verdict["verdict"].replace("_", " ")]
+    lines = [f"data: {finding['says']}" for finding in verdict["data_findings"]]
+    lines.append(verdict["verdict"].replace("_", " "))
     for effect in verdict["effects"]:
         lines.append(f"{effect['id']} ({effect['subsystem']}): {effect['says']}")
         for key, p in effect["parameters"].items():
             lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g})")
         if effect["indistinguishable_from"]:
             lines.append("  indistinguishable from " + ", ".join(effect["indistinguishable_from"]))
+    if fit["rmse_before"] is None:
+        return lines
     lines.append(
         f"held-out RMS error {fit['rmse_before']:.4g} {fit['unit']}, with the effects {fit['rmse_after']:.4g} "
         f"{fit['unit']}; noise {fit['noise_floor']:.4g} {fit['unit']}"

@@ -20,11 +20,8 @@ __all__ = ["Verdict", "diagnose"]
 class Verdict:
     """What a diagnosis found. `as_dict` has all of it, as `seldinger diagnose --json` prints it."""
 
-    def __init__(self, diagnosis: Diagnosis, seconds: float) -> None:
-        from host.diagnosis.report.verdict import as_json
-
-        self.diagnosis = diagnosis
-        self._content = as_json(diagnosis, seconds)
+    def __init__(self, content: dict[str, Any], diagnosis: Diagnosis | None) -> None:
+        self._content, self.diagnosis = content, diagnosis
 
     @property
     def verdict(self) -> str:
@@ -36,6 +33,11 @@ class Verdict:
         """Effects that are missing from the nominal model, most probable first, each as in the JSON."""
         return list(self._content["effects"])
 
+    @property
+    def data_findings(self) -> list[dict[str, str]]:
+        """What is wrong with the recordings themselves, in plain sentences: read these first."""
+        return list(self._content["data_findings"])
+
     def as_dict(self) -> dict[str, Any]:
         """The whole verdict as JSON's own types; NaN is None."""
         from protocol.requests import plain
@@ -43,21 +45,30 @@ class Verdict:
         return dict(plain(self._content))
 
     def write(self, folder: Path | str) -> Path:
-        """Write verdict.json, report.html and the scripts of proposed experiments to `folder`. Returns the report.
+        """Write verdict.json and, if there was something to compare, report.html and the scripts of proposed experiments.
+
+        Parameters:
+            folder: made if it does not exist.
+
+        Returns:
+            The report's path, or that of verdict.json without one.
 
         Raises:
             OSError: the folder cannot be written.
         """
         import json
 
-        from host.diagnosis.design.scripts import write_scripts
         from host.diagnosis.report.page import write_report
+        from host.diagnosis.report.scripts import write_scripts
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        scripts = write_scripts(self.diagnosis, folder)
+        scripts = [] if self.diagnosis is None else write_scripts(self.diagnosis, folder)
         self._content["scripts"] = [str(path) for path in scripts]
-        (folder / "verdict.json").write_text(json.dumps(self.as_dict(), allow_nan=False) + "\n", encoding="utf-8")
+        written = folder / "verdict.json"
+        written.write_text(json.dumps(self.as_dict(), allow_nan=False) + "\n", encoding="utf-8")
+        if self.diagnosis is None:
+            return written
         return write_report(self.diagnosis, self._content, folder / "report.html")
 
 
@@ -92,11 +103,13 @@ def diagnose(
         >>> verdict.effects[0]["id"]  # doctest: +SKIP
         'coulomb_friction'
     """
+    from host.diagnosis.effects import library
     from host.diagnosis.model.dataset import find_files
-    from host.diagnosis.model.effect import library
     from host.diagnosis.model.nominal import effect_of, nominal_of, nominal_path, read_nominal
     from host.diagnosis.model.tables import table_of
+    from host.diagnosis.pipeline import NothingToCompare
     from host.diagnosis.pipeline import diagnose as run
+    from host.diagnosis.report.verdict import as_json, without_fit
 
     began = time.monotonic()
     ids = {effect.id for effect in library()}
@@ -110,6 +123,13 @@ def diagnose(
     sources: list[Path | Table] = []
     for number, recording in enumerate(recordings):
         source = table_of(recording, number)
-        sources += find_files(spec, [str(source)], None) if isinstance(source, Path) else [source]
-    sources = sources or [*find_files(spec, [], data_folder)]
-    return Verdict(run(spec, sources, progress, frozenset(without)), time.monotonic() - began)
+        if isinstance(source, Path):
+            sources += find_files(spec, [str(source)], None)
+        else:
+            sources.append(source)
+    sources += [] if sources else find_files(spec, [], data_folder)
+    try:
+        result = run(spec, sources, progress, frozenset(without))
+    except NothingToCompare as nothing:
+        return Verdict(without_fit(nothing.findings, time.monotonic() - began), None)
+    return Verdict(as_json(result, time.monotonic() - began), result)

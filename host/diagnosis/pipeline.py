@@ -11,30 +11,29 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.design.experiment import Design, design
+from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
 from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
-from host.diagnosis.estimation.uncertainty import intervals
+from host.diagnosis.estimation.uncertainty import intervals, uncertain
+from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
-from host.diagnosis.model.effect import candidates
+from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Piece
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
-from host.diagnosis.selection.dictionary import lay_out
 from host.diagnosis.selection.equivalence import Standing, beside_unlisted, standings
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.search import Found, search
-from host.diagnosis.symbolic.unlisted import Rest, explain_rest
+from host.diagnosis.selection.unlisted import Rest, explain_rest
+from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-
-
-MOST_PARTLY = 2  # effects that may be named where they leave a rest: more that pile up are no names
 
 
 @dataclass
@@ -77,16 +76,35 @@ class Diagnosis:
     rest: Rest = field(default_factory=lambda: Rest(None, 0.0))
     notes: list[str] = field(default_factory=list)
     designs: list[Design] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
 
 
-def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
-    """Model, the problem at the rate that is fitted, and the problem at full rate."""
+class NothingToCompare(Exception):
+    """No recording has what the nominal model compares; `findings` say why."""
+
+    def __init__(self, findings: list[Finding]) -> None:
+        super().__init__(" ".join(finding.says for finding in findings))
+        self.findings = findings
+
+
+def inspected(spec: NominalSpec, sources: Sequence[Path | Table]) -> Inspected:
+    """Recordings as they can be compared, and what is wrong with them. Raises InputError."""
     if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
         raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
-    recordings = load(spec, tables, *channels_of(spec))
-    model = build(spec)
+    needed, optional = channels_of(spec)
+    return inspect(spec, load(spec, tables, needed, optional), optional)
+
+
+def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
+    """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError."""
+    return problems(spec, inspected(spec, sources).recordings)
+
+
+def problems(spec: NominalSpec, recordings: list[Recording]) -> tuple[Model, Problem, Problem]:
+    """Model, the problem at the rate that is fitted, and the problem at full rate."""
+    model: Model = RecordedRig(spec) if spec.recorded_rig else build(spec)
     if spec.effect:
         model = cast(Model, Known(model, spec.effect, recordings))
     factor = thinning(model, recordings)
@@ -124,9 +142,17 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
 def diagnose(
     spec: NominalSpec, sources: Sequence[Path | Table], tell: Tell, left_out: frozenset[str] = frozenset()
 ) -> Diagnosis:
-    """The whole diagnosis. `left_out`: effect ids the finder is not to know (leave-one-out proof)."""
+    """The whole diagnosis. `left_out`: effect ids the finder is not to know (leave-one-out proof).
+
+    Raises:
+        InputError: the recordings do not fit the nominal model's file.
+        NothingToCompare: a channel that the comparison needs says nothing.
+    """
     tell("reading recordings", 0.0)
-    model, problem, full = prepare(spec, sources)
+    data = inspected(spec, sources)
+    if not data.recordings:
+        raise NothingToCompare(data.findings)
+    model, problem, full = problems(spec, data.recordings)
     pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
     pool = [c for c in pool if c.effect.id not in left_out]
     found = search(problem, pool, tell)
@@ -140,8 +166,9 @@ def diagnose(
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
+    result.findings = [*data.findings, *uncertain(problem, found.best, spans)]
     result.designs = design(problem, found, standing, tell)
-    piled = rest.doubtful and len(found.best.terms) > MOST_PARTLY
+    piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects
     named = bool(found.best.terms) and not piled
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"

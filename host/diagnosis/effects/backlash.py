@@ -27,5 +27,6 @@ EFFECTS = (
         "y = play(x, width/2)",
         apply,
         family="dry",
+        remembers=True,
     ),
 )

@@ -31,7 +31,7 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 SAYS = "One clock runs faster: the delay grows by {rate}."
 EFFECTS = tuple(
-    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True)
+    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate")
     for port in ("motion", "timing")
 ) + (
     Effect(
@@ -43,6 +43,7 @@ EFFECTS = tuple(
         "y(t) = x(t - rate*t)",
         apply_pose,
         timed=True,
+        shifts="rate",
     ),
     Effect(
         "clock_drift",
@@ -53,5 +54,6 @@ EFFECTS = tuple(
         "y(t) = x(t - rate*t)",
         apply_force,
         timed=True,
+        shifts="rate",
     ),
 )

@@ -43,6 +43,7 @@ EFFECTS = (
         "y = x - lost_motion*sign(v)",
         apply,
         family="dry",
+        remembers=True,
     ),
     Effect(
         "coulomb_friction",
@@ -54,5 +55,6 @@ EFFECTS = (
         slots=slots,
         forms=("", "bristles"),
         family="dry",
+        remembers=True,
     ),
 )

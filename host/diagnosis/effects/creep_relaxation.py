@@ -81,6 +81,7 @@ EFFECTS = (
         "y = x + slow_share*(lag(x, time_constant) - x)",
         apply_force,
         timed=True,
+        several=True,
     ),
     Effect(
         "creep_relaxation",
@@ -92,6 +93,7 @@ EFFECTS = (
         apply_shape,
         timed=True,
         forms=("force",),
+        several=True,
     ),
     Effect(
         "creep_relaxation",
@@ -103,6 +105,7 @@ EFFECTS = (
         apply_motion,
         timed=True,
         contains=("rate_lag",),
+        several=True,
     ),
     Effect(
         "creep_relaxation",
@@ -115,6 +118,7 @@ EFFECTS = (
         side="output",
         source="load",
         timed=True,
+        several=True,
     ),
     Effect(
         "creep_relaxation",
@@ -125,5 +129,6 @@ EFFECTS = (
         "F = stiffness*(x - lag(x, time_constant))",
         slots=slots,
         timed=True,
+        several=True,
     ),
 )

@@ -33,6 +33,7 @@ EFFECTS = tuple(
         "Nothing happens within {half_width} of {centre}, whichever way it is entered.",
         "y = x - clip(x - centre, -half_width, half_width)",
         apply,
+        natural_bounds=True,
     )
     for port in ("motion", "limit")
 )

@@ -39,7 +39,8 @@ def rows(values: Array, c: Context, late: Array) -> Array:
 
 SAYS = "The channel is {delay} late, at every frequency alike."
 EFFECTS = tuple(
-    Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True) for port in ("motion", "timing")
+    Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True, shifts="time")
+    for port in ("motion", "timing")
 ) + (
     Effect(
         "latency",
@@ -50,6 +51,7 @@ EFFECTS = tuple(
         "y(t) = x(t - delay)",
         apply_pose,
         timed=True,
+        shifts="time",
     ),
     Effect(
         "latency",
@@ -60,5 +62,6 @@ EFFECTS = tuple(
         "y(t) = x(t - delay)",
         apply_force,
         timed=True,
+        shifts="time",
     ),
 )

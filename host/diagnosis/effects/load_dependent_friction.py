@@ -58,6 +58,7 @@ EFFECTS = (
         apply_wrapped,
         contains=("backlash", "coulomb_friction"),
         family="dry",
+        remembers=True,
     ),
     Effect(
         "load_dependent_friction",
@@ -68,6 +69,7 @@ EFFECTS = (
         "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
         apply,
         source="drag",
+        remembers=True,
     ),
     Effect(
         "load_dependent_friction",
@@ -78,5 +80,6 @@ EFFECTS = (
         "F = coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
         slots=slots,
         source="drag",
+        remembers=True,
     ),
 )

@@ -32,5 +32,6 @@ EFFECTS = (
         "y = x + jump*(t > instant)",
         apply,
         timed=True,
+        natural_bounds=True,
     ),
 )

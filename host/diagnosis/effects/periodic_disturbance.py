@@ -99,6 +99,8 @@ EFFECTS = (
         "x = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_pose,
         timed=True,
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -109,6 +111,8 @@ EFFECTS = (
         "F = F + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_force,
         timed=True,
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -119,6 +123,8 @@ EFFECTS = (
         "depth = depth + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_wall,
         timed=True,
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -130,6 +136,8 @@ EFFECTS = (
         apply,
         side="output",
         timed=True,
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -140,6 +148,8 @@ EFFECTS = (
         "y = x + sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)",
         apply,
         forms=("place",),
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -150,6 +160,8 @@ EFFECTS = (
         "F = sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         slots=slots,
         timed=True,
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -160,6 +172,8 @@ EFFECTS = (
         "F = sine*sin(2 pi x/pitch) + cosine*cos(2 pi x/pitch)",
         slots=slots,
         forms=("place",),
+        at_rest=True,
+        several=True,
     ),
     Effect(
         "periodic_disturbance",
@@ -170,5 +184,7 @@ EFFECTS = (
         "y = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply,
         timed=True,
+        at_rest=True,
+        several=True,
     ),
 )

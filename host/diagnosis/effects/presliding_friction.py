@@ -63,6 +63,7 @@ EFFECTS = (
         forms=("dahl", "maxwell"),
         contains=("backlash", "coulomb_friction"),
         family="dry",
+        remembers=True,
     ),
     Effect(
         "presliding_friction",
@@ -75,5 +76,6 @@ EFFECTS = (
         forms=("dahl", "maxwell"),
         contains=("coulomb_friction",),
         family="dry",
+        remembers=True,
     ),
 )

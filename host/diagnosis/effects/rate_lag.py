@@ -38,7 +38,7 @@ def rows(values: Array, c: Context, time_constant_s: float) -> Array:
 
 SAYS = "The output follows with a first-order lag of {time_constant}."
 EFFECTS = tuple(
-    Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True)
+    Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True, shifts="time")
     for port in ("motion", "timing")
 ) + (
     Effect(
@@ -51,6 +51,7 @@ EFFECTS = tuple(
         apply_pose,
         timed=True,
         forms=("", "positions"),
+        shifts="time",
     ),
     Effect(
         "rate_lag",
@@ -61,5 +62,6 @@ EFFECTS = tuple(
         "time_constant*dy/dt + y = x",
         apply_force,
         timed=True,
+        shifts="time",
     ),
 )

@@ -23,7 +23,17 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 EFFECTS = (
-    Effect("rectified_sensor", "forces", 90, parameters, "The force sensor gives magnitudes only.", "y = |x|", apply_force),
+    Effect(
+        "rectified_sensor",
+        "forces",
+        90,
+        parameters,
+        "The force sensor gives magnitudes only.",
+        "y = |x|",
+        apply_force,
+        natural_bounds=True,
+        hides=True,
+    ),
     Effect(
         "rectified_sensor",
         "drift",
@@ -32,5 +42,7 @@ EFFECTS = (
         "The sensor gives the magnitude only: its reading folds at zero.",
         "y = |x|",
         apply,
+        natural_bounds=True,
+        hides=True,
     ),
 )

@@ -43,7 +43,17 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 SAYS = "Beyond {limit} nothing follows."
 EFFECTS = (
     tuple(
-        Effect("saturation", port, 33, parameters, SAYS, "y = min(x, limit)", apply, forms=("upper", "lower"))
+        Effect(
+            "saturation",
+            port,
+            33,
+            parameters,
+            SAYS,
+            "y = min(x, limit)",
+            apply,
+            forms=("upper", "lower"),
+            natural_bounds=True,
+        )
         for port in ("motion", "limit")
     )
     + tuple(
@@ -56,6 +66,7 @@ EFFECTS = (
             "y = clip(x, middle - limit, middle + limit), rounded over the knee",
             apply,
             forms=("both",),
+            natural_bounds=True,
         )
         for port in ("motion", "limit")
     )
@@ -68,6 +79,7 @@ EFFECTS = (
             "The force sensor does not read beyond {limit}.",
             "y = clip(x, -limit, limit)",
             apply_force,
+            natural_bounds=True,
         ),
     )
 )

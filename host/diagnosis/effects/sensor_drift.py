@@ -67,6 +67,7 @@ EFFECTS = (
         apply_pose,
         timed=True,
         forms=("", "warm_up"),
+        at_rest=True,
     ),
     Effect(
         "sensor_drift",
@@ -78,6 +79,7 @@ EFFECTS = (
         apply_force,
         timed=True,
         forms=("", "warm_up"),
+        at_rest=True,
     ),
     Effect(
         "sensor_drift",
@@ -89,5 +91,6 @@ EFFECTS = (
         apply,
         timed=True,
         forms=("", "warm_up"),
+        at_rest=True,
     ),
 )

@@ -59,6 +59,7 @@ EFFECTS = (
         timed=True,
         contains=("coulomb_friction",),
         family="dry",
+        remembers=True,
     ),
     Effect(
         "stribeck_friction",
@@ -71,5 +72,6 @@ EFFECTS = (
         timed=True,
         contains=("coulomb_friction", "presliding_friction"),
         family="dry",
+        remembers=True,
     ),
 )

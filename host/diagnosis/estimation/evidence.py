@@ -159,6 +159,8 @@ def whiteness(residuals: list[Array], masks: list[Mask], lags: int = 25) -> floa
             continue
         x = np.where(good, r - np.mean(r[good]), 0.0)
         c0 = float(x @ x) / n
+        if c0 <= 0.0:  # exact: a model without noise
+            continue
         for k in range(1, lags + 1):
             pairs = int(np.sum(good[k:] & good[:-k]))
             rho = float(x[k:] @ x[:-k]) / max(pairs, 1) / c0

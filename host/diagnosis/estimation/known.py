@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.effects import candidates
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Parameter, Port, candidates
+from host.diagnosis.model.effect import Candidate, Parameter, Port
 from host.diagnosis.model.model import Act, Model, Piece, scale_of
 from host.diagnosis.model.nominal import EffectSpec
 from protocol.errors import InputError
@@ -29,6 +30,7 @@ class Known:
             "ports",
             "quiet_inputs",
             "screen_samples",
+            "scan_points",
             "fit_samples",
             "coarsest_s",
             "travel",

@@ -12,8 +12,11 @@ from scipy import stats
 
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, free, jacobian, size_of
+from host.diagnosis.model.findings import Finding
 
 Array = npt.NDArray[np.float64]
+DECADE = 10.0  # ratio of an interval's ends, from which a positive parameter counts as not seen
+UNSEEN = 0.1  # part of the largest contribution that half an interval of a signed parameter may move
 LARGER = 0.95  # chance below which scatter between recordings stays, if formulas are true
 
 
@@ -51,6 +54,36 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
             low, high = value - half * sizes[index], value + half * sizes[index]
         out[index] = (float(max(low, p.low)), float(min(high, p.high)))
     return out
+
+
+def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> list[Finding]:
+    """Nominal parameters that these recordings do not show: at a bound, or with an interval over a decade.
+
+    A parameter that may be negative has no decades: it counts where half its interval changes the outputs by more than
+    UNSEEN of what the parameter that contributes most does.
+    """
+    parameters = problem.model.parameters
+    sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=False)]
+    base = problem.stacked(fit.terms, fit.values)
+    moving = [index for index in free(problem.parameters(fit.terms)) if index < len(parameters)]
+    rates = {}  # RMS change of the weighted outputs by a change of one
+    for index in moving:
+        moved = fit.values.copy()
+        moved[index] += 1e-3 * sizes[index]
+        change = problem.stacked(fit.terms, moved) - base
+        rates[index] = float(np.sqrt(np.mean(change**2))) / (1e-3 * sizes[index])
+    varied = max([rates[index] * abs(float(fit.values[index])) for index in moving], default=0.0)
+    found = []
+    for index in moving:
+        p, value, (low, high) = parameters[index], float(fit.values[index]), spans[index]
+        at_bound = p.log and (value <= 1.01 * p.low or value >= 0.99 * p.high)
+        wide = high > DECADE * max(low, 1e-300) if p.log else 0.5 * (high - low) * rates[index] > UNSEEN * varied
+        if at_bound or wide:
+            where = "ended at a bound" if at_bound else "can be anything"
+            says = f"The nominal parameter {p.name} {where} from {low:.3g} to {high:.3g} {p.unit}".rstrip()
+            says += " (95 %): these recordings do not show it. Hold it at a known value, or record a motion that needs it."
+            found.append(Finding("excitation", p.name, says))
+    return found
 
 
 def _inverse(A: Array) -> Array:

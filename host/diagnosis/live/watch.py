@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.live.twin import Calibration, Listener, Twin
-from host.diagnosis.model.effect import candidates
 from host.diagnosis.model.model import Piece
 from host.diagnosis.selection.screening import screen
 from protocol.rig_file import Rig

@@ -39,6 +39,7 @@ class Recording:
     heldout: Mask
     units: dict[str, str] = field(default_factory=dict)
     begin_s: float = 0.0
+    jitter: float = 0.0  # largest deviation of a period from the median one, over it, as recorded
 
     @property
     def n(self) -> int:
@@ -113,11 +114,14 @@ def _one(
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
     time_s, timed = _time_line(spec, name, columns, n)
     dt_s = float(np.median(np.diff(time_s)))
-    if timed and np.max(np.abs(np.diff(time_s) - dt_s)) > 0.2 * dt_s:
+    if dt_s <= 0.0:
+        raise InputError("data.time", f"more than half of the stamps of {name} repeat", "seconds that increase")
+    jitter = float(np.max(np.abs(np.diff(time_s) - dt_s))) / dt_s
+    if timed and jitter > 0.2:
         time_s, channels = _even(time_s, dt_s, channels)
     nothing = np.zeros(time_s.size, dtype=bool)
     units = {key: channel.unit for key, channel in needed.items()}
-    return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units)
+    return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter)
 
 
 def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -121,6 +118,12 @@ class Effect:
     forms: tuple[str, ...] = ("",)
     contains: tuple[str, ...] = ()
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first
+    remembers: bool = False  # its state at a recording's first sample is not known: it is estimated
+    natural_bounds: bool = False  # a parameter may end at its bound: the bound is physics
+    at_rest: bool = False  # seen without any motion of its port
+    several: bool = False  # more than one may act at a port
+    hides: bool = False  # the nominal parameters cannot be fitted without it
+    shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,7 @@ class Port:
     loads: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
     drags: tuple[str, ...] = ()
+    held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
 
 
 @dataclass(frozen=True)
@@ -155,42 +159,6 @@ class Candidate:
     def name(self) -> str:
         """Effect and subsystem: what a verdict names."""
         return f"{self.effect.id}@{self.port.subsystem}"
-
-
-@cache
-def library() -> tuple[Effect, ...]:
-    """Every effect of the package `effects`, in the order of their files."""
-    from host.diagnosis import effects
-
-    found: list[Effect] = []
-    for info in sorted(pkgutil.iter_modules(effects.__path__), key=lambda item: item.name):
-        module = importlib.import_module(f"{effects.__name__}.{info.name}")
-        found += list(getattr(module, "EFFECTS", ()))
-    return tuple(found)
-
-
-def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = frozenset()) -> list[Candidate]:
-    """All candidates at `ports`; rate effects only with a time line.
-
-    `left_out`: ids, id:form, or id:form@port, not to use: what the nominal model has already, and those of a
-    leave-one-out proof.
-    """
-    found = []
-    for port in ports:
-        for effect in library():
-            if (
-                effect.id in left_out
-                or effect.port not in port.kind.split("+")
-                or effect.id in left_out
-                or (effect.timed and not timed)
-            ):
-                continue
-            sources = {"": ("",), "load": port.loads, "drag": port.drags or port.loads, "other": port.others}[effect.source]
-            forms = [
-                form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out
-            ]
-            found += [Candidate(effect, port, source, form) for source in sources for form in forms]
-    return found
 
 
 def spread(low: float, high: float, count: int) -> tuple[float, ...]:

@@ -53,6 +53,7 @@ class Model(Protocol):
     parameters: tuple[Parameter, ...]
     quiet_inputs: tuple[str, ...]
     screen_samples: int  # about so many samples are enough to screen by
+    scan_points: int  # simulations that screening one candidate may take
     fit_samples: int  # and so many to fit; beyond, samples are averaged
     coarsest_s: float  # period beyond which they must not be averaged
     travel: tuple[tuple[str, str, str], ...]  # signals a condition may speak of: words, key of Piece.inputs, unit

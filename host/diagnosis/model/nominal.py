@@ -74,14 +74,17 @@ class ControllerSpec(Request):
 
 
 class AxisSpec(Request):
-    """Force in, motion out: mass * a + damping * v + stiffness * x = force + offset."""
+    """Force in, motion out: mass * a + damping * v + stiffness * x = force + offset.
+
+    `hold`: the force between samples; left out, a free mass takes what fits its recordings best, others `linear`.
+    """
 
     subsystem: str = "axis"
     input: str
     output: str
     terms: list[Literal["mass", "damping", "stiffness", "offset"]] = ["mass", "damping", "offset"]
     reads: Literal["position", "velocity", "acceleration"] = "position"
-    hold: Literal["zero", "linear", "band_limited"] = "linear"
+    hold: Literal["zero", "linear", "band_limited"] | None = None
     controller: ControllerSpec | None = None
 
 

@@ -205,21 +205,23 @@ def fill(values: Array) -> Array:
     return np.interp(index, index[good], values[good])
 
 
-def smoothing_window(x: Array, dt_s: float, sigma: float, least_s: float, bands: float = 2.0) -> int:
-    """Samples (odd) of a local cubic that passes `bands` times the band in which the motion `x` (n,) stands out of white
-    noise `sigma`, and no less than `least_s`.
-
-    The band ends where the power spectrum comes within three times the noise's; cut-off of the cubic after Schafer (2011).
-    """
+def signal_band(x: Array, dt_s: float, sigma: float) -> float:
+    """Frequency (Hz) at which the power of the motion `x` (n,) falls to three times that of white noise `sigma`."""
     from scipy.signal import medfilt, welch
 
+    frequency, power = welch(x, fs=1.0 / dt_s, nperseg=min(x.size, 1024), window="blackman")
+    out = np.flatnonzero(medfilt(power, 9) > 3.0 * 2.0 * sigma * sigma * dt_s)
+    return float(frequency[out[-1]] if out.size and out[-1] > 0 else frequency[1])
+
+
+def smoothing_window(x: Array, dt_s: float, sigma: float, least_s: float, bands: float = 2.0) -> int:
+    """Samples (odd) of a local cubic that passes `bands` times the band in which the motion `x` (n,) stands out of white
+    noise `sigma`, and no less than `least_s`. Cut-off of the cubic after Schafer (2011).
+    """
     least = max(7, round(least_s / dt_s) | 1)
     if sigma <= 0.0 or x.size < 8 * least:
         return least
-    frequency, power = welch(x, fs=1.0 / dt_s, nperseg=min(x.size, 1024), window="blackman")
-    out = np.flatnonzero(medfilt(power, 9) > 3.0 * 2.0 * sigma * sigma * dt_s)
-    band = bands * frequency[out[-1]] if out.size else frequency[1]
-    half = (4.0 * 0.5 / (band * dt_s) + 4.6) / 3.2
+    half = (4.0 * 0.5 / (bands * signal_band(x, dt_s, sigma) * dt_s) + 4.6) / 3.2
     return int(min(max(least, 2 * int(half) + 1), x.size // 8))
 
 
@@ -257,6 +259,16 @@ def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) ->
             half = half + 1 if half < 4 else int(half * 1.3) + 1
         out[i] = 0.0 if from_zero and abs(best) < sure else best
     return out
+
+
+def white_level(x: Array) -> float:
+    """Standard deviation of white noise as strong as the upper half of the spectrum of `x` (n,)."""
+    from scipy.signal.windows import blackmanharris
+
+    window = blackmanharris(x.size)
+    power = np.abs(np.fft.rfft((x - np.mean(x)) * window)) ** 2
+    # the median of chi-squared with two degrees of freedom is ln 2 of its mean
+    return float(np.sqrt(np.median(power[power.size // 2 :]) / np.log(2.0) / np.sum(window**2)))
 
 
 def quantum(values: Array) -> float:

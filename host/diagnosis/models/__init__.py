@@ -10,7 +10,7 @@ from protocol.errors import InputError
 
 
 def build(spec: NominalSpec) -> Model:
-    """The nominal model of `spec`."""
+    """The nominal model of `spec`; the rig that recordings describe themselves is `live.recorded_rig`."""
     if spec.kind == "transmission":
         from host.diagnosis.models.transmission import Transmission
 
@@ -23,10 +23,6 @@ def build(spec: NominalSpec) -> Model:
         from host.diagnosis.models.axis import Axis
 
         return cast(Model, Axis(spec))
-    if spec.recorded_rig:
-        from host.diagnosis.models.recorded_rig import RecordedRig
-
-        return RecordedRig(spec)
     if spec.kind == "rig":
         from host.diagnosis.models.rig import Rig
 

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.force_kernel import run_axis, slot_array
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.force_kernel import run_axis, slot_array
 from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives
@@ -32,11 +32,13 @@ class Axis:
     fit_samples = 1000000000
     coarsest_s = 0.0
     screen_samples = 20000
+    scan_points = 120
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.axis is None:
             raise ValueError("axis: found nothing, wanted a section")
         self.spec = spec.axis
+        self.hold = spec.axis.hold or "linear"
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
         self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
@@ -46,7 +48,7 @@ class Axis:
         self.outputs = tuple(outputs)
         self.ports = (
             Port(name, "force", name, tuple(o.channel for o in outputs)),
-            Port(f"{name}_drive", "timing+limit+mode", name, (self.spec.output,)),
+            Port(f"{name}_drive", "timing+limit+mode", name, (self.spec.output,), held=True),
             Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
         )
         defaults = {
@@ -104,11 +106,13 @@ class Axis:
             f"{name}_drive": self.units[spec.input],
             f"{name}_reading": self.units[spec.output],
         }
-        piece.extra["steps"] = upsample(piece.inputs[spec.input], 2 * piece.extra["substeps"], spec.hold)
-        if not self.free_run:
+        if self.free_run:
+            piece.extra["stages"] = stages(piece.inputs[spec.input], piece.extra["substeps"], self.hold)
+        else:
             piece.y = np.zeros_like(y)
-            piece.y[:, ~np.isfinite(recording.channels[spec.output])] = np.nan
-            balance.prepare(piece, motion, SMOOTHING_S, spec.hold, piece.extra["steps"])
+            piece.extra["force"] = spec.input
+            seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
+            balance.prepare(piece, motion, seen, SMOOTHING_S, spec.hold)
         return piece
 
     def guess(self, pieces: list[Piece]) -> Array:
@@ -180,11 +184,10 @@ class Axis:
             linear[("mass", "damping", "stiffness", "offset").index(term)] = value
         if "mass" not in spec.terms:
             linear[0] = 1.0
-        steps = extra["steps"]
+        force = piece.inputs[spec.input]
         drive = [act for act in acts if act[0].port.name == f"{spec.subsystem}_drive"]
         if drive:
-            changed = apply_acts(piece.inputs[spec.input], drive, f"{spec.subsystem}_drive", piece, None)
-            steps = upsample(changed, 2 * extra["substeps"], spec.hold)
+            force = apply_acts(force, drive, f"{spec.subsystem}_drive", piece, None)
         slots = [
             candidate.effect.slots(values, candidate.form)
             for candidate, values in acts
@@ -199,9 +202,9 @@ class Axis:
         else:
             control, reference = np.zeros(0), load[None, :]
         if not self.free_run:
-            return balance.error(piece, linear, steps, spec.hold, p, piece.start.get(spec.subsystem, 0.0))
+            return balance.error(piece, linear, force, p, piece.start.get(spec.subsystem, 0.0))
         run = run_axis(
-            steps,
+            stages(force, extra["substeps"], self.hold) if drive else extra["stages"],
             extra["substeps"],
             piece.recording.dt_s,
             linear,
@@ -267,13 +270,23 @@ def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> tup
     return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300), noise
 
 
-def upsample(u: Array, factor: int, hold: str) -> Array:
-    """Input at `factor` points per sample, (n * factor + 1,). zero: held; linear; band_limited: sinc (whole record,
-    by Fourier).
+def stages(u: Array, substeps: int, hold: str) -> Array:
+    """Input at the start, middle and end of each sub-step, (n, substeps, 3).
+
+    A held input jumps at the samples: the end of a sample's last sub-step is still the held value, which the next sample's
+    start is not. hold: zero, linear, or band_limited (by Fourier, the whole record).
     """
     n = u.size
     if hold == "zero":
-        return np.append(np.repeat(u, factor), u[-1])
+        return np.broadcast_to(u[:, None, None], (n, substeps, 3)).copy()
+    points = _between(u, 2 * substeps, hold)
+    place = 2 * np.arange(n * substeps)[:, None] + np.arange(3)
+    return np.asarray(points[place].reshape(n, substeps, 3))
+
+
+def _between(u: Array, factor: int, hold: str) -> Array:
+    """A continuous input at `factor` points a sample, (n * factor + 1,)."""
+    n = u.size
     if hold == "linear":
         return np.append(np.interp(np.arange(n * factor) / factor, np.arange(n), u), u[-1])
     from scipy.signal import resample

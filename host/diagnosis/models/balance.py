@@ -1,67 +1,123 @@
-"""A free axis is balanced, not simulated: the force that its measured motion needs against the input, smoothed alike."""
+"""A free mass is balanced, not simulated: its equation of motion in weak form, smooth test functions along the recording.
+
+    (phi * f)(t) = m (phi'' * x)(t) + c (phi' * x)(t) + k (phi * x)(t) - offset + (phi * other forces)(t)
+
+phi is a bump of finite length: (1 - (s / L)^2)^4. Integration by parts puts every derivative on phi, so that no measured
+signal is differentiated; samples whose test function would reach over an end or a gap of the recording are not compared
+(weak form: Messenger & Bortz 2021). The force is integrated as it is held between samples.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import welch
+from scipy.signal import fftconvolve
 
-from host.diagnosis.estimation.force_kernel import along
 from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
+from host.diagnosis.model.force_kernel import along
 from host.diagnosis.model.model import Piece
-from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
+from host.diagnosis.model.operators import signal_band, white_level
 
 Array = npt.NDArray[np.float64]
+POWER = 4  # of the bump: its second derivative is smooth at the ends
+HALF_GAIN = 0.62  # half length times the frequency at which the bump's gain is one half
+FEWEST = 5  # samples in half a bump
+HOLDS = ("linear", "zero", "band_limited")
+FINE = 32  # points a sample, to integrate a held force
 
 
-def prepare(piece: Piece, motion: Array, least_s: float, hold: str, steps: Array) -> None:
-    """Window of the filter that input, inertia and friction all pass, and the motion's (acceleration, speed, place), (3, n),
-    behind it.
+def prepare(piece: Piece, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None) -> None:
+    """Test function, and the motion's (acceleration, speed, place) (3, n) under it.
 
-    The filter is a local cubic over the band in which the motion stands out of its noise; being the same for all terms it
-    bends none of their coefficients. The noise of the comparison is told by what does not go with the motion.
+    Its length follows the band in which the motion stands out of its noise; being the same for all terms it bends none of
+    their coefficients.
+
+    motion: (n,), gaps bridged; seen: where motion and force were measured; hold: how the force runs between samples, None
+    for what fits best.
     """
     dt_s, recording = piece.recording.dt_s, piece.recording
     sigma = estimate([motion], [quiescent([motion], dt_s, recording.timed)]).sigma
-    window = smoothing_window(motion, dt_s, sigma, least_s, 1.0)
-    x = _smooth(motion, window)
-    second = np.diff(x, 2) / dt_s**2  # of a motion under a held force exactly its mean over the samples beside
-    rows = np.array([np.concatenate((second[:1], second, second[-1:])), np.gradient(x, dt_s), x])
-    piece.extra.update(window=window, balance=rows)
-    force = applied(piece, steps, hold)
-    columns = np.vstack([rows, np.ones(piece.n)]).T
-    piece.extra["noise"] = _noise(force - columns @ np.linalg.lstsq(columns, force, rcond=1e-12)[0], window)
+    length = max(HALF_GAIN / signal_band(motion, dt_s, sigma), least_s, FEWEST * dt_s)
+    length = min(length, max(FEWEST * dt_s, motion.size * dt_s / 16.0))
+    half = int(np.ceil(length / dt_s))
+    s: Array = np.arange(-half, half + 1, dtype=np.float64) * dt_s
+    bump, slope, bend = _bump(s, length)
+    bump /= bump.sum()
+    slope = (slope - slope.mean()) / -float(slope @ s)
+    bend -= bump * bend.sum()
+    bend *= 2.0 / float(bend @ s**2)
+    kernels = np.array([bend, slope, bump])
+    rows = np.array([_along_record(motion, kernel) for kernel in kernels])
+    gap = np.concatenate((np.zeros(1), np.cumsum(~seen)))
+    first, last = np.maximum(np.arange(piece.n) - half, 0), np.minimum(np.arange(piece.n) + half + 1, piece.n)
+    whole = (np.arange(piece.n) >= half) & (np.arange(piece.n) < piece.n - half) & (gap[last] == gap[first])
+    piece.y[:, ~whole] = np.nan
+    kept = slice(half, piece.n - half)
+    columns = np.vstack([rows, np.ones(piece.n)])[:, kept].T
+    fits = []
+    for each in (hold,) if hold else HOLDS:
+        held = _held(s, length, dt_s, each)
+        force = _along_record(piece.inputs[piece.extra["force"]], held)[kept]
+        found = np.linalg.lstsq(columns, force, rcond=1e-12)[0]
+        fits.append((float(np.sum((force - columns @ found) ** 2)), held, found[:3]))
+    _, held, coefficients = min(fits, key=lambda item: item[0])
+    piece.extra.update(bump=bump, held_bump=held, balance=rows)
+    levels = white_level(motion), white_level(piece.inputs[piece.extra["force"]])
+    piece.extra["noise"] = _noise(coefficients, *levels, kernels, held)
 
 
-def _smooth(values: Array, window: int) -> Array:
-    """A local cubic, twice: what it lets pass beyond its band would be noise, which acceleration multiplies."""
-    return smooth_derivatives(smooth_derivatives(values, 1.0, window)[0], 1.0, window)[0]
+def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
+    """The test function and its first and second derivative at `s` (n,)."""
+    z = np.clip(1.0 - (s / length) ** 2, 0.0, None)
+    first = -2.0 * POWER * s / length**2 * z ** (POWER - 1)
+    second = 4.0 * POWER * (POWER - 1) * s**2 / length**4 * z ** (POWER - 2) - 2.0 * POWER / length**2 * z ** (POWER - 1)
+    return z**POWER, first, second
 
 
-def _noise(rest: Array, window: int) -> Noise:
-    """Noise behind the filter, as loud in all of its band as `rest` (n,) is in the quietest fifth of it."""
-    impulse = np.zeros(8 * window + 1)
-    impulse[4 * window] = 1.0
-    kernel = _smooth(impulse, window)
-    frequency, power = welch(rest, nperseg=min(rest.size, 1024), window="blackman")
-    gain = np.abs(np.exp(-2j * np.pi * np.outer(frequency, np.arange(kernel.size))) @ kernel) ** 2
-    level = float(np.quantile((power / np.maximum(gain, 1e-12))[gain > 0.25], 0.2))
-    lags = np.array([kernel[k:] @ kernel[: kernel.size - k] for k in range(ORDER + 1)])
-    return Noise(float(np.sqrt(0.5 * level * lags[0])), autoregression(lags), "the band that is compared")
+def _held(s: Array, length: float, dt_s: float, hold: str) -> Array:
+    """Weights of force samples under the test function: its integral over what each sample stands for."""
+    if hold == "band_limited":
+        weights = _bump(s, length)[0]
+    else:
+        inside = (np.arange(FINE) + 0.5) / FINE * dt_s
+        shares = [(inside, np.ones(FINE))] if hold == "zero" else []
+        if hold == "linear":
+            shares = [(inside, 1.0 - inside / dt_s), (-inside, 1.0 - inside / dt_s)]
+        weights = np.zeros_like(s)
+        for place, share in shares:
+            weights += np.sum(_bump(s[:, None] - place[None, :], length)[0] * share, axis=1)
+    return np.asarray(weights / weights.sum())
 
 
-def applied(piece: Piece, steps: Array, hold: str) -> Array:
-    """Input (n,) as it acts about each sample, behind the filter. One held between samples acts half a period late."""
-    force = steps[:: 2 * piece.extra["substeps"]][: piece.n]
-    if hold == "zero":
-        force = 0.5 * (force + np.concatenate((force[:1], force[:-1])))
-    return _smooth(force, piece.extra["window"])
+def _along_record(values: Array, kernel: Array) -> Array:
+    """Convolution (n,), of no meaning within half a kernel of the ends."""
+    return np.asarray(fftconvolve(values, kernel, mode="same"))
 
 
-def error(piece: Piece, linear: Array, steps: Array, hold: str, p: Array, start: float) -> Array:
+def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels: Array, held: Array) -> Noise:
+    """Noise behind the test function: that of the force and, by acceleration, speed and place, that of the motion.
+
+    Both are taken from the upper half of their spectra, where no axis follows: never from what the nominal model leaves.
+    """
+    of_motion = sigma_motion * (coefficients @ kernels)
+    of_force = sigma_force * held
+    lags = np.zeros(ORDER + 1)
+    for kernel in (of_motion, of_force):
+        lags += [kernel[k:] @ kernel[: kernel.size - k] for k in range(ORDER + 1)]
+    return Noise(
+        max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), "spectra of motion and force above the motion's band"
+    )
+
+
+def applied(piece: Piece, force: Array) -> Array:
+    """Input (n,) under the test function, integrated as it is held between samples."""
+    return _along_record(force, piece.extra["held_bump"])
+
+
+def error(piece: Piece, linear: Array, force: Array, p: Array, start: float) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
-    An effect of the drive changes the input, which is what is compared here: where it shrinks the
+    An effect of the drive changes the input `force` (n,), which is what is compared here: where it shrinks the
     input the error counts in the size of the recorded one, so that nothing is gained by shrinking.
     """
     extra = piece.extra
@@ -79,6 +135,6 @@ def error(piece: Piece, linear: Array, steps: Array, hold: str, p: Array, start:
             start,
             p,
         )
-        need = need + _smooth(dry, extra["window"])
-    size = float(np.std(steps)) / max(float(np.std(extra["steps"])), 1e-300)
-    return np.asarray(need - applied(piece, steps, hold))[None, :] / min(max(size, 1e-6), 1.0)
+        need = need + _along_record(dry, extra["bump"])
+    size = float(np.std(force)) / max(float(np.std(piece.inputs[extra["force"]])), 1e-300)
+    return np.asarray(need - applied(piece, force))[None, :] / min(max(size, 1e-6), 1.0)

@@ -27,6 +27,7 @@ class External:
     fit_samples = 1000000000
     coarsest_s = 0.0
     screen_samples = 20000
+    scan_points = 24
     taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.force_kernel import along, slot_array
 from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.force_kernel import along, slot_array
 from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
@@ -25,6 +25,7 @@ class Impedance:
     fit_samples = 24000
     coarsest_s = 0.02
     screen_samples = 24000
+    scan_points = 160
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.impedance is None:

@@ -72,6 +72,7 @@ class Rig:
     fit_samples = 6000
     coarsest_s = 0.04
     screen_samples = 4000
+    scan_points = 40
     taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:

@@ -21,6 +21,7 @@ class Transmission:
     fit_samples = 24000
     coarsest_s = 0.02
     screen_samples = 24000
+    scan_points = 160
     taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:

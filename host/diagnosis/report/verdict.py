@@ -9,6 +9,7 @@ import numpy as np
 
 from host.diagnosis.design.experiment import lines as experiment_lines
 from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.model.findings import Finding
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.locate import joined
@@ -36,6 +37,7 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
         "located": [_located(location) for location in result.located],
+        "data_findings": [finding_json(finding) for finding in result.findings],
         "effects": effects(result),
         "fit": {
             "heldout": True,
@@ -51,6 +53,24 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         },
         "seconds": seconds,
     }
+
+
+def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
+    """The verdict on recordings in which there is nothing to compare: findings about the data, no physics."""
+    nothing = dict.fromkeys(("rmse_before", "rmse_after", "noise_floor", "whiteness_p_before", "whiteness_p_after"))
+    return {
+        "verdict": "mismatch_not_identified",
+        "located": [],
+        "data_findings": [finding_json(finding) for finding in findings],
+        "effects": [],
+        "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
+        "seconds": seconds,
+    }
+
+
+def finding_json(finding: Finding) -> dict[str, str]:
+    """A finding about the data, as the contract has it."""
+    return {"id": finding.id, "channel": finding.channel, "says": finding.says}
 
 
 def _located(location: Location) -> dict[str, Any]:

@@ -9,22 +9,15 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
-from host.diagnosis.selection.dictionary import equation_at
 from host.diagnosis.selection.screening import term_of, without
 from host.diagnosis.selection.search import Found
 from host.diagnosis.selection.trial import Trial
-from host.diagnosis.symbolic.unlisted import Rest, equations_for
+from host.diagnosis.selection.unlisted import Rest, equations_for
+from host.diagnosis.symbolic.dictionary import equation_at
 
 Array = npt.NDArray[np.float64]
-MOST_RIVALS = 4
-TRIED = 8  # rivals refitted in an effect's place at most
-NEAR = 0.5  # a rival must have earned this part of the winner's likelihood when it was tried first
-CANNOT_TELL = 4.0  # log-likelihood below which two models are not told apart,
-CHANCE = 0.01  # nor above this p-value,
-ALIKE = 0.1  # nor where the rival's error is larger by less than this share, in the output that tells most,
-MISFIT = 0.05  # or by less than this part of the mismatch there, and
-PART = 0.25  # what it lacks is less than this part of what the effect earned: the modules themselves are idealized
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ def _better_said(problem: Problem, found: Found, candidate: Candidate, less: Fit
         return ()
     for trial in equations_for(problem, less, candidate.port, floor):
         ahead = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
-        if ahead.log_likelihood > CANNOT_TELL:
+        if ahead.log_likelihood > problem.rules.equal_log_likelihood:
             return (trial.candidate,)
     return ()
 
@@ -81,7 +74,7 @@ def _equals(
     """Rivals in the place of `candidate` that neither held-out samples nor all together tell from it."""
     best = found.best
     kept: list[Candidate] = []
-    for trial in _rivals(found, candidate)[:TRIED]:
+    for trial in _rivals(found, candidate, problem.rules)[: problem.rules.equals_fits]:
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         other = finish(
@@ -90,12 +83,12 @@ def _equals(
         ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
         held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
         rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
-        if len(kept) < MOST_RIVALS and _not_told(ahead, held, earned, rival):
+        if len(kept) < problem.rules.most_equals and _not_told(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept)
 
 
-def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
+def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:
     """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did."""
     active = {term.candidate.key for term in found.best.terms}
     names = {candidate.name, *(term.candidate.name for term in found.best.terms)}
@@ -103,16 +96,22 @@ def _rivals(found: Found, candidate: Candidate) -> list[Trial]:
     for step in (s for s in found.steps if any(trial.candidate.key == candidate.key for trial in s.trials)):
         most = max(trial.score for trial in step.trials)
         for trial in step.trials:
-            if trial.candidate.key not in active and trial.candidate.name not in names and trial.score > NEAR * most:
+            if (
+                trial.candidate.key not in active
+                and trial.candidate.name not in names
+                and trial.score > rules.equals_score * most
+            ):
                 kept.setdefault(trial.candidate.name, trial)
     return sorted(kept.values(), key=lambda trial: -trial.score)
 
 
-def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain) -> bool:
+def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: SelectionRules) -> bool:
     """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
-    if ahead.log_likelihood < CANNOT_TELL or (ahead.p_value > CHANCE and held.p_value > CHANCE):
+    if ahead.log_likelihood < rules.equal_log_likelihood or (
+        ahead.p_value > rules.equal_significance and held.p_value > rules.equal_significance
+    ):
         return True
     top = int(np.argmax(earned.independent * earned.log_ratio))
     best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
-    near = ahead.share < ALIKE or best - other < MISFIT * best
-    return bool(near and ahead.log_likelihood < PART * earned.log_likelihood)
+    near = ahead.share < rules.equal_error or best - other < rules.equal_mismatch * best
+    return bool(near and ahead.log_likelihood < rules.equal_likelihood_ratio * earned.log_likelihood)

@@ -10,7 +10,6 @@ from host.diagnosis.estimation.fit import Fit, Problem, robust, starts
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.screening import Screened, enough, term_of
 
-HIDES = frozenset({"rectified_sensor"})
 KEPT = 3
 
 
@@ -24,7 +23,7 @@ def hidden(problem: Problem, nominal: Fit, pool: list[Candidate]) -> list[Screen
     few = enough(problem)
     found = []
     for candidate in pool if own is not None else ():
-        if candidate.effect.id not in HIDES:
+        if not candidate.effect.hides:
             continue
         term = term_of(problem, candidate, nominal)
         begin = starts(term, {}, {})

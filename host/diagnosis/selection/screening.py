@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from time import process_time
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,8 @@ from host.diagnosis.model.model import scale_of
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
-AT_REST = frozenset({"periodic_disturbance", "sensor_drift"})  # seen without any motion of their port
-GRID = 160  # grid points of one candidate at most
+GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 STEPPED_SAMPLES = 150  # of each output and recording, to look for steps in
-SCAN_SECONDS = 0.4  # time to screen one candidate, about
 
 
 def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
@@ -64,7 +61,7 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
         if other.effect.id == candidate.effect.id and other.source == candidate.source:
             if other.form == candidate.form and other.effect.order == candidate.effect.order:
                 return None
-            if other.effect.id not in ("creep_relaxation", "periodic_disturbance"):
+            if not other.effect.several:
                 drop.append(other.key)
         elif other.effect.id in candidate.effect.contains or (
             candidate.effect.family and candidate.effect.family == other.effect.family
@@ -116,13 +113,10 @@ def screen(
     ]
     lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
     resting = _resting(problem)
-    began = process_time()
-    problem.stacked(fit.terms, fit.values)
-    most = int(np.clip(SCAN_SECONDS / max(process_time() - began, 1e-5), 12, GRID))
     for count, candidate in enumerate(pool):
         tell("screening", count / len(pool))
         drop = replaced_by(fit, candidate)
-        if drop is None or (candidate.port.name in resting and candidate.effect.id not in AT_REST and not candidate.source):
+        if drop is None or (candidate.port.name in resting and not candidate.effect.at_rest and not candidate.source):
             continue
         if drop not in bases:
             terms, values = without(fit, problem, drop)
@@ -136,7 +130,9 @@ def screen(
         quick = slopes is not None and candidate.port.name in slopes[0]
         if not term.parameters:
             continue
-        points = _scan(problem, (*terms, term), values, term, base, Q, rest, GRID if quick else most, slopes, lines)
+        points = _scan(
+            problem, (*terms, term), values, term, base, Q, rest, GRID if quick else problem.model.scan_points, slopes, lines
+        )
         if not points:
             continue
         points.sort(key=lambda point: point.taken, reverse=True)

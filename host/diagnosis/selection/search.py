@@ -20,33 +20,16 @@ from host.diagnosis.estimation.fit import (
     reweigh,
     set_starts,
 )
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Piece
-from host.diagnosis.selection.dictionary import Form
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, enough, screen, without
-from host.diagnosis.selection.trial import (
-    ENOUGH,
-    PRICE,
-    SMALLEST_EXCESS,
-    SMALLEST_SHARE,
-    Trial,
-    at_bound,
-    good_enough,
-    rank,
-    related,
-    weighty,
-)
+from host.diagnosis.selection.trial import Trial, at_bound, good_enough, rank, related, weighty
+from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-FULL_FITS, AT_ONE_PORT = 10, 5  # candidates refitted in full at each step, and of these at one port
-FIRST_ROUNDS, MORE_ROUNDS = 5, 9  # of a fit: from each start, and from the best of these on
-MOST_EFFECTS, MOST_STEPS = 5, 10
-DETOURS, WORTH = 2, 0.6  # rivals of the first effect taken up, and the part of the best one's score they must have
-EXCHANGES, RIVALS, RIVAL = 2, 4, 0.4  # rounds, rivals fitted in each place, and the least part of the best one's promise
-SWAPS = 3  # rivals of each effect that are tried in its place when another has joined
-REMEMBER = frozenset({"backlash", "presliding_friction", "load_dependent_friction", "coulomb_friction", "stribeck_friction"})
 
 
 @dataclass
@@ -120,9 +103,11 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     begins = [np.concatenate((values, b)) for b in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]]
     if item.nominal:
         begins = [np.concatenate(both) for both in zip(item.nominal, item.begin, strict=True)]
-    fits = [minimize(few, (*terms, item.term), begin, rounds=FIRST_ROUNDS, tolerance=1e-4) for begin in begins]
+    fits = [
+        minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4) for begin in begins
+    ]
     fit = min(fits, key=lambda f: f.cost)
-    fit = minimize(few, fit.terms, fit.values, rounds=MORE_ROUNDS, tolerance=1e-4)
+    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
     if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
     fit = finish(problem, fit)
@@ -139,17 +124,18 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
         heldout,
         trained,
         both,
-        both.log_likelihood - PRICE * (len(fit.values) - len(base.values)),
+        both.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(base.values)),
         after,
         bool(item.drop),
         problem.pieces[0].recording.dt_s,
+        problem.rules,
         any(piece.heldout.any() and not piece.fit.any() for piece in problem.pieces),
     )
 
 
 def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
     """Refit with the memory at the candidate's port started, in each recording, where that recording fits best."""
-    if candidate.effect.id not in REMEMBER:
+    if not candidate.effect.remembers:
         return fit
     port = candidate.port.name
     for _ in range(2):
@@ -216,10 +202,12 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
 def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
     """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
-    while len(best.terms) < MOST_EFFECTS and len(steps) < MOST_STEPS:
+    while len(best.terms) < problem.rules.most_effects and len(steps) < problem.rules.most_steps:
         ranked = screen(problem, best, pool, tell)
         trials = []
-        promising = _varied([item for item in ranked if item.promise > 3.0])
+        promising = _varied(
+            [item for item in ranked if item.promise > problem.rules.screening_log_likelihood], problem.rules
+        )
         if not best.terms:
             promising += hidden(problem, best, pool)
         for count, item in enumerate(promising):
@@ -257,22 +245,25 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
     begun, scale = get_starts(problem), problem.scale.copy()
     best, first = found, found.steps[0]
     top = first.trials[0].score
-    for trial in _rivals(first.trials, found.best, found.best.terms[0].candidate)[:DETOURS]:
-        if trial.score < WORTH * top or not good_enough(trial, found.nominal):
+    for trial in _rivals(first.trials, found.best, found.best.terms[0].candidate)[: problem.rules.alternative_starts]:
+        if trial.score < problem.rules.alternative_start_score * top or not good_enough(trial, found.nominal):
             continue
         base = _taken(problem, trial)
         ranked = screen(problem, base, pool, tell)
         if (
             not ranked
             or _total(problem, found.nominal, base, floor) + ranked[0].promise
-            < _total(problem, found.nominal, best.best, floor) + len(best.best.terms) * ENOUGH
+            < _total(problem, found.nominal, best.best, floor) + len(best.best.terms) * problem.rules.heldout_log_likelihood
         ):
             continue
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
         _grow(problem, other, pool, floor, trial.both.log_likelihood, tell)
         ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
         more = max(len(other.best.values) - len(best.best.values), 0)
-        if ahead.log_likelihood > ENOUGH + PRICE * more and len(other.best.terms) <= len(best.best.terms) + 1:
+        if (
+            ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
+            and len(other.best.terms) <= len(best.best.terms) + 1
+        ):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
     set_starts(problem, begun)
     problem.scale[:] = scale
@@ -285,7 +276,7 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
 def _total(problem: Problem, nominal: Fit, fit: Fit, floor: Array) -> float:
     """Likelihood on all samples that a structure has earned, less the price of its parameters."""
     gain = compare(problem.pieces, "both", nominal.residuals, fit.residuals, floor)
-    return gain.log_likelihood - PRICE * (len(fit.values) - len(nominal.values))
+    return gain.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(nominal.values))
 
 
 def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
@@ -293,13 +284,17 @@ def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
     for term in best.terms:
         step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
         rest, values = without(best, problem, (term.candidate.key,))
-        for trial in _rivals(step.trials if step else [], best, term.candidate)[:SWAPS]:
+        for trial in _rivals(step.trials if step else [], best, term.candidate)[: problem.rules.swap_fits]:
             new = trial.fit.terms[-1]
             begin = np.concatenate((values, trial.fit.values[-len(new.parameters) :]))
-            other = finish(problem, minimize(problem, (*rest, new), begin, rounds=MORE_ROUNDS, tolerance=1e-4))
+            other = finish(
+                problem, minimize(problem, (*rest, new), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
+            )
             ahead = compare(problem.pieces, "both", best.residuals, other.residuals, floor)
             more = len(other.values) - len(best.values)
-            if ahead.log_likelihood > ENOUGH + PRICE * max(more, 0) and not at_bound(other):
+            if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
+                more, 0
+            ) and not at_bound(other):
                 steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
                 return refined(problem, other)
     return best
@@ -309,7 +304,7 @@ def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Arra
     """Each of several effects taken out, and all candidates screened anew for its place: what was the best beside nothing
     may not be the best beside the others.
     """
-    for _ in range(EXCHANGES):
+    for _ in range(problem.rules.exchange_rounds):
         before = found.best.names
         for term in found.best.terms:
             if len(found.best.terms) > 1 or _frequencies(found.best, term):
@@ -330,11 +325,18 @@ def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidat
     known = _frequencies(found.best, term)
     terms, values = without(found.best, problem, (term.candidate.key,))
     less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
-    ranked = [item for item in screen(problem, less, pool, tell, known) if item.promise > 3.0 and not item.drop]
+    ranked = [
+        item
+        for item in screen(problem, less, pool, tell, known)
+        if item.promise > problem.rules.screening_log_likelihood and not item.drop
+    ]
     own = [item for item in ranked if item.candidate.key == term.candidate.key]
     top = max((item.promise for item in ranked), default=0.0)
-    others = [item for item in ranked if item not in own and item.promise > RIVAL * top]
-    trials = [try_fit(problem, less, item, floor) for item in [*own, *_varied(others)[:RIVALS]]]
+    others = [item for item in ranked if item not in own and item.promise > problem.rules.exchange_promise * top]
+    trials = [
+        try_fit(problem, less, item, floor)
+        for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
+    ]
     rank(trials, less)
     found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
@@ -342,7 +344,11 @@ def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidat
         return
     ahead = compare(problem.pieces, "both", found.best.residuals, winner.fit.residuals, floor)
     more = len(winner.fit.values) - len(found.best.values)
-    if ahead.log_likelihood > (ENOUGH if more >= 0 else -PRICE) + PRICE * more:
+    if (
+        ahead.log_likelihood
+        > (problem.rules.heldout_log_likelihood if more >= 0 else -problem.rules.parameter_penalty)
+        + problem.rules.parameter_penalty * more
+    ):
         found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
         found.best = _taken(problem, winner)
 
@@ -358,15 +364,15 @@ def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]
     return list(kept.values())
 
 
-def _varied(items: list[Screened]) -> list[Screened]:
+def _varied(items: list[Screened], rules: SelectionRules) -> list[Screened]:
     """The most promising, few of one effect or port so that rivals of other kinds get their chance."""
     kept: list[Screened] = []
     for item in items:
         same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
         here = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
-        if same < 3 and here < AT_ONE_PORT:
+        if same < 3 and here < rules.fits_per_port:
             kept.append(item)
-        if len(kept) == FULL_FITS:
+        if len(kept) == rules.fits_per_step:
             break
     return kept
 
@@ -381,8 +387,10 @@ def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
             less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
             gain = compare(problem.pieces, "both", less.residuals, best.residuals, floor)
             held = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
-            least = 0.5 * max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
-            few = gain.log_likelihood < ENOUGH + PRICE * len(term.parameters)
+            least = 0.5 * max(problem.rules.least_error_reduction, problem.rules.least_excess_reduction * gain.excess)
+            few = gain.log_likelihood < problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * len(
+                term.parameters
+            )
             if few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))

@@ -8,23 +8,8 @@ import numpy as np
 
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit
+from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate
-
-ENOUGH = 6.0  # held-out log-likelihood a new effect has to bring, besides its parameters' penalty
-SURE = 1e-2  # p-value a new effect has to reach on held-out blocks
-TOGETHER = 11.0  # log-likelihood on all samples that makes up for a held-out part that shows an effect only dimly,
-DIM = 0.12  # with at most this p-value on held-out blocks,
-LITTLE = 1.8  # and at least this log-likelihood there
-OVERWHELMING = 25.0  # log-likelihood on all samples that needs no blocks to agree: few episodes may hold all of it
-PRICE = 2.0  # log-likelihood that a parameter costs: one for the samples it was fitted to, one for the others
-SMALLEST_SHARE = 0.015  # of the held-out error of some output it has to take away,
-SMALLEST_EXCESS = 0.10  # and this much of what is above noise
-FURTHER = 0.05  # of some output's error a further effect has to take: what idealized modules lack is no effect;
-BESIDE = 0.2  # and of the likelihood of those named, but for one that takes
-LARGE, SURER = 0.3, 1e-6  # this share of what is left, with blocks held out that agree so well
-COARSE = 0.15  # far above noise, a finer shape has to take this share of the error to be told from a simpler one
-INEXACT = 0.02  # part of the likelihood that a coarser shape of the same effect may lack and still be preferred if simpler
-NATURAL_BOUNDS = frozenset({"rectified_sensor", "saturation", "missed_steps", "dead_zone"})
 
 
 @dataclass
@@ -40,6 +25,7 @@ class Trial:
     starts: list[dict[str, float]] = field(default_factory=list)
     replaced: bool = False
     period_s: float = 0.0
+    rules: SelectionRules = RULES
     apart: bool = True  # whether whole recordings are held out, not blocks between the fitted ones
 
 
@@ -56,7 +42,7 @@ def at_bound(fit: Fit) -> bool:
             )
             for p, value in zip(term.parameters, values, strict=True)
         )
-        and term.candidate.effect.id not in NATURAL_BOUNDS
+        and not term.candidate.effect.natural_bounds
     )
 
 
@@ -66,15 +52,20 @@ def rank(trials: list[Trial], base: Fit) -> None:
     """
     if not trials:
         return
+    rules = trials[0].rules
     most = np.max([trial.both.independent for trial in trials], axis=0)
     common = max(trials, key=lambda trial: float(most @ trial.both.log_ratio)).both.independent
     for trial in trials:
         more = max(len(trial.fit.values) - len(base.values), 0)
-        trial.score = 0.5 * float(common @ trial.both.log_ratio) - PRICE * more
+        trial.score = 0.5 * float(common @ trial.both.log_ratio) - rules.parameter_penalty * more
     trials.sort(key=lambda trial: trial.score, reverse=True)
     top = trials[0]
-    coarse = 0.5 * float(common @ (-np.log(1.0 - COARSE * np.minimum(1.0, 2.0 * top.both.excesses))))
-    near = top.score - max(ENOUGH, INEXACT * top.score, min(coarse, 0.3 * top.score))
+    coarse = 0.5 * float(
+        common @ (-np.log(1.0 - rules.refinement_error_reduction * np.minimum(1.0, 2.0 * top.both.excesses)))
+    )
+    near = top.score - max(
+        rules.heldout_log_likelihood, rules.refinement_tolerance * top.score, min(coarse, 0.3 * top.score)
+    )
     simpler = [
         t
         for t in trials
@@ -90,11 +81,12 @@ def of_sampling(trial: Trial) -> bool:
     """Whether a delay or lag of an axis' input, all of a drifting one, is within one sample: that is how the input was
     held between samples, not physics.
     """
-    if not trial.candidate.port.name.endswith("_drive"):
+    shift = trial.candidate.effect.shifts
+    if not shift or not trial.candidate.port.held:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
-    times = {"latency": 1.0, "rate_lag": 1.0, "clock_drift": longest_s}.get(trial.candidate.effect.id)
-    return times is not None and abs(float(trial.fit.values[-1])) * times < 1.05 * trial.period_s
+    times = longest_s if shift == "rate" else 1.0
+    return abs(float(trial.fit.values[-1])) * times < 1.05 * trial.period_s
 
 
 def related(simple: Candidate, general: Candidate) -> bool:
@@ -118,42 +110,50 @@ def good_enough(trial: Trial, base: Fit) -> bool:
 
 
 def _alone(trial: Trial, more: int) -> bool:
-    gain = trial.heldout
+    gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > ENOUGH + more
-        and gain.p_value < SURE
+        gain.log_likelihood > rules.heldout_log_likelihood + more
+        and gain.p_value < rules.significance
         and gain.share > _least(trial, gain)
-        and trial.trained.log_likelihood > ENOUGH + 2.0 * more
+        and trial.trained.log_likelihood > rules.heldout_log_likelihood + 2.0 * more
     )
 
 
 def _together(trial: Trial, more: int) -> bool:
-    gain = trial.both
+    gain, rules = trial.both, trial.rules
     return (
-        gain.log_likelihood > TOGETHER + PRICE * more
-        and gain.p_value < 0.1 * SURE
+        gain.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
+        and gain.p_value < 0.1 * rules.significance
         and gain.share > _least(trial, gain)
-        and trial.heldout.log_likelihood > LITTLE
-        and trial.heldout.p_value < DIM
+        and trial.heldout.log_likelihood > rules.weak_log_likelihood
+        and trial.heldout.p_value < rules.weak_significance
     )
 
 
 def _plainly(trial: Trial, more: int) -> bool:
     """Likelihood so large that noise cannot be its cause, gained in both parts, in however few episodes."""
+    rules = trial.rules
     return (
-        trial.both.log_likelihood > OVERWHELMING + PRICE * more
+        trial.both.log_likelihood > rules.decisive_log_likelihood + rules.parameter_penalty * more
         and trial.both.share > _least(trial, trial.both)
-        and trial.heldout.log_likelihood > LITTLE
-        and trial.trained.log_likelihood > LITTLE
+        and trial.heldout.log_likelihood > rules.weak_log_likelihood
+        and trial.trained.log_likelihood > rules.weak_log_likelihood
     )
 
 
 def weighty(trial: Trial, earned: float) -> bool:
     """Whether a trial earns enough beside the likelihood of what is named already; a finer shape is judged alone."""
-    large = trial.both.share > LARGE and trial.heldout.p_value < SURER
-    enough = trial.both.share > FURTHER and (large or trial.both.log_likelihood > BESIDE * earned)
+    rules = trial.rules
+    large = trial.both.share > rules.large_error_reduction and trial.heldout.p_value < rules.large_significance
+    enough = trial.both.share > rules.further_error_reduction and (
+        large or trial.both.log_likelihood > rules.further_likelihood_ratio * earned
+    )
     return trial.replaced or earned == 0.0 or enough
 
 
 def _least(trial: Trial, gain: Gain) -> float:
-    return max(SMALLEST_SHARE, (COARSE if trial.replaced else SMALLEST_EXCESS) * gain.excess)
+    rules = trial.rules
+    return max(
+        rules.least_error_reduction,
+        (rules.refinement_error_reduction if trial.replaced else rules.least_excess_reduction) * gain.excess,
+    )

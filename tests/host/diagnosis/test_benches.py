@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.diagnosis.estimation.force_kernel import sides
+from host.diagnosis.model.force_kernel import sides
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import diagnose
 from host.diagnosis.report.verdict import as_json

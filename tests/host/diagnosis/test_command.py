@@ -14,7 +14,7 @@ from host.cli.diagnose import diagnose
 from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
-KEYS = {"verdict", "located", "effects", "fit", "seconds", "scripts"}
+KEYS = {"verdict", "located", "data_findings", "effects", "fit", "seconds", "scripts"}
 FIT = {
     "heldout",
     "rmse_before",

@@ -10,8 +10,8 @@ import pytest
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import prepare
-from host.diagnosis.selection.dictionary import Foretold, foretell, forms_at
 from host.diagnosis.selection.search import fit_nominal
+from host.diagnosis.symbolic.dictionary import Foretold, foretell, forms_at
 from tests.host.diagnosis import planted, rig_cases
 
 MICROMETRES = 25e-6  # of insertion: a quarter of the poses' noise

@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.signal import cont2discrete
 
 from host.diagnosis.estimation.fit import free, jacobian, size_of
-from host.diagnosis.estimation.force_kernel import along, run_axis, slot_array
+from host.diagnosis.model.force_kernel import along, run_axis, slot_array
 from host.diagnosis.model.nominal import read_nominal
+from host.diagnosis.models.axis import stages
 from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.search import fit_nominal
@@ -21,9 +24,8 @@ def axis(
     u: np.ndarray, dt: float, linear: list[float], slots: dict[str, float], begin: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
     """Free run with linear interpolation of u."""
-    steps = np.append(np.interp(np.arange(u.size * 4) / 4, np.arange(u.size), u), u[-1])
     return run_axis(
-        steps,
+        stages(u, 2, "linear"),
         2,
         dt,
         np.array(linear),
@@ -46,6 +48,42 @@ def test_cubic_oscillator_matches_an_adaptive_integrator() -> None:
 
     wanted = solve_ivp(rhs, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
     assert np.max(np.abs(axis(u, dt, [1.0, 0.3, 20.0, 0.0], {"cubic": 60.0})[0] - wanted)) < 1e-5
+
+
+@pytest.mark.parametrize(("hold", "method"), [("zero", "zoh"), ("linear", "foh")])
+@pytest.mark.parametrize("row", [0, 1, 2], ids=["position", "velocity", "acceleration"])
+def test_run_of_a_linear_axis_is_the_exact_discretization(hold: str, method: str, row: int) -> None:
+    m, c, k, dt = 1.3, 2.0, 60.0, 0.01
+    u = np.random.default_rng(0).normal(size=400)
+    A, B = np.array([[0.0, 1.0], [-k / m, -c / m]]), np.array([[0.0], [1.0 / m]])
+    C, D = np.array([[1.0, 0.0], [0.0, 1.0], A[1]]), np.array([[0.0], [0.0], [1.0 / m]])
+    Ad, Bd, Cd, Dd, _ = cont2discrete((A, B, C, D), dt, method)
+    wanted = np.zeros((3, u.size))
+    state = -held_state(A, B, dt) * u[0] if method == "foh" else np.zeros((2, 1))
+    for i, value in enumerate(u):
+        wanted[:, i] = (Cd @ state + Dd * value)[:, 0]
+        state = Ad @ state + Bd * value
+    run = run_axis(
+        stages(u, 3, hold),
+        3,
+        dt,
+        np.array([m, c, k, 0.0]),
+        slot_array([]),
+        np.zeros(2),
+        np.zeros(u.size),
+        np.zeros(0),
+        np.zeros((1, u.size)),
+        0.0,
+        0.0,
+    )
+    assert np.max(np.abs(run[row] - wanted[row])) < 1e-6 * np.max(np.abs(wanted[row]))
+
+
+def held_state(A: np.ndarray, B: np.ndarray, dt: float) -> np.ndarray:
+    """State of scipy's first-order hold at rest: it holds x - Gamma2 u (Franklin, Powell, Workman 1998, ch. 6)."""
+    whole = np.zeros((4, 4))
+    whole[:2, :2], whole[:2, 2:3], whole[2, 3] = A * dt, B * dt, 1.0
+    return np.asarray(expm(whole)[:2, 3:4])
 
 
 def test_coulomb_friction_holds_without_creeping() -> None:

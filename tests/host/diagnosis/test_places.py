@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
-from host.diagnosis.model.effect import candidates
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.equivalence import standings

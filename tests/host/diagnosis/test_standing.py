@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from host.diagnosis.effects import library
 from host.diagnosis.effects.quantization import stepped
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
-from host.diagnosis.model.effect import Candidate, Parameter, Port, library
-from host.diagnosis.selection.dictionary import Foretold, Form
+from host.diagnosis.model.effect import Candidate, Parameter, Port
 from host.diagnosis.selection.equivalence import Standing, beside_unlisted
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
-from host.diagnosis.symbolic.unlisted import Rest
+from host.diagnosis.selection.unlisted import Rest
+from host.diagnosis.symbolic.dictionary import Foretold, Form
 
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
 NOTHING = Gain(0.0, 1.0, 0.0)

@@ -12,24 +12,15 @@ import numpy.typing as npt
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
 from host.diagnosis.model.effect import Port
-from host.diagnosis.selection.dictionary import Foretold, Form, equation_at, fallen, foretell, lay_out
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
-from host.diagnosis.selection.trial import ENOUGH, SMALLEST_EXCESS, SMALLEST_SHARE, Trial, rank
-from host.diagnosis.symbolic.symbolic import search_equation
+from host.diagnosis.selection.trial import Trial, rank
+from host.diagnosis.symbolic.dictionary import Foretold, Form, equation_at, fallen, foretell, lay_out
+from host.diagnosis.symbolic.equation_search import search_equation
 
 Array = npt.NDArray[np.float64]
 Tell = Callable[[str, float], None]
-MUCH = 0.15  # share of the mismatch that one known effect may leave; two at a port may leave half of that, and so on:
 # several effects that pile up and still do not fit stand for something that is in no list
-MEASURED = 2.0  # times a noise level from quiescent parts, beyond which the rest is not noise where effects are named,
-MEASURED_BARE = 3.0  # and where none is;
-BLURRED = 1.15  # and this is how well it is known: what is left within it may be noise
-GUESSED = 8.0  # times a level guessed from the spectrum, whose colour is not known
-TRIED_FORMS = 3  # refitted in the place of an effect that is named
-CHOSEN = 15.0  # log-likelihood an equation has to gain on samples to fit
-UNLIKELY = 0.1  # p-value it has to reach on held-out blocks
-NEAR = 0.7  # of the gain of an equation, at which a known effect refused by the search keeps it from being named
 
 
 @dataclass(frozen=True)
@@ -51,12 +42,12 @@ class Rest:
 
 def left_over(problem: Problem, found: Found, floor: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
-    mattered most; noise may be larger than its estimate by BLURRED.
+    mattered most; noise may be larger than its estimate by `noise_uncertainty`.
     """
     shares, weights = [], []
     for row in range(floor.size):
         before = _power(problem, found.nominal.residuals, row) - floor[row] ** 2
-        after = _power(problem, found.best.residuals, row) - (BLURRED * floor[row]) ** 2
+        after = _power(problem, found.best.residuals, row) - (problem.rules.noise_uncertainty * floor[row]) ** 2
         if before > 0.0:
             shares.append(float(np.clip(after / before, 0.0, 1.0)))
             weights.append(before / floor[row] ** 2)
@@ -67,10 +58,10 @@ def _above_noise(problem: Problem, found: Found, floor: Array) -> bool:
     """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
     guessed.
     """
-    measured = MEASURED if found.best.terms else MEASURED_BARE
+    measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
     return any(
         _power(problem, found.best.residuals, row)
-        > ((measured if noise.source == "quiescent parts" else GUESSED) * floor[row]) ** 2
+        > ((measured if noise.source == "quiescent parts" else problem.rules.residual_over_guessed_noise) * floor[row]) ** 2
         for row, noise in enumerate(problem.noise)
     )
 
@@ -90,7 +81,7 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
     places = foretell(problem, found.best, floor)
     rest = _rest(problem, found, floor, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
-    if not rest.sure or rest.foretold is None or (crowd and rest.left < MUCH / crowd[0][1]):
+    if not rest.sure or rest.foretold is None or (crowd and rest.left < problem.rules.partial_share / crowd[0][1]):
         return rest
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
@@ -123,7 +114,7 @@ def _equation_instead(
     forms = [form for form, _ in sized]
     rank(trials, base)
     winner = next((trial for trial in trials if _earned(trial)), None)
-    if evolve and (winner is None or _left(problem, found, winner.fit, floor) > MUCH):
+    if evolve and (winner is None or _left(problem, found, winner.fit, floor) > problem.rules.partial_share):
         evolved = search_equation(problem, base, port)
         trials += [_tried(problem, base, floor, target, form, 1.0) for form in evolved]
         forms += evolved
@@ -146,7 +137,7 @@ def equations_for(problem: Problem, less: Fit, port: Port, floor: Array) -> list
     ports = {p.name: p for p in problem.model.ports}
     name = next(a for a, b in problem.model.unlisted_at if b == target)
     sized = [form for place in foretell(problem, less, floor, name) for form in place.forms]
-    return [_tried(problem, less, floor, ports[target], form, size) for form, size in sized[:TRIED_FORMS]]
+    return [_tried(problem, less, floor, ports[target], form, size) for form, size in sized[: problem.rules.equation_fits]]
 
 
 def _earned(trial: Trial) -> bool:
@@ -155,12 +146,12 @@ def _earned(trial: Trial) -> bool:
     Chosen among hundreds on the samples to fit, it has to gain more there than a listed effect; few held-out blocks may hold
     all of the mismatch, so these have less of a say.
     """
-    gain = trial.heldout
+    gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > ENOUGH + 1.0
-        and trial.trained.log_likelihood > CHOSEN
-        and gain.p_value < UNLIKELY
-        and gain.share > max(SMALLEST_SHARE, SMALLEST_EXCESS * gain.excess)
+        gain.log_likelihood > rules.heldout_log_likelihood + 1.0
+        and trial.trained.log_likelihood > rules.equation_log_likelihood
+        and gain.p_value < rules.equation_significance
+        and gain.share > max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
     )
 
 
@@ -178,6 +169,8 @@ def _better_than_known(problem: Problem, found: Found, floor: Array, winner: Tri
     """Whether an equation beats the known effects it takes the place of, or else all those that were tried and refused."""
     if instead:
         gain = compare(problem.pieces, "heldout", found.best.residuals, winner.fit.residuals, floor)
-        return gain.log_likelihood > ENOUGH
+        return gain.log_likelihood > problem.rules.heldout_log_likelihood
     last = found.steps[-1].trials if found.steps else []
-    return all(trial.heldout.log_likelihood < NEAR * winner.heldout.log_likelihood for trial in last)
+    return all(
+        trial.heldout.log_likelihood < problem.rules.equation_known_ratio * winner.heldout.log_likelihood for trial in last
+    )

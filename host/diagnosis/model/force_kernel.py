@@ -311,7 +311,8 @@ def run_axis(
     """Motion of m a + c v + k x + (force terms) = u + offset from recorded or controlled input.
 
     Arguments:
-        u: (n * 2 * substeps + 1,) input at half sub-steps. linear: m, c, k, offset. begin: x and v at the first sample.
+        u: (n, substeps, 3) input at the start, middle and end of every sub-step; of no use with a controller.
+        linear: m, c, k, offset. begin: x and v at the first sample.
         control: (kp, kv, gain, limit) of a cascade controller, or empty. reference: (2, n) its reference, and what is
             added to its force. start: friction held at first. begin_s: time of the first sample.
     Returns:
@@ -340,14 +341,13 @@ def run_axis(
             drive = min(max(drive, -control[3]), control[3])
             previous = s[0]
         out[0, i], out[1, i] = s[0], s[1]
-        out[3, i] = drive if control.size else u[i * 2 * substeps]
+        out[3, i] = drive if control.size else u[i, 0, 0]
         for j in range(substeps):
-            place = (i * substeps + j) * 2
             more = offset - held
             push = (
                 (drive + more, drive + more, drive + more)
                 if control.size
-                else (u[place] + more, u[place + 1] + more, u[place + 2] + more)
+                else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0

@@ -27,10 +27,6 @@ WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
 MOST_FORMS = 2  # joined to foretell
 BEST = 6  # forms that are worth a refit
-AS_SHORT = 0.03  # of its gain a shorter form may lack and still be taken
-SURE_LIKELIHOOD = 8.0  # log-likelihood that forms have to gain, in either part, before a rest counts as mismatch
-SMALLEST_SHARE = 0.02  # of some output's error
-SURE = 0.2  # p-value over held-out blocks; few of them may hold all of the mismatch
 NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
 
@@ -57,13 +53,7 @@ class Foretold:
     trained: float
     forms: tuple[tuple[Form, float], ...] = ()
     power: float = 0.0  # fall of the held-out squared error, over noise, summed over outputs
-
-    @property
-    def sure(self) -> bool:
-        """Whether the rest is foretold better than chance allows, on samples to fit and on those held out."""
-        return (
-            min(self.log_likelihood, self.trained) > SURE_LIKELIHOOD and self.share > SMALLEST_SHARE and self.p_value < SURE
-        )
+    sure: bool = False  # whether that is more than chance allows, on samples to fit and on those held out
 
 
 def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
@@ -299,7 +289,7 @@ def _best(
     worth: tuple[tuple[Form, float], ...] = ()
     for _ in range(MOST_FORMS):
         gain = sums.gains(chosen)
-        order = _by_gain(gain, forms)
+        order = _by_gain(gain, forms, problem.rules.form_length_penalty)
         if not order:
             break
         worth = worth or tuple((forms[k], float(sums.sizes([k])[0])) for k in order[:BEST])
@@ -315,7 +305,13 @@ def _best(
         if likelihood > best.log_likelihood:
             power = fallen(problem, fit.residuals, after, floor)
             best = Foretold(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
-    return replace(best, forms=worth)
+    rules = problem.rules
+    sure = (
+        min(best.log_likelihood, best.trained) > rules.predictable_log_likelihood
+        and best.share > rules.predictable_error_reduction
+        and best.p_value < rules.predictable_significance
+    )
+    return replace(best, forms=worth, sure=sure)
 
 
 def fallen(problem: Problem, before: list[Array], after: list[Array], floor: Array) -> float:
@@ -329,10 +325,10 @@ def fallen(problem: Problem, before: list[Array], after: list[Array], floor: Arr
     return total
 
 
-def _by_gain(gain: Array, forms: list[Form]) -> list[int]:
+def _by_gain(gain: Array, forms: list[Form], penalty: float) -> list[int]:
     """Forms by their gain, a shorter one before a longer one that gains hardly more."""
     order = [int(k) for k in np.argsort(-gain) if gain[k] > 0.0][: 4 * BEST]
-    return sorted(order, key=lambda k: -gain[k] * (1.0 - AS_SHORT * forms[k].length))
+    return sorted(order, key=lambda k: -gain[k] * (1.0 - penalty * forms[k].length))
 
 
 class _Sums:

@@ -12,7 +12,7 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Port
 from host.diagnosis.model.model import Piece
 from host.diagnosis.model.operators import lag, play
-from host.diagnosis.selection.dictionary import Form
+from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
 ROWS = 2500
@@ -114,7 +114,6 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
             optimizer_iterations=3,
             n_threads=1,
             random_state=seed,
-            max_time=5,
             objectives=["r2", "length"],
         )
         regressor.fit(X, z)

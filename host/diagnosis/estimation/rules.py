@@ -1,0 +1,90 @@
+"""Every threshold that decides what a diagnosis names, under its statistical name, with its reason: one home."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+
+@dataclass(frozen=True)
+class SelectionRules:
+    """Thresholds of selection. Log-likelihoods are natural logarithms, of independent samples only; shares are of a variance.
+
+    An effect enters (forward selection) by its gain on held-out samples, by its gain on all samples where the held-out
+    ones hardly call for it, or by an overwhelming gain in few episodes; it leaves (backward elimination) and is replaced
+    (exchange) by the same measure.
+    """
+
+    # What a parameter costs: Akaike's one for the samples it was fitted to, one more for those held out.
+    parameter_penalty: float = 2.0
+
+    # Forward selection.
+    heldout_log_likelihood: float = 6.0  # least gain on held-out samples: odds of 400
+    significance: float = 0.01  # p-value over held-out blocks
+    pooled_log_likelihood: float = 11.0  # or: least gain on all samples where held-out ones show it dimly,
+    weak_significance: float = 0.12  # with at most this p-value
+    weak_log_likelihood: float = 1.8  # and at least this gain there
+    decisive_log_likelihood: float = 25.0  # or: gain that needs no agreement of blocks, since few episodes may hold it
+    least_error_reduction: float = 0.015  # share of some output's held-out error that has to go: idealization takes less
+    least_excess_reduction: float = 0.10  # and share of what is above noise
+    further_error_reduction: float = 0.05  # of a further effect: what idealized formulas leave is no effect
+    further_likelihood_ratio: float = 0.2  # and least gain over that of the effects before it,
+    large_error_reduction: float = 0.3  # but for one that takes this share of the residual
+    large_significance: float = 1e-6  # with blocks that agree so well
+    refinement_error_reduction: float = 0.15  # a finer form has to take this share to be preferred to a simpler one
+    refinement_tolerance: float = 0.02  # part of the gain that a simpler form may lack
+
+    # Search effort: how many candidates are fitted, never how long.
+    screening_log_likelihood: float = 3.0  # projected gain from which a candidate is fitted
+    fits_per_step: int = 10
+    fits_per_port: int = 5
+    first_iterations: int = 5  # of a fit from each start
+    further_iterations: int = 9  # from the best of these on
+    most_effects: int = 5
+    most_steps: int = 10
+    alternative_starts: int = 2  # second-best first effects from which selection is repeated
+    alternative_start_score: float = 0.6  # least part of the best one's score
+    exchange_rounds: int = 2
+    exchange_fits: int = 4  # rivals fitted in each place
+    exchange_promise: float = 0.4  # least part of the best projected gain
+    swap_fits: int = 3
+
+    # Indistinguishable: rivals in an effect's place.
+    most_equals: int = 4
+    equals_fits: int = 8
+    equals_score: float = 0.5  # least part of the winner's score when it was tried first
+    equal_log_likelihood: float = 4.0  # difference below which two models are equal,
+    equal_significance: float = 0.01  # or p-value above which
+    equal_error: float = 0.1  # or difference of errors below which, since formulas are idealized,
+    equal_mismatch: float = 0.05  # or part of the mismatch
+    equal_likelihood_ratio: float = 0.25  # while the difference is below this part of the effect's own gain
+
+    # None of these: what known effects leave.
+    noise_uncertainty: float = 1.15  # factor within which a measured noise level is known
+    residual_over_noise: float = 2.0  # residual beyond which an extended model is not adequate,
+    residual_over_noise_nominal: float = 3.0  # a nominal one,
+    residual_over_guessed_noise: float = 8.0  # where noise was never seen alone
+    partial_share: float = 0.15  # share of the mismatch that one effect may leave; several leave less
+    partial_effects: int = 2  # effects that are named where they leave more
+    predictable_log_likelihood: float = 8.0  # gain of simple forms from which a residual counts as structure
+    predictable_error_reduction: float = 0.02
+    predictable_significance: float = 0.2
+    form_length_penalty: float = 0.03  # part of its gain a form may lack for each symbol that it is shorter
+    equation_fits: int = 3
+    equation_log_likelihood: float = 15.0  # gain that makes an equation a finding
+    equation_significance: float = 0.1
+    equation_known_ratio: float = 0.7  # gain of a refused known effect over the equation's, above which none is named
+    equation_residual_share: float = 0.5  # an equation that leaves more of the mismatch is not a finding
+
+    # Posterior over what was fitted (Miller & Dunson 2019, coarsened likelihood: formulas are not exact).
+    coarsening: float = 60.0  # independent samples beyond which more data say nothing more of an idealized formula
+    prior_none: float = 0.05  # of physics that no candidate has
+    exact_share: float = 0.06  # share of the mismatch that an idealized formula leaves where it is the right one
+    coarsening_none: float = 8.0  # independent samples for the comparison with physics that would leave no more than that
+    confident: float = 0.9  # probability from which a verdict counts as confident
+
+    def as_dict(self) -> dict[str, float]:
+        """Rules by name, as a verdict prints them."""
+        return asdict(self)
+
+
+RULES = SelectionRules()

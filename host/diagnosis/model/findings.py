@@ -1,0 +1,389 @@
+"""Data before physics: what is wrong with the recordings themselves, in plain sentences, before anything is fitted.
+
+Each check compares channels with each other and with what the nominal model says of them. What can be put right without a
+guess (a reversed sign, a clock that runs ahead) is put right for the diagnosis, and the sentence says so; the recording
+is never changed. A channel that says nothing (constant, all missing) leaves nothing to compare: no verdict on physics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.operators import fill, quantum, smooth_derivatives, smoothing_window, white_level
+
+Array = npt.NDArray[np.float64]
+
+DEAD = 1e-9  # span over size below which a channel is constant
+MISSING_SHARE = 0.3  # of a channel's samples, from which on missing ones are a finding
+IRREGULAR = 0.2  # largest deviation of a period from the median one that counts as even
+OPPOSITE = -0.7  # correlation with what the model says, below which the sign is opposite
+EXPLAINED = 0.9  # share of the variance that a regression has to explain to say that columns are exchanged,
+UNEXPLAINED = 0.6  # and that the labelled order must stay below
+EXACT = 1e-7  # residual over span below which a channel is a copy of another
+NOISY = 1e-6  # noise over span, from which on two channels cannot be alike by chance
+LEADS = 2  # samples by which an output may not come before its input
+FACTORS = {1e3: "1000 (milli)", 1e-3: "1/1000 (milli)", 1e6: "10^6 (micro)", 1e-6: "10^-6 (micro)"}
+FACTORS |= {180.0 / np.pi: "57.3 (degrees and radians)", np.pi / 180.0: "1/57.3 (degrees and radians)"}
+SAME_FACTOR = 0.02  # a gain this near to one of the factors above is a slip of units
+ONE_TONE = 0.995  # share of an input's power in one spectral line, from which on it is one sinusoid
+CLIPPED = 0.01  # share of samples at the largest reading, from which on it is a limit
+STEADY = 5  # samples in a row at the limit
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped or
+    saturated; `channel`: the column's name in the recordings.
+    """
+
+    id: str
+    channel: str
+    says: str
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One input and the output that it drives, by a gain or by the terms `law` of input = m a + c v + k x."""
+
+    input: str
+    output: str
+    law: tuple[str, ...] = ()
+    reads: str = "position"
+    gain: float | None = None  # what the nominal model says of it
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """Recordings fit to be compared (none: there is nothing to judge), and what was found."""
+
+    recordings: list[Recording]
+    findings: list[Finding]
+
+
+def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str]) -> Inspected:
+    """Look at the recordings of `spec` before any fit. `optional`: channels that may be absent."""
+    columns = {key: channel.column for key, channel in spec.channels.items()}
+    findings: list[Finding] = []
+    paths = pairs_of(spec)
+    vital = {name for path in paths for name in (path.input, path.output)}
+    recordings = _dead(recordings, vital, columns, findings)
+    if not recordings:
+        return Inspected([], findings)
+    _stamps(recordings, findings)
+    for path in paths:
+        recordings = _compared(spec, recordings, path, columns, findings)
+        if not recordings:
+            return Inspected([], findings)
+    _saturated(recordings, paths, columns, findings)
+    _excitation(recordings, paths, columns, findings)
+    return Inspected(recordings, list(dict.fromkeys(findings)))
+
+
+def pairs_of(spec: NominalSpec) -> list[Pair]:
+    """Pairs of channels that the nominal model says to move together."""
+    found = []
+    for link in spec.link:
+        gain = spec.start("gain" if len(spec.link) == 1 else f"{link.subsystem}_gain", 1.0)[0]
+        same = spec.channels[link.input].unit == spec.channels[link.output].unit
+        given = "gain" in spec.parameters or same
+        found.append(Pair(link.input, link.output, gain=gain if given else None))
+    if spec.axis is not None:
+        law = tuple(term for term in spec.axis.terms if term != "offset")
+        found.append(Pair(spec.axis.input, spec.axis.output, law, spec.axis.reads))
+    if spec.impedance is not None:
+        law = tuple(term for term in spec.impedance.terms if term in ("mass", "damping", "stiffness"))
+        found.append(Pair(spec.impedance.output, spec.impedance.input, law))
+    return found
+
+
+def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
+    """Recordings in which every vital channel is measured and moves in at least one of them."""
+    names = list(dict.fromkeys(name for recording in recordings for name in recording.channels))
+    unusable: set[str] = set()
+    for name in names:
+        column = columns.get(name, name)
+        all_values = [recording.channels[name] for recording in recordings if name in recording.channels]
+        empty = [recording.name for recording in recordings if _seen(recording, name) == 0.0]
+        together = np.concatenate(all_values)
+        good = together[np.isfinite(together)]
+        if empty:
+            where = "in every recording" if len(empty) == len(recordings) else "in " + ", ".join(empty)
+            findings.append(Finding("missing", column, f"Column {column} holds no number {where}."))
+            unusable |= set(empty) if name in vital else set()
+        elif float(np.mean(~np.isfinite(together))) > MISSING_SHARE:
+            share = float(np.mean(~np.isfinite(together)))
+            findings.append(Finding("missing", column, f"{share:.0%} of the samples of column {column} are missing."))
+        if good.size and float(np.ptp(good)) <= DEAD * max(float(np.max(np.abs(good))), 1e-300):
+            says = f"Column {column} has the same value, {good[0]:.4g}, in every sample."
+            if name in vital:
+                says += " Without movement of this channel there is nothing to compare with the nominal model."
+                unusable |= {recording.name for recording in recordings}
+            findings.append(Finding("constant", column, says))
+    return [recording for recording in recordings if recording.name not in unusable]
+
+
+def _seen(recording: Recording, name: str) -> float:
+    values = recording.channels.get(name)
+    return 1.0 if values is None else float(np.mean(np.isfinite(values)))
+
+
+def _stamps(recordings: list[Recording], findings: list[Finding]) -> None:
+    """Irregular stamps, and recordings of unlike sampling periods."""
+    uneven = [recording for recording in recordings if recording.timed and recording.jitter > IRREGULAR]
+    if uneven:
+        worst = max(uneven, key=lambda recording: recording.jitter)
+        findings.append(
+            Finding(
+                "clock",
+                "time",
+                f"Time stamps are not even: in {worst.name} a period differs from the median one, {worst.dt_s:.4g} s, by up "
+                f"to {worst.jitter:.3g} of it. Channels were interpolated to even steps; longer gaps are left out.",
+            )
+        )
+    periods = [recording.dt_s for recording in recordings if recording.timed]
+    if periods and max(periods) > 1.05 * min(periods):
+        says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."
+        findings.append(Finding("clock", "time", says))
+
+
+def _compared(
+    spec: NominalSpec, recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """Sign, unit, copy, order and clock of one pair of channels."""
+    input_column, output_column = columns[path.input], columns[path.output]
+    copied = _copy(recordings, path.input, path.output)
+    if copied is not None:
+        findings.append(
+            Finding(
+                "alias",
+                output_column,
+                f"Column {output_column} is column {input_column} times {copied[0]:.4g}"
+                + (f", {copied[1]} samples later" if copied[1] else "")
+                + ", noise included: it was computed from it, not measured. There is nothing to compare.",
+            )
+        )
+        return []
+    for name in {name for recording in recordings for name in recording.channels} - {path.input, path.output}:
+        copied = _copy(recordings, path.output, name)
+        if copied is not None and spec.kind != "rig":
+            says = f"Column {columns[name]} is a copy of column {output_column}: it cannot explain it, and is left out."
+            findings.append(Finding("alias", columns[name], says))
+            recordings = [_with(recording, name, np.zeros(recording.n)) for recording in recordings]
+    if path.law:
+        return _by_law(recordings, path, columns, findings)
+    return _by_gain(recordings, path, columns, findings)
+
+
+def _with(recording: Recording, name: str, values: Array) -> Recording:
+    return replace(recording, channels={**recording.channels, name: values})
+
+
+def _copy(recordings: list[Recording], a: str, b: str) -> tuple[float, int] | None:
+    """(gain, lag in samples) if `b` is `a` scaled and shifted in every recording, its noise included."""
+    found = []
+    for recording in recordings:
+        x, y = recording.channels.get(a), recording.channels.get(b)
+        if x is None or y is None:
+            return None
+        x, y = fill(x), fill(y)
+        if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+            return None
+        dx, dy = np.diff(x, 2), np.diff(y, 2)
+        size = 1 << int(np.ceil(np.log2(2 * dx.size)))
+        across = np.fft.irfft(np.conj(np.fft.rfft(dx, size)) * np.fft.rfft(dy, size), size)
+        lag = int(np.argmax(np.abs(across)))
+        lag = lag - size if lag > size // 2 else lag
+        lag = 0 if abs(lag) > x.size // 10 or lag < 0 else lag
+        x, y = (x[: x.size - lag], y[lag:]) if lag else (x, y)
+        gain, offset = np.polyfit(x, y, 1)
+        exact = float(np.max(np.abs(y - gain * x - offset))) < EXACT * float(np.ptp(y))
+        if not exact or white_level(x) < NOISY * float(np.ptp(x)):
+            return None
+        found.append((float(gain), lag))
+    return found[0] if found and len({lag for _, lag in found}) == 1 else None
+
+
+def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
+    """A pair that a gain connects."""
+    x = np.concatenate([fill(r.channels[path.input]) - np.mean(fill(r.channels[path.input])) for r in recordings])
+    y = np.concatenate([fill(r.channels[path.output]) - np.mean(fill(r.channels[path.output])) for r in recordings])
+    if not np.any(x) or not np.any(y):
+        return recordings
+    correlation = float(x @ y / np.sqrt((x @ x) * (y @ y)))
+    gain = correlation * float(np.std(y) / np.std(x))
+    output_column, input_column = columns[path.output], columns[path.input]
+    if path.gain is not None and correlation * np.sign(path.gain) < OPPOSITE:
+        says = f"Column {output_column} moves against column {input_column}; the nominal model says with it. "
+        says += "One of them has the opposite sign (channels.*.sign)."
+        findings.append(Finding("sign", output_column, says))
+    if path.gain and abs(correlation) > 0.95:
+        ratio = abs(gain / path.gain)
+        for factor, words in FACTORS.items():
+            if abs(ratio / factor - 1.0) < SAME_FACTOR:
+                says = f"Column {output_column} is {words} times what the nominal model says of {input_column}: "
+                says += "the unit of one of them is probably another (channels.*.scale)."
+                findings.append(Finding("unit", output_column, says))
+        swapped = abs(gain * path.gain - 1.0) < SAME_FACTOR and abs(path.gain**2 - 1.0) > 5.0 * SAME_FACTOR
+        if swapped:
+            says = f"The gain from {input_column} to {output_column} is the inverse of the nominal one: "
+            says += "the two columns are probably exchanged."
+            findings.append(Finding("swapped", output_column, says))
+    return _causal(recordings, path, columns, findings)
+
+
+def _causal(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
+    """An output that comes before its input: clocks disagree; it is shifted back."""
+    leads = [_lead(recording, path) for recording in recordings if recording.timed]
+    if not leads or min(leads) < LEADS:
+        return recordings
+    lead = round(float(np.median(leads)))
+    output_column, input_column = columns[path.output], columns[path.input]
+    says = f"Column {output_column} moves {lead * recordings[0].dt_s:.3g} s before column {input_column} that drives it: "
+    says += "their clocks disagree, or the columns are exchanged. The diagnosis goes on with it shifted back."
+    findings.append(Finding("clock", output_column, says))
+    moved = []
+    for recording in recordings:
+        late = np.concatenate((np.full(lead, np.nan), recording.channels[path.output][:-lead]))
+        moved.append(_with(recording, path.output, late))
+    return moved
+
+
+def _lead(recording: Recording, path: Pair) -> float:
+    """Samples by which the output comes before the input, by the residual of a gain at each shift; 0 if it does not."""
+    x, y = fill(recording.channels[path.input]), fill(recording.channels[path.output])
+    most = min(x.size // 10, 200)
+    error = {}
+    for lag in range(0, most):
+        a, b = x[lag:], y[: y.size - lag]
+        a, b = a - a.mean(), b - b.mean()
+        spread = float(a @ a)
+        error[lag] = float(b @ b) - float(a @ b) ** 2 / spread if spread > 0.0 else float(b @ b)
+        error[lag] /= a.size
+    best = min(error, key=lambda lag: error[lag])
+    back = x[: x.size - 1], y[1:]  # were it merely late, a shift the other way would do no worse
+    a, b = back[0] - back[0].mean(), back[1] - back[1].mean()
+    later = (float(b @ b) - float(a @ b) ** 2 / max(float(a @ a), 1e-300)) / a.size
+    return float(best) if error[best] < 0.5 * min(error[0], later) else 0.0
+
+
+def regression(recording: Recording, path: Pair, exchanged: bool = False) -> tuple[Array, Array, float]:
+    """Coefficients of the law by smoothed derivatives, RMS of each term, and the share of the variance explained."""
+    force, motion = fill(recording.channels[path.input]), fill(recording.channels[path.output])
+    if exchanged:
+        force, motion = motion, force
+    dt = recording.dt_s
+    window = smoothing_window(motion, dt, white_level(motion), 7 * dt)
+    x, v, a = smooth_derivatives(motion, dt, window)
+    if path.reads == "velocity":
+        x, v, a = np.cumsum(x) * dt, x, v
+    table = {"mass": a, "damping": v, "stiffness": x}
+    f = smooth_derivatives(force, dt, window)[0]
+    inside = slice(window, -window) if f.size > 6 * window else slice(None)
+    columns = np.array([*(table[term] for term in path.law), np.ones_like(f)])[:, inside]
+    size = np.linalg.norm(columns, axis=1) + 1e-300
+    found = np.linalg.lstsq((columns / size[:, None]).T, f[inside], rcond=1e-9)[0] / size
+    left = f[inside] - found @ columns
+    explained = 1.0 - float(np.var(left)) / max(float(np.var(f[inside])), 1e-300)
+    return found[:-1], np.std(columns[:-1], axis=1) * np.abs(found[:-1]), explained
+
+
+def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
+    """A pair that an equation of motion connects."""
+    used = [recording for recording in recordings if recording.timed and recording.n >= 100]
+    if path.reads == "acceleration" or not used:
+        return recordings
+    straight = [regression(recording, path) for recording in used]
+    explained = float(np.median([part[2] for part in straight]))
+    force_column, motion_column = columns[path.input], columns[path.output]
+    if explained < UNEXPLAINED:
+        crossed = float(np.median([regression(recording, path, exchanged=True)[2] for recording in used]))
+        if crossed > EXPLAINED:
+            says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
+            says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. The diagnosis goes on exchanged."
+            findings.append(Finding("swapped", force_column, says))
+            exchanged = []
+            for recording in recordings:
+                a, b = recording.channels[path.input], recording.channels[path.output]
+                exchanged.append(_with(_with(recording, path.input, b), path.output, a))
+            recordings = exchanged
+            used = [recording for recording in recordings if recording.timed and recording.n >= 100]
+            straight = [regression(recording, path) for recording in used]
+            explained = crossed
+    agreement = [float(np.sum(np.sign(c) * rms)) / max(float(np.sum(rms)), 1e-300) for c, rms, _ in straight]
+    if explained > 0.5 and max(agreement) < OPPOSITE:
+        says = f"Columns {force_column} and {motion_column} have opposite signs: every term of the nominal law comes out "
+        says += f"negative. The diagnosis goes on with {force_column} reversed (channels.*.sign)."
+        findings.append(Finding("sign", force_column, says))
+        recordings = [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
+    return recordings
+
+
+def _saturated(recordings: list[Recording], paths: list[Pair], columns: dict[str, str], findings: list[Finding]) -> None:
+    """Readings that stay at their largest or smallest value while what drives them goes on."""
+    for path in paths:
+        pairs = [(path.output, path.input), (path.input, path.output)]
+        for name, driver in pairs if path.law else pairs[:1]:
+            for side, word in ((1.0, "largest"), (-1.0, "smallest")):
+                share = max(_clipped(recording, name, driver, side) for recording in recordings)
+                if share > CLIPPED:
+                    says = f"Column {columns[name]} stays at its {word} reading for {share:.1%} of a recording while "
+                    says += f"{columns[driver]} moves on: it is limited there."
+                    findings.append(Finding("saturated", columns[name], says))
+
+
+def _clipped(recording: Recording, name: str, driver: str, side: float) -> float:
+    """Share of samples in runs at the extreme reading, in which the driver goes on the same way and comes back."""
+    y, x = side * fill(recording.channels[name]), fill(recording.channels[driver])
+    if quantum(recording.channels[name]) > 0.0 or np.ptp(x) == 0.0:
+        return 0.0
+    x = side * x * (1.0 if float(np.corrcoef(x, side * y)[0, 1]) * side >= 0.0 else -1.0)
+    at = (y >= np.max(y)).astype(np.int8)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], at, [0]))))
+    total = 0
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first >= STEADY:
+            inside = x[first:last]
+            beyond = float(np.max(inside) - max(inside[0], inside[-1]))
+            total += int(last - first) if beyond > 0.01 * float(np.ptp(x)) else 0
+    return total / y.size
+
+
+def _excitation(recordings: list[Recording], paths: list[Pair], columns: dict[str, str], findings: list[Finding]) -> None:
+    """Inputs of one sinusoid, and inputs that never turn: effects that these recordings cannot tell apart or show."""
+    for path in paths:
+        tones = [_tone(recording, path.output if path.law else path.input) for recording in recordings if recording.timed]
+        name = columns[path.output if path.law else path.input]
+        if tones and all(tone > 0.0 for tone in tones) and max(tones) < 1.1 * min(tones):
+            says = f"Column {name} is one sinusoid of {tones[0]:.3g} Hz: effects that differ in how they depend on "
+            says += "frequency (delay, lag, viscous friction, mass, stiffness) cannot be told apart. Record two frequencies "
+            says += "a decade apart, and steps."
+            findings.append(Finding("excitation", name, says))
+        if not any(_turns(recording, path.output if path.law else path.input) for recording in recordings):
+            says = f"Column {name} never reverses: backlash and dry friction cannot show in these recordings."
+            findings.append(Finding("excitation", name, says))
+
+
+def _tone(recording: Recording, name: str) -> float:
+    """Frequency (Hz) of a channel that is one sinusoid; 0 for any other."""
+    x = fill(recording.channels[name])
+    window = np.blackman(x.size)
+    power = np.abs(np.fft.rfft((x - np.mean(x)) * window)) ** 2
+    top = int(np.argmax(power))
+    near = power[max(top - 3, 0) : top + 4].sum()
+    around = np.arange(max(top - 3, 0), top + 4)
+    turns = float(around @ power[around] / near) / (x.size * recording.dt_s) if top > 3 else 0.0
+    return turns if top > 3 and near > ONE_TONE * power.sum() else 0.0
+
+
+def _turns(recording: Recording, name: str) -> bool:
+    """Whether a channel goes back by more than a twentieth of its span."""
+    x = fill(recording.channels[name])
+    limit = 0.05 * float(np.ptp(x))
+    fall = float(np.max(np.maximum.accumulate(x) - x))
+    rise = float(np.max(x - np.minimum.accumulate(x)))
+    return fall > limit and rise > limit
