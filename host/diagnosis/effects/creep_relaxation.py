@@ -22,7 +22,7 @@ def taus(s: Scale) -> Parameter:
 
 def of_motion(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Slow share of the motion and its time constant."""
-    return (Parameter("slow_share", "", (s.need / s.span,), -5.0, 5.0, linear=True), taus(s))
+    return (Parameter("slow_share", "", (min(s.need / s.span, 0.5),), 0.0, 1.0, linear=True), taus(s))
 
 
 def of_load(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -40,7 +40,8 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def apply_motion(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Part p[0] of the motion arrives late, with time constant p[1]."""
-    return np.asarray(signal + p[0] * (lag(signal, c.dt_s, p[1]) - signal))
+    start = c.start / p[0] if abs(p[0]) > 1e-3 else 0.0
+    return np.asarray(signal + p[0] * (lag(signal, c.dt_s, p[1], start) - signal))
 
 
 def apply_load(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -54,8 +55,9 @@ def slots(p: Array, form: str) -> dict[str, float]:
 
 
 def share(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Slow deflection against the prompt one, and its time constant."""
-    return (Parameter("slow_share", "", (0.2,), -5.0, 5.0, linear=True), taus(s))
+    """Slow deflection against the prompt one, and its time constant: a share of what is there, or as much again and more."""
+    most = 1.0 if form != "force" else 5.0
+    return (Parameter("slow_share", "", (0.2,), 0.0, most, linear=True), taus(s))
 
 
 def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
@@ -104,6 +106,7 @@ EFFECTS = (
         "y = x + slow_share*(lag(x, time_constant) - x)",
         apply_motion,
         timed=True,
+        remembers=True,
         contains=("rate_lag",),
         several=True,
     ),

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.model.operators import shift
+
+LONGEST = 0.25  # of the recording
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Delay."""
-    size = max(2.0 * s.dt_s, 1e-3 * s.duration_s)
-    delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, 6.0 * s.dt_s, size)
-    return (Parameter("delay", "s", delays, 0.0, 0.05 * s.duration_s, step=s.dt_s),)
+    """Delay: causal, and no longer than leaves most of the recording to compare."""
+    longest = LONGEST * s.duration_s
+    delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, *spread(6.0 * s.dt_s, max(0.5 * longest, 7.0 * s.dt_s), 7))
+    return (Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """The signal as it was p[0] seconds earlier."""
-    return shift(signal, c.dt_s, np.full(signal.size, p[0]))
+    return shift(signal, c.dt_s, np.full(signal.size, p[0]), c.start)
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -39,7 +41,7 @@ def rows(values: Array, c: Context, late: Array) -> Array:
 
 SAYS = "The channel is {delay} late, at every frequency alike."
 EFFECTS = tuple(
-    Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True, shifts="time")
+    Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True, remembers=True, shifts="time")
     for port in ("motion", "timing")
 ) + (
     Effect(

@@ -6,13 +6,20 @@ import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
+EDGE = 0.01  # of the recording
+
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Size of the jump and its instant."""
+    """Size of the jump and its instant: neither at the first nor at the last samples, which no plateau bears out."""
     return (
         Parameter("jump", s.unit, (s.need,), linear=True),
         Parameter(
-            "instant", "s", tuple(np.linspace(0.02, 0.98, 49) * s.duration_s), 0.0, s.duration_s, step=0.005 * s.duration_s
+            "instant",
+            "s",
+            tuple(np.linspace(0.02, 0.98, 49) * s.duration_s),
+            EDGE * s.duration_s,
+            (1.0 - EDGE) * s.duration_s,
+            step=0.005 * s.duration_s,
         ),
     )
 
@@ -32,6 +39,5 @@ EFFECTS = (
         "y = x + jump*(t > instant)",
         apply,
         timed=True,
-        natural_bounds=True,
     ),
 )

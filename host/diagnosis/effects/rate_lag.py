@@ -16,7 +16,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """First-order low pass."""
-    return lag(signal, c.dt_s, p[0])
+    return lag(signal, c.dt_s, p[0], c.start)
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -38,7 +38,18 @@ def rows(values: Array, c: Context, time_constant_s: float) -> Array:
 
 SAYS = "The output follows with a first-order lag of {time_constant}."
 EFFECTS = tuple(
-    Effect("rate_lag", port, 60, parameters, SAYS, "time_constant*dy/dt + y = x", apply, timed=True, shifts="time")
+    Effect(
+        "rate_lag",
+        port,
+        60,
+        parameters,
+        SAYS,
+        "time_constant*dy/dt + y = x",
+        apply,
+        timed=True,
+        remembers=True,
+        shifts="time",
+    )
     for port in ("motion", "timing")
 ) + (
     Effect(

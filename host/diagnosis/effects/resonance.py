@@ -9,8 +9,10 @@ from host.diagnosis.model.operators import second_order
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Frequency and damping ratio."""
+    """Frequency and damping ratio; form `share`: of a mode that takes part in only a share of the motion."""
+    share = (Parameter("mode_share", "", (0.2,), 0.0, 1.0, linear=True),) if form == "share" else ()
     return (
+        *share,
         Parameter(
             "frequency", "Hz", spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True
         ),
@@ -30,8 +32,11 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Second-order low pass with a peak."""
-    return second_order(signal, c.dt_s, 2.0 * np.pi * p[0], p[1])
+    """Second-order low pass with a peak, of all of the motion or of a share."""
+    if form == "share":
+        moved = second_order(signal, c.dt_s, 2.0 * np.pi * p[1], p[2], c.start / p[0] if abs(p[0]) > 1e-3 else 0.0)
+        return np.asarray(signal + p[0] * (moved - signal))
+    return second_order(signal, c.dt_s, 2.0 * np.pi * p[0], p[1], c.start)
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -49,7 +54,9 @@ EFFECTS = (
         "y'' + 2 z w y' + w^2 y = w^2 x",
         apply,
         timed=True,
+        forms=("", "share"),
         contains=("rate_lag",),
+        remembers=True,
     ),
     Effect(
         "resonance",
@@ -60,7 +67,9 @@ EFFECTS = (
         "y'' + 2 z w y' + w^2 y = w^2 x",
         apply,
         timed=True,
+        forms=("", "share"),
         contains=("rate_lag",),
+        remembers=True,
     ),
     Effect(
         "resonance",

@@ -10,13 +10,15 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Limit above (or below), or one on each side, reached over a knee."""
     if form == "both":
-        middle = tuple(s.low + f * s.span for f in (0.5, 0.4, 0.6))
+        middle = tuple(s.low + f * s.span for f in (0.5, 0.4, 0.6, 0.3, 0.7))
         return (
             Parameter("middle", s.unit, middle, s.low, s.high, step=0.05 * s.span),
-            Parameter("limit", s.unit, tuple(f * s.span for f in (0.47, 0.42, 0.35)), 0.0, s.span, step=0.05 * s.span),
+            Parameter(
+                "limit", s.unit, tuple(f * s.span for f in (0.47, 0.42, 0.35, 0.25, 0.15)), 0.0, s.span, step=0.05 * s.span
+            ),
             Parameter("knee", s.unit, (0.005 * s.span, 0.03 * s.span), 1e-3 * s.span, 0.2 * s.span, log=True),
         )
-    share = (0.98, 0.93, 0.85, 0.75) if form == "upper" else (0.02, 0.07, 0.15, 0.25)
+    share = (0.98, 0.93, 0.85, 0.75, 0.6, 0.4) if form == "upper" else (0.02, 0.07, 0.15, 0.25, 0.4, 0.6)
     return (Parameter("limit", s.unit, tuple(s.low + f * s.span for f in share), s.low, s.high, step=0.05 * s.span),)
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 @dataclass(frozen=True)
 class SelectionRules:
-    """Thresholds of selection. Log-likelihoods are natural logarithms, of independent samples only; shares are of a variance.
+    """Thresholds of selection. Log-likelihoods: natural logarithms, of independent samples only. Shares: of a variance.
 
     An effect enters (forward selection) by its gain on held-out samples, by its gain on all samples where the held-out
     ones hardly call for it, or by an overwhelming gain in few episodes; it leaves (backward elimination) and is replaced

@@ -77,12 +77,12 @@ def maxwell_slip(x: Array, distance: float, start: float) -> Array:
 
 
 @njit(cache=True)
-def lag(x: Array, dt_s: float, time_constant_s: float) -> Array:
-    """First-order low pass, exact for an input that is linear between samples; starts at rest."""
+def lag(x: Array, dt_s: float, time_constant_s: float, start: float = 0.0) -> Array:
+    """First-order low pass, exact for an input that is linear between samples. `start`: first output minus input."""
     out = np.empty(x.size)
     a = math.exp(-dt_s / time_constant_s)
     slope = time_constant_s / dt_s * (1.0 - a)
-    y = x[0]
+    y = x[0] + start
     out[0] = y
     for i in range(1, x.size):
         y = a * y + (slope - a) * x[i - 1] + (1.0 - slope) * x[i]
@@ -91,13 +91,16 @@ def lag(x: Array, dt_s: float, time_constant_s: float) -> Array:
 
 
 @njit(cache=True)
-def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float) -> Array:
-    """Unit-gain second-order low pass by Runge-Kutta sub-steps, input linear between samples; starts at rest."""
+def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float, start: float = 0.0) -> Array:
+    """Unit-gain second-order low pass by Runge-Kutta sub-steps, input linear between samples.
+
+    start: first output minus input; with one the output begins at the input's speed, as in motion; without at rest.
+    """
     out = np.empty(x.size)
     steps = max(1, math.ceil(omega_rad_s * dt_s / 0.3))
     h = dt_s / steps
     w2, c = omega_rad_s * omega_rad_s, 2.0 * damping * omega_rad_s
-    y, v = x[0], 0.0
+    y, v = x[0] + start, ((x[1] - x[0]) / dt_s if start != 0.0 else 0.0)
     out[0] = y
     for i in range(1, x.size):
         for j in range(steps):
@@ -115,12 +118,19 @@ def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float) -> A
 
 
 @njit(cache=True)
-def shift(x: Array, dt_s: float, delay_s: Array) -> Array:
-    """`x` as it was `delay_s[i]` seconds earlier, straight between samples as `lag` has it; held at the ends."""
+def shift(x: Array, dt_s: float, delay_s: Array, start: float = 0.0) -> Array:
+    """`x` as it was `delay_s[i]` seconds earlier, straight between samples as `lag` has it; held at the end.
+
+    start: first output minus input, of a recording that was cut from motion; until the first sample arrives the output
+    goes straight from there to the input's first value.
+    """
     n = x.size
     out = np.empty(n)
     for i in range(n):
-        place = min(max(i - delay_s[i] / dt_s, 0.0), n - 1.0)
+        place = min(i - delay_s[i] / dt_s, n - 1.0)
+        if place < 0.0:
+            out[i] = x[0] + start * place * dt_s / -delay_s[i]
+            continue
         k = min(int(place), n - 2)
         out[i] = x[k] + (place - k) * (x[k + 1] - x[k])
     return out

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from host.diagnosis.design.experiment import lines as experiment_lines
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Parameter
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.locate import joined
+from host.diagnosis.selection.posterior import Posterior, of_refused, posterior
 
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the rest is said not to be noise
 PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
@@ -38,6 +40,8 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         "verdict": result.verdict,
         "located": [_located(location) for location in result.located],
         "data_findings": [finding_json(finding) for finding in result.findings],
+        "probability_none": probability_none(result),
+        "rules": result.problem.rules.as_dict(),
         "effects": effects(result),
         "fit": {
             "heldout": True,
@@ -62,10 +66,30 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
         "verdict": "mismatch_not_identified",
         "located": [],
         "data_findings": [finding_json(finding) for finding in findings],
+        "probability_none": 1.0,
+        "rules": RULES.as_dict(),
         "effects": [],
         "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
         "seconds": seconds,
     }
+
+
+def posterior_of(result: Diagnosis, standing: Standing) -> Posterior:
+    """Probabilities at the place of one effect."""
+    rules = result.problem.rules
+    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), result.rest.left, rules)
+
+
+def probability_none(result: Diagnosis) -> float:
+    """Probability that no effect that was considered is what is missing: nothing is, or physics that is in no list."""
+    if result.verdict == "missing_physics":
+        strongest = max(result.standings, key=lambda standing: standing.gain.log_likelihood)
+        found = posterior_of(result, strongest)
+        return found.nothing + found.none + sum(p for rival, p in found.rivals if rival.effect.id == "unlisted")
+    last = next((step.trials for step in reversed(result.found.steps) if step.trials), [])
+    if not result.standings:
+        return 1.0 - of_refused(last)
+    return 1.0 - max(posterior_of(result, standing).effect for standing in result.standings)
 
 
 def finding_json(finding: Finding) -> dict[str, str]:
@@ -135,7 +159,10 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
 def _effect(
     result: Diagnosis, parameters: tuple[Parameter, ...], values: Any, spans: Any, standing: Standing
 ) -> dict[str, Any]:
-    candidate = standing.candidate
+    candidate, probable = standing.candidate, posterior_of(result, standing)
+    by_name: dict[str, float] = {}
+    for rival, p in probable.rivals:
+        by_name[rival.name] = by_name.get(rival.name, 0.0) + p
     shown = {
         p.key: {"value": float(v), "ci95": [float(a), float(b)]}
         for p, v, (a, b) in zip(parameters, values, spans, strict=True)
@@ -144,6 +171,9 @@ def _effect(
     return {
         "id": candidate.effect.id,
         "subsystem": candidate.port.subsystem,
+        "port": candidate.port.name,
+        "probability": probable.effect,
+        "alternatives": [{"name": name, "probability": p} for name, p in sorted(by_name.items(), key=lambda item: -item[1])],
         "says": sentence(candidate, parameters, values),
         "equation": equation(candidate),
         "parameters": shown,

@@ -11,6 +11,7 @@ from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.posterior import coarse
 from host.diagnosis.selection.screening import term_of, without
 from host.diagnosis.selection.search import Found
 from host.diagnosis.selection.trial import Trial
@@ -28,6 +29,8 @@ class Standing:
     gain: Gain  # on held-out samples
     both: Gain  # on all samples
     alike: tuple[Candidate, ...]
+    rivals: tuple[tuple[Candidate, float], ...] = ()  # refitted in its place, with the coarsened difference of likelihoods
+    parameters: int = 1
 
 
 def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
@@ -38,9 +41,10 @@ def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
         less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
         gain = compare(problem.pieces, "heldout", less.residuals, found.best.residuals, floor)
         both = compare(problem.pieces, "both", less.residuals, found.best.residuals, floor)
-        alike = _equals(problem, found, term.candidate, less, both, floor)
-        alike += _better_said(problem, found, term.candidate, less, floor)
-        out.append(Standing(term.candidate, gain, both, alike))
+        alike, rivals = _equals(problem, found, term.candidate, less, both, floor)
+        said = _better_said(problem, found, term.candidate, less, floor)
+        alike += tuple(candidate for candidate, _ in said)
+        out.append(Standing(term.candidate, gain, both, alike, (*rivals, *said), len(term.parameters)))
     return out
 
 
@@ -57,23 +61,29 @@ def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
     return [*standing[:first], replace(named, alike=(*named.alike, unknown)), *standing[first + 1 :]]
 
 
-def _better_said(problem: Problem, found: Found, candidate: Candidate, less: Fit, floor: Array) -> tuple[Candidate, ...]:
+def _better_said(
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, floor: Array
+) -> tuple[tuple[Candidate, float], ...]:
     """An equation of no listed effect that does plainly better in the place of `candidate`: this may be a stand-in."""
     if candidate.effect.id == "unlisted":
         return ()
     for trial in equations_for(problem, less, candidate.port, floor):
-        ahead = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
-        if ahead.log_likelihood > problem.rules.equal_log_likelihood:
-            return (trial.candidate,)
+        behind = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
+        if behind.log_likelihood > problem.rules.equal_log_likelihood:
+            more = len(found.best.values) - len(trial.fit.values)
+            return ((trial.candidate, -coarse(behind, -more, problem.rules)),)
     return ()
 
 
 def _equals(
     problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, floor: Array
-) -> tuple[Candidate, ...]:
-    """Rivals in the place of `candidate` that neither held-out samples nor all together tell from it."""
+) -> tuple[tuple[Candidate, ...], list[tuple[Candidate, float]]]:
+    """Rivals in the place of `candidate`: those that neither held-out samples nor all together tell from it, and all that
+    were refitted with their coarsened differences.
+    """
     best = found.best
     kept: list[Candidate] = []
+    refitted: list[tuple[Candidate, float]] = []
     for trial in _rivals(found, candidate, problem.rules)[: problem.rules.equals_fits]:
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
@@ -83,9 +93,10 @@ def _equals(
         ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
         held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
         rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
+        refitted.append((trial.candidate, coarse(ahead, len(best.values) - len(other.values), problem.rules)))
         if len(kept) < problem.rules.most_equals and _not_told(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
-    return tuple(kept)
+    return tuple(kept), refitted
 
 
 def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:

@@ -122,11 +122,25 @@ def _equation_instead(
         winner = next((trial for trial in trials if _earned(trial)), None)
     if winner is None or not _better_than_known(problem, found, floor, winner, bool(there)):
         return False
+    if _left(problem, found, winner.fit, floor) > problem.rules.equation_residual_share:
+        return False
+    if there and _still_earned(problem, found.best, winner, there, floor):
+        return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
     found.steps.append(Step("equation", winner.candidate.key, winner.heldout, trials))
     found.best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
     reweigh(problem, found.best)
     return True
+
+
+def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], floor: Array) -> bool:
+    """Whether the effects that an equation would replace gain as much beside it as they must to enter: then they stay."""
+    term = winner.fit.terms[-1]
+    begin = np.concatenate((best.values, winner.fit.values[-len(term.parameters) :]))
+    both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
+    gain = compare(problem.pieces, "heldout", winner.fit.residuals, both.residuals, floor)
+    more = len(both.values) - len(winner.fit.values)
+    return gain.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
 
 
 def equations_for(problem: Problem, less: Fit, port: Port, floor: Array) -> list[Trial]:

@@ -120,7 +120,9 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
         front = getattr(regressor, "pareto_front_", [])
         for item in front:
             found.append(_form(regressor, item, names, size, lambda p: features(problem, p, port)))
-    unique = {form.text: (form, on_table) for form, on_table in found if form.length <= LONGEST}
+    unique = {
+        form.text: (form, on_table) for form, on_table in found if form.length <= LONGEST and form.text.count("exp(") < 2
+    }
     ranked = sorted(unique.values(), key=lambda f: float(np.mean((f[1](X) / size - z) ** 2)) * (1.0 + 0.02 * f[0].length))
     return [form for form, _ in ranked[:3]]
 

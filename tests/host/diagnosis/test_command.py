@@ -14,7 +14,7 @@ from host.cli.diagnose import diagnose
 from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
-KEYS = {"verdict", "located", "data_findings", "effects", "fit", "seconds", "scripts"}
+KEYS = {"verdict", "located", "data_findings", "probability_none", "rules", "effects", "fit", "seconds", "scripts"}
 FIT = {
     "heldout",
     "rmse_before",
@@ -28,6 +28,9 @@ FIT = {
 EFFECT = {
     "id",
     "subsystem",
+    "port",
+    "probability",
+    "alternatives",
     "says",
     "equation",
     "parameters",

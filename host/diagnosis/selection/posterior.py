@@ -1,0 +1,76 @@
+"""Probabilities of what was fitted, and of none of these.
+
+For an effect of the extended model, M ranges over: the effect; its rivals, each refitted in its place beside the other
+effects; an equation of recorded signals in its place; nothing there at all; and physics that no candidate has. With
+
+    dl(M) = log-likelihood of the extended model - that of M
+
+computed on independent samples only (n, autocorrelation taken out), dk the parameters that it has more than M, each of
+which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
+
+    w(effect) = 1,   w(rival) = exp(-r dl + c dk),   w(nothing) = max(exp(-dl + c dk), p-value on held-out blocks)
+    w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
+
+where `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum.
+The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
+independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
+is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from host.diagnosis.estimation.evidence import Gain
+from host.diagnosis.estimation.rules import SelectionRules
+from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.trial import Trial
+
+FARTHEST = 700.0  # of a logarithm that is taken to its exponential
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probability of an effect, of its rivals by name, of nothing in its place, and of physics that is in no list."""
+
+    effect: float
+    rivals: tuple[tuple[Candidate, float], ...]
+    nothing: float
+    none: float
+
+
+def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
+    """Coarsened difference of log-likelihoods of two models, the first with so many parameters more."""
+    n = float(np.sum(ahead.independent))
+    power = rules.coarsening / (n + rules.coarsening)
+    return power * ahead.log_likelihood - rules.parameter_penalty * parameters_more
+
+
+def posterior(
+    gain: Gain, heldout: Gain, parameters: int, rivals: list[tuple[Candidate, float]], left: float, rules: SelectionRules
+) -> Posterior:
+    """Probabilities at the place of one effect.
+
+    gain, heldout: of the effect on all and on held-out samples; parameters: their number; rivals: each with its coarsened
+    difference; left: share of the mismatch that the extended model leaves.
+    """
+    weights = [(rival, _exp(-difference)) for rival, difference in rivals]
+    nothing = max(_exp(-(gain.log_likelihood - rules.parameter_penalty * parameters)), min(heldout.p_value, 1.0))
+    odds = rules.prior_none / (1.0 - rules.prior_none)
+    none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
+    total = 1.0 + sum(weight for _, weight in weights) + nothing + none
+    return Posterior(1.0 / total, tuple((rival, weight / total) for rival, weight in weights), nothing / total, none / total)
+
+
+def of_refused(trials: list[Trial]) -> float:
+    """Probability that one of the effects that were refused is there after all, each as probable beforehand as nothing is
+    over their number.
+    """
+    odds = sum(_exp(min(trial.score, trial.heldout.log_likelihood)) for trial in trials) / max(len(trials), 1)
+    return min(odds / (1.0 + odds), 0.5)
+
+
+def _exp(value: float) -> float:
+    return float(np.exp(np.clip(value, -FARTHEST, FARTHEST)))
