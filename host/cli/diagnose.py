@@ -28,6 +28,9 @@ def diagnose(
         str | None, typer.Option(help="Folder of the recordings that the nominal TOML names (default: SELDINGER_DATA).")
     ] = None,
     without: Annotated[list[str] | None, typer.Option(help="Id of an effect that is not to be considered.")] = None,
+    time_budget: Annotated[
+        float | None, typer.Option(help="Seconds after which nothing further is tried; the verdict says so.", min=0.0)
+    ] = None,
     quiet: Annotated[bool, typer.Option(help="No progress on standard error.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Compare a running rig with its twin, and raise alarms.")] = False,
     rig: Annotated[str | None, typer.Option(help="With --live: the rig's file (default: the simulated rig).")] = None,
@@ -81,15 +84,16 @@ def summary(verdict: dict[str, Any]) -> list[str]:
     lines = [f"data: {finding['says']}" for finding in verdict["data_findings"]]
     lines.append(verdict["verdict"].replace("_", " "))
     for effect in verdict["effects"]:
-        lines.append(f"{effect['id']} ({effect['subsystem']}): {effect['says']}")
+        lines.append(f"{effect['id']} ({effect['subsystem']}), probability {effect['probability']:.2f}: {effect['says']}")
         for key, p in effect["parameters"].items():
             lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g})")
         if effect["indistinguishable_from"]:
             lines.append("  indistinguishable from " + ", ".join(effect["indistinguishable_from"]))
+    lines += [f"worse: {text}" for text in verdict["worse"]]
     if fit["rmse_before"] is None:
-        return lines
+        return [*lines, f"next: {verdict['next']}"]
     lines.append(
         f"held-out RMS error {fit['rmse_before']:.4g} {fit['unit']}, with the effects {fit['rmse_after']:.4g} "
         f"{fit['unit']}; noise {fit['noise_floor']:.4g} {fit['unit']}"
     )
-    return lines
+    return [*lines, f"next: {verdict['next']}"]

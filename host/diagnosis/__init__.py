@@ -1,4 +1,10 @@
-"""The mismatch finder: where simulation and recordings disagree, which physics is missing, its model and the evidence."""
+"""The mismatch finder: where simulation and recordings disagree, which physics is missing, its model and the evidence.
+
+Steps, each a room, arrows in this order: `model` (recordings, channels, data findings, operators) and `effects` (the
+vocabulary); `estimation` (fit, noise, evidence, intervals, rules); `models` (nominal models, one file a kind); `symbolic`
+(equations of recorded signals); `selection` (objective and decision rule are written there); `design` (experiments that
+tell models apart); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from protocol.errors import InputError
 
 if TYPE_CHECKING:
+    from host.diagnosis.estimation.rules import SelectionRules
     from host.diagnosis.model.tables import Table
     from host.diagnosis.pipeline import Diagnosis
 
@@ -79,6 +86,8 @@ def diagnose(
     without: Sequence[str] = (),
     known: Sequence[str] = (),
     data_folder: str | None = None,
+    rules: SelectionRules | None = None,
+    time_budget_s: float | None = None,
     progress: Callable[[str, float], None] = lambda what, part: None,
 ) -> Verdict:
     """Compare recordings with a nominal model and name the physics that it lacks.
@@ -90,6 +99,8 @@ def diagnose(
         without: ids of effects that are not to be considered.
         known: effects to take for granted, `id@subsystem:key=value,...`.
         data_folder: where files that the nominal model names lie (default: SELDINGER_DATA).
+        rules: thresholds of selection (default: `host.diagnosis.estimation.rules.RULES`).
+        time_budget_s: time after which nothing further is tried; the verdict then says `stopped_early`.
         progress: called with what is being done and the part of it that is done (0 to 1).
 
     Returns:
@@ -104,6 +115,7 @@ def diagnose(
         'coulomb_friction'
     """
     from host.diagnosis.effects import library
+    from host.diagnosis.estimation.rules import RULES
     from host.diagnosis.model.dataset import find_files
     from host.diagnosis.model.nominal import effect_of, nominal_of, nominal_path, read_nominal
     from host.diagnosis.model.tables import table_of
@@ -129,7 +141,7 @@ def diagnose(
             sources.append(source)
     sources += [] if sources else find_files(spec, [], data_folder)
     try:
-        result = run(spec, sources, progress, frozenset(without))
+        result = run(spec, sources, progress, frozenset(without), rules or RULES, time_budget_s)
     except NothingToCompare as nothing:
         return Verdict(without_fit(nothing.findings, time.monotonic() - began), None)
     return Verdict(as_json(result, time.monotonic() - began), result)

@@ -17,6 +17,7 @@ from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
@@ -77,6 +78,7 @@ class Diagnosis:
     notes: list[str] = field(default_factory=list)
     designs: list[Design] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    stopped_early: bool = False
 
 
 class NothingToCompare(Exception):
@@ -102,15 +104,19 @@ def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, 
     return problems(spec, inspected(spec, sources).recordings)
 
 
-def problems(spec: NominalSpec, recordings: list[Recording]) -> tuple[Model, Problem, Problem]:
+def problems(
+    spec: NominalSpec, recordings: list[Recording], rules: SelectionRules = RULES
+) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
     model: Model = RecordedRig(spec) if spec.recorded_rig else build(spec)
     if spec.effect:
         model = cast(Model, Known(model, spec.effect, recordings))
     factor = thinning(model, recordings)
     columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
-    full = _problem(model, recordings, columns)
-    return model, (_problem(model, [thin(r, factor) for r in recordings], columns) if factor > 1 else full), full
+    full = replace(_problem(model, recordings, columns), rules=rules)
+    if factor <= 1:
+        return model, full, full
+    return model, replace(_problem(model, [thin(r, factor) for r in recordings], columns), rules=rules), full
 
 
 def thinning(model: Model, recordings: list[Recording]) -> int:
@@ -140,19 +146,26 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
 
 
 def diagnose(
-    spec: NominalSpec, sources: Sequence[Path | Table], tell: Tell, left_out: frozenset[str] = frozenset()
+    spec: NominalSpec,
+    sources: Sequence[Path | Table],
+    tell: Tell,
+    left_out: frozenset[str] = frozenset(),
+    rules: SelectionRules = RULES,
+    time_budget_s: float | None = None,
 ) -> Diagnosis:
-    """The whole diagnosis. `left_out`: effect ids the finder is not to know (leave-one-out proof).
+    """The whole diagnosis. `left_out`: effect ids that are not considered (leave-one-out proof).
 
     Raises:
         InputError: the recordings do not fit the nominal model's file.
         NothingToCompare: a channel that the comparison needs says nothing.
     """
     tell("reading recordings", 0.0)
+    budget = Budget(time_budget_s)
     data = inspected(spec, sources)
     if not data.recordings:
         raise NothingToCompare(data.findings)
-    model, problem, full = problems(spec, data.recordings)
+    model, problem, full = problems(spec, data.recordings, rules)
+    problem.budget = budget
     pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
     pool = [c for c in pool if c.effect.id not in left_out]
     found = search(problem, pool, tell)
@@ -167,7 +180,8 @@ def diagnose(
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
     result.findings = [*data.findings, *uncertain(problem, found.best, spans)]
-    result.designs = design(problem, found, standing, tell)
+    result.designs = [] if budget.spent() else design(problem, found, standing, tell)
+    result.stopped_early = budget.spent()
     piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects
     named = bool(found.best.terms) and not piled
     result.verdict = (

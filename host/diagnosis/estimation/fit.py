@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.noise import Noise
-from host.diagnosis.estimation.rules import RULES, SelectionRules
+from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter
 from host.diagnosis.model.model import Act, Model, Piece
 
@@ -52,6 +52,7 @@ class Problem:
     scale: Array
     columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
     rules: SelectionRules = RULES
+    budget: Budget = field(default_factory=Budget)
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""

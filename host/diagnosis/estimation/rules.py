@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import time
+from dataclasses import asdict, dataclass, field
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ class SelectionRules:
     # Posterior over what was fitted (Miller & Dunson 2019, coarsened likelihood: formulas are not exact).
     coarsening: float = 60.0  # independent samples beyond which more data say nothing more of an idealized formula
     prior_none: float = 0.05  # of physics that no candidate has
+    prior_equal: float = 0.12  # of all rivals together that are indistinguishable, at least: formulas are idealized
     exact_share: float = 0.06  # share of the mismatch that an idealized formula leaves where it is the right one
     coarsening_none: float = 8.0  # independent samples for the comparison with physics that would leave no more than that
     confident: float = 0.9  # probability from which a verdict counts as confident
@@ -88,3 +90,15 @@ class SelectionRules:
 
 
 RULES = SelectionRules()
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Time (s) that the user gives a search, or None: nothing but an explicit budget lets a clock end a search."""
+
+    seconds: float | None = None
+    began: float = field(default_factory=time.monotonic)
+
+    def spent(self) -> bool:
+        """Whether the time is up: what is begun is brought to its end, nothing further is tried."""
+        return self.seconds is not None and time.monotonic() - self.began > self.seconds

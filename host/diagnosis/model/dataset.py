@@ -87,7 +87,17 @@ def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec],
         pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [
             whole
         ]
-    return _split(pieces, spec.data.heldout)
+    return _split(_named_apart(pieces), spec.data.heldout)
+
+
+def _named_apart(pieces: list[Recording]) -> list[Recording]:
+    """Recordings of one name get a number: two stay two."""
+    count: dict[str, int] = {}
+    out = []
+    for piece in pieces:
+        count[piece.name] = count.get(piece.name, 0) + 1
+        out.append(piece if count[piece.name] == 1 else replace(piece, name=f"{piece.name} ({count[piece.name]})"))
+    return out
 
 
 def one_clock(recordings: list[Recording]) -> bool:

@@ -11,6 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.pictures import pictures, shown
 from host.diagnosis.report.quantities import interval, quantity, short
+from host.diagnosis.report.verdict import words
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
@@ -52,7 +53,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
         nominal=_nominal(result),
         candidates=candidates(result),
-        located=[{**place, "times": times(place)} for place in verdict["located"]],
+        located=[{**place, "times": times(place, timed=piece.recording.timed)} for place in verdict["located"]],
         scripts=[Path(path).name for path in verdict.get("scripts", ())],
         on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
         partly=result.rest.left,
@@ -62,24 +63,28 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         switches=switches(result),
         heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
         verdict=verdict["verdict"],
+        findings=verdict["data_findings"],
+        worse=verdict["worse"],
+        comparisons=comparisons(result, verdict),
+        probability_none=short(verdict["probability_none"]),
+        next_step=verdict["next"],
+        rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
     )
     target.write_text(text, encoding="utf-8")
     return target
 
 
-def words(effect_id: str) -> str:
-    """An id as people write it."""
-    return effect_id.replace("_", " ")
-
-
 def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
     """The verdict in one sentence."""
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
+    data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
+    also = f"; data: {', '.join(data)}" if data else ""
+    also += f"; worse in {len(verdict['worse'])} held-out comparisons" if verdict["worse"] else ""
     if verdict["verdict"] == "nothing_missing":
-        return "Nothing is missing: the nominal model explains these recordings"
+        return "Nothing is missing: the nominal model explains these recordings" + also
     if verdict["verdict"] == "mismatch_not_identified":
-        return "There is a mismatch, and no known effect accounts for it"
-    return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1])
+        return "There is a mismatch, and no known effect accounts for it" + also
+    return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]) + also
 
 
 def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
@@ -120,14 +125,17 @@ def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
     return {p.key: (p.name, p.unit) for term in result.found.best.terms for p in term.parameters}
 
 
-def times(place: dict[str, Any], most: int = 3) -> str:
+def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
     """When a place is at fault: the longest windows, recording by recording."""
+    unit = "s" if timed else "samples"
     told = []
     for name, spans in place["windows_by_recording"].items():
         longest = sorted(sorted(spans, key=lambda s: s[0] - s[1])[:most])
         if spans:
             more = f" and {len(spans) - most} more" if len(spans) > most else ""
-            told.append(f"{name}: " + ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in longest) + more)
+            told.append(
+                f"{name}: " + ", ".join(f"{a:.{int(timed)}f} to {b:.{int(timed)}f} {unit}" for a, b in longest) + more
+            )
     return "; ".join(told[:most]) + (f"; and {len(told) - most} more recordings" if len(told) > most else "")
 
 
@@ -137,7 +145,8 @@ def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> d
     for key, p in effect["parameters"].items():
         name, unit = units.get(key, (key, ""))
         low, high = p["ci95"]
-        rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"])))
+        mark = " at its bound" if low == high or p["value"] in (low, high) else ""
+        rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"]) + mark))
     return {
         **effect,
         "name": words(effect["id"]),
@@ -149,9 +158,26 @@ def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> d
             for text in effect["experiment_to_tell_apart"].splitlines()
             for line in wrap(text, 88, subsequent_indent="    ")
         ],
+        "probability": short(effect["probability"]),
+        "others": ", ".join(
+            f"{words(other['name'].replace('@', ' at '))} {other['probability']:.2f}" for other in effect["alternatives"][:4]
+        ),
         "gain": short(effect["evidence"]["heldout_log_likelihood_gain"]),
         "p": short(effect["evidence"]["p_value"]),
     }
+
+
+def comparisons(result: Diagnosis, verdict: dict[str, Any]) -> list[tuple[str, str, str, str, bool]]:
+    """Held-out RMS error of every output in every recording: recording, output, before, after, whether it grew."""
+    units = {output.channel: output.unit for output in result.model.outputs}
+    rows = []
+    for recording, channels in verdict["fit"]["per_recording"].items():
+        for channel, error in channels.items():
+            before, after = error["rmse_before"], error["rmse_after"]
+            grew = any(text.startswith(f"{channel} in {recording}:") for text in verdict["worse"])
+            told = (quantity(before, units[channel]), quantity(after, units[channel]))
+            rows.append((recording, words(channel), *told, grew))
+    return rows
 
 
 def switches(result: Diagnosis) -> tuple[str, str]:

@@ -17,6 +17,7 @@ from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, of_refused, posterior
 
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the rest is said not to be noise
+WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
 PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
 
 
@@ -38,7 +39,7 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
     }
     return {
         "verdict": result.verdict,
-        "located": [_located(location) for location in result.located],
+        "located": [_located(location, result) for location in result.located],
         "data_findings": [finding_json(finding) for finding in result.findings],
         "probability_none": probability_none(result),
         "rules": result.problem.rules.as_dict(),
@@ -55,8 +56,49 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
             "whiteness_p_before": figures.white_before[primary],
             "whiteness_p_after": figures.white_after[primary],
         },
+        "worse": worse(result),
+        "next": next_step(result),
+        "stopped_early": result.stopped_early,
         "seconds": seconds,
     }
+
+
+def worse(result: Diagnosis) -> list[str]:
+    """Outputs and held-out recordings whose error grew with the effects by more than a twentieth, as sentences."""
+    found = []
+    for recording, channels in per_recording(result).items():
+        for channel, error in channels.items():
+            before, after = error["rmse_before"], error["rmse_after"]
+            if after > WORSE * before:
+                says = f"{channel} in {recording}: held-out RMS error {before:.3g} before, {after:.3g} with the effects."
+                found.append(says)
+    return found
+
+
+def next_step(result: Diagnosis) -> str:
+    """What to do next, in one sentence."""
+    named = effects(result)
+    if result.stopped_early:
+        return "Diagnose again with a longer time budget: the search was stopped before its end."
+    first = next((finding for finding in result.findings if finding.id != "excitation"), None)
+    if first is not None:
+        return f"Put the data right first ({first.id}: {first.channel}), then diagnose again."
+    unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]
+    if result.designs:
+        return f"Record the proposed motion and diagnose again with it: {result.designs[0].says}"
+    if result.verdict == "mismatch_not_identified":
+        return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
+    if unsure:
+        return f"Record a further motion that shows {words(unsure[0]['id'])}, and diagnose again: it is not sure yet."
+    if named:
+        return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
+    unseen = next((finding for finding in result.findings), None)
+    return unseen.says if unseen is not None else "Nothing: the nominal model explains these recordings."
+
+
+def words(effect_id: str) -> str:
+    """An id as people write it."""
+    return effect_id.replace("_", " ")
 
 
 def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
@@ -70,6 +112,9 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
         "rules": RULES.as_dict(),
         "effects": [],
         "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
+        "worse": [],
+        "next": "Put the data right first, then diagnose again: " + (findings[0].says if findings else ""),
+        "stopped_early": False,
         "seconds": seconds,
     }
 
@@ -97,8 +142,9 @@ def finding_json(finding: Finding) -> dict[str, str]:
     return {"id": finding.id, "channel": finding.channel, "says": finding.says}
 
 
-def _located(location: Location) -> dict[str, Any]:
+def _located(location: Location, result: Diagnosis) -> dict[str, Any]:
     return {
+        "windows_unit": "s" if result.full.pieces[0].recording.timed else "samples",
         "subsystem": location.subsystem,
         "channels": location.channels,
         "windows_s": every_window(location),
@@ -150,9 +196,11 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
     white = result.figures.white_after[result.figures.primary] > NOT_WHITE
     if ranked and result.rest.sure and result.rest.left > PARTLY:
-        ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of it is left."
+        ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of its power is left."
     elif ranked and not white:
-        ranked[0]["says"] += " What is left on held-out samples is small but not yet white noise."
+        figures = result.figures
+        share = figures.after[figures.primary] / max(figures.before[figures.primary], 1e-300)
+        ranked[0]["says"] += f" The held-out RMS error is {share:.0%} of what it was, and not yet white noise."
     return ranked
 
 

@@ -44,7 +44,9 @@ def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
         alike, rivals = _equals(problem, found, term.candidate, less, both, floor)
         said = _better_said(problem, found, term.candidate, less, floor)
         alike += tuple(candidate for candidate, _ in said)
-        out.append(Standing(term.candidate, gain, both, alike, (*rivals, *said), len(term.parameters)))
+        least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
+        differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
+        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters)))
     return out
 
 
@@ -85,6 +87,8 @@ def _equals(
     kept: list[Candidate] = []
     refitted: list[tuple[Candidate, float]] = []
     for trial in _rivals(found, candidate, problem.rules)[: problem.rules.equals_fits]:
+        if problem.budget.spent():
+            break
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         other = finish(
@@ -124,5 +128,6 @@ def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: Selecti
         return True
     top = int(np.argmax(earned.independent * earned.log_ratio))
     best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
-    near = ahead.share < rules.equal_error or best - other < rules.equal_mismatch * best
+    idealized = earned.excesses[top] > 0.0  # where the best model leaves noise only, its formula is no idealization
+    near = ahead.share < rules.equal_error or (idealized and best - other < rules.equal_mismatch * best)
     return bool(near and ahead.log_likelihood < rules.equal_likelihood_ratio * earned.log_likelihood)

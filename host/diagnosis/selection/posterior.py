@@ -11,7 +11,8 @@ which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
     w(effect) = 1,   w(rival) = exp(-r dl + c dk),   w(nothing) = max(exp(-dl + c dk), p-value on held-out blocks)
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
 
-where `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum.
+where `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
+rivals that are indistinguishable (`equivalence`) have at least the weight `prior_equal` together.
 The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
 independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
 is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.

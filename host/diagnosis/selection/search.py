@@ -202,15 +202,18 @@ def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
 def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
     """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
-    while len(best.terms) < problem.rules.most_effects and len(steps) < problem.rules.most_steps:
+    rules = problem.rules
+    while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
         ranked = screen(problem, best, pool, tell)
-        trials = []
+        trials: list[Trial] = []
         promising = _varied(
             [item for item in ranked if item.promise > problem.rules.screening_log_likelihood], problem.rules
         )
         if not best.terms:
             promising += hidden(problem, best, pool)
         for count, item in enumerate(promising):
+            if trials and problem.budget.spent():
+                break
             tell(f"fitting {item.candidate.key}", count / len(promising))
             trials.append(try_fit(problem, best, item, floor))
         rank(trials, best)
@@ -240,7 +243,7 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
     """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
     screening promises beside them would outdo all that was found.
     """
-    if not found.best.terms:
+    if not found.best.terms or problem.budget.spent():
         return found
     begun, scale = get_starts(problem), problem.scale.copy()
     best, first = found, found.steps[0]
@@ -307,7 +310,7 @@ def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Arra
     for _ in range(problem.rules.exchange_rounds):
         before = found.best.names
         for term in found.best.terms:
-            if len(found.best.terms) > 1 or _frequencies(found.best, term):
+            if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
                 _in_place_of(problem, found, term, pool, floor, tell)
         found.best = _prune(problem, found.best, floor, found.steps)
         if found.best.names == before or len(found.best.terms) < 2:

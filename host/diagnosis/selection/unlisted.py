@@ -85,7 +85,7 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
         return rest
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
-        if _equation_instead(problem, found, floor, *pairs[place], tell, evolve=number == 0):
+        if not problem.budget.spent() and _equation_instead(problem, found, floor, *pairs[place], tell, evolve=number == 0):
             return _rest(problem, found, floor, foretell(problem, found.best, floor))
     return replace(rest, doubtful=bool(crowd))
 

@@ -14,7 +14,20 @@ from host.cli.diagnose import diagnose
 from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
-KEYS = {"verdict", "located", "data_findings", "probability_none", "rules", "effects", "fit", "seconds", "scripts"}
+KEYS = {
+    "verdict",
+    "located",
+    "data_findings",
+    "probability_none",
+    "rules",
+    "worse",
+    "next",
+    "stopped_early",
+    "effects",
+    "fit",
+    "seconds",
+    "scripts",
+}
 FIT = {
     "heldout",
     "rmse_before",

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from host.diagnosis.live.twin import Listener
-from host.diagnosis.live.watch import Watch
-from host.diagnosis.live.watch import watch as live
+from host.diagnosis.live.watch import Watch, watch
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 from protocol.zenoh_session import Session
@@ -140,7 +139,7 @@ def test_watch_publishes_what_it_finds() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Session(RIG.name, [endpoint], []) as here, Session(RIG.name, [], [endpoint]) as there:
         arriving, publisher = there.latest("alarm"), here.publisher("alarm")
-        count = live.watch(RIG, Bus(), publisher.put, said.append, lambda: not chunks)
+        count = watch(RIG, Bus(), publisher.put, said.append, lambda: not chunks)
         got: list[Message | None] = []
         until(lambda: got.append(arriving.take()) or got[-1] is not None, "the alarm")
     assert count == 1 and said == ["learning", "watching"]
