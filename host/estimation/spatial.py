@@ -116,6 +116,12 @@ class SpatialEstimate:
             )
         return tuple(said)
 
+    @property
+    def quieter_than_noise(self) -> bool:
+        """Whether the residual is not zero and yet far below what the sensors' noise leaves (chance 0.001)."""
+        freedom = self.degrees_of_freedom
+        return freedom > 0 and TINY * (freedom + 3) < self.chi_square < chi_square_limit(freedom, -ODD_DEVIATIONS)
+
     def _principal(self) -> tuple[Array, Array]:
         values, directions = np.linalg.eigh(0.5 * (self.covariance_N2 + self.covariance_N2.T))
         return values, directions
@@ -179,8 +185,10 @@ def estimate_cosserat(  # noqa: PLR0913 - keyword arguments of a public function
     )
     if plain and (limits.one_to_one or limits.continued):
         found = _quick(rod, case, sensors, roll, catheter.distal_length_m, limits, start)
-        if found is not None:
+        if found is not None and not (limits.one_to_one and found.quieter_than_noise):
             return found
+        if found is not None:  # poses as exact as these separate answers that noise would make indistinguishable
+            limits = limits._replace(thorough=True)
     sensors = [PoseSensor(*sensor) for sensor in sensors]
     return _careful(sample(rod, case, sensors, prior, roll), catheter.distal_length_m, limits, start[:COVARIANCE])
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar
-from host.mechanics.cosserat import CosseratSolution, CosseratSolutions, solve_cosserat, solve_cosserat_cases
+from host.mechanics.cosserat import FRAMES, CosseratSolution, CosseratSolutions, solve_cosserat, solve_cosserat_cases
 from host.mechanics.rod import checked_stations, column
 from host.mechanics.threads import in_threads
 from protocol.catheter import Catheter
@@ -114,6 +114,8 @@ def solve(  # noqa: PLR0913 - keyword arguments of a public function, each docum
     Examples:
         >>> solve(load_catheter("livewire"), 0.01, 10.0, [0.0, 0.05, 0.0]).tip_position_m  # doctest: +SKIP
     """
+    if frame not in FRAMES:
+        raise InputError("frame", frame, "base or tip")
     if model == "cosserat":
         force = (0.0, 0.0, 0.0) if force_N is None else force_N
         if not (_many(force) or _is_array(insertion_m) or _is_array(curvature_per_m)):
