@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from protocol import board_pins
 from protocol.rig_file import Pins
+from protocol.serial_frames import AXES
 
 
 class InputLine(NamedTuple):
@@ -54,7 +55,7 @@ def input_problems(pins: Pins, inputs: int) -> list[str]:
     if estop.hit:
         why = "pressed, or its switch is normally closed" if estop.normally_open else "pressed, or its wire is broken"
         problems.append(f"the emergency stop ({estop.pin}) is {estop.contact}: {why}")
-    for axis in board_pins.AXES:
+    for axis in AXES:
         ends = [line for name, line in lines.items() if name.split()[1] == axis]
         if not all(line.hit for line in ends):
             continue

@@ -147,7 +147,7 @@ def travel_of(points: Array, rig: Rig) -> dict[str, tuple[float, float]]:
     config, known = tick_parameters(rig)[0].kinematics, rig.transmission
     joint, stages = np.array([known.insertion_at_home_m, 0.0, 0.0]), []
     for point in points:
-        inverse_kinematics.apply_nearest(config, np.ascontiguousarray(point), joint, joint)
+        joint[:] = inverse_kinematics.apply_nearest(config, np.ascontiguousarray(point), joint)
         insertion = (joint[0] - known.insertion_at_home_m) / known.insertion_slope
         stages.append([insertion, joint[1] / known.roll_slope, joint[2]])
     table, out = np.array(stages), {}

@@ -68,7 +68,7 @@ def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
     """The demo's plant with a still heart, the tip `clearance_m` before the wall, the backlash taken up forward."""
     out = np.zeros(3)
     kinematics = tick_parameters(rig)[0].kinematics
-    inverse_kinematics.apply(kinematics, np.array([*WALL_POINT_M[:2], WALL_POINT_M[2] - clearance_m]), 0.0, out)
+    out[:] = inverse_kinematics.apply(kinematics, np.array([*WALL_POINT_M[:2], WALL_POINT_M[2] - clearance_m]), 0.0)
     transmission = rig.transmission
     handle = (out[0] - transmission.insertion_at_home_m) / transmission.insertion_slope
     handle += 0.5 * transmission.insertion_backlash_m

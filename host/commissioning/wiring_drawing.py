@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from protocol.board_pins import AXES, PROCESSORS, Signal, signals
+from protocol.board_pins import PROCESSORS, Signal, signals
 from protocol.rig_file import Pins
+from protocol.serial_frames import AXES
 
 ROW, LEFT, RIGHT, WIDTH = 22, 250, 560, 900
 COLOURS = {

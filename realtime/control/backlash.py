@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from numba import njit
 
-from realtime.control.records import BACKLASH_PARAMS, BACKLASH_STATE
-
-Config, State = BACKLASH_PARAMS, BACKLASH_STATE
+from realtime.control.records import BacklashParams, BacklashState
 
 # A width learned in contact may differ from the rig file's by this much.
 _FREEDOM_m = 0.001
 
 
 @njit(cache=True)
-def first_width(config) -> float:  # type: ignore[no-untyped-def]
+def first_width(config: BacklashParams) -> float:
     """The width (m) believed at first: a play taken for too wide kicks the body at each reversal, too narrow does not."""
     return max(config.width_m - config.caution_m, 0.0)
 
 
 @njit(cache=True)
-def start(config, state, body_m: float) -> None:  # type: ignore[no-untyped-def]
+def start(config: BacklashParams, state: BacklashState, body_m: float) -> None:
     """Take the gap as taken up forward at body insertion `body_m` (m, relative to home)."""
     state.direction = 1.0
     state.extreme_m = body_m
@@ -29,7 +27,7 @@ def start(config, state, body_m: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def follow(config, state, handle_m: float) -> float:  # type: ignore[no-untyped-def]
+def follow(config: BacklashParams, state: BacklashState, handle_m: float) -> float:
     """Where the body is (m, relative to home) after the handle came to `handle_m`: the play operator."""
     half_m = 0.5 * state.width_m
     before_m = state.body_m
@@ -40,7 +38,7 @@ def follow(config, state, handle_m: float) -> float:  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def narrow(config, state, by_m: float) -> float:  # type: ignore[no-untyped-def]
+def narrow(config: BacklashParams, state: BacklashState, by_m: float) -> float:
     """Believe the play `by_m` narrower, at most _FREEDOM_m off what the rig file says; returns what was changed (m)."""
     least = max(config.width_m - _FREEDOM_m, 0.0)
     width_m = min(max(state.width_m - by_m, least), config.width_m + _FREEDOM_m)
@@ -50,13 +48,13 @@ def narrow(config, state, by_m: float) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def handle_for(config, state, body_m: float) -> float:  # type: ignore[no-untyped-def]
+def handle_for(config: BacklashParams, state: BacklashState, body_m: float) -> float:
     """The handle (m) on the flank of the present direction that puts the body at `body_m`; both relative to home."""
     return body_m / config.slope + 0.5 * state.direction * state.width_m
 
 
 @njit(cache=True)
-def apply(config, state, body_m: float) -> float:  # type: ignore[no-untyped-def]
+def apply(config: BacklashParams, state: BacklashState, body_m: float) -> float:
     """The handle insertion (m) that brings the body to `body_m` (m), both relative to home.
 
     Half the width is added in the direction of motion. The direction turns only after the body has come back
@@ -72,7 +70,9 @@ def apply(config, state, body_m: float) -> float:  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def apply_ahead(config, state, body_m: float, soon_m: float, later_m: float, depth_m: float) -> float:  # type: ignore[no-untyped-def]
+def apply_ahead(
+    config: BacklashParams, state: BacklashState, body_m: float, soon_m: float, later_m: float, depth_m: float
+) -> float:
     """As `apply`, with the reversal foreseen: the jump begins before the body has to turn.
 
     soon_m: where the body is to be about one crossing of the gap from now; later_m: some time after that. The handle
@@ -90,12 +90,12 @@ def apply_ahead(config, state, body_m: float, soon_m: float, later_m: float, dep
 
 
 @njit(cache=True)
-def roll(config, body_rad: float) -> float:  # type: ignore[no-untyped-def]
+def roll(config: BacklashParams, body_rad: float) -> float:
     """The handle roll (rad) that turns the distal end to `body_rad` (rad): the slope's inverse."""
     return body_rad / config.roll_slope
 
 
 @njit(cache=True)
-def distal_roll(config, handle_rad: float) -> float:  # type: ignore[no-untyped-def]
+def distal_roll(config: BacklashParams, handle_rad: float) -> float:
     """The distal end's roll (rad) for a handle roll (rad)."""
     return handle_rad * config.roll_slope

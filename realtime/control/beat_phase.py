@@ -12,9 +12,8 @@ import math
 import numpy as np
 from numba import njit
 
-from realtime.control.records import BEAT, BEAT_HARMONICS, BEAT_PHASES, BEAT_RATES
-
-State = BEAT
+from realtime.control.declare import Tensor
+from realtime.control.records import BEAT_HARMONICS, BEAT_PHASES, BEAT_RATES, Beat
 
 PARTS = 2 * BEAT_HARMONICS
 # Rates on the grid, relative to the mean one, and how likely a beat has each: mostly near the mean, any at times.
@@ -35,15 +34,15 @@ _WILD = 1e-4  # likelihood that any sample has under any phase
 
 
 @njit(cache=True)
-def start(state, cosine_m: float, sine_m: float) -> None:  # type: ignore[no-untyped-def]
+def start(state: Beat, cosine_m: float, sine_m: float) -> None:
     """Begin with a plain wave; `cosine_m`, `sine_m`: its pair (p, q) now, as `frequency_bank.pair` tells it."""
     size_m, phase = math.hypot(cosine_m, sine_m), math.atan2(sine_m, cosine_m)
     for a in range(PARTS):
         state.wave_m[a] = size_m if a == 0 else 0.0
         for b in range(PARTS):
-            state.seen[a, b] = 0.0
-        state.seen[a, a] = _FIRST_SAMPLES * (1.0 if a < 2 else 4.0)
-        state.told_m[a] = state.seen[a, a] * state.wave_m[a]
+            state.information[a, b] = 0.0
+        state.information[a, a] = _FIRST_SAMPLES * (1.0 if a < 2 else 4.0)
+        state.projected_m[a] = state.information[a, a] * state.wave_m[a]
     total = 0.0
     for i in range(BEAT_PHASES):
         off = (2.0 * math.pi / BEAT_PHASES * i - phase + math.pi) % (2.0 * math.pi) - math.pi
@@ -57,7 +56,7 @@ def start(state, cosine_m: float, sine_m: float) -> None:  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def ahead(moment_m, mean_rate: float, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
+def ahead(moment_m: Tensor, mean_rate: float, ahead_s: float) -> float:
     """The beat's part of the position (m) `ahead_s` later (or earlier), from `moment_m` (rates, harmonics, 2)."""
     value = 0.0
     for j in range(BEAT_RATES):
@@ -71,7 +70,7 @@ def ahead(moment_m, mean_rate: float, ahead_s: float) -> float:  # type: ignore[
 
 
 @njit(cache=True)
-def variance(state) -> float:  # type: ignore[no-untyped-def]
+def variance(state: Beat) -> float:
     """Variance (m2) of the beat's part now, over the possibilities."""
     mean = square = 0.0
     for i in range(BEAT_PHASES):
@@ -86,7 +85,7 @@ def variance(state) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def propagate(state, mean_rate: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def propagate(state: Beat, mean_rate: float, dt_s: float) -> None:
     """All possibilities move on by `dt_s`; some change to another rate. mean_rate: rad/s."""
     stay = math.exp(-_CHANGES_PER_BEAT * dt_s * mean_rate / (2.0 * math.pi))
     for j in range(BEAT_RATES):
@@ -107,7 +106,7 @@ def propagate(state, mean_rate: float, dt_s: float) -> None:  # type: ignore[no-
 
 
 @njit(cache=True)
-def correct(state, value_m: float, noise_m2: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def correct(state: Beat, value_m: float, noise_m2: float, dt_s: float) -> None:
     """Weigh the possibilities by a sample of the beat's part, `value_m` of variance `noise_m2`, and learn the wave."""
     total, keep = 0.0, math.exp(-dt_s / _MEMORY_S)
     for i in range(BEAT_PHASES):
@@ -119,36 +118,36 @@ def correct(state, value_m: float, noise_m2: float, dt_s: float) -> None:  # typ
             state.share[i, j] *= likelihood
             total += state.share[i, j]
     for a in range(PARTS):
-        state.told_m[a] *= keep
+        state.projected_m[a] *= keep
         for b in range(PARTS):
-            state.seen[a, b] *= keep
+            state.information[a, b] *= keep
     for i in range(BEAT_PHASES):
         share = 0.0
         for j in range(BEAT_RATES):
             state.share[i, j] /= total
             share += state.share[i, j]
         for a in range(PARTS):
-            state.told_m[a] += share * WAVE[i, a] * value_m
+            state.projected_m[a] += share * WAVE[i, a] * value_m
             for b in range(a + 1):
-                state.seen[a, b] += share * WAVE[i, a] * WAVE[i, b]
+                state.information[a, b] += share * WAVE[i, a] * WAVE[i, b]
     for a in range(PARTS):
-        state.seen[a, a] += 1e-3 * dt_s
+        state.information[a, a] += 1e-3 * dt_s
     _solve(state)
     _sum_up(state)
 
 
 @njit(cache=True)
-def _solve(state) -> None:  # type: ignore[no-untyped-def]
-    """wave_m from seen wave_m = told_m, by Cholesky factors of the lower half of `seen`."""
+def _solve(state: Beat) -> None:
+    """wave_m from information wave_m = projected_m, by Cholesky factors of the lower half of `information`."""
     L, x = state.factor, state.wave_m
     for a in range(PARTS):
         for b in range(a + 1):
-            value = state.seen[a, b]
+            value = state.information[a, b]
             for c in range(b):
                 value -= L[a, c] * L[b, c]
             L[a, b] = math.sqrt(max(value, 1e-12)) if a == b else value / L[b, b]
     for a in range(PARTS):
-        value = state.told_m[a]
+        value = state.projected_m[a]
         for b in range(a):
             value -= L[a, b] * x[b]
         x[a] = value / L[a, a]
@@ -160,7 +159,7 @@ def _solve(state) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _sum_up(state) -> None:  # type: ignore[no-untyped-def]
+def _sum_up(state: Beat) -> None:
     """The moments (rates, harmonics, cosine and sine) from which `ahead` foretells."""
     for j in range(BEAT_RATES):
         for h in range(BEAT_HARMONICS):

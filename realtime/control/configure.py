@@ -43,22 +43,24 @@ def _fill_predictive(p: np.record, rig: Rig) -> None:
         slide_speed_m_per_s=control.slide_speed_m_per_s,
         force_slew_N_per_s=control.force_slew_N_per_s,
         force_margin_N=control.force_margin_N,
-        offset_memory_s=control.offset_memory_s,
-        contact_memory_s=control.contact_memory_s,
         crossing_s=crossing_s,
         reversal_share=control.reversal_share,
         reversal_depth_m=control.reversal_depth_m,
-        force_noise_N=rig.force_sensor.noise_N,
+        slow_approach_share=control.blind_approach_share,
+    )
+    _fill(p.tip_offset, free_memory_s=control.offset_memory_s, contact_memory_s=control.contact_memory_s)
+    _fill(
+        p.wall,
+        compliance_m_per_N=control.tip_compliance_m_per_N,
         play_noise_m=control.play_noise_m,
         position_noise_m=rig.tracker.position_noise_m,
-        compliance_m_per_N=control.tip_compliance_m_per_N,
-        blind_share=control.blind_approach_share,
     )
-    p.estimate_wall.by_phase = p.tip_wall.by_phase = 1
+    p.force_noise_N = rig.force_sensor.noise_N
+    p.wall.by_estimate.by_phase = p.wall.by_pose.by_phase = 1
     for record, stiffness_sd, play_sd_m, acceleration, local2, memory_s in (
-        (p.wall, control.stiffness_sd, control.play_sd_m, 1e-4, FOLLOWING2, 1.0),
-        (p.estimate_wall, 0.0, 0.0, 2e-5, STANDING2, 3.0),
-        (p.tip_wall, 0.0, 0.0, 1e-5, FOLLOWING2, 3.0),
+        (p.wall.by_force, control.stiffness_sd, control.play_sd_m, 1e-4, FOLLOWING2, 1.0),
+        (p.wall.by_estimate, 0.0, 0.0, 2e-5, STANDING2, 3.0),
+        (p.wall.by_pose, 0.0, 0.0, 1e-5, FOLLOWING2, 3.0),
     ):
         _fill(
             record,

@@ -6,12 +6,14 @@ import math
 
 from numba import njit
 
+from realtime.control.declare import Floats, ReadFloats
+
 # A normal that is learned stays within this angle's cosine of the one commanded (20 degrees).
 _LEAST_COSINE = 0.94
 
 
 @njit(cache=True)
-def to_base(quaternion_wxyz, vector, out) -> None:  # type: ignore[no-untyped-def]
+def to_base(quaternion_wxyz: ReadFloats, vector: ReadFloats, out: Floats) -> None:
     """`vector` (3,) of a frame whose pose in the base frame is the unit quaternion (4,), in the base frame, into `out`."""
     w, x, y, z = quaternion_wxyz[0], quaternion_wxyz[1], quaternion_wxyz[2], quaternion_wxyz[3]
     a, b, c = vector[0], vector[1], vector[2]
@@ -21,13 +23,21 @@ def to_base(quaternion_wxyz, vector, out) -> None:  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def dot(a, b) -> float:  # type: ignore[no-untyped-def]
+def dot(a: ReadFloats, b: ReadFloats) -> float:
     """Scalar product of two (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
-def follow_force(normal, commanded, force_N, share: float) -> None:  # type: ignore[no-untyped-def]
+def take(normal: Floats, commanded: ReadFloats) -> None:
+    """Set `normal` (3,) to the commanded one, if that is a unit vector."""
+    if abs(dot(commanded, commanded) - 1.0) < 1e-3:
+        for i in range(3):
+            normal[i] = commanded[i]
+
+
+@njit(cache=True)
+def follow_force(normal: Floats, commanded: ReadFloats, force_N: ReadFloats, share: float) -> None:
     """Turn `normal` (3,), unit, outward, by `share` (0 to 1) towards where the force (3,) on a smooth wall says it is.
 
     `commanded` (3,), unit: the normal given; the learned one stays within 20 degrees of it. No force: nothing learned.

@@ -6,9 +6,8 @@ from numba import njit
 
 from realtime.control.codes import SOURCE_ESTIMATE, SOURCE_SENSOR
 from realtime.control.constraint_frame import to_base
-from realtime.control.records import FORCE_RING, FORCE_SOURCE_STATE
-
-State = FORCE_SOURCE_STATE
+from realtime.control.declare import ReadFloats
+from realtime.control.records import FORCE_RING, Force, ForceSourceState, Inputs, Params
 
 # A reading above this is no contact force, whatever the sensor says.
 _RANGE_N = 20.0
@@ -26,26 +25,26 @@ _SMOOTH_S = 0.08
 
 
 @njit(cache=True)
-def start(params, state) -> None:  # type: ignore[no-untyped-def]
+def start(params: Params, state: ForceSourceState) -> None:
     """As at arming: the source of the parameters, nothing known of how sensor and estimate agree."""
     state.source = params.force_source
     state.pairs, state.bias_N, state.apart_N2, state.usual_N2, state.good_s, state.smooth_N = 0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
 @njit(cache=True)
-def _plausible(force) -> bool:  # type: ignore[no-untyped-def]
+def _plausible(force: Force) -> bool:
     square = force.force_N[0] ** 2 + force.force_N[1] ** 2 + force.force_N[2] ** 2
     return square < _RANGE_N**2
 
 
 @njit(cache=True)
-def compression(force_N, normal) -> float:  # type: ignore[no-untyped-def]
+def compression(force_N: ReadFloats, normal: ReadFloats) -> float:
     """Compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
     return -(force_N[0] * normal[0] + force_N[1] * normal[1] + force_N[2] * normal[2])
 
 
 @njit(cache=True)
-def _take_sensor(state, sensor, normal) -> bool:  # type: ignore[no-untyped-def]
+def _take_sensor(state: ForceSourceState, sensor: Force, normal: ReadFloats) -> bool:
     """A new reading of the sensor; False where it is not one."""
     if not _plausible(sensor):
         return False
@@ -59,7 +58,7 @@ def _take_sensor(state, sensor, normal) -> bool:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _sensor_at(state, stamp_ns: int) -> int:  # type: ignore[no-untyped-def]
+def _sensor_at(state: ForceSourceState, stamp_ns: int) -> int:
     """Place in the ring of the sensor's reading at `stamp_ns` (within 2 ms), or -1."""
     for k in range(FORCE_RING):
         place = (state.head - k) % FORCE_RING
@@ -71,7 +70,7 @@ def _sensor_at(state, stamp_ns: int) -> int:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _take_estimate(state, estimate, normal, now_ns: int, touching: bool) -> bool:  # type: ignore[no-untyped-def]
+def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats, now_ns: int, touching: bool) -> bool:
     """A new estimate; False where it is not one. In contact it is compared with the sensor at its time."""
     noise_N2 = 0.0
     for i in range(3):
@@ -89,7 +88,7 @@ def _take_estimate(state, estimate, normal, now_ns: int, touching: bool) -> bool
 
 
 @njit(cache=True)
-def _compare(state, apart_N: float) -> None:  # type: ignore[no-untyped-def]
+def _compare(state: ForceSourceState, apart_N: float) -> None:
     off_N = apart_N - state.bias_N if state.pairs > 0 else 0.0
     state.apart_N2 += (off_N * off_N - state.apart_N2) / _APART
     if parted(state):
@@ -100,13 +99,13 @@ def _compare(state, apart_N: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def parted(state) -> bool:  # type: ignore[no-untyped-def]
+def parted(state: ForceSourceState) -> bool:
     """Whether sensor and estimate differ by more than they use to."""
     return state.pairs > _LEARNED and state.apart_N2 > max(_PARTED * state.usual_N2, _LEAST_N**2)
 
 
 @njit(cache=True)
-def _choose(params, state, now_ns: int, touching: bool) -> bool:  # type: ignore[no-untyped-def]
+def _choose(params: Params, state: ForceSourceState, now_ns: int, touching: bool) -> bool:
     """Hand over where needed; returns whether the source has changed."""
     if params.force_source == SOURCE_ESTIMATE or not touching:
         changed = state.source != params.force_source
@@ -126,7 +125,9 @@ def _choose(params, state, now_ns: int, touching: bool) -> bool:  # type: ignore
 
 
 @njit(cache=True)
-def apply(params, state, inputs, frame_wxyz, normal, touching: bool) -> int:  # type: ignore[no-untyped-def]
+def apply(
+    params: Params, state: ForceSourceState, inputs: Inputs, frame_wxyz: ReadFloats, normal: ReadFloats, touching: bool
+) -> int:
     """Take in what has come of both. Returns how many readings of either were refused.
 
     frame_wxyz: the tip's measured orientation, used where the sensor sits on the tip; normal: outward, unit.
@@ -154,7 +155,7 @@ def apply(params, state, inputs, frame_wxyz, normal, touching: bool) -> int:  # 
     state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0
     state.fresh = 0
     if state.source == SOURCE_SENSOR and new == SOURCE_SENSOR:
-        _set(state, inputs.sensor, state.reading_N, state.normal_N[SOURCE_SENSOR], params.predictive.force_noise_N**2)
+        _set(state, inputs.sensor, state.reading_N, state.normal_N[SOURCE_SENSOR], params.force_noise_N**2)
         state.smooth_N = state.value_N
     elif state.source == SOURCE_ESTIMATE and estimated:
         before_ns = state.stamp_ns
@@ -166,7 +167,7 @@ def apply(params, state, inputs, frame_wxyz, normal, touching: bool) -> int:  # 
 
 
 @njit(cache=True)
-def _set(state, force, vector_N, value_N: float, spread_N2: float) -> None:  # type: ignore[no-untyped-def]
+def _set(state: ForceSourceState, force: Force, vector_N: ReadFloats, value_N: float, spread_N2: float) -> None:
     stamped = 0 <= force.arrival_ns - force.stamp_ns <= _ESTIMATE_AGE_NS
     state.stamp_ns = force.stamp_ns if stamped else force.arrival_ns
     state.fresh, state.value_N, state.spread_N2 = 1, value_N, spread_N2

@@ -1,4 +1,4 @@
-"""Where the tip would be with nothing touching it: forward kinematics of the believed joints, now and in the past."""
+"""Where the tip would be without a load: forward kinematics of the predicted joints, now and in the past."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import math
 from numba import njit
 
 from realtime.control import inverse_kinematics
-from realtime.control.records import HISTORY, HISTORY_POINTS, N_AXES
-
-State = HISTORY
+from realtime.control.declare import Joint, Point, ReadFloats
+from realtime.control.records import HISTORY_POINTS, N_AXES, History, KinematicsParams
 
 # Joints are kept about this often; the ring then reaches further back than the latest pose.
 SPACING_NS = 1_000_000
 
 
 @njit(cache=True)
-def apply(config, joint, out_m) -> None:  # type: ignore[no-untyped-def]
-    """Tip (3,) m of an unloaded catheter at `joint` (insertion m, roll rad, knob rad), into `out_m`; (7.1), (7.2).
+def apply(config: KinematicsParams, joint: ReadFloats) -> Point:
+    """Return the tip (m) of an unloaded catheter at `joint` (insertion m, roll rad, knob rad); (7.1), (7.2).
 
     The exposed part of the distal shaft is an arc, the body behind it straight; undoes `inverse_kinematics.apply`.
     """
@@ -29,14 +28,12 @@ def apply(config, joint, out_m) -> None:  # type: ignore[no-untyped-def]
         lateral_m, along_m = 0.5 * bend * arc_m, arc_m
     else:
         lateral_m, along_m = (1.0 - math.cos(bend)) / curvature, math.sin(bend) / curvature
-    out_m[0] = lateral_m * math.sin(joint[1])
-    out_m[1] = -lateral_m * math.cos(joint[1])
-    out_m[2] = straight_m + along_m
+    return lateral_m * math.sin(joint[1]), -lateral_m * math.cos(joint[1]), straight_m + along_m
 
 
 @njit(cache=True)
-def remember(state, time_ns: int, joint, flank: float) -> None:  # type: ignore[no-untyped-def]
-    """Note that the joints (3,) are, or will be, `joint` at `time_ns`, the play pushed at `flank`; times must rise."""
+def remember(state: History, time_ns: int, joint: ReadFloats, flank: float) -> None:
+    """Note that the joints (3,) are, or will be, `joint` at `time_ns`, the gap pushed at `flank`; times must rise."""
     if state.count > 0 and time_ns - state.time_ns[state.head] < SPACING_NS - 100_000:
         return
     state.head = (state.head + 1) % HISTORY_POINTS
@@ -48,23 +45,21 @@ def remember(state, time_ns: int, joint, flank: float) -> None:  # type: ignore[
 
 
 @njit(cache=True)
-def joint_at(state, time_ns: int, out) -> float:  # type: ignore[no-untyped-def]
-    """The joints (3,) at `time_ns` into `out`, linear between notes; returns the flank, +-1.
-
-    0.0 where that is further back than the ring: `out` is then left alone.
-    """
+def joint_at(state: History, time_ns: int) -> tuple[Joint, float]:
+    """Return the joints at `time_ns`, linear between notes, and the flank, +-1; a flank of 0.0: further back than noted."""
     if state.count == 0:
-        return 0.0
+        return (0.0, 0.0, 0.0), 0.0
     k = state.head
     for _ in range(state.count - 1):
         if state.time_ns[k] <= time_ns:
             break
         k = (k - 1) % HISTORY_POINTS
     if state.time_ns[k] > time_ns:
-        return 0.0
+        return (0.0, 0.0, 0.0), 0.0
     after = k if k == state.head else (k + 1) % HISTORY_POINTS
     span = state.time_ns[after] - state.time_ns[k]
     share = (time_ns - state.time_ns[k]) / span if span > 0 else 0.0
-    for axis in range(N_AXES):
-        out[axis] = state.joint[k, axis] + share * (state.joint[after, axis] - state.joint[k, axis])
-    return state.flank[k]
+    insertion_m = state.joint[k, 0] + share * (state.joint[after, 0] - state.joint[k, 0])
+    roll_rad = state.joint[k, 1] + share * (state.joint[after, 1] - state.joint[k, 1])
+    knob_rad = state.joint[k, 2] + share * (state.joint[after, 2] - state.joint[k, 2])
+    return (insertion_m, roll_rad, knob_rad), state.flank[k]

@@ -6,9 +6,8 @@ import math
 
 from numba import njit
 
-from realtime.control.records import BANK, BANK_POINTS
+from realtime.control.records import BANK_POINTS, Bank
 
-Bank = BANK
 # The grid is wide enough for 40-180 heart beats and 6-36 breaths a minute.
 POINTS = BANK_POINTS
 # Samples come in at about this rate; faster streams are averaged first.
@@ -16,7 +15,7 @@ STEP_S = 0.020
 
 
 @njit(cache=True)
-def start(bank, low_Hz: float, high_Hz: float, memory_s: float, level: float) -> None:  # type: ignore[no-untyped-def]
+def start(bank: Bank, low_Hz: float, high_Hz: float, memory_s: float, level: float) -> None:
     """Forget everything; look between `low_Hz` and `high_Hz` over the last two `memory_s` or so. `level`: first guess
     of the mean (unit of the signal)."""
     bank.low_Hz, bank.high_Hz, bank.memory_s, bank.since_s, bank.level = low_Hz, high_Hz, memory_s, 0.0, level
@@ -28,19 +27,19 @@ def start(bank, low_Hz: float, high_Hz: float, memory_s: float, level: float) ->
 
 
 @njit(cache=True)
-def frequency_Hz(bank, place: float) -> float:  # type: ignore[no-untyped-def]
+def frequency_Hz(bank: Bank, place: float) -> float:
     """Frequency (Hz) at a place on the grid, 0 to POINTS - 1, fractions allowed."""
     return bank.low_Hz * (bank.high_Hz / bank.low_Hz) ** (place / (POINTS - 1))
 
 
 @njit(cache=True)
-def amplitude(bank, point: int) -> float:  # type: ignore[no-untyped-def]
+def amplitude(bank: Bank, point: int) -> float:
     """Amplitude (unit of the signal) near grid point number `point`."""
     return 2.0 * math.hypot(bank.second[point, 0], bank.second[point, 1])
 
 
 @njit(cache=True)
-def apply(bank, value: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def apply(bank: Bank, value: float, dt_s: float) -> None:
     """Take in the signal's mean `value` over the last `dt_s` seconds.
 
     Two leaky sums in cascade (window t exp(-t/memory)): side lobes fall with the square of the distance, so that breath
@@ -64,7 +63,7 @@ def apply(bank, value: float, dt_s: float) -> None:  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def peak(bank) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+def peak(bank: Bank) -> tuple[float, float]:
     """(frequency in Hz, amplitude) of the strongest motion inside the grid; (0, 0) where there is none but at its edge.
 
     Where half the frequency also moves by a third as much, that is taken: the strongest may be a second harmonic. Asked
@@ -88,7 +87,7 @@ def peak(bank) -> tuple[float, float]:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def pair(bank, heard_Hz: float) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+def pair(bank: Bank, heard_Hz: float) -> tuple[float, float]:
     """(cosine, sine) part now of the motion at `heard_Hz`, from the nearest grid point: value = cosine part, turning."""
     place = (POINTS - 1) * math.log(heard_Hz / bank.low_Hz) / math.log(bank.high_Hz / bank.low_Hz)
     k = min(max(round(place), 0), POINTS - 1)
@@ -100,6 +99,6 @@ def pair(bank, heard_Hz: float) -> tuple[float, float]:  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _is_top(bank, point: int) -> bool:  # type: ignore[no-untyped-def]
+def _is_top(bank: Bank, point: int) -> bool:
     here = amplitude(bank, point)
     return here >= amplitude(bank, point - 1) and here >= amplitude(bank, point + 1)

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-import numpy as np
 from numba import njit
 
 from realtime.control import inverse_kinematics
-from realtime.control.records import HYBRID_PARAMS, HYBRID_STATE, N_AXES
-
-Config, State = HYBRID_PARAMS, HYBRID_STATE
+from realtime.control.declare import Floats, Point, ReadFloats
+from realtime.control.records import N_AXES, HybridParams, HybridState, KinematicsParams
 
 # Greatest joint error acted on (m, rad, rad), and greatest stored integral, both against windup.
 _ERROR_LIMIT = (0.010, 0.5, 0.5)
 _FORCE_INTEGRAL_LIMIT_N_s = 0.5
 
 
+class Aim(NamedTuple):
+    """What the tip is to do: be at (3,) m; in contact press with a force (N) against the outward normal (3,)."""
+
+    target_m: ReadFloats
+    normal: ReadFloats
+    wanted_N: float
+    contact: bool
+
+
 @njit(cache=True)
-def move_goal(goal_m, target_m, step_m: float) -> None:  # type: ignore[no-untyped-def]
+def move_goal(goal_m: Floats, target_m: ReadFloats, step_m: float) -> None:
     """Bring `goal_m` (3,) up to `step_m` nearer to `target_m` (3,), in place."""
     distance = 0.0
     for i in range(3):
@@ -30,49 +38,50 @@ def move_goal(goal_m, target_m, step_m: float) -> None:  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def tip_error(  # type: ignore[no-untyped-def]
-    config,
-    state,
-    contact: bool,
-    tip_m,
-    target_m,
-    normal,
-    wanted_N: float,
-    force_N: float,
-    period_s: float,
-    out_m,
-) -> None:
-    """Wanted tip displacement (3,) m into `out_m`.
+def tip_error(
+    config: HybridParams, state: HybridState, tip_m: ReadFloats, aim: Aim, force_N: float, period_s: float
+) -> Point:
+    """Return the wanted displacement of the tip (m), from its position (3,) and the measured compression (N).
 
     The selection matrix S = normal normal^T takes the normal direction from the force loop,
     delta = K_pf e + K_if integral(e), and leaves the others to the position loop.
     """
+    target_m, normal = aim.target_m, aim.normal
+    error_m = (target_m[0] - tip_m[0], target_m[1] - tip_m[1], target_m[2] - tip_m[2])
+    if not aim.contact:
+        return error_m
     along = 0.0
     for i in range(3):
-        out_m[i] = target_m[i] - tip_m[i]
-        along += out_m[i] * normal[i]
-    if not contact:
-        return
-    error_N = wanted_N - force_N
+        along += error_m[i] * normal[i]
+    error_N = aim.wanted_N - force_N
     integral = state.force_integral_N_s + error_N * period_s
     state.force_integral_N_s = min(max(integral, -_FORCE_INTEGRAL_LIMIT_N_s), _FORCE_INTEGRAL_LIMIT_N_s)
     delta_m = config.force_gain_m_per_N * error_N + config.force_integral_m_per_N_s * state.force_integral_N_s
-    for i in range(3):
-        out_m[i] += (-delta_m - along) * normal[i]
+    change_m = -delta_m - along
+    return (
+        error_m[0] + change_m * normal[0],
+        error_m[1] + change_m * normal[1],
+        error_m[2] + change_m * normal[2],
+    )
 
 
 @njit(cache=True)
-def apply(config, kinematics, state, tip_m, error_m, period_s: float, work) -> None:  # type: ignore[no-untyped-def]
+def apply(
+    config: HybridParams,
+    kinematics: KinematicsParams,
+    state: HybridState,
+    tip_m: ReadFloats,
+    error_m: ReadFloats,
+    period_s: float,
+) -> None:
     """Advance the joint command (body insertion m, roll rad, knob rad) of `state` by one tick.
 
     The inverse kinematics is called twice (Fig. 6.12), on the branch nearest to the last command: for the predicted tip
-    and for the wanted one; their difference is the joint error of the PI controller. `work` (3, 3) is scratch space.
+    (3,) and for the wanted one, `error_m` (3,) further; their difference is the joint error of the PI controller.
     """
-    measured, wanted, goal_m = work[0], work[1], work[2]
-    for i in range(3):
-        goal_m[i] = tip_m[i] + error_m[i]
-    inverse_kinematics.apply_nearest(kinematics, tip_m, state.joint, measured)
-    inverse_kinematics.apply_nearest(kinematics, goal_m, state.joint, wanted)
+    goal_m = (tip_m[0] + error_m[0], tip_m[1] + error_m[1], tip_m[2] + error_m[2])
+    measured = inverse_kinematics.apply_nearest(kinematics, tip_m, state.joint)
+    wanted = inverse_kinematics.apply_nearest(kinematics, goal_m, state.joint)
     for axis in range(N_AXES):
         limit = _ERROR_LIMIT[axis]
         error = min(max(wanted[axis] - measured[axis], -limit), limit)
@@ -83,16 +92,8 @@ def apply(config, kinematics, state, tip_m, error_m, period_s: float, work) -> N
 
 
 @njit(cache=True)
-def forget(state) -> None:  # type: ignore[no-untyped-def]
+def forget(state: HybridState) -> None:
     """Empty the integrators: the joint command stays where it is, so the change of phase has no bump."""
     for axis in range(N_AXES):
         state.integral[axis] = 0.0
     state.force_integral_N_s = 0.0
-
-
-WORK_SHAPE = (3, 3)
-
-
-def new_work() -> np.ndarray:
-    """Scratch space for `apply`."""
-    return np.zeros(WORK_SHAPE)

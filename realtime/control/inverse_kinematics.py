@@ -8,9 +8,8 @@ import numpy as np
 from numba import njit
 from scipy.interpolate import PchipInterpolator
 
-from realtime.control.records import CURVE_POINTS, KINEMATICS_PARAMS
-
-Config = KINEMATICS_PARAMS
+from realtime.control.declare import Joint, ReadFloats
+from realtime.control.records import CURVE_POINTS, KinematicsParams
 
 # A part of a sweep with less than this share of its median slope is a dead zone.
 DEAD_SHARE = 0.05
@@ -68,7 +67,7 @@ def _bending_branches(knob: np.ndarray, curvature: np.ndarray) -> list[tuple[np.
 
 
 @njit(cache=True)
-def knob_of_curvature(config, curvature_per_m: float) -> float:  # type: ignore[no-untyped-def]
+def knob_of_curvature(config: KinematicsParams, curvature_per_m: float) -> float:
     """Knob angle (rad) for a curvature (1/m), limited to the curve's range."""
     span = 2.0 * config.max_curvature_per_m
     place = (curvature_per_m + config.max_curvature_per_m) / span * (CURVE_POINTS - 1)
@@ -79,7 +78,7 @@ def knob_of_curvature(config, curvature_per_m: float) -> float:  # type: ignore[
 
 
 @njit(cache=True)
-def curvature_of_knob(config, knob_rad: float) -> float:  # type: ignore[no-untyped-def]
+def curvature_of_knob(config: KinematicsParams, knob_rad: float) -> float:
     """Curvature (1/m) that a knob angle (rad) asks for: the fitted curve read the other way round."""
     curve = config.knob_of_curvature_rad
     low, high = 0, CURVE_POINTS - 1
@@ -128,7 +127,7 @@ def curvature_of_lateral(lateral_m: float, length_m: float) -> float:
 
 
 @njit(cache=True)
-def bend_and_insertion(config, lateral_m: float, axial_m: float) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+def bend_and_insertion(config: KinematicsParams, lateral_m: float, axial_m: float) -> tuple[float, float]:
     """Curvature (1/m) and insertion (m) that put the unloaded tip `lateral_m` >= 0 off and `axial_m` along the axis.
 
     While only part of the distal shaft is out, the whole exposed catheter is one arc: (6.1) corrected, no
@@ -144,7 +143,7 @@ def bend_and_insertion(config, lateral_m: float, axial_m: float) -> tuple[float,
 
 
 @njit(cache=True)
-def _with_body_out(config, lateral_m: float, axial_m: float, beyond: bool):  # type: ignore[no-untyped-def]
+def _with_body_out(config: KinematicsParams, lateral_m: float, axial_m: float, beyond: bool) -> tuple[float, float]:
     """Curvature (1/m) and insertion (m) by (7.1), (7.2): the whole distal shaft bends, on either side of the fold."""
     bend = bend_of_reach(lateral_m / config.distal_length_m, beyond)
     along = config.distal_length_m * (1.0 if bend < 1e-6 else math.sin(bend) / bend)
@@ -159,7 +158,7 @@ def _faded(radius_m: float, axis_radius_m: float) -> float:
 
 
 @njit(cache=True)
-def _roll_and_lateral(config, tip_m, last_roll_rad: float):  # type: ignore[no-untyped-def]
+def _roll_and_lateral(config: KinematicsParams, tip_m: ReadFloats, last_roll_rad: float) -> tuple[float, float]:
     """Roll (rad) nearest to `last_roll_rad`, unwrapped, and the tip's offset (m, signed) in the plane of that roll."""
     radius_m = math.hypot(tip_m[0], tip_m[1])
     roll = math.atan2(tip_m[0], -tip_m[1])
@@ -170,8 +169,8 @@ def _roll_and_lateral(config, tip_m, last_roll_rad: float):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def apply(config, tip_m, last_roll_rad: float, out) -> None:  # type: ignore[no-untyped-def]
-    """Insertion (m), roll (rad), knob (rad) of an unloaded catheter with its tip at `tip_m` (3,), into `out` (3,).
+def apply(config: KinematicsParams, tip_m: ReadFloats, last_roll_rad: float) -> Joint:
+    """Return insertion (m), roll (rad), knob (rad) of an unloaded catheter with its tip at `tip_m` (3,).
 
     Roll is continuous: of the two branches (bend to one side, or to the other with the roll half a turn away) the
     one nearest to `last_roll_rad` is taken, unwrapped. Near the axis, where noise decides the direction, the roll
@@ -181,17 +180,15 @@ def apply(config, tip_m, last_roll_rad: float, out) -> None:  # type: ignore[no-
     """
     roll, lateral_m = _roll_and_lateral(config, tip_m, last_roll_rad)
     curvature, insertion = bend_and_insertion(config, abs(lateral_m), tip_m[2])
-    out[0] = insertion
-    out[1] = roll
-    out[2] = knob_of_curvature(config, math.copysign(curvature, lateral_m))
+    return insertion, roll, knob_of_curvature(config, math.copysign(curvature, lateral_m))
 
 
 @njit(cache=True)
-def apply_nearest(config, tip_m, last_joint, out) -> None:  # type: ignore[no-untyped-def]
-    """As `apply`, with both choices of branch made nearest to `last_joint` (3,) (m, rad, rad): roll, and the knob.
+def apply_nearest(config: KinematicsParams, tip_m: ReadFloats, last_joint: ReadFloats) -> Joint:
+    """Return the joints as `apply` does, on the branches of roll and knob nearest to `last_joint` (3,) (m, rad, rad).
 
     Past the fold (Algorithm 6.1's other curve) counts where it is not out of the knob's range and the whole distal shaft
-    is out. `last_joint` and `out` may be one array.
+    is out.
     """
     length_m = config.distal_length_m
     roll, lateral_m = _roll_and_lateral(config, tip_m, last_joint[1])
@@ -202,13 +199,11 @@ def apply_nearest(config, tip_m, last_joint, out) -> None:  # type: ignore[no-un
         here = abs(curvature - last) * length_m + abs(insertion - last_joint[0]) / length_m
         if abs(other - last) * length_m + abs(other_m - last_joint[0]) / length_m < here:
             curvature, insertion = other, other_m
-    out[0] = insertion
-    out[1] = roll
-    out[2] = knob_of_curvature(config, math.copysign(curvature, lateral_m))
+    return insertion, roll, knob_of_curvature(config, math.copysign(curvature, lateral_m))
 
 
 @njit(cache=True)
-def out_of_reach_m(config, tip_m, least_m: float, most_m: float, knob_rad: float) -> float:  # type: ignore[no-untyped-def]
+def out_of_reach_m(config: KinematicsParams, tip_m: ReadFloats, least_m: float, most_m: float, knob_rad: float) -> float:
     """How far (m) a wanted tip (3,) is from the nearest that either branch comes to within the limits.
 
     least_m, most_m: of the insertion; knob_rad: how far the knob turns either way. Roll is taken as free.

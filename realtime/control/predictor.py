@@ -6,15 +6,14 @@ import math
 
 from numba import njit
 
-from realtime.control.records import PREDICTOR_PARAMS, PREDICTOR_STATE
-
-Config, State = PREDICTOR_PARAMS, PREDICTOR_STATE
+from realtime.control.declare import Floats
+from realtime.control.records import Pose, PredictorParams, PredictorState
 
 ACCEPTED, REJECTED, NOTHING_NEW = 1, -1, 0
 
 
 @njit(cache=True)
-def plausible(config, state, pose) -> bool:  # type: ignore[no-untyped-def]
+def plausible(config: PredictorParams, state: PredictorState, pose: Pose) -> bool:
     """Whether a pose may be used: finite, inside the workspace, unit quaternion, not faster than the limit allows."""
     norm = 0.0
     for i in range(4):
@@ -38,7 +37,7 @@ def plausible(config, state, pose) -> bool:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _restart(config, state, pose) -> None:  # type: ignore[no-untyped-def]
+def _restart(config: PredictorParams, state: PredictorState, pose: Pose) -> None:
     state.started = 1
     for i in range(3):
         state.position_m[i] = pose.position_m[i]
@@ -49,7 +48,7 @@ def _restart(config, state, pose) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def apply(config, state, pose) -> int:  # type: ignore[no-untyped-def]
+def apply(config: PredictorParams, state: PredictorState, pose: Pose) -> int:
     """Take in `pose` (record POSE) at the time it was measured. Returns ACCEPTED, REJECTED or NOTHING_NEW.
 
     One scalar filter per axis, all three with the same covariance (p00, p01, p11 in m2, m2/s, m2/s2): white
@@ -87,7 +86,7 @@ def apply(config, state, pose) -> int:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def predict(state, now_ns: int, out_m) -> None:  # type: ignore[no-untyped-def]
+def predict(state: PredictorState, now_ns: int, out_m: Floats) -> None:
     """The tip position (3,) m at `now_ns`, written into `out_m`; the velocity is trusted for 60 ms at most."""
     ahead_s = min(max((now_ns - state.stamp_ns) * 1e-9, 0.0), 0.060)
     for i in range(3):

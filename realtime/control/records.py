@@ -1,438 +1,481 @@
-"""The records that cross the tick: parameters, state, inputs, outputs. One declaration, read by kernels and people."""
+"""The records that cross the tick: parameters, state, inputs, outputs. Every field is declared here and nowhere else."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from realtime.control.declare import Floats, Ints, Matrix, Tensor, as_markdown, dtype_of, part, real, whole
+
 N_AXES = 3
 CURVE_POINTS = 129
-
-POSE = np.dtype(
-    [
-        ("count", "i8"),
-        ("stamp_ns", "i8"),
-        ("arrival_ns", "i8"),
-        ("position_m", "f8", 3),
-        ("quaternion_wxyz", "f8", 4),
-    ],
-    align=True,
-)
-FORCE = np.dtype(
-    [
-        ("count", "i8"),
-        ("stamp_ns", "i8"),
-        ("arrival_ns", "i8"),
-        ("force_N", "f8", 3),
-        ("covariance_N2", "f8", (3, 3)),
-    ],
-    align=True,
-)
-BOARD = np.dtype(
-    [
-        ("count", "i8"),
-        ("arrival_ns", "i8"),
-        ("mcu_offset_ns", "i8"),
-        ("position_steps", "i8", N_AXES),
-        ("encoder_counts", "i8", N_AXES),
-        ("state", "i8"),
-        ("fault", "i8"),
-        ("ready", "i8"),
-    ],
-    align=True,
-)
-COMMAND = np.dtype(
-    [
-        ("count", "i8"),
-        ("kind", "i8"),
-        ("armed", "i8"),
-        ("target_m", "f8", 3),
-        ("normal", "f8", 3),
-        ("force_N", "f8"),
-        ("clear", "i8"),
-        ("watch", "i8"),
-    ],
-    align=True,
-)
-
-INPUTS = np.dtype(
-    [
-        ("now_ns", "i8"),
-        ("tip", POSE),
-        ("shaft", POSE),
-        ("sensor", FORCE),
-        ("estimate", FORCE),
-        ("board", BOARD),
-        ("command", COMMAND),
-    ],
-    align=True,
-)
-
-PREDICTOR_PARAMS = np.dtype(
-    [
-        ("acceleration_noise_m_per_s2", "f8"),
-        ("position_noise_m", "f8"),
-        ("max_speed_m_per_s", "f8"),
-        ("gate_sigma", "f8"),
-        ("workspace_min_m", "f8", 3),
-        ("workspace_max_m", "f8", 3),
-    ],
-    align=True,
-)
-PREDICTOR_STATE = np.dtype(
-    [
-        ("started", "i8"),
-        ("seen", "i8"),
-        ("stamp_ns", "i8"),
-        ("accepted_ns", "i8"),
-        ("position_m", "f8", 3),
-        ("velocity_m_per_s", "f8", 3),
-        ("quaternion_wxyz", "f8", 4),
-        ("p00", "f8"),
-        ("p01", "f8"),
-        ("p11", "f8"),
-        ("rejected", "i8"),
-        ("rejected_in_row", "i8"),
-    ],
-    align=True,
-)
-
-# The wall's motion (`target_predictor`): harmonics of heart and breath, and three models of the same motion.
+# The wall's motion: harmonics of heart and breath, and four models of the same motion.
 HEART_HARMONICS, BREATH_HARMONICS = 3, 2
 TARGET_N = 2 + 2 * (HEART_HARMONICS + BREATH_HARMONICS) + 4
 TARGET_MODELS = 4
 BANK_POINTS = 24
-BANK = np.dtype(
-    [
-        ("low_Hz", "f8"),
-        ("high_Hz", "f8"),
-        ("memory_s", "f8"),
-        ("since_s", "f8"),
-        ("level", "f8"),
-        ("phase_rad", "f8", BANK_POINTS),
-        ("first", "f8", (BANK_POINTS, 2)),
-        ("second", "f8", (BANK_POINTS, 2)),
-    ],
-    align=True,
-)
 # The grid of `beat_phase`.
 BEAT_PHASES, BEAT_RATES, BEAT_HARMONICS = 48, 15, 3
-BEAT = np.dtype(
-    [
-        ("share", "f8", (BEAT_PHASES, BEAT_RATES)),
-        ("moved", "f8", (BEAT_PHASES, BEAT_RATES)),
-        ("wave_m", "f8", 2 * BEAT_HARMONICS),
-        ("told_m", "f8", 2 * BEAT_HARMONICS),
-        ("seen", "f8", (2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)),
-        ("factor", "f8", (2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)),
-        ("moment_m", "f8", (BEAT_RATES, BEAT_HARMONICS, 2)),
-    ],
-    align=True,
-)
-TARGET_PARAMS = np.dtype(
-    [
-        ("by_phase", "i8"),
-        ("horizon_s", "f8"),
-        ("gate_sigma", "f8"),
-        ("stiffness_sd", "f8"),
-        ("play_sd_m", "f8"),
-        ("level_acceleration_m_per_s2", "f8"),
-        ("local_acceleration2", "f8"),
-        ("score_memory_s", "f8"),
-        ("heart_min_Hz", "f8"),
-        ("heart_max_Hz", "f8"),
-        ("breath_min_Hz", "f8"),
-        ("breath_max_Hz", "f8"),
-    ],
-    align=True,
-)
-TARGET_STATE = np.dtype(
-    [
-        ("started", "i8"),
-        ("time_ns", "i8"),
-        ("x", "f8", (TARGET_MODELS, TARGET_N)),
-        ("P", "f8", (TARGET_MODELS, TARGET_N, TARGET_N)),
-        ("score_m2", "f8", TARGET_MODELS),
-        ("weight", "f8", TARGET_MODELS),
-        ("noise_m2", "f8"),
-        ("shot_ns", "i8"),
-        ("shot", "f8", (TARGET_MODELS, TARGET_N)),
-        ("heart_found", "i8"),
-        ("breath_found", "i8"),
-        ("mean_rate", "f8"),
-        ("worse_s", "f8"),
-        ("bank_value", "f8"),
-        ("bank_s", "f8"),
-        ("bank_n", "i8"),
-        ("heart_bank", BANK),
-        ("breath_bank", BANK),
-        ("last_heart_Hz", "f8"),
-        ("agreed", "i8"),
-        ("rejected", "i8"),
-        ("rejected_s", "f8"),
-        ("beat", BEAT),
-        ("beat_shot_m", "f8", (BEAT_RATES, BEAT_HARMONICS, 2)),
-        ("shot_rate", "f8"),
-        ("row", "f8", TARGET_N),
-        ("cross", "f8", TARGET_N),
-        ("angle", "f8", (HEART_HARMONICS + BREATH_HARMONICS, 2)),
-    ],
-    align=True,
-)
-
-STAGE_PARAMS = np.dtype(
-    [
-        ("steps_per_unit", "f8", N_AXES),
-        ("max_speed", "f8", N_AXES),
-        ("max_accel", "f8", N_AXES),
-        ("min_unit", "f8", N_AXES),
-        ("max_unit", "f8", N_AXES),
-    ],
-    align=True,
-)
-STAGE_STATE = np.dtype([("position", "f8", N_AXES), ("speed", "f8", N_AXES)], align=True)
-
-BACKLASH_PARAMS = np.dtype(
-    [
-        ("width_m", "f8"),
-        ("caution_m", "f8"),
-        ("slope", "f8"),
-        ("threshold_m", "f8"),
-        ("roll_slope", "f8"),
-    ],
-    align=True,
-)
-BACKLASH_STATE = np.dtype(
-    [
-        ("direction", "f8"),
-        ("extreme_m", "f8"),
-        ("body_m", "f8"),
-        ("flank", "f8"),
-        ("width_m", "f8"),
-    ],
-    align=True,
-)
-
-KINEMATICS_PARAMS = np.dtype(
-    [
-        ("distal_length_m", "f8"),
-        ("insertion_at_home_m", "f8"),
-        ("max_curvature_per_m", "f8"),
-        ("axis_radius_m", "f8"),
-        ("knob_of_curvature_rad", "f8", CURVE_POINTS),
-    ],
-    align=True,
-)
-
-HYBRID_PARAMS = np.dtype(
-    [
-        ("position_gain_per_s", "f8"),
-        ("position_integral_per_s2", "f8"),
-        ("force_gain_m_per_N", "f8"),
-        ("force_integral_m_per_N_s", "f8"),
-        ("approach_speed_m_per_s", "f8"),
-        ("contact_force_N", "f8"),
-    ],
-    align=True,
-)
-HYBRID_STATE = np.dtype(
-    [
-        ("joint", "f8", N_AXES),
-        ("integral", "f8", N_AXES),
-        ("force_integral_N_s", "f8"),
-        ("goal_m", "f8", 3),
-        ("above_ns", "i8"),
-    ],
-    align=True,
-)
-
-PREDICTIVE_PARAMS = np.dtype(
-    [
-        ("move_speed_m_per_s", "f8"),
-        ("move_accel_m_per_s2", "f8"),
-        ("slide_speed_m_per_s", "f8"),
-        ("force_slew_N_per_s", "f8"),
-        ("force_margin_N", "f8"),
-        ("offset_memory_s", "f8"),
-        ("contact_memory_s", "f8"),
-        ("crossing_s", "f8"),
-        ("reversal_share", "f8"),
-        ("reversal_depth_m", "f8"),
-        ("force_noise_N", "f8"),
-        ("play_noise_m", "f8"),
-        ("position_noise_m", "f8"),
-        ("compliance_m_per_N", "f8"),
-        ("blind_share", "f8"),
-    ],
-    align=True,
-)
-PREDICTIVE_STATE = np.dtype(
-    [
-        ("normal", "f8", 3),
-        ("offset_m", "f8", 3),
-        ("touch_offset_m", "f8", 3),
-        ("offset_s", "f8"),
-        ("offset_ns", "i8"),
-        ("goal_speed", "f8"),
-        ("along_m", "f8"),
-        ("touch_m", "f8"),
-        ("depth_m", "f8"),
-        ("wanted_N", "f8"),
-        ("mean_m", "f8"),
-        ("felt_ns", "i8"),
-        ("away_s", "f8"),
-        ("speed", "f8", N_AXES),
-        ("soon", "f8", N_AXES),
-        ("later", "f8", N_AXES),
-        ("point_m", "f8", 3),
-        ("joint", "f8", N_AXES),
-        ("short_m", "f8"),
-        ("short_s", "f8"),
-    ],
-    align=True,
-)
-# Sensor and estimate side by side (`force_source`).
+# Readings of the force sensor that are kept for a comparison with a late estimate.
 FORCE_RING = 96
-FORCE_SOURCE_STATE = np.dtype(
-    [
-        ("source", "i8"),
-        ("seen", "i8", 2),
-        ("arrival_ns", "i8", 2),
-        ("normal_N", "f8", 2),
-        ("noise_N2", "f8"),
-        ("equal", "i8"),
-        ("head", "i8"),
-        ("ring_ns", "i8", FORCE_RING),
-        ("ring_N", "f8", FORCE_RING),
-        ("pairs", "i8"),
-        ("bias_N", "f8"),
-        ("apart_N2", "f8"),
-        ("usual_N2", "f8"),
-        ("good_s", "f8"),
-        ("smooth_N", "f8"),
-        ("changed", "i8"),
-        ("fresh", "i8"),
-        ("stamp_ns", "i8"),
-        ("value_N", "f8"),
-        ("spread_N2", "f8"),
-        ("age_from_ns", "i8"),
-        ("force_N", "f8", 3),
-        ("reading_N", "f8", 3),
-    ],
-    align=True,
-)
-# Where the distal end is believed to have been (insertion m, roll rad, knob rad): a ring, the newest at `head`.
+# Predicted joints that are kept for late poses and estimates.
 HISTORY_POINTS = 192
-HISTORY = np.dtype(
-    [
-        ("head", "i8"),
-        ("count", "i8"),
-        ("time_ns", "i8", HISTORY_POINTS),
-        ("joint", "f8", (HISTORY_POINTS, N_AXES)),
-        ("flank", "f8", HISTORY_POINTS),
-    ],
-    align=True,
-)
 
-SAFETY_PARAMS = np.dtype(
-    [
-        ("over_force_N", "f8"),
-        ("hold_after_ns", "i8"),
-        ("stop_after_ns", "i8"),
-        ("force_timeout_ns", "i8"),
-        ("board_timeout_ns", "i8"),
-        ("retract_speed_m_per_s", "f8"),
-        ("retract_distance_m", "f8"),
-    ],
-    align=True,
-)
 
-PARAMS = np.dtype(
-    [
-        ("period_s", "f8"),
-        ("setpoint_lead_ns", "i8"),
-        ("setpoint_expiry_us", "i8"),
-        ("stage", STAGE_PARAMS),
-        ("backlash", BACKLASH_PARAMS),
-        ("kinematics", KINEMATICS_PARAMS),
-        ("hybrid", HYBRID_PARAMS),
-        ("predictor", PREDICTOR_PARAMS),
-        ("safety", SAFETY_PARAMS),
-        ("force_source", "i8"),
-        ("sensor_on_tip", "i8"),
-        ("law", "i8"),
-        ("predictive", PREDICTIVE_PARAMS),
-        ("wall", TARGET_PARAMS),
-        ("estimate_wall", TARGET_PARAMS),
-        ("tip_wall", TARGET_PARAMS),
-    ],
-    align=True,
-)
+# --- inputs ---
 
-STATE = np.dtype(
-    [
-        ("ticks", "i8"),
-        ("phase", "i8"),
-        ("action", "i8"),
-        ("cause", "i8"),
-        ("latched", "i8"),
-        ("latch_clear", "i8"),
-        ("retract_from_m", "f8"),
-        ("setpoint_number", "i8"),
-        ("predictor", PREDICTOR_STATE),
-        ("stage", STAGE_STATE),
-        ("backlash", BACKLASH_STATE),
-        ("hybrid", HYBRID_STATE),
-        ("force", FORCE_SOURCE_STATE),
-        ("force_seen", "i8"),
-        ("force_rejected", "i8"),
-        ("command_seen", "i8"),
-        ("cleared", "i8"),
-        ("contact_since_ns", "i8"),
-        ("work", "f8", (4, 3)),
-        ("home_m", "f8"),
-        ("believed", "f8", N_AXES),
-        ("history", HISTORY),
-        ("predictive", PREDICTIVE_STATE),
-        ("wall", TARGET_STATE),
-        ("tip_wall", TARGET_STATE),
-    ],
-    align=True,
-)
 
-OUTPUTS = np.dtype(
-    [
-        ("now_ns", "i8"),
-        ("valid", "i8"),
-        ("number", "i8"),
-        ("execute_us", "i8"),
-        ("expiry_us", "i8"),
-        ("position_steps", "i8", N_AXES),
-        ("stage_unit", "f8", N_AXES),
-        ("joint", "f8", N_AXES),
-        ("tip_m", "f8", 3),
-        ("tip_velocity_m_per_s", "f8", 3),
-        ("goal_m", "f8", 3),
-        ("force_N", "f8", 3),
-        ("normal_force_N", "f8"),
-        ("wanted_force_N", "f8"),
-        ("phase", "i8"),
-        ("action", "i8"),
-        ("cause", "i8"),
-        ("poses_rejected", "i8"),
-        ("forces_rejected", "i8"),
-        ("pose_age_ns", "i8"),
-        ("force_source", "i8"),
-        ("wall_m", "f8"),
-        ("wall_sd_m", "f8"),
-        ("heart_Hz", "f8"),
-        ("breath_Hz", "f8"),
-        ("stiffness_N_per_m", "f8"),
-        ("play_m", "f8"),
-    ],
-    align=True,
-)
+class Pose:
+    """A tracker pose, in the base frame."""
+
+    count: int = whole("", "rises by one with each pose")
+    stamp_ns: int = whole("ns", "when it was measured")
+    arrival_ns: int = whole("ns", "when it arrived")
+    position_m: Floats = real("m", "position of the sensor", 3)
+    quaternion_wxyz: Floats = real("", "rotation sensor to base, unit, scalar first", 4)
+
+
+class Force:
+    """A force on the tissue, in the base frame: the sensor's reading, or the model's estimate."""
+
+    count: int = whole("", "rises by one with each reading")
+    stamp_ns: int = whole("ns", "when it was measured; of an estimate: when its pose was")
+    arrival_ns: int = whole("ns", "when it arrived")
+    force_N: Floats = real("N", "force on the tissue", 3)
+    covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
+
+
+class Board:
+    """The stepper board's newest status."""
+
+    count: int = whole("", "rises by one with each status")
+    arrival_ns: int = whole("ns", "when it arrived")
+    mcu_offset_ns: int = whole("ns", "rig's clock minus the board's clock")
+    position_steps: Ints = whole("steps", "steps made, by axis", N_AXES)
+    encoder_counts: Ints = whole("counts", "encoder, by axis", N_AXES)
+    state: int = whole("", "a BoardState; FAULT also after a reset")
+    fault: int = whole("", "the board's fault code, 0 for none")
+    ready: int = whole("", "1 when the board takes set-points")
+
+
+class Command:
+    """What the operator wants, and what the supervision found."""
+
+    count: int = whole("", "rises by one with each command that the loop has to act on")
+    kind: int = whole("", "a CommandKind")
+    armed: int = whole("", "1 when the loop is to be armed")
+    target_m: Floats = real("m", "tip position wanted", 3)
+    normal: Floats = real("", "outward normal of the wall, unit, towards the tip", 3)
+    force_N: float = real("N", "force wanted along the inward normal")
+    clear: int = whole("", "rises by one when the operator clears latched causes")
+    watch: int = whole("", "causes that the supervision found, a bit set of `safety.CAUSES`")
+
+
+class Inputs:
+    """All that the tick reads of the world."""
+
+    now_ns: int = whole("ns", "time of this tick")
+    tip: Pose = part(Pose, "newest pose of the tip")
+    shaft: Pose = part(Pose, "newest pose of the shaft")
+    sensor: Force = part(Force, "newest reading of the force sensor")
+    estimate: Force = part(Force, "newest converged estimate")
+    board: Board = part(Board, "newest status of the board")
+    command: Command = part(Command, "newest command")
+
+
+# --- parameters and state of the control blocks ---
+
+
+class PredictorParams:
+    """Tip predictor (`predictor`)."""
+
+    acceleration_noise_m_per_s2: float = real("m/s^2", "white acceleration of the tip, per square root of Hz")
+    position_noise_m: float = real("m", "noise of the tracker, standard deviation")
+    max_speed_m_per_s: float = real("m/s", "a faster tip is not plausible")
+    gate_sigma: float = real("", "poses further off than this many standard deviations are rejected")
+    workspace_min_m: Floats = real("m", "lowest plausible position", 3)
+    workspace_max_m: Floats = real("m", "highest plausible position", 3)
+
+
+class PredictorState:
+    """Tip predictor (`predictor`)."""
+
+    started: int = whole("", "1 after the first accepted pose")
+    seen: int = whole("", "count of the newest pose that was looked at")
+    stamp_ns: int = whole("ns", "when the newest accepted pose was measured")
+    accepted_ns: int = whole("ns", "when the newest accepted pose arrived")
+    position_m: Floats = real("m", "filtered position at stamp_ns", 3)
+    velocity_m_per_s: Floats = real("m/s", "filtered velocity at stamp_ns", 3)
+    quaternion_wxyz: Floats = real("", "orientation of the newest accepted pose", 4)
+    p00: float = real("m^2", "variance of the position, each axis")
+    p01: float = real("m^2/s", "covariance of position and velocity")
+    p11: float = real("m^2/s^2", "variance of the velocity")
+    rejected: int = whole("", "poses rejected since the start; only for telemetry")
+    rejected_in_row: int = whole("", "poses rejected since the last accepted one")
+
+
+class Bank:
+    """Leaky Fourier sums on a grid of frequencies (`frequency_bank`)."""
+
+    low_Hz: float = real("Hz", "lowest frequency of the grid")
+    high_Hz: float = real("Hz", "highest frequency of the grid")
+    memory_s: float = real("s", "time constant of each sum")
+    since_s: float = real("s", "signal seen since the start")
+    level: float = real("m", "mean of the signal")
+    phase_rad: Floats = real("rad", "phase of each grid point", BANK_POINTS)
+    first: Matrix = real("m", "first sum, cosine and sine", BANK_POINTS, 2)
+    second: Matrix = real("m", "second sum, cosine and sine", BANK_POINTS, 2)
+
+
+class Beat:
+    """Phase and wave of an uneven heart (`beat_phase`)."""
+
+    share: Matrix = real("", "probability of each phase and rate", BEAT_PHASES, BEAT_RATES)
+    moved: Matrix = real("", "the same while it is moved on; scratch", BEAT_PHASES, BEAT_RATES)
+    wave_m: Floats = real("m", "harmonics of the wave, cosine and sine", 2 * BEAT_HARMONICS)
+    projected_m: Floats = real("m", "right side of the wave's normal equations", 2 * BEAT_HARMONICS)
+    information: Matrix = real("", "left side of the wave's normal equations", 2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)
+    factor: Matrix = real("", "its Cholesky factor; scratch", 2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)
+    moment_m: Tensor = real("m", "moments by rate and harmonic, cosine and sine", BEAT_RATES, BEAT_HARMONICS, 2)
+
+
+class TargetParams:
+    """Predictor of the wall (`target_predictor`) for one kind of sample."""
+
+    by_phase: int = whole("", "1 to run the phased model, for slow streams of samples")
+    horizon_s: float = real("s", "predictions are scored this far ahead")
+    gate_sigma: float = real("", "samples further off than this many standard deviations of every model are rejected")
+    stiffness_sd: float = real("", "standard deviation of the relative error of the stiffness at first")
+    play_sd_m: float = real("m", "standard deviation of the error of half the backlash at first")
+    level_acceleration_m_per_s2: float = real("m/s^2", "drift of the level, per square root of Hz")
+    local_acceleration2: float = real("m^2/s^3", "squared acceleration of the local model")
+    score_memory_s: float = real("s", "time constant of the models' scores")
+    heart_min_Hz: float = real("Hz", "slowest heart")
+    heart_max_Hz: float = real("Hz", "fastest heart")
+    breath_min_Hz: float = real("Hz", "slowest breath")
+    breath_max_Hz: float = real("Hz", "fastest breath")
+
+
+class TargetState:
+    """Predictor of the wall (`target_predictor`)."""
+
+    started: int = whole("", "1 after the first sample")
+    time_ns: int = whole("ns", "time of the states")
+    x: Matrix = real("m", "state of each model, in the order of `target_models`", TARGET_MODELS, TARGET_N)
+    P: Tensor = real("m^2", "covariance of each model", TARGET_MODELS, TARGET_N, TARGET_N)
+    score_m2: Floats = real("m^2", "mean square error of each model's predictions", TARGET_MODELS)
+    weight: Floats = real("", "weight of each model in the mean", TARGET_MODELS)
+    noise_m2: float = real("m^2", "mean variance of the samples")
+    shot_ns: int = whole("ns", "time of the states that are being scored")
+    shot: Matrix = real("m", "states that are being scored", TARGET_MODELS, TARGET_N)
+    heart_found: int = whole("", "1 once the heart's rate is known")
+    breath_found: int = whole("", "1 once the breath's rate is known")
+    mean_rate: float = real("rad/s", "mean rate of the heart")
+    worse_s: float = real("s", "how long the restless model has been the better one")
+    bank_value: float = real("m", "sum of the samples for the banks")
+    bank_s: float = real("s", "time that they span")
+    bank_n: int = whole("", "how many they are")
+    heart_bank: Bank = part(Bank, "search for the heart's rate")
+    breath_bank: Bank = part(Bank, "search for the breath's rate")
+    last_heart_Hz: float = real("Hz", "the bank's peak at the last look")
+    agreed: int = whole("", "looks in a row that agreed on the peak; negative: wait")
+    rejected: int = whole("", "samples rejected since the start; only for telemetry")
+    rejected_s: float = real("s", "how long samples have been rejected in a row")
+    beat: Beat = part(Beat, "the phased model's beat")
+    beat_shot_m: Tensor = real("m", "its moments that are being scored", BEAT_RATES, BEAT_HARMONICS, 2)
+    shot_rate: float = real("rad/s", "the mean rate that is being scored")
+    row: Floats = real("", "measurement row; scratch", TARGET_N)
+    cross: Floats = real("m^2", "covariance times row; scratch", TARGET_N)
+    angle: Matrix = real("", "cosine and sine by which each harmonic turned; scratch", HEART_HARMONICS + BREATH_HARMONICS, 2)
+
+
+class StageParams:
+    """Stages (`stage_limiter`); units are m or rad, by axis."""
+
+    steps_per_unit: Floats = real("steps/unit", "steps for one m or rad", N_AXES)
+    max_speed: Floats = real("unit/s", "speed limit", N_AXES)
+    max_accel: Floats = real("unit/s^2", "acceleration limit", N_AXES)
+    min_unit: Floats = real("unit", "lower end of the travel", N_AXES)
+    max_unit: Floats = real("unit", "upper end of the travel", N_AXES)
+
+
+class StageState:
+    """Stages (`stage_limiter`); units are m or rad, by axis."""
+
+    position: Floats = real("unit", "commanded position", N_AXES)
+    speed: Floats = real("unit/s", "commanded speed", N_AXES)
+
+
+class BacklashParams:
+    """Backlash of the insertion and slope of the roll (`backlash`)."""
+
+    width_m: float = real("m", "width of the gap, from the rig file")
+    caution_m: float = real("m", "how much narrower it is assumed at first")
+    slope: float = real("", "body insertion per handle insertion")
+    threshold_m: float = real("m", "way back that counts as a reversal")
+    roll_slope: float = real("", "distal roll per handle roll")
+
+
+class BacklashState:
+    """Backlash of the insertion (`backlash`)."""
+
+    direction: float = real("", "+1 or -1: side of the gap that is to push")
+    extreme_m: float = real("m", "furthest body insertion in this direction")
+    body_m: float = real("m", "predicted body insertion, relative to home")
+    flank: float = real("", "+1 or -1: side of the gap that pushed last")
+    width_m: float = real("m", "width of the gap, as learned")
+
+
+class KinematicsParams:
+    """Unloaded catheter (`inverse_kinematics`, `free_tip`)."""
+
+    distal_length_m: float = real("m", "length of the part that bends")
+    insertion_at_home_m: float = real("m", "distal insertion with the handle at home")
+    max_curvature_per_m: float = real("1/m", "greatest curvature")
+    axis_radius_m: float = real("m", "below this distance from the axis the roll is held")
+    knob_of_curvature_rad: Floats = real("rad", "knob over a uniform grid of curvatures", CURVE_POINTS)
+
+
+class HybridParams:
+    """The thesis' law (`hybrid`), and the threshold of contact."""
+
+    position_gain_per_s: float = real("1/s", "proportional gain of the joint loop")
+    position_integral_per_s2: float = real("1/s^2", "integral gain of the joint loop")
+    force_gain_m_per_N: float = real("m/N", "proportional gain of the force loop")
+    force_integral_m_per_N_s: float = real("m/(N s)", "integral gain of the force loop")
+    approach_speed_m_per_s: float = real("m/s", "speed of the goal without contact")
+    contact_force_N: float = real("N", "force that counts as contact")
+
+
+class HybridState:
+    """Joint command and goal, and the integrators of the thesis' law."""
+
+    joint: Floats = real("m, rad, rad", "joint command: insertion, roll, knob", N_AXES)
+    integral: Floats = real("m s, rad s", "integral of the joint error", N_AXES)
+    force_integral_N_s: float = real("N s", "integral of the force error")
+    goal_m: Floats = real("m", "moving goal of the tip", 3)
+    above_ns: int = whole("ns", "since when the force has been beyond its threshold; 0: it is not")
+
+
+class TipOffsetParams:
+    """Learning of the tip's offset (`tip_offset`)."""
+
+    free_memory_s: float = real("s", "time constant in free space")
+    contact_memory_s: float = real("s", "time constant in contact")
+
+
+class TipOffsetState:
+    """How far the tip is from the model's free tip (`tip_offset`)."""
+
+    offset_m: Floats = real("m", "measured tip minus the model's free tip", 3)
+    touch_offset_m: Floats = real("m", "the offset when contact began", 3)
+    learned_s: float = real("s", "time learned from so far, up to the time constant")
+    stamp_ns: int = whole("ns", "when the newest pose that was learned from was measured")
+    insertion_error_m: float = real("m", "predicted insertion minus the insertion that explains the poses")
+    insertion_learned_s: float = real("s", "time that the insertion was learned from, up to its time constant")
+
+
+class WallParams:
+    """Observation of the wall by force and by pose (`wall_observer`)."""
+
+    compliance_m_per_N: float = real("m/N", "assumed compliance of catheter and tissue in series")
+    play_noise_m: float = real("m", "error that the backlash leaves, standard deviation")
+    position_noise_m: float = real("m", "noise of the tracker, standard deviation")
+    by_force: TargetParams = part(TargetParams, "predictor fed by the force sensor")
+    by_estimate: TargetParams = part(TargetParams, "predictor fed by estimates of the force")
+    by_pose: TargetParams = part(TargetParams, "predictor fed by the tip's poses")
+
+
+class WallState:
+    """Observation of the wall (`wall_observer`)."""
+
+    force: TargetState = part(TargetState, "the wall by its force")
+    pose: TargetState = part(TargetState, "the wall by the tip's poses")
+    mean_depth_m: float = real("m", "mean depth of the free tip along the inward normal")
+    stamp_ns: int = whole("ns", "when the newest accepted force was measured")
+
+
+class PredictiveParams:
+    """The predictive law (`predictive`)."""
+
+    move_speed_m_per_s: float = real("m/s", "speed of the goal in free space")
+    move_accel_m_per_s2: float = real("m/s^2", "acceleration of the goal")
+    slide_speed_m_per_s: float = real("m/s", "speed of the goal in contact, and of the search for a lost wall")
+    force_slew_N_per_s: float = real("N/s", "rate limit of the force set-point")
+    force_margin_N: float = real("N", "prediction error that does not reduce the force set-point")
+    crossing_s: float = real("s", "time the stage needs to cross the gap")
+    reversal_share: float = real("", "share of it by which a reversal is planned ahead")
+    reversal_depth_m: float = real("m", "least way back that is worth a reversal")
+    slow_approach_share: float = real("", "share of the approach speed without a force sensor")
+
+
+class PredictiveState:
+    """The predictive law (`predictive`)."""
+
+    goal_speed_m_per_s: float = real("m/s", "speed of the moving goal")
+    touch_depth_m: float = real("m", "depth of the free tip when contact began")
+    reversal_depth_m: float = real("m", "way back that is worth a reversal now")
+    force_setpoint_N: float = real("N", "force to press with now")
+    away_s: float = real("s", "how long the contact has been lost")
+    speed: Floats = real("m/s, rad/s", "speed of the joint command", N_AXES)
+    joint_at_crossing: Floats = real("m, rad, rad", "joint command one planned crossing from now", N_AXES)
+    joint_after_crossing: Floats = real("m, rad, rad", "joint command a little later", N_AXES)
+
+
+class ForceSourceState:
+    """Choice between force sensor and estimate (`force_source`); pairs are [sensor, estimate]."""
+
+    source: int = whole("", "a ForceSource: which one closes the loop")
+    seen: Ints = whole("", "count of the newest reading that was looked at", 2)
+    arrival_ns: Ints = whole("ns", "when the newest plausible reading arrived", 2)
+    normal_N: Floats = real("N", "its compression", 2)
+    noise_N2: float = real("N^2", "variance of the newest estimate along the normal")
+    equal: int = whole("", "equal readings of the sensor in a row")
+    head: int = whole("", "newest place of the ring")
+    ring_ns: Ints = whole("ns", "stamps of the sensor's last readings", FORCE_RING)
+    ring_N: Floats = real("N", "their compression", FORCE_RING)
+    pairs: int = whole("", "estimates that were compared with the sensor")
+    bias_N: float = real("N", "mean of estimate minus sensor")
+    apart_N2: float = real("N^2", "mean square of their difference lately")
+    usual_N2: float = real("N^2", "mean square of their difference in good times")
+    good_s: float = real("s", "how long the sensor has been good")
+    smooth_N: float = real("N", "compression of the source, smoothed if it is the estimate")
+    changed: int = whole("", "1 in the tick of a handover; only for telemetry")
+    fresh: int = whole("", "1 where the source has a new reading")
+    stamp_ns: int = whole("ns", "when that was measured")
+    value_N: float = real("N", "its compression")
+    spread_N2: float = real("N^2", "its variance")
+    age_from_ns: int = whole("ns", "when it arrived")
+    force_N: Floats = real("N", "its force, base frame", 3)
+    reading_N: Floats = real("N", "the sensor's newest reading, base frame", 3)
+
+
+class History:
+    """Ring of predicted joints (`free_tip`)."""
+
+    head: int = whole("", "newest place of the ring")
+    count: int = whole("", "places in use")
+    time_ns: Ints = whole("ns", "when the stages are there", HISTORY_POINTS)
+    joint: Matrix = real("m, rad, rad", "joints then", HISTORY_POINTS, N_AXES)
+    flank: Floats = real("", "+1 or -1: side of the gap that pushed last", HISTORY_POINTS)
+
+
+class SafetyParams:
+    """Limits of the failsafe."""
+
+    over_force_N: float = real("N", "greatest force; above it the catheter is retracted")
+    hold_after_ns: int = whole("ns", "age of a pose that makes the loop hold")
+    stop_after_ns: int = whole("ns", "age of a pose or force that stops or retracts")
+    force_timeout_ns: int = whole("ns", "age of a force that makes the loop hold in contact")
+    board_timeout_ns: int = whole("ns", "age of a board's status that stops")
+    retract_speed_m_per_s: float = real("m/s", "speed of a retraction")
+    retract_distance_m: float = real("m", "length of a retraction")
+
+
+class Params:
+    """All that the rig file fixes."""
+
+    period_s: float = real("s", "time between ticks")
+    setpoint_lead_ns: int = whole("ns", "a set-point is executed this long after its tick")
+    setpoint_expiry_us: int = whole("us", "a set-point later than this is not executed")
+    stage: StageParams = part(StageParams, "stages")
+    backlash: BacklashParams = part(BacklashParams, "backlash and slopes")
+    kinematics: KinematicsParams = part(KinematicsParams, "unloaded catheter")
+    hybrid: HybridParams = part(HybridParams, "the thesis' law")
+    predictor: PredictorParams = part(PredictorParams, "tip predictor")
+    safety: SafetyParams = part(SafetyParams, "failsafe")
+    force_source: int = whole("", "a ForceSource: which force closes the loop, if it is good")
+    force_noise_N: float = real("N", "noise of the force sensor, standard deviation")
+    sensor_on_tip: int = whole("", "1 when the force sensor turns with the tip")
+    law: int = whole("", "a ControlLaw")
+    tip_offset: TipOffsetParams = part(TipOffsetParams, "learning of the tip's offset")
+    wall: WallParams = part(WallParams, "observation of the wall")
+    predictive: PredictiveParams = part(PredictiveParams, "the predictive law")
+
+
+class State:
+    """All that the tick remembers."""
+
+    ticks: int = whole("", "ticks so far")
+    phase: int = whole("", "a Phase")
+    action: int = whole("", "a SafetyAction")
+    latched: int = whole("", "causes kept until the operator clears them, a bit set")
+    retract_from_m: float = real("m", "body insertion where the retraction began")
+    setpoint_number: int = whole("", "number of the newest set-point")
+    predictor: PredictorState = part(PredictorState, "tip predictor")
+    stage: StageState = part(StageState, "stages")
+    backlash: BacklashState = part(BacklashState, "backlash")
+    hybrid: HybridState = part(HybridState, "joint command, goal, the thesis' law")
+    force: ForceSourceState = part(ForceSourceState, "force sensor and estimate")
+    force_seen: int = whole("", "readings of the source so far")
+    force_rejected: int = whole("", "readings rejected so far")
+    command_seen: int = whole("", "count of the newest command that was acted on")
+    cleared: int = whole("", "count of the newest clearing that was acted on")
+    home_m: float = real("m", "distal insertion of the body at home, as located at rest")
+    predicted_joint: Floats = real("m, rad, rad", "joints when the stages are where they were sent", N_AXES)
+    normal: Floats = real("", "outward normal of the wall, as learned", 3)
+    history: History = part(History, "predicted joints of the last 0.2 s")
+    tip_offset: TipOffsetState = part(TipOffsetState, "offset of the tip")
+    wall: WallState = part(WallState, "motion of the wall")
+    predictive: PredictiveState = part(PredictiveState, "the predictive law")
+
+
+class Outputs:
+    """What the tick decides, and what telemetry shows of it."""
+
+    now_ns: int = whole("ns", "time of this tick")
+    valid: int = whole("", "1 when the set-point is to be sent")
+    number: int = whole("", "number of the set-point")
+    execute_us: int = whole("us", "board time at which it is reached")
+    expiry_us: int = whole("us", "after execute_us + expiry_us it is never executed")
+    position_steps: Ints = whole("steps", "the set-point, by axis", N_AXES)
+    stage_unit: Floats = real("m, rad, rad", "the same in units of the axes", N_AXES)
+    joint: Floats = real("m, rad, rad", "predicted joints, the insertion corrected by the poses", N_AXES)
+    tip_m: Floats = real("m", "predicted tip", 3)
+    tip_velocity_m_per_s: Floats = real("m/s", "velocity of the tip", 3)
+    goal_m: Floats = real("m", "moving goal of the tip", 3)
+    force_N: Floats = real("N", "force of the source, base frame", 3)
+    normal_force_N: float = real("N", "compression that the loop works with")
+    wanted_force_N: float = real("N", "compression wanted")
+    phase: int = whole("", "a Phase")
+    action: int = whole("", "a SafetyAction")
+    cause: int = whole("", "causes that stand or are latched, a bit set of `safety.CAUSES`")
+    poses_rejected: int = whole("", "poses rejected so far")
+    forces_rejected: int = whole("", "force readings rejected so far")
+    pose_age_ns: int = whole("ns", "age of the newest accepted pose")
+    force_source: int = whole("", "a ForceSource")
+    wall_m: float = real("m", "predicted wall along the inward normal")
+    wall_sd_m: float = real("m", "its standard deviation")
+    heart_Hz: float = real("Hz", "heart rate found, 0 for none")
+    breath_Hz: float = real("Hz", "breath rate found, 0 for none")
+    stiffness_N_per_m: float = real("N/m", "stiffness learned, catheter and tissue in series")
+    play_m: float = real("m", "width of the backlash learned")
+
+
+POSE, FORCE, BOARD, COMMAND, INPUTS = map(dtype_of, (Pose, Force, Board, Command, Inputs))
+PREDICTOR_PARAMS, PREDICTOR_STATE = dtype_of(PredictorParams), dtype_of(PredictorState)
+BANK, BEAT = dtype_of(Bank), dtype_of(Beat)
+TARGET_PARAMS, TARGET_STATE = dtype_of(TargetParams), dtype_of(TargetState)
+STAGE_PARAMS, STAGE_STATE = dtype_of(StageParams), dtype_of(StageState)
+BACKLASH_PARAMS, BACKLASH_STATE = dtype_of(BacklashParams), dtype_of(BacklashState)
+HYBRID_PARAMS, HYBRID_STATE = dtype_of(HybridParams), dtype_of(HybridState)
+HISTORY = dtype_of(History)
+PARAMS, STATE, OUTPUTS = dtype_of(Params), dtype_of(State), dtype_of(Outputs)
 
 
 def new(dtype: np.dtype) -> np.recarray:
-    """A zeroed record array of length 1 and `dtype`, for `record[0]` in kernels and in plain Python alike."""
+    """Return a zeroed record array of length 1, for `record[0]` in kernels and in plain Python alike."""
     return np.zeros(1, dtype).view(np.recarray)
+
+
+def page() -> str:
+    """Return docs/records.md: every record with its fields."""
+    return (
+        "# Records of the tick\n\n"
+        "The control tick reads parameters and inputs and changes state and outputs. Every field is declared once, in\n"
+        "`realtime/control/records.py`; this page is made from the declarations: `python -m realtime.control.records`.\n"
+        + as_markdown(Params, Inputs, State, Outputs)
+    )
+
+
+if __name__ == "__main__":
+    print(page(), end="")

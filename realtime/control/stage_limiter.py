@@ -6,9 +6,7 @@ import math
 
 from numba import njit
 
-from realtime.control.records import STAGE_PARAMS, STAGE_STATE
-
-Config, State = STAGE_PARAMS, STAGE_STATE
+from realtime.control.records import StageParams, StageState
 
 # Share of the acceleration limit that braking is planned with, and the pull towards the target (1/s) close to it.
 _BRAKING_SHARE = 0.8
@@ -25,7 +23,7 @@ def crossing_time_s(distance: float, max_speed: float, max_accel: float) -> floa
 
 
 @njit(cache=True)
-def follow(config, state, axis: int, target: float, target_speed: float, period_s: float) -> None:  # type: ignore[no-untyped-def]
+def follow(config: StageParams, state: StageState, axis: int, target: float, target_speed: float, period_s: float) -> None:
     """Move `axis` one tick towards `target` (m or rad), which itself moves at `target_speed` (per s).
 
     A target or speed that is not finite stops the stage. The nearest way under the limits is taken: full speed, then
@@ -48,12 +46,12 @@ def follow(config, state, axis: int, target: float, target_speed: float, period_
 
 
 @njit(cache=True)
-def apply(config, state, axis: int, target: float, period_s: float) -> None:  # type: ignore[no-untyped-def]
+def apply(config: StageParams, state: StageState, axis: int, target: float, period_s: float) -> None:
     """Move `axis` one tick towards `target` (m or rad), which stands still."""
     follow(config, state, axis, target, 0.0, period_s)
 
 
 @njit(cache=True)
-def brake(config, state, axis: int, period_s: float) -> None:  # type: ignore[no-untyped-def]
+def brake(config: StageParams, state: StageState, axis: int, period_s: float) -> None:
     """Bring `axis` to rest at its acceleration limit."""
     follow(config, state, axis, math.nan, 0.0, period_s)

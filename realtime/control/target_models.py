@@ -10,7 +10,8 @@ import math
 
 from numba import njit
 
-from realtime.control.records import BREATH_HARMONICS, HEART_HARMONICS, TARGET_MODELS, TARGET_N
+from realtime.control.declare import Floats, Matrix
+from realtime.control.records import BREATH_HARMONICS, HEART_HARMONICS, TARGET_MODELS, TARGET_N, TargetState
 
 # State of one model (m, m/s, rad/s, 1, m): level, its speed, pairs (p, q) of each harmonic, both rates, by what share
 # the contact is stiffer than assumed, and by how much half the play is less than believed.
@@ -39,7 +40,7 @@ _SOFTEST, _STIFFEST = -0.6, 1.0
 
 
 @njit(cache=True)
-def position(x, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
+def position(x: Floats, ahead_s: float) -> float:
     """Position (m) of a model's state `x` (N,) `ahead_s` later (or earlier)."""
     fade = math.exp(-max(ahead_s, 0.0) / _LEVEL_MEMORY_S)
     value = x[LEVEL] + x[SPEED] * (_LEVEL_MEMORY_S * (1.0 - fade) if ahead_s > 0.0 else ahead_s)
@@ -56,7 +57,7 @@ def position(x, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def propagate_local(x, P, dt_s: float, acceleration2: float) -> None:  # type: ignore[no-untyped-def]
+def propagate_local(x: Floats, P: Matrix, dt_s: float, acceleration2: float) -> None:
     """The local model (level and speed, the rest of `x` and `P` is zero) by `dt_s`; acceleration2 (m2/s3): its noise."""
     fade = math.exp(-dt_s / _LEVEL_MEMORY_S)
     reach = _LEVEL_MEMORY_S * (1.0 - fade)
@@ -70,7 +71,7 @@ def propagate_local(x, P, dt_s: float, acceleration2: float) -> None:  # type: i
 
 
 @njit(cache=True)
-def _turn(x, angle, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def _turn(x: Floats, angle: Matrix, dt_s: float) -> None:
     """Turn all pairs of `x` by their angle in `dt_s`; cos and sin into `angle` (PAIRS, 2)."""
     for group in range(2):
         first, count = (0, HEART_HARMONICS) if group == 0 else (HEART_HARMONICS, BREATH_HARMONICS)
@@ -85,7 +86,7 @@ def _turn(x, angle, dt_s: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _rows(P, x, angle, dt_s: float, fade: float, back: float) -> None:  # type: ignore[no-untyped-def]
+def _rows(P: Matrix, x: Floats, angle: Matrix, dt_s: float, fade: float, back: float) -> None:
     """P <- F P, by the blocks of F: level and speed, each turning pair with its rate, the heart's rate."""
     reach = _LEVEL_MEMORY_S * (1.0 - fade)
     for j in range(N):
@@ -106,14 +107,14 @@ def _rows(P, x, angle, dt_s: float, fade: float, back: float) -> None:  # type: 
 
 
 @njit(cache=True)
-def _transpose(P) -> None:  # type: ignore[no-untyped-def]
+def _transpose(P: Matrix) -> None:
     for i in range(N):
         for j in range(i):
             P[i, j], P[j, i] = P[j, i], P[i, j]
 
 
 @njit(cache=True)
-def propagate(x, P, angle, model: int, dt_s: float, mean_rate: float, level2: float) -> None:  # type: ignore[no-untyped-def]
+def propagate(x: Floats, P: Matrix, angle: Matrix, model: int, dt_s: float, mean_rate: float, level2: float) -> None:
     """A model with harmonics by `dt_s`: x <- F x, P <- F P F^T + Q.
 
     angle (PAIRS, 2): scratch; mean_rate (rad/s): what a restless beat comes back to; level2: the level's squared
@@ -132,7 +133,7 @@ def propagate(x, P, angle, model: int, dt_s: float, mean_rate: float, level2: fl
 
 
 @njit(cache=True)
-def _add_noise(x, P, model: int, dt_s: float, q: float) -> None:  # type: ignore[no-untyped-def]
+def _add_noise(x: Floats, P: Matrix, model: int, dt_s: float, q: float) -> None:
     P[LEVEL, LEVEL] += q * dt_s**3 / 3.0
     P[LEVEL, SPEED] += q * dt_s**2 / 2.0
     P[SPEED, LEVEL] += q * dt_s**2 / 2.0
@@ -152,7 +153,7 @@ def _add_noise(x, P, model: int, dt_s: float, q: float) -> None:  # type: ignore
 
 
 @njit(cache=True)
-def _set_row(state, m: int, travel_m: float, flank: float, ago_s: float) -> None:  # type: ignore[no-untyped-def]
+def _set_row(state: TargetState, m: int, travel_m: float, flank: float, ago_s: float) -> None:
     """Row of the measurement `ago_s` before the state's time: value = wall - stiffer * travel - play * flank."""
     x, row = state.x[m], state.row
     row[LEVEL], row[SPEED] = 1.0, -ago_s
@@ -167,7 +168,7 @@ def _set_row(state, m: int, travel_m: float, flank: float, ago_s: float) -> None
 
 
 @njit(cache=True)
-def innovation_variance(state, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:  # type: ignore[no-untyped-def]
+def innovation_variance(state: TargetState, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:
     """Innovation variance of model `m`; state.cross = P row^T."""
     P, row, cross = state.P[m], state.row, state.cross
     if m == LOCAL:
@@ -185,7 +186,7 @@ def innovation_variance(state, m: int, noise_m2: float, travel_m: float, flank: 
 
 
 @njit(cache=True)
-def correct(state, m: int, innovation: float, spread: float) -> None:  # type: ignore[no-untyped-def]
+def correct(state: TargetState, m: int, innovation: float, spread: float) -> None:
     x, P, cross = state.x[m], state.P[m], state.cross
     n = 2 if m == LOCAL else N
     for i in range(n):

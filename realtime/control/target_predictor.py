@@ -14,14 +14,16 @@ import math
 from numba import njit
 
 from realtime.control import beat_phase, frequency_bank, target_models
+from realtime.control.declare import Floats, Matrix
 from realtime.control.frequency_bank import STEP_S
 from realtime.control.records import (
     BEAT_HARMONICS,
     BEAT_RATES,
     BREATH_HARMONICS,
     HEART_HARMONICS,
-    TARGET_PARAMS,
-    TARGET_STATE,
+    Bank,
+    TargetParams,
+    TargetState,
 )
 from realtime.control.target_models import (
     BREATH,
@@ -42,8 +44,6 @@ from realtime.control.target_models import (
 
 ACCEPTED, REJECTED, NOTHING_NEW = 1, -1, 0
 
-Config, State = TARGET_PARAMS, TARGET_STATE
-
 _RESTART_AFTER_S = 0.1  # wild samples for this long are a new truth, not outliers
 _SMALLEST_M = 5e-5  # a peak lower than this is no heart
 _TAKE_OVER_S = 2.0
@@ -53,7 +53,7 @@ _BREATHLESS = 100.0  # times the squared acceleration of a slow stream's level, 
 
 
 @njit(cache=True)
-def start(config, state, stamp_ns: int, level_m: float) -> None:  # type: ignore[no-untyped-def]
+def start(config: TargetParams, state: TargetState, stamp_ns: int, level_m: float) -> None:
     """Begin at `stamp_ns` with the wall at `level_m`; nothing is known of its motion."""
     state.started, state.time_ns, state.shot_ns = 1, stamp_ns, stamp_ns
     state.heart_found = state.breath_found = state.agreed = state.rejected = 0
@@ -75,7 +75,7 @@ def start(config, state, stamp_ns: int, level_m: float) -> None:  # type: ignore
 
 
 @njit(cache=True)
-def ahead(state, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
+def ahead(state: TargetState, ahead_s: float) -> float:
     """The wall's position (m) `ahead_s` after the state's time: the models' forecasts by their weights."""
     value = 0.0
     for m in range(MODELS):
@@ -85,14 +85,14 @@ def ahead(state, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _position(state, m: int, ahead_s: float) -> float:  # type: ignore[no-untyped-def]
+def _position(state: TargetState, m: int, ahead_s: float) -> float:
     """Position (m) that model `m` has `ahead_s` after (or before) the state's time."""
     value = target_models.position(state.x[m], ahead_s)
     return value + beat_phase.ahead(state.beat.moment_m, state.mean_rate, ahead_s) if m == PHASED else value
 
 
 @njit(cache=True)
-def _in_use(config, state) -> int:  # type: ignore[no-untyped-def]
+def _in_use(config: TargetParams, state: TargetState) -> int:
     """How many of the models, counted in their order, run now."""
     if state.heart_found == 0 and state.breath_found == 0:
         return 1
@@ -100,13 +100,13 @@ def _in_use(config, state) -> int:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def at(state, time_ns: int) -> float:  # type: ignore[no-untyped-def]
+def at(state: TargetState, time_ns: int) -> float:
     """The wall's position (m) at `time_ns`; trusted for half a second past the last sample."""
     return ahead(state, min((time_ns - state.time_ns) * 1e-9, 0.5))
 
 
 @njit(cache=True)
-def shift(state, by_m: float) -> None:  # type: ignore[no-untyped-def]
+def shift(state: TargetState, by_m: float) -> None:
     """Move the wall by `by_m` in all models: it is looked for where no force can tell."""
     for m in range(MODELS):
         state.x[m, LEVEL] += by_m
@@ -114,7 +114,7 @@ def shift(state, by_m: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def variance_ahead(state) -> float:  # type: ignore[no-untyped-def]
+def variance_ahead(state: TargetState) -> float:
     """Variance (m2) that forecasts of `horizon_s` have had lately, noise of the samples included."""
     value = 0.0
     for m in range(MODELS):
@@ -123,14 +123,14 @@ def variance_ahead(state) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def least_score(state) -> float:  # type: ignore[no-untyped-def]
+def least_score(state: TargetState) -> float:
     """Mean square (m2) that the best model's forecasts have been off the samples lately."""
     least_m2 = min(state.score_m2[LOCAL], state.score_m2[STEADY], state.score_m2[RESTLESS])
     return min(least_m2, state.score_m2[PHASED]) if state.weight[PHASED] > 0.0 else least_m2
 
 
 @njit(cache=True)
-def rates_Hz(state) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+def rates_Hz(state: TargetState) -> tuple[float, float]:
     """Heart and breath rate (Hz) now; 0 where not found yet."""
     best = STEADY if state.weight[STEADY] >= state.weight[RESTLESS] else RESTLESS
     heart = state.x[best, HEART_RATE] / (2.0 * math.pi) if state.heart_found else 0.0
@@ -139,19 +139,19 @@ def rates_Hz(state) -> tuple[float, float]:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def stiffer(state) -> float:  # type: ignore[no-untyped-def]
+def stiffer(state: TargetState) -> float:
     """By what share catheter and tissue in series are stiffer than assumed, as learned."""
     return _learned(state, STIFFNESS)
 
 
 @njit(cache=True)
-def play(state) -> float:  # type: ignore[no-untyped-def]
+def play(state: TargetState) -> float:
     """By how much (m) half the play is less than believed, as learned."""
     return _learned(state, PLAY)
 
 
 @njit(cache=True)
-def _learned(state, what: int) -> float:  # type: ignore[no-untyped-def]
+def _learned(state: TargetState, what: int) -> float:
     steady, restless = state.weight[STEADY], state.weight[RESTLESS]
     if steady + restless < 1e-6:
         return state.x[STEADY, what]
@@ -159,7 +159,7 @@ def _learned(state, what: int) -> float:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def credit_play(state, part_m: float) -> None:  # type: ignore[no-untyped-def]
+def credit_play(state: TargetState, part_m: float) -> None:
     """Half the believed play has been made less by `part_m`: that much is no longer to be learned."""
     for m in (STEADY, RESTLESS):
         state.x[m, PLAY] -= part_m
@@ -167,20 +167,20 @@ def credit_play(state, part_m: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _innovation(state, m: int, value_m: float, travel_m: float, flank: float, ago_s: float) -> float:  # type: ignore[no-untyped-def]
+def _innovation(state: TargetState, m: int, value_m: float, travel_m: float, flank: float, ago_s: float) -> float:
     x = state.x[m]
     e, p = (stiffer(state), play(state)) if m == LOCAL else (x[STIFFNESS], x[PLAY])
     return value_m + e * travel_m + p * flank - _position(state, m, -ago_s)
 
 
 @njit(cache=True)
-def _spread(state, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:  # type: ignore[no-untyped-def]
+def _spread(state: TargetState, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:
     more_m2 = beat_phase.variance(state.beat) if m == PHASED else 0.0
     return target_models.innovation_variance(state, m, noise_m2 + more_m2, travel_m, flank, ago_s)
 
 
 @njit(cache=True)
-def _to_time(config, state, stamp_ns: int) -> float:  # type: ignore[no-untyped-def]
+def _to_time(config: TargetParams, state: TargetState, stamp_ns: int) -> float:
     """Bring all models up to `stamp_ns`; returns how long (s) before their time the stamp is, 0 normally."""
     dt_s = (stamp_ns - state.time_ns) * 1e-9
     if dt_s <= 0.0:
@@ -200,7 +200,9 @@ def _to_time(config, state, stamp_ns: int) -> float:  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def apply(config, state, stamp_ns: int, value_m: float, travel_m: float, flank: float, noise_m2: float) -> int:  # type: ignore[no-untyped-def]
+def apply(
+    config: TargetParams, state: TargetState, stamp_ns: int, value_m: float, travel_m: float, flank: float, noise_m2: float
+) -> int:
     """Take in a sample as of `stamp_ns`, of variance `noise_m2`: wall = `value_m` + stiffer * `travel_m` + play * `flank`.
 
     By the force: value is where the unloaded tip would be along the wall's inward normal, less assumed compliance times
@@ -250,7 +252,7 @@ def apply(config, state, stamp_ns: int, value_m: float, travel_m: float, flank: 
 
 
 @njit(cache=True)
-def _judge(config, state, wall_m: float, ago_s: float, noise_m2: float) -> None:  # type: ignore[no-untyped-def]
+def _judge(config: TargetParams, state: TargetState, wall_m: float, ago_s: float, noise_m2: float) -> None:
     """Compare what each model foretold `horizon_s` ago with this sample, once a horizon; renew the weights."""
     age_s = (state.time_ns - state.shot_ns) * 1e-9 - ago_s
     if age_s < config.horizon_s - 1e-4:
@@ -283,7 +285,7 @@ def _judge(config, state, wall_m: float, ago_s: float, noise_m2: float) -> None:
 
 
 @njit(cache=True)
-def _settle_rates(state, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def _settle_rates(state: TargetState, dt_s: float) -> None:
     """The restless model's mean rate; and where it has long been the better one, the steady one starts from it."""
     state.mean_rate += min(dt_s / _MEAN_RATE_S, 1.0) * (state.x[RESTLESS, HEART_RATE] - state.mean_rate)
     worse = state.score_m2[RESTLESS] < 0.5 * state.score_m2[STEADY]
@@ -299,7 +301,7 @@ def _settle_rates(state, dt_s: float) -> None:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _listen(config, state, wall_m: float, dt_s: float) -> None:  # type: ignore[no-untyped-def]
+def _listen(config: TargetParams, state: TargetState, wall_m: float, dt_s: float) -> None:
     """Feed the frequency banks with means over STEP_S, and begin or renew the harmonics where they find a rate."""
     state.bank_value += wall_m
     state.bank_s += dt_s
@@ -334,7 +336,7 @@ def _listen(config, state, wall_m: float, dt_s: float) -> None:  # type: ignore[
 
 
 @njit(cache=True)
-def _begin(state, bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:  # type: ignore[no-untyped-def]
+def _begin(state: TargetState, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:
     """Open the harmonics of heart or breath in all models, as `bank` heard them: at `rate_Hz`, of about `size_m`."""
     fresh = state.heart_found == 0 and state.breath_found == 0
     for m in (STEADY, RESTLESS, PHASED):
@@ -355,7 +357,7 @@ def _begin(state, bank, first: int, count: int, rate: int, rate_Hz: float, size_
 
 
 @njit(cache=True)
-def _open(x, P, bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:  # type: ignore[no-untyped-def]
+def _open(x: Floats, P: Matrix, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:
     """`count` pairs from `first` on, and their rate, in one model's state and covariance."""
     for i in range(first, first + 2 * count):
         x[i] = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from numba import njit
 
@@ -18,6 +19,8 @@ from realtime.control import (
     safety,
     stage_limiter,
     target_predictor,
+    tip_offset,
+    wall_observer,
 )
 from realtime.control.codes import (
     ACTION_HOLD,
@@ -40,9 +43,11 @@ from realtime.control.codes import (
     SOURCE_ESTIMATE,
     SOURCE_SENSOR,
 )
-from realtime.control.records import N_AXES
+from realtime.control.constraint_frame import dot
+from realtime.control.declare import Floats, Point, ReadFloats
+from realtime.control.records import N_AXES, Command, Inputs, Outputs, Params, State
 
-# Contact is believed after this long above the threshold, and lost after this long below half of it.
+# Contact begins after this long above the threshold, and is lost after this long below half of it.
 _CONTACT_NS = 3_000_000
 _LOST_NS = 500_000_000
 # Estimates are noisier than a sensor: their threshold is so much higher.
@@ -51,82 +56,107 @@ _NOISY_FACTOR = 2.0
 _NORMAL_S = 2.0
 # How far beyond the given target the approach goes on looking for the wall.
 _SEARCH_m = 0.010
+# This many poses rejected in a row make the loop hold.
+_WILD_POSES = 3
 
 
 @njit(cache=True)
-def _take_force(params, state, inputs) -> None:  # type: ignore[no-untyped-def]
+def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> None:
+    """Learn the tip's offset, and in contact the wall, from an accepted pose."""
+    joint, flank = free_tip.joint_at(state.history, inputs.tip.stamp_ns)
+    if flank == 0.0:
+        return
+    free_phase = state.phase == PHASE_HOLD or state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH
+    free = free_phase and state.force.smooth_N < params.hybrid.contact_force_N
+    tip_offset.apply(params.tip_offset, params.kinematics, state.tip_offset, joint, inputs.tip, state.normal, touching, free)
+    if touching:
+        wall_observer.take_pose(params.wall, state.wall, inputs.tip.stamp_ns, inputs.tip.position_m, state.normal)
+
+
+@njit(cache=True)
+def _take_force(params: Params, state: State, inputs: Inputs) -> None:
+    """Choose the force source, and in contact learn the wall's normal, its motion and the backlash from a new reading."""
     touching = state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT
     force = state.force
     state.force_rejected += force_source.apply(
-        params, force, inputs, state.predictor.quaternion_wxyz, state.predictive.normal, touching
+        params, force, inputs, state.predictor.quaternion_wxyz, state.normal, touching
     )
     state.force_seen = force.seen[force.source]
     if force.fresh == 0 or state.phase != PHASE_CONTACT or params.law != LAW_PREDICTIVE:
         return
     if force.source == SOURCE_SENSOR and force.value_N > params.hybrid.contact_force_N:
-        constraint_frame.follow_force(
-            state.predictive.normal, inputs.command.normal, force.force_N, params.period_s / _NORMAL_S
-        )
-    result = predictive.feel(params, state, force.source == SOURCE_ESTIMATE, force.stamp_ns, force.value_N, force.spread_N2)
+        constraint_frame.follow_force(state.normal, inputs.command.normal, force.force_N, params.period_s / _NORMAL_S)
+    result, dt_s = wall_observer.take_force(
+        params.wall, params.kinematics, state.wall, state.history, force, state.normal, params.hybrid.contact_force_N
+    )
     if result == target_predictor.REJECTED:
         state.force_rejected += 1
+    elif result == target_predictor.ACCEPTED:
+        wall_observer.hand_over_play(params.backlash, state.backlash, state.wall, dt_s)
 
 
 @njit(cache=True)
-def _flags(params, state, inputs, pose_result: int, forces_rejected: int) -> int:  # type: ignore[no-untyped-def]
-    """The bit set of all that is wrong at this tick."""
+def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, forces_rejected: int) -> int:
+    """Return the bit set of all that is wrong at this tick."""
     limits, now_ns, armed = params.safety, inputs.now_ns, state.phase != PHASE_DISARMED
     flags = 0
     if pose_result == predictor.REJECTED:
         flags |= safety.POSE_REJECTED
     if forces_rejected != state.force_rejected:
         flags |= safety.FORCE_REJECTED
-    if state.predictor.rejected_in_row >= 3:
+    if state.predictor.rejected_in_row >= _WILD_POSES:
         flags |= safety.POSES_WILD
-    pose_age_ns = now_ns - state.predictor.accepted_ns
-    force, force_age_ns = state.force.force_N, now_ns - state.force.age_from_ns
+    if armed:
+        flags |= _armed_flags(params, state, inputs)
+    force_age_ns = now_ns - state.force.age_from_ns
     force_timeout_ns = limits.force_timeout_ns
     if state.force.source == SOURCE_ESTIMATE:
         force_timeout_ns = limits.hold_after_ns
         if params.force_source == SOURCE_SENSOR:
             flags |= safety.FORCE_HANDOVER
-    if armed and pose_age_ns > limits.hold_after_ns:
-        flags |= safety.POSE_STALE
-    if armed and pose_age_ns > limits.stop_after_ns:
-        flags |= safety.POSE_LOST
-    if (
-        armed
-        and force_age_ns <= force_timeout_ns
-        and math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2) > limits.over_force_N
-    ):
-        flags |= safety.OVER_FORCE
+    if armed and force_age_ns <= force_timeout_ns:
+        force = state.force.force_N
+        if math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2) > limits.over_force_N:
+            flags |= safety.OVER_FORCE
     if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
         if force_age_ns > force_timeout_ns:
             flags |= safety.FORCE_STALE
         if force_age_ns > limits.stop_after_ns:
             flags |= safety.FORCE_LOST
-    if armed and inputs.command.kind == COMMAND_STOP:
-        flags |= safety.OPERATOR_STOP
-    if armed and inputs.board.state == BOARD_FAULT:
-        flags |= safety.BOARD_FAULT
-    if armed and now_ns - inputs.board.arrival_ns > limits.board_timeout_ns:
-        flags |= safety.BOARD_SILENT
-    if armed:
-        flags |= inputs.command.watch
     return flags
 
 
 @njit(cache=True)
-def _believe(params, state) -> None:  # type: ignore[no-untyped-def]
-    """Where the distal end will be when the stages are where they were sent: through play, slope and knob."""
-    state.believed[0] = backlash.follow(params.backlash, state.backlash, state.stage.position[0]) + state.home_m
-    state.believed[1] = backlash.distal_roll(params.backlash, state.stage.position[1])
-    state.believed[2] = state.stage.position[2]
+def _armed_flags(params: Params, state: State, inputs: Inputs) -> int:
+    """Return what is wrong for an armed loop with poses, board and operator; and what the supervision found."""
+    limits, now_ns = params.safety, inputs.now_ns
+    flags = inputs.command.watch
+    pose_age_ns = now_ns - state.predictor.accepted_ns
+    if pose_age_ns > limits.hold_after_ns:
+        flags |= safety.POSE_STALE
+    if pose_age_ns > limits.stop_after_ns:
+        flags |= safety.POSE_LOST
+    if inputs.command.kind == COMMAND_STOP:
+        flags |= safety.OPERATOR_STOP
+    if inputs.board.state == BOARD_FAULT:
+        flags |= safety.BOARD_FAULT
+    if now_ns - inputs.board.arrival_ns > limits.board_timeout_ns:
+        flags |= safety.BOARD_SILENT
+    return flags
 
 
 @njit(cache=True)
-def _locate(params, state, inputs, tip_m) -> None:  # type: ignore[no-untyped-def]
-    """Joints of a rig at rest: stages as the board says, the insertion such that the free tip is where it is measured."""
+def _predict_joint(params: Params, state: State) -> None:
+    """Predict where the distal end will be when the stages are where they were sent: backlash, slopes, knob."""
+    insertion_m = backlash.follow(params.backlash, state.backlash, state.stage.position[0])
+    state.predicted_joint[0] = insertion_m + state.home_m
+    state.predicted_joint[1] = backlash.distal_roll(params.backlash, state.stage.position[1])
+    state.predicted_joint[2] = state.stage.position[2]
+
+
+@njit(cache=True)
+def _locate(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
+    """Set the joints of a rig at rest: stages as the board says, the insertion such that the free tip is at `tip_m`."""
     for axis in range(N_AXES):
         state.stage.position[axis] = inputs.board.position_steps[axis] / params.stage.steps_per_unit[axis]
         state.stage.speed[axis] = 0.0
@@ -136,42 +166,43 @@ def _locate(params, state, inputs, tip_m) -> None:  # type: ignore[no-untyped-de
     joint[1] = backlash.distal_roll(config, state.stage.position[1])
     joint[2] = state.stage.position[2]
     joint[0] = forward_m + params.kinematics.insertion_at_home_m
-    inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint, state.work[0])
-    joint[0] = state.work[0, 0]
+    joint[0] = inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint)[0]
     state.home_m = joint[0] - forward_m
-    _believe(params, state)
+    _predict_joint(params, state)
 
 
 @njit(cache=True)
-def _arm(params, state, inputs, tip_m) -> None:  # type: ignore[no-untyped-def]
-    """Start from where the stages are, at rest."""
+def _arm(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
+    """Start from where the stages are, at rest, with nothing learned."""
     _locate(params, state, inputs, tip_m)
     force_source.start(params, state.force)
     hybrid.forget(state.hybrid)
-    predictive.start(state)
+    state.history.count = 0
+    tip_offset.start(state.tip_offset)
+    wall_observer.forget(state.wall)
+    predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
     for i in range(3):
         state.hybrid.goal_m[i] = tip_m[i]
     state.phase = PHASE_HOLD
 
 
 @njit(cache=True)
-def _enter(params, state, phase: int, tip_m, now_ns: int) -> None:  # type: ignore[no-untyped-def]
-    """Change of phase without a bump: the goal starts at the tip, the integrators empty, the joint command stays."""
+def _enter(params: Params, state: State, phase: int, tip_m: ReadFloats) -> None:
+    """Change the phase without a bump: the goal starts at the tip, the integrators empty, the joint command stays."""
     if state.phase == phase:
         return
     state.phase = phase
     hybrid.forget(state.hybrid)
     if params.law == LAW_PREDICTIVE:
-        predictive.stay(state)
+        predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
     state.hybrid.above_ns = 0
-    state.contact_since_ns = now_ns
     state.retract_from_m = state.hybrid.joint[0]
     for i in range(3):
         state.hybrid.goal_m[i] = tip_m[i]
 
 
 @njit(cache=True)
-def _sensible(params, command) -> bool:  # type: ignore[no-untyped-def]
+def _sensible(params: Params, command: Command) -> bool:
     """Whether a command may be acted on: finite target in the workspace, unit normal, force below the limit."""
     config, square = params.predictor, 0.0
     for i in range(3):
@@ -182,8 +213,8 @@ def _sensible(params, command) -> bool:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _obey(params, state, inputs, action: int, tip_m) -> None:  # type: ignore[no-untyped-def]
-    """The phase that the operator's command and the failsafe action lead to. Only disarming leads out of a stop."""
+def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, tip_m: ReadFloats) -> None:
+    """Set the phase that the command and the failsafe action lead to. Only disarming leads out of a stop."""
     command = inputs.command
     ready = inputs.board.ready != 0 and state.predictor.started != 0
     if command.armed == 0:
@@ -191,11 +222,11 @@ def _obey(params, state, inputs, action: int, tip_m) -> None:  # type: ignore[no
         return
     if action == ACTION_STOP:
         if state.phase != PHASE_DISARMED:
-            _enter(params, state, PHASE_STOPPED, tip_m, inputs.now_ns)
+            _enter(params, state, PHASE_STOPPED, tip_m)
         return
     if action == ACTION_RETRACT:
         if state.phase != PHASE_DISARMED and state.phase != PHASE_STOPPED:
-            _enter(params, state, PHASE_RETRACT, tip_m, inputs.now_ns)
+            _enter(params, state, PHASE_RETRACT, tip_m)
         return
     if state.phase == PHASE_STOPPED:
         return
@@ -207,23 +238,34 @@ def _obey(params, state, inputs, action: int, tip_m) -> None:  # type: ignore[no
     if command.count == state.command_seen:
         return
     state.command_seen = command.count
-    if command.kind == COMMAND_HOLD:
-        _enter(params, state, PHASE_HOLD, tip_m, inputs.now_ns)
-    elif command.kind == COMMAND_RETRACT:
-        _enter(params, state, PHASE_RETRACT, tip_m, inputs.now_ns)
-    elif not _sensible(params, command):
-        _enter(params, state, PHASE_HOLD, tip_m, inputs.now_ns)
-    elif command.kind == COMMAND_POSITION:
-        _enter(params, state, PHASE_POSITION, tip_m, inputs.now_ns)
-    elif command.kind == COMMAND_CONTACT:
-        if state.phase != PHASE_CONTACT:
-            _enter(params, state, PHASE_APPROACH, tip_m, inputs.now_ns)
+    _follow_command(params, state, command, tip_m)
 
 
 @njit(cache=True)
-def _watch_contact(params, state, inputs, force_N: float, tip_m) -> None:  # type: ignore[no-untyped-def]
-    """Approach turns into contact and back, each after its debouncing time."""
-    config, hy, now_ns = params.hybrid, state.hybrid, inputs.now_ns
+def _follow_command(params: Params, state: State, command: Command, tip_m: ReadFloats) -> None:
+    """Set the phase that a new command wants of the armed loop."""
+    if command.kind == COMMAND_HOLD:
+        _enter(params, state, PHASE_HOLD, tip_m)
+    elif command.kind == COMMAND_RETRACT:
+        _enter(params, state, PHASE_RETRACT, tip_m)
+    elif not _sensible(params, command):
+        _enter(params, state, PHASE_HOLD, tip_m)
+    elif command.kind == COMMAND_POSITION:
+        _enter(params, state, PHASE_POSITION, tip_m)
+    elif command.kind == COMMAND_CONTACT and state.phase != PHASE_CONTACT:
+        _enter(params, state, PHASE_APPROACH, tip_m)
+
+
+@njit(cache=True)
+def _depth_m(params: Params, state: State) -> float:
+    """Return the depth (m) of the predicted free tip along the inward normal."""
+    return -dot(free_tip.apply(params.kinematics, state.predicted_joint), state.normal)
+
+
+@njit(cache=True)
+def _watch_contact(params: Params, state: State, now_ns: int, force_N: float, tip_m: ReadFloats) -> None:
+    """Turn approach into contact and back, each after its debouncing time."""
+    config, hy = params.hybrid, state.hybrid
     approaching = state.phase == PHASE_APPROACH
     threshold_N = config.contact_force_N
     if state.force.source == SOURCE_ESTIMATE:
@@ -235,112 +277,119 @@ def _watch_contact(params, state, inputs, force_N: float, tip_m) -> None:  # typ
     if hy.above_ns == 0:
         hy.above_ns = now_ns
     if now_ns - hy.above_ns >= (_CONTACT_NS if approaching else _LOST_NS):
-        _enter(params, state, PHASE_CONTACT if approaching else PHASE_APPROACH, tip_m, now_ns)
+        _enter(params, state, PHASE_CONTACT if approaching else PHASE_APPROACH, tip_m)
         if approaching:
-            predictive.touch(params, state, force_N)
+            wall_observer.forget(state.wall)
+            tip_offset.touch(state.tip_offset)
+            predictive.touch(state.predictive, force_N, _depth_m(params, state))
 
 
 @njit(cache=True)
-def _retract(params, state, inputs, tip_m) -> None:  # type: ignore[no-untyped-def]
+def _retract(params: Params, state: State, tip_m: ReadFloats) -> None:
     hy = state.hybrid
     if state.retract_from_m - hy.joint[0] < params.safety.retract_distance_m:
         hy.joint[0] -= params.safety.retract_speed_m_per_s * params.period_s
     else:
-        _enter(params, state, PHASE_STOPPED, tip_m, inputs.now_ns)
+        _enter(params, state, PHASE_STOPPED, tip_m)
 
 
 @njit(cache=True)
-def _approach_target(command, out_m) -> None:  # type: ignore[no-untyped-def]
-    for i in range(3):
-        out_m[i] = command.target_m[i] - _SEARCH_m * command.normal[i]
+def _approach_target(command: Command) -> Point:
+    target_m, normal = command.target_m, command.normal
+    return (
+        target_m[0] - _SEARCH_m * normal[0],
+        target_m[1] - _SEARCH_m * normal[1],
+        target_m[2] - _SEARCH_m * normal[2],
+    )
 
 
 @njit(cache=True)
-def _control_thesis(params, state, inputs, tip_m, force_N: float) -> None:  # type: ignore[no-untyped-def]
-    """The thesis' law (Figs. 6.12, 7.1): PI loops around the inverse kinematics, force PI outside."""
-    command, hy, period_s = inputs.command, state.hybrid, params.period_s
-    error_m, goal_m = state.work[3], state.hybrid.goal_m
+def _control_thesis(params: Params, state: State, command: Command, tip_m: ReadFloats, force_N: float) -> None:
+    """Run the thesis' law (Figs. 6.12, 7.1): PI loops around the inverse kinematics, force PI outside."""
+    hy, period_s, goal_m = state.hybrid, params.period_s, state.hybrid.goal_m
+    step_m = params.hybrid.approach_speed_m_per_s * period_s
     if state.phase == PHASE_POSITION:
-        hybrid.move_goal(goal_m, command.target_m, params.hybrid.approach_speed_m_per_s * period_s)
+        hybrid.move_goal(goal_m, command.target_m, step_m)
     elif state.phase == PHASE_APPROACH:
-        _approach_target(command, error_m)
-        hybrid.move_goal(goal_m, error_m, params.hybrid.approach_speed_m_per_s * period_s)
+        hybrid.move_goal(goal_m, _approach_target(command), step_m)
     elif state.phase == PHASE_CONTACT:
         for i in range(3):
             goal_m[i] = command.target_m[i]
     else:
         return
-    hybrid.tip_error(
-        params.hybrid,
-        hy,
-        state.phase == PHASE_CONTACT,
-        tip_m,
-        goal_m,
-        command.normal,
-        command.force_N,
-        force_N,
-        period_s,
-        error_m,
-    )
-    hybrid.apply(params.hybrid, params.kinematics, hy, tip_m, error_m, period_s, state.work)
+    aim = hybrid.Aim(goal_m, command.normal, command.force_N, state.phase == PHASE_CONTACT)
+    error_m = hybrid.tip_error(params.hybrid, hy, tip_m, aim, force_N, period_s)
+    hybrid.apply(params.hybrid, params.kinematics, hy, tip_m, error_m, period_s)
 
 
 @njit(cache=True)
-def _control_predictive(params, state, inputs, force_N: float) -> None:  # type: ignore[no-untyped-def]
-    command, law = inputs.command, params.predictive
+def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: float) -> None:
+    """Run the predictive law."""
+    command, law, own, hy = inputs.command, params.predictive, state.predictive, state.hybrid
+    offset_m, period_s, depth_m = state.tip_offset.offset_m, params.period_s, params.backlash.threshold_m
     if state.phase == PHASE_POSITION:
-        predictive.go(params, state, command.target_m, law.move_speed_m_per_s)
+        move = predictive.Move(command.target_m, law.move_speed_m_per_s, period_s)
+        predictive.go(law, own, hy, params.kinematics, offset_m, move, depth_m)
     elif state.phase == PHASE_APPROACH:
-        _approach_target(command, state.work[3])
-        slow = law.blind_share if state.force.source == SOURCE_ESTIMATE else 1.0
-        predictive.go(params, state, state.work[3], slow * params.hybrid.approach_speed_m_per_s)
+        share = law.slow_approach_share if state.force.source == SOURCE_ESTIMATE else 1.0
+        speed = share * params.hybrid.approach_speed_m_per_s
+        approach = predictive.Move(_approach_target(command), speed, period_s)
+        predictive.go(law, own, hy, params.kinematics, offset_m, approach, depth_m)
     elif state.phase == PHASE_CONTACT:
-        predictive.press(params, state, inputs.now_ns, command.target_m, command.force_N, force_N)
+        slide = predictive.Move(command.target_m, law.slide_speed_m_per_s, period_s)
+        contact = predictive.Contact(
+            state.normal,
+            offset_m,
+            _depth_m(params, state),
+            command.force_N,
+            force_N < 0.5 * params.hybrid.contact_force_N,
+            params.force_source == SOURCE_ESTIMATE,
+            inputs.now_ns + params.setpoint_lead_ns,
+        )
+        predictive.press(law, own, hy, params.kinematics, params.wall, state.wall, slide, contact)
     else:
-        predictive.stay(state)
+        predictive.stay(own, hy, state.predicted_joint)
 
 
 @njit(cache=True)
-def _control(params, state, inputs, tip_m, force_N: float) -> None:  # type: ignore[no-untyped-def]
+def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, force_N: float) -> None:
     """Advance the joint command by one tick according to the phase."""
     if state.phase == PHASE_RETRACT:
-        _retract(params, state, inputs, tip_m)
+        _retract(params, state, tip_m)
         return
     if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
-        _watch_contact(params, state, inputs, force_N, tip_m)
+        _watch_contact(params, state, inputs.now_ns, force_N, tip_m)
     if params.law == LAW_PREDICTIVE:
         _control_predictive(params, state, inputs, force_N)
     else:
-        _control_thesis(params, state, inputs, tip_m, force_N)
+        _control_thesis(params, state, inputs.command, tip_m, force_N)
 
 
 @njit(cache=True)
-def _move_stages(params, state, foreseeing: bool) -> None:  # type: ignore[no-untyped-def]
-    """Joint command -> handle (backlash and slope inverses) -> limited stage motion."""
-    period_s, hy, play, own = params.period_s, state.hybrid, params.backlash, state.predictive
+def _move_stages(params: Params, state: State, plan_reversals: bool) -> None:
+    """Move the stages: joint command -> handle (inverses of backlash and slope) -> limited motion."""
+    period_s, hy, gap, own = params.period_s, state.hybrid, params.backlash, state.predictive
     if state.phase == PHASE_STOPPED or state.phase == PHASE_DISARMED:
         for axis in range(N_AXES):
             stage_limiter.brake(params.stage, state.stage, axis, period_s)
         return
     body_m = hy.joint[0] - state.home_m
-    if foreseeing:
-        handle_m = backlash.apply_ahead(
-            play, state.backlash, body_m, own.soon[0] - state.home_m, own.later[0] - state.home_m, own.depth_m
-        )
-        stage_limiter.follow(params.stage, state.stage, 0, handle_m, own.speed[0] / play.slope, period_s)
-        stage_limiter.follow(
-            params.stage, state.stage, 1, backlash.roll(play, hy.joint[1]), backlash.roll(play, own.speed[1]), period_s
-        )
+    roll_rad = backlash.roll(gap, hy.joint[1])
+    if plan_reversals:
+        crossing_m, after_m = own.joint_at_crossing[0] - state.home_m, own.joint_after_crossing[0] - state.home_m
+        handle_m = backlash.apply_ahead(gap, state.backlash, body_m, crossing_m, after_m, own.reversal_depth_m)
+        stage_limiter.follow(params.stage, state.stage, 0, handle_m, own.speed[0] / gap.slope, period_s)
+        stage_limiter.follow(params.stage, state.stage, 1, roll_rad, backlash.roll(gap, own.speed[1]), period_s)
         stage_limiter.follow(params.stage, state.stage, 2, hy.joint[2], own.speed[2], period_s)
         return
-    stage_limiter.apply(params.stage, state.stage, 0, backlash.apply(play, state.backlash, body_m), period_s)
-    stage_limiter.apply(params.stage, state.stage, 1, backlash.roll(play, hy.joint[1]), period_s)
+    stage_limiter.apply(params.stage, state.stage, 0, backlash.apply(gap, state.backlash, body_m), period_s)
+    stage_limiter.apply(params.stage, state.stage, 1, roll_rad, period_s)
     stage_limiter.apply(params.stage, state.stage, 2, hy.joint[2], period_s)
 
 
 @njit(cache=True)
-def _report(params, state, inputs, outputs, force_N: float, flags: int) -> None:  # type: ignore[no-untyped-def]
-    outputs.now_ns = inputs.now_ns
+def _set_setpoint(params: Params, state: State, inputs: Inputs, outputs: Outputs) -> None:
+    """Fill the set-point for the board."""
     armed = state.phase != PHASE_DISARMED and inputs.board.ready != 0
     outputs.valid = 1 if armed else 0
     if armed:
@@ -352,61 +401,112 @@ def _report(params, state, inputs, outputs, force_N: float, flags: int) -> None:
     for axis in range(N_AXES):
         outputs.stage_unit[axis] = state.stage.position[axis]
         outputs.position_steps[axis] = round(state.stage.position[axis] * params.stage.steps_per_unit[axis])
-        outputs.joint[axis] = state.believed[axis]
-    outputs.joint[0] -= state.predictive.short_m  # for whoever reads forces from the shape; the law has its offset
+
+
+@njit(cache=True)
+def _report(params: Params, state: State, inputs: Inputs, outputs: Outputs, force_N: float, flags: int) -> None:
+    """Fill what telemetry shows."""
+    outputs.now_ns = inputs.now_ns
+    for axis in range(N_AXES):
+        outputs.joint[axis] = state.predicted_joint[axis]
+    # For the estimator, which reads the force from the shape; the law has its own offset.
+    outputs.joint[0] -= state.tip_offset.insertion_error_m
     for i in range(3):
         outputs.tip_velocity_m_per_s[i] = state.predictor.velocity_m_per_s[i]
         outputs.goal_m[i] = state.hybrid.goal_m[i]
         outputs.force_N[i] = state.force.force_N[i]
     outputs.normal_force_N = force_N
     outputs.force_source, outputs.play_m = state.force.source, state.backlash.width_m
-    predictive.report(params, state, inputs.now_ns, outputs)
     outputs.wanted_force_N = inputs.command.force_N
     outputs.phase, outputs.action, outputs.cause = state.phase, state.action, flags | state.latched
     outputs.poses_rejected, outputs.forces_rejected = state.predictor.rejected, state.force_rejected
     outputs.pose_age_ns = inputs.now_ns - state.predictor.accepted_ns
+    wall = state.wall.force
+    if wall.started == 0:
+        outputs.wall_m = outputs.wall_sd_m = outputs.heart_Hz = outputs.breath_Hz = outputs.stiffness_N_per_m = 0.0
+        return
+    outputs.wall_m = target_predictor.at(wall, inputs.now_ns + params.setpoint_lead_ns)
+    outputs.wall_sd_m = math.sqrt(max(target_predictor.variance_ahead(wall) - wall.noise_m2, 0.0))
+    outputs.heart_Hz, outputs.breath_Hz = target_predictor.rates_Hz(wall)
+    outputs.stiffness_N_per_m = (1.0 + target_predictor.stiffer(wall)) / params.wall.compliance_m_per_N
 
 
 @njit(cache=True)
-def tick(params, state, inputs, outputs) -> None:  # type: ignore[no-untyped-def]
-    """One period of the loop.
+def _predict_tip(params: Params, state: State, now_ns: int, touching: bool, tip_m: Floats) -> None:
+    """Replace the predictor's tip (3,) by the model's with its learned offset, in contact on the wall."""
+    joint, flank = free_tip.joint_at(state.history, now_ns)
+    if flank == 0.0:
+        return
+    tip = tip_offset.tip(params.kinematics, state.tip_offset, joint)
+    if touching and state.wall.pose.started != 0:
+        tip = wall_observer.on_wall(state.wall, tip, state.normal, now_ns)
+    for i in range(3):
+        tip_m[i] = tip[i]
 
-    Arguments are record arrays of length 1 of PARAMS, STATE, INPUTS and OUTPUTS (`realtime.control.records`); state and
-    outputs are changed in place. Finite outputs for any inputs: what is not finite is rejected where it enters.
+
+@njit(cache=True)
+def _compression_N(params: Params, state: State, now_ns: int, touching: bool) -> float:
+    """Return the compression (N) now: the sensor's reading, or the estimate, in contact brought up to date."""
+    if state.force.source != SOURCE_ESTIMATE:
+        return state.force.value_N
+    if touching and state.wall.force.started != 0:
+        joint, flank = free_tip.joint_at(state.history, now_ns)
+        if flank != 0.0:
+            depth_m = -dot(free_tip.apply(params.kinematics, joint), state.normal)
+            return wall_observer.force_at(params.wall, state.wall, depth_m, now_ns)
+    return state.force.smooth_N
+
+
+@njit(cache=True)
+def tick(params: Any, state: Any, inputs: Any, outputs: Any) -> None:
+    """Run one period of the loop.
+
+    Args:
+        params: PARAMS record array of length 1 (`realtime.control.records`).
+        state: STATE, changed in place.
+        inputs: INPUTS. What is not finite is rejected where it enters: outputs are finite for any inputs.
+        outputs: OUTPUTS, filled.
     """
-    p, s, u, y = params[0], state[0], inputs[0], outputs[0]
-    ours = p.law == LAW_PREDICTIVE
+    p: Params = params[0]
+    s: State = state[0]
+    u: Inputs = inputs[0]
+    y: Outputs = outputs[0]
+    is_predictive = p.law == LAW_PREDICTIVE
     touching = s.phase == PHASE_CONTACT
+    # 1. What arrived: the commanded normal, the pose, the force.
     if not touching or u.command.count != s.command_seen:
-        predictive.face(s, u.command.normal)
+        constraint_frame.take(s.normal, u.command.normal)
     pose_result = predictor.apply(p.predictor, s.predictor, u.tip)
     if pose_result == predictor.ACCEPTED and s.phase != PHASE_DISARMED:
-        predictive.observe(p, s, u.tip, touching)
+        _take_pose(p, s, u, touching)
     rejected = s.force_rejected
     _take_force(p, s, u)
+    # 2. Where the tip is now, and how hard it presses.
     tip_m = y.tip_m
     predictor.predict(s.predictor, u.now_ns, tip_m)
-    if ours and s.phase != PHASE_DISARMED and s.predictive.offset_s > 0.0:
-        predictive.tip_now(p, s, u.now_ns, touching, tip_m)
-    force_N = s.force.value_N
-    if s.force.source == SOURCE_ESTIMATE:
-        force_N = predictive.force_now(p, s, u.now_ns) if ours and touching else s.force.smooth_N
+    if is_predictive and s.phase != PHASE_DISARMED and s.tip_offset.learned_s > 0.0:
+        _predict_tip(p, s, u.now_ns, touching, tip_m)
+    force_N = _compression_N(p, s, u.now_ns, is_predictive and touching)
     if not math.isfinite(force_N):
         force_N = 0.0
+    # 3. What is wrong, and what is done about it.
     flags = _flags(p, s, u, pose_result, rejected)
     clear = u.command.clear != s.cleared
     s.cleared = u.command.clear
     action, latched = safety.decide(flags, s.latched, clear)
     s.action, s.latched = action, latched
-    _obey(p, s, u, action, tip_m)
+    # 4. Phase, joint command, stages.
+    _follow_operator(p, s, u, action, tip_m)
     if s.phase == PHASE_DISARMED and s.predictor.started != 0:
         _locate(p, s, u, tip_m)
     if action < ACTION_HOLD or s.phase == PHASE_RETRACT:
         _control(p, s, u, tip_m, force_N)
-    elif ours:
-        predictive.stay(s)
-    _move_stages(p, s, ours and s.phase != PHASE_RETRACT)
-    _believe(p, s)
-    free_tip.remember(s.history, u.now_ns + p.setpoint_lead_ns, s.believed, s.backlash.flank)
+    elif is_predictive:
+        predictive.stay(s.predictive, s.hybrid, s.predicted_joint)
+    _move_stages(p, s, is_predictive and s.phase != PHASE_RETRACT)
+    _predict_joint(p, s)
+    free_tip.remember(s.history, u.now_ns + p.setpoint_lead_ns, s.predicted_joint, s.backlash.flank)
+    # 5. The set-point, and what telemetry shows.
     s.ticks += 1
+    _set_setpoint(p, s, u, y)
     _report(p, s, u, y, force_N, flags)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -121,7 +122,7 @@ def check_net_ft(host: str, seconds: float = 5.0, port: int = RDT_PORT, web_port
     return report
 
 
-def _run(thread: SensorThread, samples: list, seconds: float, report: DeviceReport) -> bool:
+def _run(thread: SensorThread, samples: list[Any], seconds: float, report: DeviceReport) -> bool:
     """Let the thread collect for `seconds` after its first sample; False when none came."""
     thread.start()
     deadline_s = time.monotonic() + START_UP_S

@@ -67,7 +67,7 @@ class Nano17Calibration:
         """(Fx, Fy, Fz, Tx, Ty, Tz) in N and Nm, sensor frame, of six voltages at the thermistor's temperature."""
         above_K = self.temperature_C(thermistor_V) - self.reference_C
         signal_V = np.asarray(gauges_V) - self.zero_V - above_K * np.asarray(self.zero_V_per_K)
-        return self.matrix @ signal_V * (1.0 + self.gain_per_K * above_K)
+        return np.asarray(self.matrix @ signal_V * (1.0 + self.gain_per_K * above_K))
 
 
 def parse_calibration_file(text: bytes) -> Nano17Calibration:

@@ -212,4 +212,4 @@ def _word_offset(inputs_dtype: np.dtype, name: str, mailbox: Mailbox) -> int:
     field, offset = fields[name][:2]
     if field != mailbox.dtype or offset % 8 or field.itemsize % 8:
         raise ValueError(f"mailboxes[{name!r}]: found {mailbox.dtype} at byte {offset}, wanted {field} on a word boundary")
-    return offset // 8
+    return int(offset) // 8

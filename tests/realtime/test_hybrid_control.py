@@ -33,7 +33,7 @@ def changed(rig: Rig, section: str = "control", **values: object) -> Rig:
 def bench(rig: Rig, heart: HeartConfig, seed: int = 0, normal: tuple = (0.0, 0.0, -1.0)) -> IdealRig:
     """The tip 3 mm before the wall, the play taken up forward."""
     out, transmission = np.zeros(3), rig.transmission
-    inverse_kinematics.apply(tick_parameters(rig)[0].kinematics, WALL_m - (0.0, 0.0, 0.003), 0.0, out)
+    out[:] = inverse_kinematics.apply(tick_parameters(rig)[0].kinematics, WALL_m - (0.0, 0.0, 0.003), 0.0)
     handle = (out[0] - transmission.insertion_at_home_m) / transmission.insertion_slope + 0.5 * 0.0031
     return IdealRig(
         rig,
@@ -115,7 +115,7 @@ def test_the_wall_s_normal_is_learned_from_the_force(rig: Rig) -> None:
     run = bench(rig, STILL, normal=(0.0, float(np.sin(tilt)), float(-np.cos(tilt))))
     run.inputs[0].command.normal[:] = (0.0, 0.0, -1.0)
     run.press(0.15, WALL_m, 8.0)
-    learned = run.state[0].predictive.normal
+    learned = run.state[0].normal
     assert run.outputs[0].phase == Phase.CONTACT
     assert np.degrees(np.arccos(learned @ (0.0, np.sin(tilt), -np.cos(tilt)))) < 2.0
 
@@ -171,19 +171,20 @@ def test_the_free_tip_undoes_the_inverse_kinematics(rig: Rig, insertion: float, 
     curvature = bend / min(config.distal_length_m, config.distal_length_m + insertion)
     assume(abs(curvature) < 44 and abs(bend) > 0.05)
     joint = np.array([insertion, roll, inverse_kinematics.knob_of_curvature(config, curvature)])
-    free_tip.apply(config, joint, tip)
-    inverse_kinematics.apply(config, tip, roll, back)
+    tip[:] = free_tip.apply(config, joint)
+    back[:] = inverse_kinematics.apply(config, tip, roll)
     assert back == pytest.approx(joint, abs=1e-6)
 
 
 def test_past_joints_are_interpolated_and_run_out() -> None:
-    ring, out = new(HISTORY)[0], np.zeros(3)
-    assert free_tip.joint_at(ring, 5, out) == 0.0
+    ring = new(HISTORY)[0]
+    assert free_tip.joint_at(ring, 5)[1] == 0.0
     for k in range(1, 400):
         free_tip.remember(ring, 1_000_000 * k, np.array([1.0, 2.0, 3.0]) * k, 1.0 if k < 300 else -1.0)
-    assert free_tip.joint_at(ring, 350_250_000, out) == -1.0 and out == pytest.approx(np.array([1.0, 2.0, 3.0]) * 350.25)
-    assert free_tip.joint_at(ring, 290_000_000, out) == 1.0
-    assert free_tip.joint_at(ring, 100_000_000, out) == 0.0
+    joint, flank = free_tip.joint_at(ring, 350_250_000)
+    assert flank == -1.0 and joint == pytest.approx(np.array([1.0, 2.0, 3.0]) * 350.25)
+    assert free_tip.joint_at(ring, 290_000_000)[1] == 1.0
+    assert free_tip.joint_at(ring, 100_000_000)[1] == 0.0
 
 
 vector = st.tuples(*[st.floats(-5, 5)] * 3).map(np.array)
@@ -217,9 +218,10 @@ def test_the_selection_matrix_keeps_force_and_position_apart(
     rig: Rig, tip: np.ndarray, target: np.ndarray, force: float
 ) -> None:
     """The thesis' law: across the normal only the position error, along it only the force error."""
-    config, normal, out = tick_parameters(rig)[0].hybrid, np.array([0.0, 0.6, -0.8]), np.zeros(3)
+    config, normal = tick_parameters(rig)[0].hybrid, np.array([0.0, 0.6, -0.8])
     across = np.eye(3) - np.outer(normal, normal)
-    hybrid.tip_error(config, new(HYBRID_STATE)[0], True, tip, target, normal, WANTED_N, force, 1e-3, out)
+    aim = hybrid.Aim(target, normal, WANTED_N, True)
+    out = np.array(hybrid.tip_error(config, new(HYBRID_STATE)[0], tip, aim, force, 1e-3))
     assert across @ out == pytest.approx(across @ (target - tip), abs=1e-9)
     error = WANTED_N - force
     assert -out @ normal == pytest.approx(
@@ -250,4 +252,4 @@ def test_in_free_space_the_insertion_that_forces_are_told_from_is_found(rig: Rig
     truth_m = float(run.plant.truth()["insertion_m"])
     assert run.outputs[0].joint[0] == pytest.approx(truth_m, abs=3e-4)
     if start_in_play < 0.0:
-        assert run.state[0].believed[0] > truth_m + 2e-3
+        assert run.state[0].predicted_joint[0] > truth_m + 2e-3

@@ -55,7 +55,7 @@ def test_nearest_branch_undoes_the_arc_on_both_sides(
     assume(abs(abs(bend) - ik.FOLD_BEND) > 0.05 or insertion < 0)
     assume(lateral * bend > 0)
     last, out = np.array([insertion, roll + off, ik.knob_of_curvature(config, curvature)]), np.zeros(3)
-    ik.apply_nearest(config, tip, last, out)
+    out[:] = ik.apply_nearest(config, tip, last)
     assert out[0] == pytest.approx(insertion, abs=2e-7)
     assert out[1] == pytest.approx(roll, abs=1e-9)
     assert out[2] == pytest.approx(last[2], abs=1e-5)
@@ -66,7 +66,7 @@ def test_always_finite_and_within_the_curve(
     config: np.record, tip: tuple[float, float, float], roll: float, knob: float
 ) -> None:
     out = np.zeros(3)
-    ik.apply_nearest(config, np.array(tip), np.array([0.0, roll, knob]), out)
+    out[:] = ik.apply_nearest(config, np.array(tip), np.array([0.0, roll, knob]))
     assert np.all(np.isfinite(out)) and abs(out[1] - roll) <= math.pi / 2 + 1e-9
     assert config.knob_of_curvature_rad[0] <= out[2] <= config.knob_of_curvature_rad[-1]
 
@@ -76,7 +76,7 @@ def test_no_jump_on_a_path_out_of_the_sheath_past_the_fold(config: np.record) ->
     for insertion in np.linspace(-0.030, 0.020, 1001):
         tip = tip_of(np.array([insertion, 0.0]), 30.0)
         before = joint.copy()
-        ik.apply_nearest(config, tip, joint, joint)
+        joint[:] = ik.apply_nearest(config, tip, joint)
         jumps.append(np.abs(joint - before))
     assert np.max(np.array(jumps)[:, 0]) < 2e-4 and np.max(np.array(jumps)[:, 2]) < 0.02
     assert joint[0] == pytest.approx(0.020, abs=1e-6)
@@ -85,7 +85,7 @@ def test_no_jump_on_a_path_out_of_the_sheath_past_the_fold(config: np.record) ->
 def test_straight_is_no_singularity_and_the_knob_passes_its_slack(config: np.record) -> None:
     joint, knobs = np.zeros(3), []
     for lateral in np.linspace(0.004, -0.004, 801):
-        ik.apply_nearest(config, np.array([0.0, -lateral, 0.12]), joint, joint)
+        joint[:] = ik.apply_nearest(config, np.array([0.0, -lateral, 0.12]), joint)
         knobs.append(joint[2])
     assert abs(joint[1]) < 1e-9 and np.all(np.diff(knobs) <= 1e-12)
     assert np.max(np.abs(np.diff(knobs))) < math.radians(0.6)

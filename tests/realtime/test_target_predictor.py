@@ -39,7 +39,7 @@ class Run:
         by_phase: bool = True,
     ) -> None:
         parameters = tick_parameters(rig)[0]
-        self.config = parameters.wall if step_ms < 10 else parameters.tip_wall
+        self.config = parameters.wall.by_force if step_ms < 10 else parameters.wall.by_pose
         self.config.by_phase = int(by_phase and step_ms >= 10)
         self.state, self.wall_m, self.noise_m = new(TARGET_STATE)[0], wall_m, noise_m
         rng = np.random.default_rng(seed)
@@ -161,7 +161,7 @@ def test_stiffness_and_play_are_learned(rig: Rig) -> None:
     for k in range(1, len(wall)):
         body, flank = 0.0005 * np.sin(5.5e-3 * k), 1.0 if np.cos(5.5e-3 * k) > 0.0 else -1.0
         value = wall[k] + 0.25 * body - 0.0002 * flank + 3e-5 * rng.standard_normal()
-        target_predictor.apply(parameters.wall, state, 1_000_000_000 + 1_000_000 * k, value, body, flank, 9e-10)
+        target_predictor.apply(parameters.wall.by_force, state, 1_000_000_000 + 1_000_000 * k, value, body, flank, 9e-10)
     assert state.x[STEADY, STIFFNESS] == pytest.approx(-0.25, abs=0.03)
     assert state.x[STEADY, PLAY] == pytest.approx(0.0002, abs=0.00003)
 
@@ -180,7 +180,7 @@ any_float = st.floats(allow_nan=True, allow_infinity=True)
 @settings(max_examples=50)
 @given(values=st.lists(st.tuples(any_float, any_float, any_float), min_size=1, max_size=20), step_ms=st.integers(1, 400))
 def test_finite_for_any_samples(rig: Rig, values: list, step_ms: int) -> None:
-    config, state = tick_parameters(rig)[0].wall, new(TARGET_STATE)[0]
+    config, state = tick_parameters(rig)[0].wall.by_force, new(TARGET_STATE)[0]
     for k, (value, travel, flank) in enumerate(values):
         target_predictor.apply(config, state, 10**9 + k * step_ms * 10**6, value, travel, flank, 1e-8)
         assert np.isfinite(target_predictor.ahead(state, 0.1)) and np.all(np.isfinite(state.x))

@@ -98,7 +98,7 @@ def control_tick(seed: int, _report: Report) -> list[Row]:
 
     def plain_ticks(params: Any, state: Any, inputs: Any, outputs: Any, force: Array, first: int, count: int) -> None:
         for i in range(first, first + count):
-            _feed.py_func(inputs[0], force, i)
+            _feed.py_func(inputs[0], force, i)  # type: ignore[attr-defined]
             plain(params, state, inputs, outputs)
 
     ours, peer = Loop(_ticks), Loop(plain_ticks)

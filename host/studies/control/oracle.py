@@ -51,7 +51,7 @@ def _follow(rig: Rig, seed: int, beat: HeartConfig, seconds: float, force_N: flo
         base_m += (TRIM_m_per_N_s * error_N if touching else SEARCH_m_per_s) * STEP_S
         for row, later in zip(joints, ahead, strict=True):
             tip = np.array([TARGET_M[0], TARGET_M[1], base_m + gain * wall[k + later]])
-            inverse_kinematics.apply(p.kinematics, tip, 0.0, row)
+            row[:] = inverse_kinematics.apply(p.kinematics, tip, 0.0)
         speed = (joints[1] - joints[0]) / SLOPE_S
         handle = backlash.apply_ahead(
             p.backlash,

@@ -130,7 +130,7 @@ def random_goals(rig: Rig, count: int, seed: int) -> Array:
     last = np.array(TARGET_M)
     while len(goals) < count:
         joint = np.array([rng.uniform(-0.085, -0.030), rng.uniform(-1.2, 1.2), rng.uniform(0.2, 1.3)])
-        free_tip.apply(kinematics, joint, out)
+        out[:] = free_tip.apply(kinematics, joint)
         if 0.020 < np.linalg.norm(out - last) < 0.035:
             goals.append(out.copy())
             last = out.copy()
@@ -225,7 +225,7 @@ def foretell(
 ) -> Foretold:
     """The predictor on the simulated heart, by forces, or by poses (rate and noise of the rig, 2 ms jitter, 5 % lost)."""
     parameters, rng = tick_parameters(rig)[0], np.random.default_rng([seed, 40])
-    config = parameters.tip_wall if by_pose else parameters.wall
+    config = parameters.wall.by_pose if by_pose else parameters.wall.by_force
     noise_m = rig.tracker.position_noise_m if by_pose else rig.force_sensor.noise_N * rig.control.tip_compliance_m_per_N
     wall = _wall_motion(beat, seed, seconds)
     step = round(1000 / rig.tracker.rate_hz) if by_pose else 1

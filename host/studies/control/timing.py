@@ -48,7 +48,7 @@ def tick_us(rig: Rig, seed: int = 1) -> dict[str, float]:
     """Percentiles of the tick's time (us) over TICKS ticks in contact, on the machine as it is; best of three rounds."""
     out = np.zeros(3)
     kinematics = tick_parameters(rig)[0].kinematics
-    inverse_kinematics.apply(kinematics, np.array(TARGET_M) - (0.0, 0.0, 0.003), 0.0, out)
+    out[:] = inverse_kinematics.apply(kinematics, np.array(TARGET_M) - (0.0, 0.0, 0.003), 0.0)
     handle = out[0] - rig.transmission.insertion_at_home_m + 0.5 * rig.transmission.insertion_backlash_m
     bench = IdealRig(
         rig,

@@ -82,8 +82,8 @@ def navigate(
     for k in range(round(seconds / frame_s)):
         late.append(plant.sensor_pose(0.0)[0] + tracker.position_noise_m * random.standard_normal(3))
         seen = late.popleft() if len(late) > 1 else late[0]
-        inverse_kinematics.apply_nearest(config, seen, joint, measured)
-        inverse_kinematics.apply_nearest(config, goal_m, joint, wanted)
+        measured[:] = inverse_kinematics.apply_nearest(config, seen, joint)
+        wanted[:] = inverse_kinematics.apply_nearest(config, goal_m, joint)
         before = stages()
         joint += per_frame * (wanted - measured)
         if direction * (joint[0] - extreme) >= 0.0:

@@ -1,0 +1,120 @@
+"""How a record of the tick is declared: each field once, with its type, unit and one line of meaning.
+
+A declared class is three things: the type that compiled kernels are checked against, the numpy dtype (`dtype_of`), and
+the rows of the table in docs/records.md (`as_markdown`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, overload
+
+import numpy as np
+
+
+class Floats(Protocol):
+    """A vector of floats, as kernels use it: an array, or a field of a record."""
+
+    def __getitem__(self, index: int, /) -> float: ...
+
+    def __setitem__(self, index: int, value: float, /) -> None: ...
+
+
+class ReadFloats(Protocol):
+    """A vector of floats that is only read: an array, a field of a record, or a tuple."""
+
+    def __getitem__(self, index: int, /) -> float: ...
+
+
+class Ints(Protocol):
+    """A vector of integers."""
+
+    def __getitem__(self, index: int, /) -> int: ...
+
+    def __setitem__(self, index: int, value: int, /) -> None: ...
+
+
+class Matrix(Protocol):
+    """A table of floats; one index gives a row."""
+
+    @overload
+    def __getitem__(self, index: int, /) -> Floats: ...
+
+    @overload
+    def __getitem__(self, index: tuple[int, int], /) -> float: ...
+
+    def __setitem__(self, index: tuple[int, int], value: float, /) -> None: ...
+
+
+class Tensor(Protocol):
+    """A table of three indices; one index gives a matrix."""
+
+    @overload
+    def __getitem__(self, index: int, /) -> Matrix: ...
+
+    @overload
+    def __getitem__(self, index: tuple[int, int, int], /) -> float: ...
+
+    def __setitem__(self, index: tuple[int, int, int], value: float, /) -> None: ...
+
+
+Joint = tuple[float, float, float]  # insertion (m), roll (rad), knob (rad)
+Point = tuple[float, float, float]  # m
+
+
+class Field(NamedTuple):
+    """One field: "f8", "i8" or the class of a nested record; unit; meaning; shape, () for a scalar."""
+
+    kind: Any
+    unit: str
+    doc: str
+    shape: tuple[int, ...] = ()
+
+
+def real(unit: str, doc: str, *shape: int) -> Any:
+    """Declare a float of 64 bits, or an array of them."""
+    return Field("f8", unit, doc, shape)
+
+
+def whole(unit: str, doc: str, *shape: int) -> Any:
+    """Declare an integer of 64 bits, or an array of them."""
+    return Field("i8", unit, doc, shape)
+
+
+def part(record: type, doc: str) -> Any:
+    """Declare a nested record."""
+    return Field(record, "", doc)
+
+
+def fields_of(record: type) -> dict[str, Field]:
+    """Return the fields of a declared class by name, in the order of declaration."""
+    return {name: field for name, field in vars(record).items() if isinstance(field, Field)}
+
+
+def dtype_of(record: type) -> np.dtype[np.void]:
+    """Return the numpy dtype of a declared class, aligned as a C compiler would."""
+    columns = [
+        (name, field.kind if isinstance(field.kind, str) else dtype_of(field.kind), field.shape)
+        for name, field in fields_of(record).items()
+    ]
+    return np.dtype(columns, align=True)
+
+
+def _nested(record: type) -> Iterator[type]:
+    yield record
+    for field in fields_of(record).values():
+        if not isinstance(field.kind, str):
+            yield from _nested(field.kind)
+
+
+def as_markdown(*records: type) -> str:
+    """Return a table for each of `records` and those nested in them, each once."""
+    lines = []
+    for record in dict.fromkeys(inner for outer in records for inner in _nested(outer)):
+        lines += ["", f"## {record.__name__}", "", (record.__doc__ or "").strip(), ""]
+        lines += ["| field | type | unit | meaning |", "|---|---|---|---|"]
+        for name, field in fields_of(record).items():
+            kind = {"f8": "float", "i8": "integer"}.get(field.kind) if isinstance(field.kind, str) else field.kind.__name__
+            size = " x ".join(map(str, field.shape))
+            lines.append(f"| `{name}` | {kind}{f' [{size}]' if size else ''} | {field.unit or '-'} | {field.doc} |")
+    return "\n".join(lines) + "\n"
