@@ -22,6 +22,7 @@ import numpy as np
 from sim.concealed import generic as concealed_generic
 from sim.concealed import rig as concealed_rig
 from sim.concealed import system as concealed_system
+from sim.concealed.label import Label
 from sim.concealed.menu import MENU, UNLISTED, Dish, equivalents
 from sim.concealed.rig import Session
 from sim.concealed.signals import tidy, windows
@@ -372,7 +373,7 @@ def _near(system: System, rng: np.random.Generator) -> Array:
     return p
 
 
-def rebuild(truth: dict[str, Any]) -> tuple[System, list[Planted]]:
+def rebuild(truth: Label) -> tuple[System, list[Planted]]:
     """System and planted effects of a label, for the oracle."""
     plan = Plan(**truth["plan"])
     dishes = [*MENU[plan.kind], *UNLISTED[plan.kind], _FORCE_SCALE, _STANDING_BIAS]

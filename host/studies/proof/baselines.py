@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from host.studies.proof.scoring import gap_closed
+from sim.concealed.label import Label
 from sim.concealed.rig import Session
 from sim.concealed.suite import rebuild
 from sim.concealed.system import Planted, System, columns
@@ -53,7 +54,7 @@ def _widths(system: System) -> tuple[int, int]:
     return {"rig": (3, 17), "transmission": (3, 2), "axis": (1, 1), "impedance": (1, 1)}[system.kind]
 
 
-def compare(label: dict[str, Any], folder: Path) -> dict[str, dict[str, Any]]:
+def compare(label: Label, folder: Path) -> dict[str, dict[str, Any]]:
     """Per baseline: detected, gap_closed, seconds; or why it is unavailable."""
     system, planted = rebuild(label)
     session = read_session(system, folder)
@@ -79,7 +80,7 @@ def compare(label: dict[str, Any], folder: Path) -> dict[str, dict[str, Any]]:
     return out
 
 
-def _scores(label: dict[str, Any], system: System, left: Array, explained: Array) -> dict[str, Any]:
+def _scores(label: Label, system: System, left: Array, explained: Array) -> dict[str, Any]:
     """Detected: mean squared error falls, over blocks of one second, by more than four standard errors in a channel."""
     before, after = left**2, (left - explained) ** 2
     block = max(1, round(1.0 / system.period_s))

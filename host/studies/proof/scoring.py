@@ -71,7 +71,7 @@ def judge(
     everything = set().union(*(claim for _, claim in said)) if said else set()
     library = label["category"] in ("single", "pair")
     errors, covered = parameters(label, effects) if library and said else ((), ())
-    facts = {
+    facts: dict[str, Any] = {
         "category": label["category"],
         "rho": label["rho"],
         "rho_wanted": label["rho_wanted"],

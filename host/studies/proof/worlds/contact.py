@@ -43,10 +43,10 @@ def _handle_effects() -> tuple[Plantable, ...]:
 class Pressed:
     """Catheter on a sphere that moves with heart and breath."""
 
-    name = "rod"
-    outputs = ("tip_x_m", "tip_y_m", "tip_z_m")
-    effects = _handle_effects()
-    outside = (
+    name: str = "rod"
+    outputs: tuple[str, ...] = ("tip_x_m", "tip_y_m", "tip_z_m")
+    effects: tuple[Plantable, ...] = _handle_effects()
+    outside: tuple[Plantable, ...] = (
         Plantable(
             "unlisted",
             "tip",

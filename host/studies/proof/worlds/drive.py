@@ -78,8 +78,11 @@ def _smooth(code: int, q: Array, x: float, v: float, t: float) -> float:
 
 
 @njit(cache=True)
-def _rates(p: Array, s: Array, u: float, t: float, codes: Array, q: Array, x0: float, memory: Array, out: Array) -> None:
+def _rates(
+    p: Array, s: Array, u: float, t: float, effects: tuple[Array, Array], x0: float, memory: Array, out: Array
+) -> None:
     """Write the time derivative of s (8,) to out."""
+    codes, q = effects
     x, v = s[0], s[1]
     out[:] = 0.0
     against = p[1] * v + p[2] * x
@@ -162,7 +165,7 @@ def run(
                 for k in range(_STATES):
                     stage[k] = s[k] + (share * h * d[r - 1, k] if r > 0 else 0.0)
                 acting = stage[2] if w.lag_s > 0.0 else u
-                _rates(p, stage, acting, t, codes, q, x0, memory, d[r])
+                _rates(p, stage, acting, t, effects, x0, memory, d[r])
                 d[r, 2] = (u - stage[2]) / w.lag_s if w.lag_s > 0.0 else 0.0
             if step == 0:
                 out[i, 0], out[i, 1], out[i, 2] = s[0], s[1], d[0, 1]

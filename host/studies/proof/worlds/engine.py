@@ -265,6 +265,7 @@ class Slider(ode.Axis):
     outside = _SLIDER_OUTSIDE
 
     def __init__(self, sprung: bool) -> None:
+        """Choose between a slide with a spring and a free one."""
         self.sprung = sprung
         self.name = "slider" if sprung else "free_slider"
 
@@ -517,16 +518,16 @@ _STIFF, _DAMP = np.array([150.0, 60.0]), np.array([8.0, 3.0])
 class Arm:
     """Two-link arm under joint servos: angles in, torques out, by a Python function with the drawing's link data."""
 
-    name = "arm"
-    outputs = ("shoulder_Nm", "elbow_Nm")
-    effects = (
+    name: str = "arm"
+    outputs: tuple[str, ...] = ("shoulder_Nm", "elbow_Nm")
+    effects: tuple[Plantable, ...] = (
         Plantable("latency", "elbow", lambda s, c: {"delay_s": 0.1 * c.slow_s * s}, compared=("delay_s",)),
         Plantable("sensor_drift", "elbow", lambda s, c: {"drift_Nm": 0.05 * c.force * s}, signed=True),
         Plantable("saturation", "shoulder", lambda s, c: {"limit_Nm": 1.1 * c.force / (1.0 + 0.3 * s)}),
         Plantable("gravity_load", "elbow", lambda s, c: {"payload_kg": 0.05 * s}, same=("unlisted",)),
         Plantable("coulomb_friction", "elbow", lambda s, c: {"torque_Nm": 0.03 * c.force * s}, same=("unlisted",)),
     )
-    outside = (
+    outside: tuple[Plantable, ...] = (
         Plantable("unlisted", "elbow", lambda s, c: {"payload_kg": 0.05 * s}, same=("gravity_load",), says="payload"),
         Plantable(
             "unlisted", "elbow", lambda s, c: {"size": 0.05 * s}, says="joint friction goes with the other joint's torque"

@@ -180,10 +180,10 @@ def _half_derivative(x: Array, h: float, c: Scales) -> Array:
 class Link:
     """Motion in, motion out: output = gain * input + offset."""
 
-    name = "link"
-    outputs = ("output_m",)
-    effects = _motion_effects("link", others=True, loads=True)
-    outside = _unlisted("link")
+    name: str = "link"
+    outputs: tuple[str, ...] = ("output_m",)
+    effects: tuple[Plantable, ...] = _motion_effects("link", others=True, loads=True)
+    outside: tuple[Plantable, ...] = _unlisted("link")
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
         """Draw gain, offset, sampling and noise."""
@@ -326,10 +326,10 @@ _PRESS_OUTSIDE = (
 class Press:
     """Motion in, force out: force = damping * speed + stiffness * motion + offset."""
 
-    name = "press"
-    outputs = ("force_N",)
-    effects = _PRESS_EFFECTS
-    outside = _PRESS_OUTSIDE
+    name: str = "press"
+    outputs: tuple[str, ...] = ("force_N",)
+    effects: tuple[Plantable, ...] = _PRESS_EFFECTS
+    outside: tuple[Plantable, ...] = _PRESS_OUTSIDE
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
         """Draw stiffness, damping, sampling and noise."""
@@ -508,10 +508,12 @@ _AXIS_OUTSIDE = (
 class Axis:
     """Force in, motion out: mass, damping, with or without a spring."""
 
-    outputs = ("position_m",)
-    outside = _AXIS_OUTSIDE
+    outputs: tuple[str, ...] = ("position_m",)
+    effects: tuple[Plantable, ...]
+    outside: tuple[Plantable, ...] = _AXIS_OUTSIDE
 
     def __init__(self, sprung: bool) -> None:
+        """Choose between an axis with a spring and a free one."""
         self.sprung = sprung
         self.name = "axis" if sprung else "free_axis"
         self.effects = _DRY + (_SPRUNG if sprung else ())

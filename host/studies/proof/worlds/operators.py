@@ -46,7 +46,7 @@ def plays(x: Array, widths: Array, weights: Array) -> Array:
 
 
 def prandtl_ishlinskii(x: Array, share: float, distance: float) -> Array:
-    """x with `share` of it lost to friction that builds up over about `distance`; 0 <= share < 1."""
+    """Motion x with `share` of it lost to friction that builds up over about `distance`; 0 <= share < 1."""
     widths = distance * np.geomspace(0.15, 3.0, 8)
     weights = np.exp(-widths / distance)
     return np.asarray((1.0 - share) * x + share * plays(x, widths, weights / weights.sum()))
@@ -61,13 +61,13 @@ def lag(x: Array, h: float, tau_s: float) -> Array:
 
 
 def creep(x: Array, h: float, share: float, tau_s: float) -> Array:
-    """x of which `share` follows through four lags from tau/4 to 4 tau (s)."""
+    """Motion x of which `share` follows through four lags from tau/4 to 4 tau (s)."""
     slow = np.mean([lag(x, h, tau_s * factor) for factor in (0.25, 0.63, 1.6, 4.0)], axis=0)
     return np.asarray((1.0 - share) * x + share * slow)
 
 
 def delayed(x: Array, h: float, delay_s: float) -> Array:
-    """x later by delay_s; the first value stands before the grid."""
+    """Motion x later by delay_s; the first value stands before the grid."""
     at = np.arange(x.size) - delay_s / h
     return np.interp(at, np.arange(x.size), x)
 

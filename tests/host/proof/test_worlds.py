@@ -1,0 +1,137 @@
+"""The other worlds: they follow from the seed, say nothing of the truth, and their physics is what it is said to be."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from host.diagnosis.model.nominal import read_nominal
+from host.studies.proof.worlds import case, contact, drive, nominal_rod, ode, rod, suite
+from host.studies.proof.worlds import operators as op
+from protocol.errors import InputError
+
+NONE = (np.zeros(0, np.int64), np.zeros((0, 4)))
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_axis_is_integrated_as_solve_ivp_does(held: bool) -> None:
+    p, t = np.array([0.7, 2.0, 90.0, 0.1]), np.arange(0.0, 3.0, 0.02)
+    u = np.sin(4.0 * t) + 0.3 * np.sin(17.0 * t)
+    effects = (np.array([drive.HARDENING, drive.LINE]), np.array([[0.4, 0.02, 0, 0], [0.2, 1.3, 0.4, 0]]))
+    out, _ = drive.run(p, t, u, held, drive.Actuator(lag_s=0.03), effects, drive.Loop(), np.zeros(t.size))
+
+    def slope(now: float, s: np.ndarray) -> list[float]:
+        k = min(int(now / 0.02 + 1e-9), t.size - 2)
+        wanted = u[k] if held else u[k] + (now - t[k]) / 0.02 * (u[k + 1] - u[k])
+        force = s[2] + p[3] - p[1] * s[1] - p[2] * s[0]
+        force -= 0.4 * (np.sinh(s[0] / 0.02) - s[0] / 0.02) - 0.2 * np.sin(2 * np.pi * 1.3 * now + 0.4)
+        return [s[1], force / p[0], (wanted - s[2]) / 0.03]
+
+    begin = [(u[0] + p[3]) / p[2], 0.0, u[0]]
+    exact = solve_ivp(slope, (0.0, t[-1]), begin, t_eval=t, rtol=1e-9, atol=1e-12, max_step=0.01).y[0]
+    assert np.max(np.abs(out[:, 0] - exact)) < 1e-5 * np.ptp(exact)
+
+
+def test_friction_holds_and_a_delay_is_a_delay() -> None:
+    p, t = np.array([1.0, 1.0, 50.0, 0.0]), np.arange(0.0, 4.0, 0.01)
+    u = 0.2 * np.sin(6.0 * t)
+    grip = (np.array([drive.COULOMB]), np.array([[0.5, 0.0, 0.0, 1e-3]]))
+    stuck, _ = drive.run(p, t, u, False, drive.Actuator(), grip, drive.Loop(), np.zeros(t.size))
+    loose, _ = drive.run(p, t, u, False, drive.Actuator(), NONE, drive.Loop(), np.zeros(t.size))
+    late, _ = drive.run(p, t, u, False, drive.Actuator(delay_s=0.05), NONE, drive.Loop(), np.zeros(t.size))
+    assert np.ptp(stuck[:, 0]) < 0.05 * np.ptp(loose[:, 0])
+    assert np.max(np.abs(late[105:, 0] - loose[100:-5, 0])) < 0.02 * np.ptp(loose[:, 0])
+
+
+def test_operators_do_what_their_names_say() -> None:
+    h = 1e-3
+    x = np.sin(np.arange(0.0, 12.0, h))
+    assert np.ptp(op.play(x, h, 0.4)) == pytest.approx(1.6, abs=0.01)
+    assert np.max(op.dead_zone(x, 0.3)) == pytest.approx(0.7, abs=0.01)
+    assert np.max(op.saturated(x, 0.5)) < 0.5
+    assert op.delayed(x, h, 0.25)[5000] == pytest.approx(x[4750])
+    gain = np.ptp(op.lag(x, h, 1.0)[7000:]) / 2.0
+    assert gain == pytest.approx(1.0 / np.sqrt(2.0), abs=0.01)
+    assert np.max(np.abs(op.maxwell_slip(x, 0.05))) == pytest.approx(1.0)
+
+
+def test_the_pressed_rod_agrees_with_the_nominal_rod_under_its_own_force() -> None:
+    p = np.array([-0.065, 0.95, 29.0, 8e-4, nominal_rod.TORSION_TO_BENDING, nominal_rod.DISTAL_M])
+    n = 40
+    handle = np.column_stack([np.linspace(-1e-3, 3e-3, n), np.linspace(-0.4, 0.4, n), np.linspace(0.4, 0.6, n)])
+    bend, length = 29.0 * 0.5, 0.045
+    centre = np.array([4e-3, -(1 - np.cos(bend * length)) / bend - 6e-3, np.sin(bend * length) / bend + 0.028])
+    tip, force, good = rod.session(p, handle, np.tile(centre, (n, 1)), np.array([0.03, 400.0]), np.zeros(3))
+    assert good and np.max(np.linalg.norm(force, axis=1)) > 0.1 and np.max(np.abs(force[:, 0])) > 0.01
+    inputs = dict(zip(("insertion_m", "roll_rad", "knob_rad"), handle.T, strict=True))
+    inputs |= dict(zip(("force_x_N", "force_y_N", "force_z_N"), force.T, strict=True))
+    told = nominal_rod.tips(inputs, dict(zip(nominal_rod.NAMES, p[:4], strict=True)), np.arange(n) * 0.02)
+    assert np.max(np.abs(np.column_stack(list(told.values())) - tip)) < 1e-7
+
+
+def test_noise_in_a_loop_is_the_noise_that_is_recorded() -> None:
+    setup = ode.Link().draw(np.random.default_rng(5), True)
+    assert np.array_equal(setup.noise(1, "output_m"), setup.noise(1, "output_m"))
+    assert not np.array_equal(setup.noise(0, "output_m")[:50], setup.noise(1, "output_m")[:50])
+
+
+@pytest.mark.parametrize("mechanism", [*ode.MECHANISMS, *contact.MECHANISMS], ids=lambda m: m.name)
+@pytest.mark.parametrize("closed", [False, True])
+def test_without_an_effect_the_nominal_model_is_adequate(mechanism: case.Mechanism, closed: bool) -> None:
+    rhos = []
+    for number in range(12):
+        setup = mechanism.draw(np.random.default_rng([number, 17]), closed)
+        try:
+            rhos.append(case.size_of(setup, mechanism.left(setup, mechanism.run(setup, [])))[0])
+        except ValueError:  # a loop that does not settle is drawn anew
+            continue
+        if len(rhos) == 2:
+            break
+    assert len(rhos) == 2 and min(rhos) < case.NULL_BELOW
+
+
+@pytest.mark.parametrize("world", ["mujoco"])
+def test_engine_cases_without_an_effect_are_adequate(world: str) -> None:
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'seldinger[mujoco]'")
+    for mechanism in suite.mechanisms(world):
+        setup = mechanism.draw(np.random.default_rng(23), False)
+        assert case.size_of(setup, mechanism.left(setup, mechanism.run(setup, [])))[0] < 0.3, mechanism.name
+
+
+def test_the_same_seed_gives_the_same_suite_and_no_trace_of_the_truth(tmp_path: Path) -> None:
+    planned = [p for p in case.plans("ode", 1, 24, len(ode.MECHANISMS)) if p.mechanism in (0, 2) and p.category != "null"][
+        :3
+    ]
+    digests = []
+    for turn in ("one", "two"):
+        labels = []
+        for plan in planned:
+            made = case.make(ode.MECHANISMS, plan)
+            case.write(made, tmp_path / turn / plan.id)
+            labels.append(made.label)
+        digests.append(json.dumps(labels, sort_keys=True))
+    assert digests[0] == digests[1]
+    for plan in planned:
+        first, second = (sorted((tmp_path / turn / plan.id).iterdir()) for turn in ("one", "two"))
+        assert [a.read_bytes() for a in first] == [b.read_bytes() for b in second]
+        nominal = read_nominal(tmp_path / "one" / plan.id / "nominal.toml")
+        assert nominal.data.heldout and not nominal.effect
+        for effect in json.loads(digests[0])[0]["truth"]:
+            assert effect.partition("@")[0] not in (tmp_path / "one" / plan.id / "nominal.toml").read_text()
+
+
+def test_the_mix_is_as_told() -> None:
+    planned = case.plans("ode", 9, 100, 4)
+    count = {c: sum(p.category == c for p in planned) for c in case.SHARES}
+    assert count == {"null": 30, "single": 40, "pair": 15, "outside": 15}
+    assert {p.mechanism for p in planned} == {0, 1, 2, 3}
+    assert abs(sum(p.closed_loop for p in planned) - 50) <= 1
+    with pytest.raises(ValueError, match="cases and seed"):
+        case.plans("ode", 1, 0, 4)
+
+
+def test_an_unknown_world_is_one_line() -> None:
+    with pytest.raises(InputError, match="--world"):
+        suite.mechanisms("moon")
