@@ -37,7 +37,7 @@ class Asker(Protocol):
         """The reply, None where no answer arrives in time."""
 
 
-class Commander:
+class CommandSender:
     """Commands one rig as `name`. Each method sends one command and returns its Acknowledgement; none raises.
 
     session: as in Asker. clock_ns: this side's clock; the rig's is learnt from its replies. new_id: unique texts.

@@ -66,7 +66,7 @@ def cobs_decode(data: bytes) -> bytes:
     return bytes(out)
 
 
-class Message(NamedTuple):
+class AnyFrame(NamedTuple):
     """A frame that arrived whole: its name, sequence number and fields as on the wire (arrays as tuples)."""
 
     name: str
@@ -98,7 +98,7 @@ def encode(frame_name: str, sequence: int, **fields: Any) -> bytes:
     return cobs_encode(body + struct.pack(">H", crc16(body))) + DELIMITER
 
 
-def decode_body(body: bytes) -> Message:
+def decode_body(body: bytes) -> AnyFrame:
     """Message of one frame without its COBS coding. Raises ValueError when anything about it is wrong."""
     if len(body) < 4 or crc16(body) != 0:  # with its check sum, high byte first, a body leaves no remainder
         raise ValueError(f"frame: found {len(body)} bytes with a wrong check sum")
@@ -109,7 +109,7 @@ def decode_body(body: bytes) -> Message:
     fields: dict[str, Any] = {
         f.name: next(flat) if f.count == 1 else tuple(next(flat) for _ in range(f.count)) for f in frame.fields
     }
-    return Message(frame.name, body[1], fields)
+    return AnyFrame(frame.name, body[1], fields)
 
 
 @dataclass
@@ -136,7 +136,7 @@ class StreamDecoder:
         self._overlong = False
         self._sequence: int | None = None
 
-    def feed(self, data: bytes) -> list[Message]:
+    def feed(self, data: bytes) -> list[AnyFrame]:
         """Messages completed by `data`, oldest first."""
         out = []
         parts = data.split(DELIMITER)
@@ -155,7 +155,7 @@ class StreamDecoder:
             return
         self._pending += part
 
-    def _finish(self) -> Message | None:
+    def _finish(self) -> AnyFrame | None:
         raw, overlong = bytes(self._pending), self._overlong
         self._pending.clear()
         self._overlong = False

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from protocol.commander import Acknowledgement, Commander
+from protocol.commander import Acknowledgement, CommandSender
 from protocol.enums import Phase
 from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Message, Pose, Reply, SimulatedTruth, encode
@@ -78,7 +78,7 @@ class Scenario:
         self._leaving = self.loop.step(0, FromRig())
         self._latest: dict[str, Message] = {}
         self._commands = 0
-        self.commander = Commander(self, "scenario", clock_ns=lambda: self.loop.now_ns, new_id=self._next_id)
+        self.commander = CommandSender(self, "scenario", clock_ns=lambda: self.loop.now_ns, new_id=self._next_id)
         self._started = time.monotonic()
         self._stop = False
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from host.commissioning.characterization import Characterization, calibrated_rig_text, transmission_toml
-from host.commissioning.characterization_report import Line, lines_of, write_characterization
+from host.commissioning.characterization_report import TableRow, lines_of, write_characterization
 from host.commissioning.sweep_fits import Estimate
 from protocol.rig_file import Rig, parse_rig
 
@@ -22,7 +22,7 @@ class CalibrationFiles:
     calibration: Path
     rig_file: Path
     page: Path
-    lines: Sequence[Line]
+    lines: Sequence[TableRow]
     report: dict[str, Any]
 
 

@@ -13,8 +13,8 @@ from host.commissioning.characterization import Characterization, transmission_t
 from host.commissioning.sweep_fits import Estimate, Run, dead_zone_curvature, play
 from host.recordings.header import software_version
 from host.report.figure_page import page_environment
-from host.report.run_report import Line, quantity
-from host.report.style import ESTIMATED, MEASURED, MUTED, TRUTH, WANTED, Picture, legend_above, picture
+from host.report.run_report import TableRow, quantity
+from host.report.style import ESTIMATED, MEASURED, MUTED, TRUTH, WANTED, ReportFigure, legend_above, report_figure
 
 _PM = "\u00b1"
 _DEG = math.degrees(1.0)
@@ -50,19 +50,19 @@ def _bounded(value: Estimate, scale: float, digits: int) -> str:
     return f"{_PM} {value.half95 * scale:.{digits}f} (95 %)"
 
 
-def lines_of(found: Characterization) -> list[Line]:
+def lines_of(found: Characterization) -> list[TableRow]:
     """The figures in people's units, each with its interval."""
     width, slope, roll, edges = found.insertion.width, found.insertion.slope, found.roll.slope, found.knob.edges_rad
     lines = [
-        Line("Backlash of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),
-        Line("Slope of insertion", f"{slope.value:.4f}", _bounded(slope, 1.0, 4)),
-        Line(
+        TableRow("Backlash of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),
+        TableRow("Slope of insertion", f"{slope.value:.4f}", _bounded(slope, 1.0, 4)),
+        TableRow(
             "Body at home",
             quantity(found.insertion_at_home_m.value * 1e3, "mm", 2),
             _bounded(found.insertion_at_home_m, 1e3, 2),
         ),
-        Line("Slope of roll", f"{roll.value:.4f}", _bounded(roll, 1.0, 4)),
-        Line(
+        TableRow("Slope of roll", f"{roll.value:.4f}", _bounded(roll, 1.0, 4)),
+        TableRow(
             "Backlash of roll",
             quantity(found.roll_backlash_rad.value * _DEG, "°", 2),
             _bounded(found.roll_backlash_rad, _DEG, 2),
@@ -70,12 +70,12 @@ def lines_of(found: Characterization) -> list[Line]:
     ]
     for name, edge in zip(("Lower stop", "Slack from", "Slack to", "Upper stop"), edges, strict=True):
         lines.append(
-            Line(f"Knob: {name[0].lower()}{name[1:]}", quantity(edge.value * _DEG, "°", 2), _bounded(edge, _DEG, 2))
+            TableRow(f"Knob: {name[0].lower()}{name[1:]}", quantity(edge.value * _DEG, "°", 2), _bounded(edge, _DEG, 2))
         )
     return lines
 
 
-def pictures_of(found: Characterization) -> list[Picture]:
+def pictures_of(found: Characterization) -> list[ReportFigure]:
     """Figs. 6.3 to 6.8 of this rig, and the tip's curves over the knob (6.10, 6.11)."""
     degrees = (_DEG, "°")
     return [
@@ -121,7 +121,7 @@ def _model(run: Run, offset: float, width: float, slope: float) -> tuple[np.ndar
 
 def _in_time(
     runs: tuple[Run, ...], unit: tuple[float, str], title: str, figure_name: str, offset: float, width: float, slope: float
-) -> Picture:
+) -> ReportFigure:
     scale, name = unit
     shown = [runs[0], runs[-1]]
 
@@ -146,7 +146,7 @@ def _in_time(
             axes.set_ylabel(name)
             legend_above(axes, 3)
 
-    return picture(
+    return report_figure(
         draw,
         2.9,
         5.0,
@@ -158,7 +158,7 @@ def _in_time(
 
 def _loops(
     runs: tuple[Run, ...], unit: tuple[float, str], title: str, figure_name: str, offset: float, width: float, slope: float
-) -> Picture:
+) -> ReportFigure:
     scale, name = unit
     largest = max(runs, key=lambda run: run.amplitude)
     middle = 0.5 * (largest.encoder.max() + largest.encoder.min())
@@ -185,7 +185,7 @@ def _loops(
         axes.set_ylabel(f"distal end, {name}")
         legend_above(axes, 3)
 
-    return picture(
+    return report_figure(
         draw,
         3.6,
         3.2,
@@ -195,7 +195,7 @@ def _loops(
     )
 
 
-def knob_picture(found: Characterization) -> Picture:
+def knob_picture(found: Characterization) -> ReportFigure:
     """Curvature over the knob: measured by (6.1), by the tip's direction, fitted, and without dead zones (Fig. 6.8)."""
     sweep, knob = found.knob_sweep, found.knob
 
@@ -225,7 +225,7 @@ def knob_picture(found: Characterization) -> Picture:
         axes.set_ylabel("curvature, 1/m")
         legend_above(axes, 2 if narrow else 3)
 
-    return picture(
+    return report_figure(
         draw,
         3.4,
         3.2,
@@ -237,7 +237,7 @@ def knob_picture(found: Characterization) -> Picture:
     )
 
 
-def tip_picture(found: Characterization) -> Picture:
+def tip_picture(found: Characterization) -> ReportFigure:
     """Where the tip is, seen from the distal shaft's proximal end, over the knob (Figs. 6.10, 6.11)."""
     sweep, length = found.knob_sweep, found.distal_length_m
     fitted = np.interp(sweep.knob_rad, found.knob.knob_rad, found.knob.curvature_per_m)
@@ -266,7 +266,7 @@ def tip_picture(found: Characterization) -> Picture:
             axes.set_ylabel(label)
             legend_above(axes, 2)
 
-    return picture(
+    return report_figure(
         draw,
         2.9,
         5.0,

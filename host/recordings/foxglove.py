@@ -108,7 +108,7 @@ class FoxgloveChannels:
         self._picture = Picture(configuration, catheter)
         self._due_ns = {name: 0 for name in ("scene", "tip")}
 
-    def hear(self, topic: str, body: Body) -> list[Derived]:
+    def derive(self, topic: str, body: Body) -> list[Derived]:
         """Take in one message as a dict; what is due because of it."""
         if topic == "log":
             return [
@@ -125,7 +125,7 @@ class FoxgloveChannels:
                     },
                 )
             ]
-        self._picture.hear(topic, body)
+        self._picture.take(topic, body)
         if topic == "pose/tip" and body.get("position_m") is not None and self._due("tip", body["stamp_ns"], POSE_EVERY_NS):
             return [
                 Derived(

@@ -54,7 +54,7 @@ class Picture:
             rows.clear()
         self.now_ns, self._log_new = 0, True
 
-    def hear(self, topic: str, body: Body) -> None:
+    def take(self, topic: str, body: Body) -> None:
         """Take in one message as a dict; a missing key counts as nil. Topics of no concern cost nothing."""
         if topic.startswith("pose/") and body.get("position_m") is None:
             return  # not seen this time: the one before stands until it is old

@@ -219,7 +219,7 @@ class RecordingWriter:
         now_ns = stamp_ns if recorded_ns is None else recorded_ns
         body = {name: value for name, value in msgspec.msgpack.decode(payload).items() if value is not None}
         self._add(topic, body, stamp_ns, sequence, now_ns)
-        for derived in self._foxglove.hear(topic, body):
+        for derived in self._foxglove.derive(topic, body):
             self._add(derived.topic, derived.body, derived.stamp_ns, 0, now_ns)
         if self._chunk_bytes >= CHUNK_BYTES or abs(now_ns - self._chunk_start_ns) >= CHUNK_NS:
             self._sync()

@@ -16,7 +16,7 @@ from host.report.run_report import duration, lateness_of, quantity, verdict_of
 from host.report.run_summary import RunSummary, summarize
 
 
-class Run(Protocol):
+class FinishedRun(Protocol):
     """What is known of a run in addition to its recording: how it ended, and what the loop and the board counted."""
 
     @property
@@ -32,7 +32,7 @@ class Run(Protocol):
     def interrupted(self) -> str: ...
 
 
-def demo_result(recording: Recording, run: Run, report: Path) -> dict[str, Any]:
+def demo_result(recording: Recording, run: FinishedRun, report: Path) -> dict[str, Any]:
     """The object of `seldinger demo --json`.
 
     Forces, tip and timing come from the recording. `run.counts` adds what happened between two recorded board messages
@@ -73,7 +73,7 @@ def _whole(value: float) -> float | int:
     return int(value) if math.isfinite(value) and value == int(value) else value
 
 
-def print_summary(result: dict[str, Any], run: Run, console: Console | None = None) -> None:
+def print_summary(result: dict[str, Any], run: FinishedRun, console: Console | None = None) -> None:
     """Verdict, a short table, and where recording and report are, on standard error."""
     console = console or Console(stderr=True, highlight=False)
     summary = summarize(Recording(run.recording))

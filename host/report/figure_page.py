@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from host.recordings.header import software_version
-from host.report.style import Picture
+from host.report.style import ReportFigure
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 HOLDS, DOES_NOT_HOLD, NOT_REPRODUCIBLE = "holds", "does_not_hold", "not_reproducible"
@@ -31,7 +31,7 @@ class Section:
     ours: str
     verdict: str
     says: str
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[ReportFigure, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:

@@ -22,9 +22,9 @@ from host.report.style import (
     TRUTH,
     WANTED,
     WIDE_IN,
-    Picture,
+    ReportFigure,
     legend_above,
-    picture,
+    report_figure,
     thinned,
 )
 from protocol.topics import HISTOGRAM_EDGES_US
@@ -41,7 +41,7 @@ class RunFigures:
         self.start_ns = recording.span_ns[0]
         self.end_s = max(summary.duration_s, 1e-3)
 
-    def all(self) -> list[Picture]:
+    def all(self) -> list[ReportFigure]:
         """Those for which the recording has the data, in the order of the report."""
         made = [self.force(), self.force_detail(), self.tip(), self.path(), self.stages(), self.timeline(), self.ticks()]
         return [figure for figure in made if figure is not None]
@@ -91,7 +91,7 @@ class RunFigures:
         axes.set_xlabel("time, s")
         axes.set_ylabel("force into the wall, N")
 
-    def force(self) -> Picture | None:
+    def force(self) -> ReportFigure | None:
         """The whole run's force."""
         if not self.recording.topics.get("force/sensor") and not self.recording.topics.get("force/estimate"):
             return None
@@ -109,7 +109,7 @@ class RunFigures:
             axes.set_ylim(max(low_N, -1.0), min(high_N, 2.0))
             legend_above(axes, 2 if narrow else 4)
 
-        return picture(
+        return report_figure(
             draw,
             3.0,
             3.1,
@@ -119,7 +119,7 @@ class RunFigures:
             "the tracked poses alone; its band is two standard deviations.",
         )
 
-    def force_detail(self) -> Picture | None:
+    def force_detail(self) -> ReportFigure | None:
         """The last seconds of contact, large enough to see the heart beat."""
         contact = self.summary.contact
         if contact is None or not self.recording.topics.get("force/sensor"):
@@ -132,7 +132,7 @@ class RunFigures:
             self._force_lines(axes, from_s, to_s)
             legend_above(axes, 2 if narrow else 4)
 
-        return picture(
+        return report_figure(
             draw,
             2.7,
             3.0,
@@ -141,7 +141,7 @@ class RunFigures:
             f"The last {to_s - from_s:.0f} s of contact. Variation with the heart beat is control error.",
         )
 
-    def tip(self) -> Picture | None:
+    def tip(self) -> ReportFigure | None:
         """Tip against target (and wall, where a simulator knows it), along and across the force direction."""
         pose, state = table_or_none(self.recording, "pose/tip"), table_or_none(self.recording, "state")
         if pose is None or state is None:
@@ -185,7 +185,7 @@ class RunFigures:
             across.set_xlabel("time, s")
             across.set_xlim(0, self.end_s)
 
-        return picture(
+        return report_figure(
             draw,
             3.7,
             4.2,
@@ -196,7 +196,7 @@ class RunFigures:
             "controlled. Tracker readings include noise.",
         )
 
-    def path(self) -> Picture | None:
+    def path(self) -> ReportFigure | None:
         """The tip's way from the side and from above, with the catheter's shape at its start and its end."""
         tip, shaft = table_or_none(self.recording, "pose/tip"), table_or_none(self.recording, "pose/shaft")
         if tip is None:
@@ -218,7 +218,7 @@ class RunFigures:
             side.legend(loc="lower left", bbox_to_anchor=(0.01, 0.02))
 
         high_in, narrow_high_in = ((width - 0.7) * sum(rise) + 1.15 for width in (WIDE_IN, NARROW_IN))
-        return picture(
+        return report_figure(
             draw,
             high_in,
             narrow_high_in,
@@ -258,7 +258,7 @@ class RunFigures:
         axes.set_aspect("equal", adjustable="box", anchor="W")
         axes.set_ylabel(f"{row[0]}, mm")
 
-    def stages(self) -> Picture | None:
+    def stages(self) -> ReportFigure | None:
         """Commands and encoders of the three axes."""
         stage = table_or_none(self.recording, "stage")
         if stage is None:
@@ -285,7 +285,7 @@ class RunFigures:
             figure.axes[-1].set_xlabel("time, s")
             legend_above(figure.axes[0], 2)
 
-        return picture(
+        return report_figure(
             draw,
             3.9,
             4.4,
@@ -294,7 +294,7 @@ class RunFigures:
             "Axes of the handle: commanded positions and encoder readings.",
         )
 
-    def timeline(self) -> Picture | None:
+    def timeline(self) -> ReportFigure | None:
         """Phases and safety actions as bars."""
         if not self.summary.modes:
             return None
@@ -328,7 +328,7 @@ class RunFigures:
             axes.set_xlabel("time, s")
             legend_above(axes, 3 if narrow else 7)
 
-        return picture(
+        return report_figure(
             draw,
             1.6,
             2.1,
@@ -337,7 +337,7 @@ class RunFigures:
             "Phases of the control loop, and safety actions.",
         )
 
-    def ticks(self) -> Picture | None:
+    def ticks(self) -> ReportFigure | None:
         """How long the loop's work took, on a logarithmic scale."""
         times = self.summary.ticks
         if not times.histogram.any():
@@ -384,7 +384,7 @@ class RunFigures:
             axes.set_xlabel("time of one tick's work, µs")
             axes.set_ylabel("ticks")
 
-        return picture(
+        return report_figure(
             draw,
             2.5,
             2.8,

@@ -18,7 +18,7 @@ NBSP = "\u00a0"
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-class Verdict(NamedTuple):
+class RunVerdict(NamedTuple):
     """`level` good, fair or bad; one sentence; and what else must be known, sentence by sentence.
 
     Of a failed run the sentence ends in the first cause: `remedy` is what to do about it, `followed` what came after it.
@@ -31,7 +31,7 @@ class Verdict(NamedTuple):
     followed: tuple[str, ...] = ()
 
 
-class Line(NamedTuple):
+class TableRow(NamedTuple):
     """One line of the table of figures: what, how much, and what to hold it against."""
 
     name: str
@@ -87,19 +87,19 @@ def lateness_of(summary: RunSummary) -> str:
     return "virtual time: the simulation waits" if summary.virtual else f"{summary.ticks.missed} late"
 
 
-def verdict_of(summary: RunSummary) -> Verdict:
+def verdict_of(summary: RunSummary) -> RunVerdict:
     """Judge a run. Good: the force was kept and nothing intervened. Bad: no contact, a stop or a board fault."""
     remarks = _remarks(summary)
     stopped = summary.worst_action in ("retract", "stop") or bool(summary.board.faults)
     if summary.contact is None or summary.contact_seconds == 0:
         sentence = f"No contact in {summary.duration_s:.0f} s."
         level = "bad" if stopped or summary.target_force_N > 0 else "fair"
-        return _with_first_cause(Verdict(level, sentence, remarks), summary)
+        return _with_first_cause(RunVerdict(level, sentence, remarks), summary)
     held = f"The wall was touched for {quantity(summary.contact_seconds, 's', 1)}"
     if stopped:
-        return _with_first_cause(Verdict("bad", f"{held}, then the run was stopped.", remarks), summary)
+        return _with_first_cause(RunVerdict("bad", f"{held}, then the run was stopped.", remarks), summary)
     if not math.isfinite(summary.target_force_N):
-        return Verdict("fair", held + "; no force was requested.", remarks)
+        return RunVerdict("fair", held + "; no force was requested.", remarks)
     settled = summary.contact.seconds > SETTLE_S
     sentence = (
         f"Mean force {quantity(summary.force_mean_N, 'N', 3)} "
@@ -108,10 +108,10 @@ def verdict_of(summary: RunSummary) -> Verdict:
         f"RMS error {quantity(summary.force_rms_error_N * 1e3, 'mN', 0)}."
     )
     clean = summary.force_kept and not remarks
-    return Verdict("good" if clean else "fair", sentence, remarks)
+    return RunVerdict("good" if clean else "fair", sentence, remarks)
 
 
-def _with_first_cause(verdict: Verdict, summary: RunSummary) -> Verdict:
+def _with_first_cause(verdict: RunVerdict, summary: RunSummary) -> RunVerdict:
     """Return a failed run's verdict with its first cause, remedy and what followed."""
     first = summary.first
     if verdict.level != "bad" or first is None or first.cause == "operator_stop":
@@ -152,31 +152,33 @@ def _remarks(summary: RunSummary) -> tuple[str, ...]:
     return tuple([text for wrong, text in said if wrong] + list(causes))
 
 
-def lines_of(summary: RunSummary) -> list[Line]:
+def lines_of(summary: RunSummary) -> list[TableRow]:
     """Return the short table, in mN, mm and µs."""
     ticks, estimate = summary.ticks, summary.estimate
     limit = quantity(summary.force_limit_N, "N", 2)
     lines = [
-        Line(
+        TableRow(
             "Mean force",
             quantity(summary.force_mean_N, "N", 3),
             f"set-point {quantity(summary.target_force_N, 'N', 2)}",
         ),
-        Line("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),
-        Line("Peak force", quantity(summary.force_peak_N, "N", 3), f"limit {limit}"),
-        Line("Tip error across the normal", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"),
-        Line(
+        TableRow("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),
+        TableRow("Peak force", quantity(summary.force_peak_N, "N", 3), f"limit {limit}"),
+        TableRow(
+            "Tip error across the normal", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"
+        ),
+        TableRow(
             "Time in contact",
             quantity(summary.contact_seconds, "s", 1),
             f"of {quantity(summary.contact.seconds, 's', 1)} in the phase contact" if summary.contact else "",
         ),
-        Line("Tick, median", duration(ticks.p50_us), f"99.9 %: {duration(ticks.p999_us)}"),
-        Line("Longest tick", duration(ticks.max_us), lateness_of(summary)),
+        TableRow("Tick, median", duration(ticks.p50_us), f"99.9 %: {duration(ticks.p999_us)}"),
+        TableRow("Longest tick", duration(ticks.max_us), lateness_of(summary)),
     ]
     if estimate.count:
         lines.insert(
             3,
-            Line(
+            TableRow(
                 "Estimated minus measured force",
                 quantity(estimate.rms_error_N * 1e3, "mN", 0),
                 f"RMS; mean {signed(estimate.mean_error_N * 1e3, 'mN', 0)}, "
@@ -185,7 +187,7 @@ def lines_of(summary: RunSummary) -> list[Line]:
         )
     if math.isfinite(ticks.lateness_p99_us):
         lines.append(
-            Line(
+            TableRow(
                 "Wake-up delay, 99 %",
                 quantity(ticks.lateness_p99_us, "µs", 0),
                 f"worst {quantity(ticks.lateness_max_us, 'µs', 0)}",
@@ -194,7 +196,7 @@ def lines_of(summary: RunSummary) -> list[Line]:
     return lines
 
 
-def firmware_of(summary: RunSummary) -> list[Line]:
+def firmware_of(summary: RunSummary) -> list[TableRow]:
     """Return the board's counters; empty if the recording has no message of the board."""
     board, ticks = summary.board, summary.ticks
     if not board.known:
@@ -202,24 +204,24 @@ def firmware_of(summary: RunSummary) -> list[Line]:
     gap = ", ".join(str(steps) for steps in board.encoder_gap_steps)
     where = f" ({ticks.longest_gap_where})" if ticks.longest_gap_where else ""
     lines = [
-        Line("Faults", ", ".join(board.faults) or "none"),
-        Line("Damaged frames", str(board.crc_errors)),
-        Line("Queue underruns", str(board.underruns)),
-        Line("Set-points refused", str(board.rejected)),
-        Line("Resets", str(board.resets)),
-        Line("Encoder minus steps, largest", f"{gap} steps", "insertion, roll, knob"),
+        TableRow("Faults", ", ".join(board.faults) or "none"),
+        TableRow("Damaged frames", str(board.crc_errors)),
+        TableRow("Queue underruns", str(board.underruns)),
+        TableRow("Set-points refused", str(board.rejected)),
+        TableRow("Resets", str(board.resets)),
+        TableRow("Encoder minus steps, largest", f"{gap} steps", "insertion, roll, knob"),
     ]
     if ticks.longest_gap_ns:
-        lines.append(Line("Longest gap between set-points", f"{ticks.longest_gap_ns * 1e-6:.1f} ms{where}"))
+        lines.append(TableRow("Longest gap between set-points", f"{ticks.longest_gap_ns * 1e-6:.1f} ms{where}"))
     return lines
 
 
-def _safety_rows(recording: Recording, summary: RunSummary) -> list[Line]:
+def _safety_rows(recording: Recording, summary: RunSummary) -> list[TableRow]:
     start_ns = recording.span_ns[0]
-    return [Line(f"{(span.start_ns - start_ns) * 1e-9:.2f} s", span.name, span.note) for span in summary.safety[:200]]
+    return [TableRow(f"{(span.start_ns - start_ns) * 1e-9:.2f} s", span.name, span.note) for span in summary.safety[:200]]
 
 
-def _event_rows(recording: Recording, most: int = 200) -> list[Line]:
+def _event_rows(recording: Recording, most: int = 200) -> list[TableRow]:
     """Commands with their replies, and log lines, in order of time."""
     start_ns = recording.span_ns[0]
     replies = {reply["id"]: reply for reply in recording.messages("reply")}
@@ -232,41 +234,41 @@ def _event_rows(recording: Recording, most: int = 200) -> list[Line]:
         rows.append((command["stamp_ns"], "command", f"{' '.join(words)}: {answer}"))
     rows += [(line["stamp_ns"], line["source"], line["text"]) for line in recording.messages("log")]
     rows.sort(key=lambda row: row[0])
-    return [Line(f"{(stamp_ns - start_ns) * 1e-9:.2f} s", source, text) for stamp_ns, source, text in rows[:most]]
+    return [TableRow(f"{(stamp_ns - start_ns) * 1e-9:.2f} s", source, text) for stamp_ns, source, text in rows[:most]]
 
 
-def _topic_rows(recording: Recording, summary: RunSummary) -> list[Line]:
+def _topic_rows(recording: Recording, summary: RunSummary) -> list[TableRow]:
     duration_s = max(summary.duration_s, 1e-9)
     rows = []
     for topic, count in sorted(recording.topics.items()):
         lost = f", {summary.lost[topic]} lost" if topic in summary.lost else ""
-        rows.append(Line(topic, str(count), f"{count / duration_s:.1f} /s{lost}"))
+        rows.append(TableRow(topic, str(count), f"{count / duration_s:.1f} /s{lost}"))
     return rows
 
 
-def _appendix(recording: Recording) -> list[tuple[str, list[Line]]]:
+def _appendix(recording: Recording) -> list[tuple[str, list[TableRow]]]:
     """Run, catheter and effective configuration as flat tables."""
-    run = [Line(name, value) for name, value in recording.run.items() if value]
-    sections: list[tuple[str, list[Line]]] = [("run", run)]
+    run = [TableRow(name, value) for name, value in recording.run.items() if value]
+    sections: list[tuple[str, list[TableRow]]] = [("run", run)]
     flat_catheter = _flat(recording.catheter)
     if flat_catheter:
         sections.append(("catheter parameters", flat_catheter))
-    general: list[Line] = []
+    general: list[TableRow] = []
     for name, value in recording.configuration.items():
         if isinstance(value, dict):
             sections.append((f"configuration: {name}", _flat(value)))
         else:
-            general.append(Line(name, _shown(value)))
+            general.append(TableRow(name, _shown(value)))
     return sections[:1] + ([("configuration", general)] if general else []) + sections[1:]
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> list[Line]:
-    lines: list[Line] = []
+def _flat(values: dict[str, Any], prefix: str = "") -> list[TableRow]:
+    lines: list[TableRow] = []
     for name, value in values.items():
         if isinstance(value, dict):
             lines += _flat(value, f"{prefix}{name}.")
         elif value is not None:
-            lines.append(Line(prefix + name, _shown(value)))
+            lines.append(TableRow(prefix + name, _shown(value)))
     return lines
 
 

@@ -20,7 +20,7 @@ SETTLE_S = 3.0
 
 
 @dataclass(frozen=True)
-class Span:
+class TimeSpan:
     """Something that held from start_ns to end_ns."""
 
     start_ns: int
@@ -91,9 +91,9 @@ class RunSummary:
     force_peak_N: float
     tip_rms_error_m: float
     contact_seconds: float
-    contact: Span | None
-    modes: tuple[Span, ...]
-    safety: tuple[Span, ...]
+    contact: TimeSpan | None
+    modes: tuple[TimeSpan, ...]
+    safety: tuple[TimeSpan, ...]
     ticks: TickTimes
     board: BoardHealth
     estimate: EstimateQuality
@@ -123,7 +123,7 @@ def table_or_none(recording: Recording, topic: str) -> dict[str, Array] | None:
     return recording.table(topic) if recording.topics.get(topic) else None
 
 
-def spans(stamp_ns: Array, names: Array, notes: Array | None = None) -> list[Span]:
+def spans(stamp_ns: Array, names: Array, notes: Array | None = None) -> list[TimeSpan]:
     """Runs of equal (name, note): each lasts until the next begins, the last one until the last stamp."""
     notes = np.full(len(names), "") if notes is None else notes
     if len(names) == 0:
@@ -132,7 +132,7 @@ def spans(stamp_ns: Array, names: Array, notes: Array | None = None) -> list[Spa
     starts = np.concatenate([[0], changes])
     ends = np.append(stamp_ns[changes], stamp_ns[-1])
     return [
-        Span(int(stamp_ns[start]), int(end), str(names[start]), str(notes[start]))
+        TimeSpan(int(stamp_ns[start]), int(end), str(names[start]), str(notes[start]))
         for start, end in zip(starts, ends, strict=True)
     ]
 
@@ -141,8 +141,8 @@ def summarize(recording: Recording) -> RunSummary:
     """All figures of `recording`; topics that it does not have leave theirs at NaN, zero or empty."""
     first_ns, last_ns = recording.span_ns
     state, force = table_or_none(recording, "state"), table_or_none(recording, "force/sensor")
-    modes: list[Span] = []
-    safety: list[Span] = []
+    modes: list[TimeSpan] = []
+    safety: list[TimeSpan] = []
     direction, target_N = np.array([0.0, 0.0, 1.0]), float("nan")
     if state is not None:
         modes = spans(state["stamp_ns"], state["mode"])
@@ -191,12 +191,12 @@ def _direction(state: dict[str, Array], otherwise: Array) -> Array:
     return rows[-1] if len(rows) else otherwise
 
 
-def _contact_of(modes: list[Span]) -> Span | None:
+def _contact_of(modes: list[TimeSpan]) -> TimeSpan | None:
     touching = [span for span in modes if span.name == "contact"]
-    return Span(touching[0].start_ns, touching[-1].end_ns, "contact") if touching else None
+    return TimeSpan(touching[0].start_ns, touching[-1].end_ns, "contact") if touching else None
 
 
-def within(stamp_ns: Array, span: Span | None, settle_s: float = 0.0) -> Array:
+def within(stamp_ns: Array, span: TimeSpan | None, settle_s: float = 0.0) -> Array:
     """Mask of the stamps in `span` (its end excluded), less its first `settle_s` where it is longer than that."""
     if span is None:
         return np.zeros(len(stamp_ns), dtype=bool)
@@ -209,7 +209,7 @@ def _rms(values: Array) -> float:
 
 
 def _force_figures(
-    force: dict[str, Array] | None, contact: Span | None, direction: Array, target_N: float
+    force: dict[str, Array] | None, contact: TimeSpan | None, direction: Array, target_N: float
 ) -> tuple[float, float, float, float]:
     """(mean and RMS error after settling, peak of the whole run, seconds of touch)."""
     if force is None:
@@ -230,7 +230,7 @@ def _force_figures(
     )
 
 
-def _tip_error_m(recording: Recording, state: dict[str, Array] | None, contact: Span | None, direction: Array) -> float:
+def _tip_error_m(recording: Recording, state: dict[str, Array] | None, contact: TimeSpan | None, direction: Array) -> float:
     """RMS distance of the tracked tip from its target during contact, across the direction that force controls."""
     pose = table_or_none(recording, "pose/tip")
     if pose is None or state is None:
@@ -295,7 +295,7 @@ def _as_steps(recording: Recording, table: dict[str, Array], axis: str) -> Array
 
 
 def _estimate(
-    recording: Recording, force: dict[str, Array] | None, contact: Span | None, direction: Array
+    recording: Recording, force: dict[str, Array] | None, contact: TimeSpan | None, direction: Array
 ) -> EstimateQuality:
     table = table_or_none(recording, "force/estimate")
     if table is None or force is None:
@@ -342,8 +342,8 @@ __all__ = [
     "BoardHealth",
     "EstimateQuality",
     "RunSummary",
-    "Span",
     "TickTimes",
+    "TimeSpan",
     "estimate_along",
     "spans",
     "stack",

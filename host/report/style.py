@@ -67,7 +67,7 @@ _STYLE: Any = {
 WIDE_IN, NARROW_IN = 7.4, 3.5
 
 
-class Picture(NamedTuple):
+class ReportFigure(NamedTuple):
     """One figure as two SVG data addresses, what it shows in words for those who do not see it, and a caption."""
 
     wide: str
@@ -85,9 +85,9 @@ def _as_address(figure: Figure) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
-def picture(
+def report_figure(
     draw: Callable[[Figure, bool], None], height_in: float, narrow_height_in: float, title: str, alt: str, caption: str
-) -> Picture:
+) -> ReportFigure:
     """`draw(figure, narrow)` on a page's width and on a phone's."""
     addresses = []
     with matplotlib.rc_context(_STYLE):
@@ -96,7 +96,7 @@ def picture(
             figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.05))
             draw(figure, narrow)
             addresses.append(_as_address(figure))
-    return Picture(addresses[0], addresses[1], title, alt, caption)
+    return ReportFigure(addresses[0], addresses[1], title, alt, caption)
 
 
 def thinned(x: Array, y: Array, bins: int = 700) -> tuple[Array, Array]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from protocol.commander import Acknowledgement, Asker
-from protocol.commander import Commander as PlainCommander
+from protocol.commander import Acknowledgement, Asker, CommandSender
 
 RENEW_S = 1.0
 
 
-class Commander(PlainCommander):
-    """`protocol.commander.Commander` whose lease is renewed in the background, from `take` to `release` or `close`.
+class Commander(CommandSender):
+    """`protocol.commander.CommandSender` whose lease is renewed in the background, from `take` to `release` or `close`.
 
     Use as a context, or `close` it: an unclosed one keeps others from commanding as long as its process lives.
     """

@@ -74,7 +74,7 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
             scenario = Scenario(
                 rig, world, record, estimator=service, force_source=settings.force_source, pace=settings.pace
             )
-            with _stopping(scenario, run):
+            with _SignalsStop(scenario, run):
                 run.outcome = scenario.press(
                     ContactJob(target_m=TARGET_M, force_N=settings.force_N, hold_s=settings.hold_s),
                     lambda phase, share: progress(phase, share, float(scenario.loop.outputs[0].normal_force_N)),
@@ -102,7 +102,7 @@ def _counts(scenario: Scenario, world: World, outcome: Outcome) -> dict[str, Any
     }
 
 
-class _stopping:
+class _SignalsStop:
     """While it lasts, SIGINT and SIGTERM end the scenario instead of the process."""
 
     def __init__(self, scenario: Scenario, run: DemoRun) -> None:

@@ -71,7 +71,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Row:
+class LiveRow:
     """One finished run: alarms, the largest score, and the residual at its end relative to the usual one."""
 
     task: Task
@@ -130,7 +130,7 @@ def effect_of(task: Task) -> tuple[Effect, ...]:
     return (replace(plain, parameters=values, start_s=ON_S),)
 
 
-def run(task: Task, board: str = "native") -> Row:
+def run(task: Task, board: str = "native") -> LiveRow:
     """The watch on one run of the simulated rig."""
     rig = load_rig(SIMULATED_RIG)
     watch, alarms, scores = Watch(rig), [], [0.0]
@@ -151,7 +151,7 @@ def run(task: Task, board: str = "native") -> Row:
             scenario.arm()
             desk: Any = VirtualDesk(scenario)
             perform(round_trip(rig, task.seconds), desk)
-        return Row(task, world.now_ns * 1e-9, tuple(map(_alarm, alarms)), max(scores), _ratio(watch))
+        return LiveRow(task, world.now_ns * 1e-9, tuple(map(_alarm, alarms)), max(scores), _ratio(watch))
 
 
 def _alarm(alarm: Alarm) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def tasks(quiet_s: float, planted: int, only: str = "") -> Iterator[Task]:
         yield Task("planted", name, job, 100 + k, HOLD_S, round(size, 3))
 
 
-def doubled(row: Row) -> Task | None:
+def doubled(row: LiveRow) -> Task | None:
     """The run whose residual is DOUBLE the usual one, from that of the default size; None where that one shows nothing.
 
     The effect's part grows with its size and adds to the usual residual by its square.
@@ -203,13 +203,13 @@ def doubled(row: Row) -> Task | None:
     return replace(row.task, part="doubled", seed=row.task.seed + 1, size=round(size, 3))
 
 
-def table(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[LiveRow]) -> str:
     """The page's table."""
     head = "| planted | job | size | residual, of the usual | alarm (s after) | named | also possible |"
     return "\n".join([head, "|---|---|---|---|---|---|---|", *(row.line for row in rows)])
 
 
-def quiet_line(rows: Sequence[Row]) -> str:
+def quiet_line(rows: Sequence[LiveRow]) -> str:
     """How often there was an alarm without an effect, by job."""
     parts = []
     for job in dict.fromkeys(row.task.job for row in rows):
@@ -220,7 +220,7 @@ def quiet_line(rows: Sequence[Row]) -> str:
     return f"Without any effect: {'; '.join(parts)}; largest score {highest:.2f} of 1."
 
 
-def doubled_line(rows: Sequence[Row]) -> str:
+def doubled_line(rows: Sequence[LiveRow]) -> str:
     """Delay of the alarms where the residual is about twice the usual one."""
     late = [row.delay_s for row in rows if row.delay_s is not None]
     in_time = sum(delay <= WITHIN_S for delay in late)
@@ -231,7 +231,7 @@ def doubled_line(rows: Sequence[Row]) -> str:
     )
 
 
-def planted_line(rows: Sequence[Row]) -> str:
+def planted_line(rows: Sequence[LiveRow]) -> str:
     """How often the alarm named a wrong subsystem."""
     reported = [row for row in rows if row.first]
     wrong = [row for row in reported if row.first and row.first["subsystem"] != row.task.planted.partition("@")[2]]
@@ -243,7 +243,7 @@ def planted_line(rows: Sequence[Row]) -> str:
     )
 
 
-def summary(rows: Sequence[Row]) -> str:
+def summary(rows: Sequence[LiveRow]) -> str:
     """The page's text: one table, one line for each figure."""
     by = {part: [row for row in rows if row.task.part == part] for part in ("default", "doubled", "planted", "quiet")}
     parts = [table([*by["default"], *by["doubled"]])]
@@ -261,7 +261,7 @@ def write_docs(path: Path, text: str) -> None:
     path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
 
 
-def read_rows(path: Path) -> dict[str, Row]:
+def read_rows(path: Path) -> dict[str, LiveRow]:
     """Finished runs of an earlier call by their keys; a last line that was cut off is left out."""
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
@@ -269,7 +269,7 @@ def read_rows(path: Path) -> dict[str, Row]:
             content = json.loads(line)
         except ValueError:
             continue
-        row = Row(**{**content, "task": Task(**content["task"]), "alarms": tuple(content["alarms"])})
+        row = LiveRow(**{**content, "task": Task(**content["task"]), "alarms": tuple(content["alarms"])})
         found[row.task.key] = row
     return found
 
@@ -282,7 +282,7 @@ class Book:
         self._path, self._board = path, board
         self.rows = read_rows(path) if path else {}
 
-    def row(self, task: Task) -> Row:
+    def row(self, task: Task) -> LiveRow:
         """The finished run of `task`."""
         if task.key not in self.rows:
             row = self.rows[task.key] = run(task, self._board)

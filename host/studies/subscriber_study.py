@@ -31,7 +31,7 @@ _SETTLED_S, _OVER_S = 2.0, 1.0
 
 
 @dataclass
-class Measured:
+class MeasuredLoop:
     """Sums over all slices of one kind. lateness, work: histograms as the loop keeps them; threads_s: how late a thread
     of the same process woke that wanted to sleep 1 ms, as those of the devices do."""
 
@@ -59,7 +59,7 @@ class Measured:
 class Study:
     """By kind, and what cyclictest found in slices between them (None: not installed, or failed)."""
 
-    measured: dict[str, Measured]
+    measured: dict[str, MeasuredLoop]
     cyclictest: np.ndarray | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -104,11 +104,11 @@ def study(kinds: Sequence[str], seconds: float, board: str = "native") -> Study:
     return found
 
 
-def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[str, Measured]) -> None:
+def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[str, MeasuredLoop]) -> None:
     loop = process.loop
     with bad_subscriber(kind, process.rig.name, process.rig.zenoh.connect[0]) as bad:
         late, work, before, flooded = loop.lateness.copy(), loop.work.copy(), loop.snapshot(), process.counts().flooded
-        one = measured.setdefault(kind, Measured(np.zeros_like(late), np.zeros_like(work)))
+        one = measured.setdefault(kind, MeasuredLoop(np.zeros_like(late), np.zeros_like(work)))
         end = time.monotonic() + seconds
         while (now := time.monotonic()) < end:
             time.sleep(0.001)

@@ -80,7 +80,7 @@ class LiveRig:
         except ValueError:
             self.malformed += 1
             return
-        self._picture.hear(topic, msgpack.unpackb(payload))
+        self._picture.take(topic, msgpack.unpackb(payload))
         if topic == "state":
             self._heard_s = time.monotonic()
 

@@ -172,7 +172,7 @@ class Replay:
                 for index in chosen:
                     body = self._recording.message(topic, int(index))
                     if body is not None:
-                        self._picture.hear(topic, body)
+                        self._picture.take(topic, body)
             self._next[topic] = upto
 
     def _seek(self, at_s: float) -> None:

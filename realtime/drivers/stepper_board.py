@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from protocol.enums import BoardState
-from protocol.serial_codec import Message, StreamDecoder, encode
+from protocol.serial_codec import AnyFrame, StreamDecoder, encode
 from protocol.serial_frames import (
     AXES,
     BAUD,
@@ -255,7 +255,7 @@ class StepperBoardLink:
         """Whether the board takes set-points, by its last STATUS."""
         return self.status is not None and self.status.state in (BoardState.ARMED, BoardState.RUNNING)
 
-    def _on_identity(self, message: Message, now_ns: int) -> list[LinkEvent]:
+    def _on_identity(self, message: AnyFrame, now_ns: int) -> list[LinkEvent]:
         identity = BoardIdentity(**message.fields)
         major, minor = divmod(identity.firmware_version, 256)
         if identity.protocol_hash != PROTOCOL_HASH or major != FIRMWARE_VERSION[0]:
@@ -287,7 +287,7 @@ class StepperBoardLink:
             )
         return events
 
-    def _on_status(self, message: Message, now_ns: int) -> list[LinkEvent]:
+    def _on_status(self, message: AnyFrame, now_ns: int) -> list[LinkEvent]:
         status = BoardStatus(arrival_ns=now_ns, **message.fields)
         events = self._check_boot(status.boot_count, now_ns)
         if self.status is None and self.phase is LinkPhase.HELLO:
@@ -315,7 +315,7 @@ class StepperBoardLink:
             )
         ]
 
-    def _on_ack(self, message: Message, now_ns: int) -> list[LinkEvent]:
+    def _on_ack(self, message: AnyFrame, now_ns: int) -> list[LinkEvent]:
         result = Result(message.fields["result"])
         frame = FRAME_BY_ID.get(message.fields["command"])
         pending = self._pending.pop(message.fields["command_sequence"], None)

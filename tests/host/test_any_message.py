@@ -105,7 +105,7 @@ def take_in(
     recorder, picture, service = readers
     message: Message = decode(TOPICS[topic].message, payload)
     recorder.write_encoded(topic, payload, message.stamp_ns, message.sequence, recorded_ns)
-    picture.hear(topic, msgspec.msgpack.decode(payload))
+    picture.take(topic, msgspec.msgpack.decode(payload))
     picture.frame()
     service.hear(topic, message)
     answer = service.answer(recorded_ns)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from host.cli.bench import bench as bench_command
 from host.studies.benchmarks import control
 from host.studies.benchmarks import runner as bench
-from host.studies.benchmarks.runner import Timed, alternate, find, row_of, run
+from host.studies.benchmarks.runner import PairedTimes, alternate, find, row_of, run
 from protocol.errors import InputError
 
 CONTRACT_KEYS = ("name", "unit", "median", "p95", "seed", "peer", "peer_median", "speedup")
@@ -43,7 +43,9 @@ def test_both_sides_run_in_turn_on_each_input() -> None:
 
 
 def test_a_row_has_the_contracts_keys() -> None:
-    row = row_of("x", "cold", "some peer", Timed([1e-6, 2e-6, 3e-6], [1e-3] * 3), 5, tip_error_m=1e-9, peer_tip_error_m=1e-4)
+    row = row_of(
+        "x", "cold", "some peer", PairedTimes([1e-6, 2e-6, 3e-6], [1e-3] * 3), 5, tip_error_m=1e-9, peer_tip_error_m=1e-4
+    )
     assert all(key in row for key in CONTRACT_KEYS)
     assert row["unit"] == "us" and row["median"] == pytest.approx(2.0) and row["speedup"] == pytest.approx(500.0)
     assert row["tip_error_m"] == 1e-9 and row["seed"] == 5 and row["cases"] == 3

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from host.run.commander import Commander
-from protocol.commander import Commander as PlainCommander
+from protocol.commander import CommandSender
 from protocol.topics import Command, Reply
 from protocol.zenoh_session import RequestServer, Session
 from realtime.core.command_gate import CommandGate
@@ -45,7 +45,7 @@ def gate(tmp_path: Path) -> Iterator[Gate]:
 @pytest.fixture
 def console(gate: Gate, tmp_path: Path) -> Iterator[Session]:
     with Session("simulated", [], [f"unixsock-stream/{tmp_path}/rig.sock"]) as session:
-        probe = PlainCommander(session, "probe")
+        probe = CommandSender(session, "probe")
         assert until(lambda: probe.give("clock").accepted)
         yield session
 
@@ -107,7 +107,7 @@ def test_a_rig_that_is_not_there_is_said(tmp_path: Path) -> None:
 
 
 def test_a_session_that_was_closed_is_no_answer(gate: Gate, console: Session) -> None:
-    commander = PlainCommander(console, "console")
+    commander = CommandSender(console, "console")
     assert commander.take().accepted
     console.close()
     assert commander.hold().result == "unanswered"

@@ -9,7 +9,7 @@ import pytest
 
 from host.commissioning.experiment_script import check_script
 from host.studies import live_study
-from host.studies.live_study import BEGIN, CASES, END, ON_S, Book, Row, Task
+from host.studies.live_study import BEGIN, CASES, END, ON_S, Book, LiveRow, Task
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 
@@ -18,8 +18,8 @@ def alarm(since_s: float, at_s: float, subsystem: str = "roll") -> dict[str, obj
     return {"at_s": at_s, "since_s": since_s, "subsystem": subsystem, "effect": "whip", "words": words}
 
 
-def row(part: str = "planted", *alarms: dict[str, object], ratio: float = 2.0, seconds: float = 60.0) -> Row:
-    return Row(Task(part, "whip@roll", "round", 1, 32.0), seconds, alarms, 0.9, ratio)
+def row(part: str = "planted", *alarms: dict[str, object], ratio: float = 2.0, seconds: float = 60.0) -> LiveRow:
+    return LiveRow(Task(part, "whip@roll", "round", 1, 32.0), seconds, alarms, 0.9, ratio)
 
 
 def test_a_row_says_when_what_and_what_else() -> None:
@@ -38,7 +38,7 @@ def test_figures_are_counted() -> None:
     wrong = row("planted", alarm(ON_S, ON_S + 5.0, "knob"))
     said = live_study.planted_line([wrong, soon, never])
     assert "3; 2 reported, 1 of them with a wrong subsystem (whip@roll as knob)" in said
-    quiet = Row(Task("quiet", "", "press", 1, 600.0), 1800.0, (alarm(10.0, 15.0),), 1.2, 1.0)  # type: ignore[arg-type]
+    quiet = LiveRow(Task("quiet", "", "press", 1, 600.0), 1800.0, (alarm(10.0, 15.0),), 1.2, 1.0)  # type: ignore[arg-type]
     assert "press 1 alarms in 0.50 hours (1 runs)" in live_study.quiet_line([quiet])
 
 
@@ -69,9 +69,9 @@ def test_the_full_form_is_five_hours_of_each_job_and_sixty_planted_runs() -> Non
 def test_finished_runs_are_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = []
 
-    def fake(task: Task, board: str) -> Row:
+    def fake(task: Task, board: str) -> LiveRow:
         done.append(task)
-        return Row(task, 60.0, (), 0.5, 1.5)
+        return LiveRow(task, 60.0, (), 0.5, 1.5)
 
     monkeypatch.setattr(live_study, "run", fake)
     task = Task("quiet", "", "press", 3, 60.0)

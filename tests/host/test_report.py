@@ -270,7 +270,7 @@ def test_the_page_tells_the_same_first_cause(tmp_path: Path) -> None:
     came = [(body["stamp_ns"], topic, body) for topic in ("loop", "board", "state") for body in recording.messages(topic)]
     for stamp_ns, topic, body in sorted(came, key=lambda item: item[:2]):
         if stamp_ns < 10_500 * MS:
-            picture.hear(topic, {name: value for name, value in body.items() if value is not None})
+            picture.take(topic, {name: value for name, value in body.items() if value is not None})
     first = picture.frame()["first"]
     assert first["says"] in verdict_of(summarize(recording)).sentence and first["followed"]
 

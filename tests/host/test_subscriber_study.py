@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from host.studies.bad_subscriber import KINDS
-from host.studies.subscriber_study import NOBODY, SAYS, Measured, Study, page_section
+from host.studies.subscriber_study import NOBODY, SAYS, MeasuredLoop, Study, page_section
 from realtime.loop.native_loop import BINS
 
 
-def measured(late_us: int, missed: int = 0) -> Measured:
+def measured(late_us: int, missed: int = 0) -> MeasuredLoop:
     lateness = np.zeros(BINS + 2, np.int64)
     lateness[late_us] = 1000
     lateness[-1] = 1000 * (late_us + 1)
-    return Measured(lateness, lateness.copy(), ticks=1000, missed=missed, flooded=7, threads_s=[1e-4] * 99 + [2e-3])
+    return MeasuredLoop(lateness, lateness.copy(), ticks=1000, missed=missed, flooded=7, threads_s=[1e-4] * 99 + [2e-3])
 
 
 def test_the_page_has_a_row_for_each_kind_and_one_for_comparison() -> None:
@@ -35,8 +35,8 @@ def test_the_page_has_a_row_for_each_kind_and_one_for_comparison() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--with", "frozen,nosy"], 'with: found "nosy", wanted all, or some of ' + ", ".join(KINDS)),
-        (["--docs", "page.md"], "docs: found page.md, wanted --with beside it"),
+        (["--with", "frozen,nosy"], '--with: found "nosy", wanted one of ' + ", ".join(KINDS)),
+        (["--docs", "page.md"], '--docs: found "page.md", wanted --with too'),
     ],
 )
 def test_what_it_refuses(arguments: list[str], says: str) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet
-from protocol.commander import Commander
+from protocol.commander import CommandSender
 from protocol.enums import Phase, SafetyAction
 from protocol.rig_file import load_rig
 from protocol.topics import Command, Log, Message, Reply, encode
@@ -142,7 +142,7 @@ def process_and_cable(tmp_path: Path) -> Iterator[tuple[RealtimeProcess, Cable]]
 @pytest.mark.slow
 def test_a_board_unplugged_while_armed_is_found_again_and_disarmed(process_and_cable: tuple[RealtimeProcess, Cable]) -> None:
     process, cable = process_and_cable
-    commander = Commander(Door(process), "test")
+    commander = CommandSender(Door(process), "test")
 
     def armed_and_holding() -> bool:
         commander.take()

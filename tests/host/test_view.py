@@ -69,13 +69,13 @@ def test_a_picture_of_nothing_and_of_old_poses_shows_neither_tip_nor_force() -> 
     picture = Picture({}, {})
     frame = picture.frame()
     assert frame["mode"] == "" and frame["scene"]["shape"] is None and frame["loop"] is None
-    picture.hear("pose/tip", {"stamp_ns": 0, "position_m": [0.0, 0.0, 0.02], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]})
-    picture.hear("force/sensor", {"stamp_ns": 0, "force_N": [0.0, 0.0, 0.1]})
+    picture.take("pose/tip", {"stamp_ns": 0, "position_m": [0.0, 0.0, 0.02], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]})
+    picture.take("force/sensor", {"stamp_ns": 0, "force_N": [0.0, 0.0, 0.1]})
     state = {"mode": "hold", "safety_action": "hold", "cause": "no fresh pose", "tip_m": [0.0, 0.0, 0.02]}
-    picture.hear("state", {**state, "stamp_ns": 100 * MS})
+    picture.take("state", {**state, "stamp_ns": 100 * MS})
     fresh = picture.frame()
     assert fresh["scene"]["tip"] == [0.0, 0.0, 0.02] and fresh["scene"]["force"] == [0.0, 0.0, 0.1]
-    picture.hear("state", {**state, "stamp_ns": 900 * MS})
+    picture.take("state", {**state, "stamp_ns": 900 * MS})
     old = picture.frame()
     assert old["scene"]["tip"] == [] and old["scene"]["force"] == [] and old["causes"] == ["no fresh pose"]
     assert len(old["rows"]) == 1, "each sample is handed out once"

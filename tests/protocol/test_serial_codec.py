@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from protocol.serial_codec import Message, StreamDecoder, cobs_decode, cobs_encode, crc16, encode
+from protocol.serial_codec import AnyFrame, StreamDecoder, cobs_decode, cobs_encode, crc16, encode
 from protocol.serial_frames import FRAME_BY_NAME, FRAMES, Field, Frame
 
 _RANGES = {"u8": (0, 2**8 - 1), "u16": (0, 2**16 - 1), "u32": (0, 2**32 - 1), "i32": (-(2**31), 2**31 - 1)}
@@ -18,19 +18,19 @@ def values_of(field: Field) -> st.SearchStrategy:
     return one if field.count == 1 else st.tuples(*[one] * field.count)
 
 
-def messages_of(frame: Frame) -> st.SearchStrategy[Message]:
+def messages_of(frame: Frame) -> st.SearchStrategy[AnyFrame]:
     fields = st.fixed_dictionaries({f.name: values_of(f) for f in frame.fields})
-    return st.builds(Message, st.just(frame.name), st.integers(0, 255), fields)
+    return st.builds(AnyFrame, st.just(frame.name), st.integers(0, 255), fields)
 
 
 any_message = st.sampled_from(FRAMES).flatmap(messages_of)
 
 
-def wire(message: Message) -> bytes:
+def wire(message: AnyFrame) -> bytes:
     return encode(message.name, message.sequence, **message.fields)
 
 
-def numbered(messages: list[Message]) -> list[Message]:
+def numbered(messages: list[AnyFrame]) -> list[AnyFrame]:
     return [m._replace(sequence=i & 0xFF) for i, m in enumerate(messages)]
 
 
@@ -52,12 +52,12 @@ def test_cobs_round_trip(data: bytes) -> None:
 
 
 @given(any_message)
-def test_round_trip(message: Message) -> None:
+def test_round_trip(message: AnyFrame) -> None:
     assert StreamDecoder().feed(wire(message)) == [message]
 
 
 @given(st.lists(any_message, max_size=8), st.lists(st.integers(1, 40), min_size=1))
-def test_any_portions(messages: list[Message], sizes: list[int]) -> None:
+def test_any_portions(messages: list[AnyFrame], sizes: list[int]) -> None:
     messages = numbered(messages)
     stream = b"".join(map(wire, messages))
     decoder, out, at, turn = StreamDecoder(), [], 0, 0
@@ -70,7 +70,7 @@ def test_any_portions(messages: list[Message], sizes: list[int]) -> None:
 
 
 @st.composite
-def damaged_stream(draw: st.DrawFn) -> tuple[list[Message], bytes]:
+def damaged_stream(draw: st.DrawFn) -> tuple[list[AnyFrame], bytes]:
     """Frames of which some are flipped, cut, doubled, swapped or dropped, and what was sent."""
     messages = numbered(draw(st.lists(any_message, min_size=1, max_size=6)))
     pieces = [bytearray(wire(m)) for m in messages]
@@ -94,7 +94,7 @@ def damaged_stream(draw: st.DrawFn) -> tuple[list[Message], bytes]:
 
 
 @given(damaged_stream())
-def test_nothing_arrives_that_was_not_sent(case: tuple[list[Message], bytes]) -> None:
+def test_nothing_arrives_that_was_not_sent(case: tuple[list[AnyFrame], bytes]) -> None:
     sent, stream = case
     out = StreamDecoder().feed(stream)
     assert all(message in sent for message in out)
@@ -102,7 +102,7 @@ def test_nothing_arrives_that_was_not_sent(case: tuple[list[Message], bytes]) ->
 
 
 @given(any_message, any_message, st.data())
-def test_damage_is_counted_and_the_next_frame_arrives(first: Message, second: Message, data: st.DataObject) -> None:
+def test_damage_is_counted_and_the_next_frame_arrives(first: AnyFrame, second: AnyFrame, data: st.DataObject) -> None:
     decoder = StreamDecoder()
     decoder.feed(encode("PING", 255))
     raw = bytearray(wire(first._replace(sequence=0)))

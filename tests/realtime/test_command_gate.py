@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.commander import Commander
+from protocol.commander import CommandSender
 from protocol.topics import MAX_PAYLOAD_BYTES, Command, Reply, encode
 from realtime.core.command_gate import AHEAD_NS, BURST, LEASE_NS, LONGEST_LIFE_NS, REMEMBERED, CommandGate, for_the_record
 
@@ -31,8 +31,8 @@ class Rig:
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
         return self.gate.answer(command.commander, encode(command))[1]
 
-    def commander(self, name: str = "console") -> Commander:
-        return Commander(self, name, clock_ns=lambda: self.now_ns)
+    def commander(self, name: str = "console") -> CommandSender:
+        return CommandSender(self, name, clock_ns=lambda: self.now_ns)
 
     def command(self, **changes: Any) -> Command:
         self.ids += 1

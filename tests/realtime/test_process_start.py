@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.commander import Acknowledgement, Commander
+from protocol.commander import Acknowledgement, CommandSender
 from protocol.rig_file import SIMULATED_RIG, parse_rig, read_rig_data
 from protocol.topics import RigState
 from protocol.zenoh_session import Session
@@ -42,7 +42,7 @@ def test_commands_are_answered_while_the_loop_compiles(board: str, tmp_path: Pat
     data["zenoh"] |= {"listen": [endpoint], "connect": [endpoint]}
     rig = parse_rig(data)
     with Session(rig.name, [endpoint], []) as session:
-        states, commander = session.latest("state"), Commander(session, "console", timeout_s=PATIENCE_S)
+        states, commander = session.latest("state"), CommandSender(session, "console", timeout_s=PATIENCE_S)
         process = RealtimeProcess(rig, board_port=board, tracker_port="/nowhere")
         compiled, prepare = threading.Event(), process.loop.prepare
         process.loop.prepare = lambda: (compiled.wait(PATIENCE_S), prepare())  # type: ignore[method-assign,assignment]

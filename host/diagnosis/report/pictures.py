@@ -15,7 +15,18 @@ from host.diagnosis.model.model import Piece
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.quantities import scaled
 from host.diagnosis.selection.locate import joined
-from host.report.style import ESTIMATED, FAINT, INK, MEASURED, MUTED, TRUTH, Picture, legend_above, picture, thinned
+from host.report.style import (
+    ESTIMATED,
+    FAINT,
+    INK,
+    MEASURED,
+    MUTED,
+    TRUTH,
+    ReportFigure,
+    legend_above,
+    report_figure,
+    thinned,
+)
 
 Array = npt.NDArray[np.float64]
 FAULT, SHADE = "#b03a32", "#f6e3da"
@@ -40,7 +51,7 @@ def shown(result: Diagnosis) -> tuple[Piece, int, int]:
     return result.full.pieces[index], index, row
 
 
-def chain(result: Diagnosis) -> Picture:
+def chain(result: Diagnosis) -> ReportFigure:
     """The links from input to output; those at fault in red."""
     names = list(dict.fromkeys(port.subsystem for port in result.model.ports))
     names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
@@ -80,10 +91,10 @@ def chain(result: Diagnosis) -> Picture:
 
     words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
     height = 0.55 * np.ceil(len(names) / 4) + 0.1
-    return picture(draw, float(height), float(0.55 * np.ceil(len(names) / 3) + 0.1), "The links", words, "")
+    return report_figure(draw, float(height), float(0.55 * np.ceil(len(names) / 3) + 0.1), "The links", words, "")
 
 
-def over_time(result: Diagnosis) -> Picture:
+def over_time(result: Diagnosis) -> ReportFigure:
     """Recording and both models, and below what each leaves; windows of the mismatch shaded."""
     piece, index, row = shown(result)
     output = result.model.outputs[row]
@@ -119,7 +130,7 @@ def over_time(result: Diagnosis) -> Picture:
 
     unused = "" if piece.fit.any() else ", not used to fit"
     caption = f"Recording {piece.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
-    return picture(
+    return report_figure(
         draw,
         4.3,
         4.6,
@@ -129,7 +140,7 @@ def over_time(result: Diagnosis) -> Picture:
     )
 
 
-def loop(result: Diagnosis) -> Picture | None:
+def loop(result: Diagnosis) -> ReportFigure | None:
     """Input against what the nominal model leaves: memory shows as a loop."""
     ports = {port.name: port for port in result.model.ports}
     name = next(
@@ -163,7 +174,7 @@ def loop(result: Diagnosis) -> Picture | None:
         axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
         legend_above(axes, 1 if narrow else 2)
 
-    return picture(
+    return report_figure(
         draw,
         3.3,
         3.0,
@@ -187,7 +198,7 @@ def most_moved(result: Diagnosis, index: int, subsystem: str) -> int:
     return max(rows, key=weight) if rows else result.figures.primary
 
 
-def before_after(result: Diagnosis) -> Picture:
+def before_after(result: Diagnosis) -> ReportFigure:
     """RMS error on held-out samples of every output, before and after, over the noise."""
     figures = result.figures
     rows = [row for row in range(len(figures.before)) if np.isfinite(figures.before[row])]
@@ -216,7 +227,9 @@ def before_after(result: Diagnosis) -> Picture:
         legend_above(axes, 2)
 
     height = 0.24 * len(rows) + 0.95
-    return picture(draw, height, height + 0.1, "Fit before and after", "Held-out error of each output before and after.", "")
+    return report_figure(
+        draw, height, height + 0.1, "Fit before and after", "Held-out error of each output before and after.", ""
+    )
 
 
 def pictures(result: Diagnosis) -> dict[str, Any]:

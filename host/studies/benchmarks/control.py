@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from host.studies.benchmarks.runner import Report, Row, Timed, alternate, row_of
+from host.studies.benchmarks.runner import PairedTimes, Report, Row, alternate, row_of
 from protocol.enums import CommandKind, Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control import predictor
@@ -51,7 +51,7 @@ def _ticks(params: Any, state: Any, inputs: Any, outputs: Any, force: Any, first
         tick(params, state, inputs, outputs)
 
 
-class Loop:
+class BenchedLoop:
     """A tick with hand-fed inputs, brought into contact; `run` makes some periods pass."""
 
     def __init__(self, run: Callable[..., None]) -> None:
@@ -101,11 +101,11 @@ def control_tick(seed: int, _report: Report) -> list[Row]:
             _feed.py_func(inputs[0], force, i)  # type: ignore[attr-defined]
             plain(params, state, inputs, outputs)
 
-    ours, peer = Loop(_ticks), Loop(plain_ticks)
+    ours, peer = BenchedLoop(_ticks), BenchedLoop(plain_ticks)
     phases = [int(loop.outputs[0].phase) for loop in (ours, peer)]
     assert phases == [Phase.CONTACT, Phase.CONTACT], phases
     apart = float(np.abs(ours.outputs[0].joint - peer.outputs[0].joint).max())
-    timed: Timed = alternate([ours.run] * READINGS, [lambda: peer.run(TICKS)] * READINGS)
+    timed: PairedTimes = alternate([ours.run] * READINGS, [lambda: peer.run(TICKS)] * READINGS)
     timed.peer_s = [seconds / TICKS for seconds in timed.peer_s]
     return [row_of("control_tick", "in contact", "the same as plain Python", timed, seed, joint_difference=apart)]
 
@@ -169,6 +169,6 @@ def kalman_predict(seed: int, _report: Report) -> list[Row]:
     ours(POSES)
     peer()
     apart = float(np.abs(out - theirs).max())
-    timed: Timed = alternate([ours] * READINGS, [peer] * READINGS)
+    timed: PairedTimes = alternate([ours] * READINGS, [peer] * READINGS)
     timed.peer_s = [seconds / POSES for seconds in timed.peer_s]
     return [row_of("kalman_predict", "", "textbook matrices in numpy", timed, seed, position_difference_m=apart)]

@@ -32,8 +32,8 @@ from host.estimation.spatial_kernels import (
 )
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product
-from host.studies.benchmarks.runner import Report, Row, Timed, alternate, row_of
-from host.studies.benchmarks.spatial_cases import Case, LENGTH_m, SENSOR_OFFSETS_m, direction, random_cases, sensed
+from host.studies.benchmarks.runner import PairedTimes, Report, Row, alternate, row_of
+from host.studies.benchmarks.spatial_cases import LENGTH_m, SENSOR_OFFSETS_m, SpatialCase, direction, random_cases, sensed
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def unweighted(case: int) -> Array:
     return np.diag([1.0 / LENGTH_m] * positions + [0.5] * (rows - positions))
 
 
-def problem(case: int, sample: Case, positions: Array, quaternions: Array, W: Array) -> PoseSample:
+def problem(case: int, sample: SpatialCase, positions: Array, quaternions: Array, W: Array) -> PoseSample:
     """The sample as the kernels take it, from poses of all three sensors."""
     count = int(SENSORS_OF_CASE[case])
     return sample_of(
@@ -81,7 +81,7 @@ def problem(case: int, sample: Case, positions: Array, quaternions: Array, W: Ar
     )
 
 
-class Ours:
+class EstimateCalls:
     """One sample on our side; `force` is what the last run left."""
 
     def __init__(self, p: PoseSample, start: Array, fair: float) -> None:
@@ -92,7 +92,7 @@ class Ours:
         _estimates(self.p, self.start, self.starts, self.fair, self.force, self.scratch, repeats)
 
 
-class Peer:
+class EstimatePeer:
     """The same sample for scipy: Levenberg-Marquardt of MINPACK with differences, on our model at our accuracy."""
 
     def __init__(self, p: PoseSample, start: Array) -> None:
@@ -107,14 +107,14 @@ class Peer:
         self.force = least_squares(self._residual, self.start, method="lm", x_scale=0.1, max_nfev=400).x
 
 
-def _row(case: int, variant: str, cases: list[Case], starts: list[Array], seed: int) -> Row:
+def _row(case: int, variant: str, cases: list[SpatialCase], starts: list[Array], seed: int) -> Row:
     W, rows = weights(case), int(ROWS_OF_CASE[case])
     fair = chi_square_limit(max(rows - 3, 0), FAIR_DEVIATIONS)
     problems = [problem(case, c, *sensed(c), W) for c in cases]
-    ours = [Ours(p, start, fair) for p, start in zip(problems, starts, strict=True)]
-    peers = [Peer(p, start) for p, start in zip(problems, starts, strict=True)]
+    ours = [EstimateCalls(p, start, fair) for p, start in zip(problems, starts, strict=True)]
+    peers = [EstimatePeer(p, start) for p, start in zip(problems, starts, strict=True)]
     ours[0](1), peers[0]()
-    timed: Timed = alternate(ours, peers)
+    timed: PairedTimes = alternate(ours, peers)
     truth = np.array([c.force_tip_N for c in cases])
     errors = [np.linalg.norm(np.array([side.force for side in sides]) - truth, axis=1) for sides in (ours, peers)]
     right = [e < RIGHT_N for e in errors]
@@ -205,7 +205,7 @@ def batch(seed: int, _report: Report) -> list[Row]:
     args = (np.array(curvature), 4, [0.0, 0.03], np.array(positions), np.array(quaternions))
     workers = min(2, os.cpu_count() or 1)
     estimate_batch(catheter, 0.01, *args, workers=workers)
-    timed, poses_per_s = Timed(), 0.0
+    timed, poses_per_s = PairedTimes(), 0.0
     for _ in range(3):
         start, wall = time.process_time(), time.perf_counter()
         estimate_batch(catheter, 0.01, *args, workers=workers)

@@ -55,19 +55,19 @@ PEER_BLOCKS_LONGER_THAN_s = 0.02  # ... and one reading is enough
 
 
 @dataclass
-class Timed:
+class PairedTimes:
     """Seconds per call, one for each input, of ours and of the peer."""
 
     ours_s: list[float] = field(default_factory=list)
     peer_s: list[float] = field(default_factory=list)
 
 
-def alternate(ours: Sequence[Callable[[int], object]], peers: Sequence[Callable[[], object]]) -> Timed:
+def alternate(ours: Sequence[Callable[[int], object]], peers: Sequence[Callable[[], object]]) -> PairedTimes:
     """Times ours[i](repeats) and peers[i]() in turn, input by input.
 
     Arguments: ours[i] runs input i as often as given, inside compiled code; peers[i] runs it once.
     """
-    timed = Timed()
+    timed = PairedTimes()
     for mine, theirs in zip(ours, peers, strict=True):
         once = _seconds(lambda mine=mine: mine(1))  # type: ignore[misc]
         repeats = max(1, int(SECONDS_PER_BLOCK / max(once, 1e-9)))
@@ -87,7 +87,7 @@ def _seconds(call: Callable[[], object]) -> float:
     return (time.perf_counter_ns() - start) * 1e-9
 
 
-def row_of(name: str, variant: str, peer: str, timed: Timed, seed: int, **accuracy: object) -> Row:
+def row_of(name: str, variant: str, peer: str, timed: PairedTimes, seed: int, **accuracy: object) -> Row:
     """One row of the result: medians and 95th percentiles in microseconds, and what both sides reached.
 
     `accuracy`: for instance tip_error_m and peer_tip_error_m, right and peer_right of cases; what they mean is in docs.

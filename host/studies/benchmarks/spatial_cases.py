@@ -21,7 +21,7 @@ NO_STATIONS = np.zeros(0)
 SENSOR_OFFSETS_m = np.array([0.0, 0.030, 0.050])
 
 
-class Case(NamedTuple):
+class SpatialCase(NamedTuple):
     """One input with its answer: rod record (9,), force in both frames (3,) N, tip pose in the base frame."""
 
     rod: Array
@@ -43,17 +43,17 @@ def direction(rng: np.random.Generator) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def reference(rod: Array, force: Array) -> Case | None:
+def reference(rod: Array, force: Array) -> SpatialCase | None:
     """The case with its answer from the robust solver at high accuracy; None where the branch folds back."""
     x, out = np.zeros(3), np.zeros((1, ROW))
     status, *_ = robust_branch(rod, force, NO_STATIONS, REFERENCE_BEND, x, out)
-    return Case(rod, force, x, -out[0, :3], conjugate(out[0, 6:10])) if status == CONVERGED else None
+    return SpatialCase(rod, force, x, -out[0, :3], conjugate(out[0, 6:10])) if status == CONVERGED else None
 
 
-def random_cases(count: int, seed: int, largest_number: float | None = None) -> list[Case]:
+def random_cases(count: int, seed: int, largest_number: float | None = None) -> list[SpatialCase]:
     """Inputs with an answer: 0.02 to 0.25 N in the base frame, or load numbers F L2 / EI up to `largest_number`."""
     rng = np.random.default_rng(seed)
-    cases: list[Case] = []
+    cases: list[SpatialCase] = []
     while len(cases) < count:
         rod = random_rod(rng)
         size = (
@@ -67,7 +67,7 @@ def random_cases(count: int, seed: int, largest_number: float | None = None) -> 
     return cases
 
 
-def sensed(case: Case) -> tuple[Array, Array]:
+def sensed(case: SpatialCase) -> tuple[Array, Array]:
     """Noiseless poses at SENSOR_OFFSETS_m: positions (3, 3), quaternions (3, 4), base frame."""
     rows = np.zeros((4, ROW))
     sweep(case.rod, case.force_tip_N, SENSOR_OFFSETS_m, REFERENCE_BEND, ALL_TANGENTS, rows, np.zeros(WORK))

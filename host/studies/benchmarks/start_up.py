@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from host.studies.benchmarks.runner import Report, Row, Timed, row_of
+from host.studies.benchmarks.runner import PairedTimes, Report, Row, row_of
 
 TURNS = 3
 CLOCKED = """
@@ -36,7 +36,7 @@ def _seconds(job: str) -> float:
 def import_and_solve(seed: int, _report: Report) -> list[Row]:
     """Import and first solution in a fresh interpreter, compared with scipy's: both without the interpreter's own start."""
     _seconds(OURS)
-    timed = Timed()
+    timed = PairedTimes()
     for _ in range(TURNS):
         timed.ours_s.append(_seconds(OURS))
         timed.peer_s.append(_seconds(PEER))

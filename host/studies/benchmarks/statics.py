@@ -16,8 +16,8 @@ from host.mechanics.helical_kernels import load_up
 from host.mechanics.thesis_reference import ELEMENTS, ORIENTATION_THRESHOLD, algorithm_3_1, euler_sweep
 from host.mechanics.tip_shooting import UNIQUE_BELOW, load_number
 from host.studies.benchmarks import boundary_value
-from host.studies.benchmarks.runner import Report, Row, Timed, alternate, row_of
-from host.studies.benchmarks.spatial_cases import NO_STATIONS, Case, direction, random_cases
+from host.studies.benchmarks.runner import PairedTimes, Report, Row, alternate, row_of
+from host.studies.benchmarks.spatial_cases import NO_STATIONS, SpatialCase, direction, random_cases
 
 Array = NDArray[np.float64]
 
@@ -62,10 +62,10 @@ def _helical(chain: Array, force: Array, first: float, u: Array, repeats: int) -
     return done
 
 
-class Ours:
+class SolveCalls:
     """One case on our side: keeps what the last run left, so that its error can be read after the timing."""
 
-    def __init__(self, case: Case, run: Callable[[Array, Array, Array, int], object]) -> None:
+    def __init__(self, case: SpatialCase, run: Callable[[Array, Array, Array, int], object]) -> None:
         self.case, self.x, self.out, self.work = case, np.zeros(3), np.zeros((1, ROW)), np.zeros(WORK)
         self._run = run
 
@@ -79,10 +79,10 @@ class Ours:
         return float(np.linalg.norm(-self.out[0, :3] - self.case.tip_position_m))
 
 
-class Peer:
+class SolvePeer:
     """One case on the peer's side; `run` returns the tip position, or None where it gave up."""
 
-    def __init__(self, case: Case, run: Callable[[], Array | None]) -> None:
+    def __init__(self, case: SpatialCase, run: Callable[[], Array | None]) -> None:
         self.case, self._run = case, run
         self.position: Array | None = None
 
@@ -97,11 +97,11 @@ class Peer:
         return np.inf if self.position is None else float(np.linalg.norm(self.position - self.case.tip_position_m))
 
 
-def compared(name: str, variant: str, peer: str, ours: list[Ours], peers: list[Peer], seed: int) -> Row:
+def compared(name: str, variant: str, peer: str, ours: list[SolveCalls], peers: list[SolvePeer], seed: int) -> Row:
     """Both sides timed, with the median and largest tip error of the answers that are the reference's equilibrium."""
     for mine, theirs in zip(ours[:1], peers[:1], strict=True):
         mine(1), theirs()
-    timed: Timed = alternate(ours, peers)
+    timed: PairedTimes = alternate(ours, peers)
     errors = [np.array([side.error_m for side in sides]) for sides in (ours, peers)]
     found = [e[e < RIGHT_m] if np.any(e < RIGHT_m) else np.array([np.inf]) for e in errors]
     return row_of(
@@ -124,15 +124,15 @@ def tip_frame(seed: int, _report: Report) -> list[Row]:
     cases = random_cases(CASES, seed)
     shape = np.empty((ELEMENTS + 1, 7))
 
-    def euler(case: Case) -> Array:
+    def euler(case: SpatialCase) -> Array:
         euler_sweep(case.rod, case.force_tip_N, TENSION_N, ELEMENTS, shape)
         return shape[-1, :3].copy()
 
     ours = [
-        Ours(case, lambda x, out, work, n, c=case: _sweeps(c.rod, c.force_tip_N, FINE, out, work, n))  # type: ignore[misc]
+        SolveCalls(case, lambda x, out, work, n, c=case: _sweeps(c.rod, c.force_tip_N, FINE, out, work, n))  # type: ignore[misc]
         for case in cases
     ]
-    peers = [Peer(case, lambda c=case: euler(c)) for case in cases]  # type: ignore[misc]
+    peers = [SolvePeer(case, lambda c=case: euler(c)) for case in cases]  # type: ignore[misc]
     return [compared("cosserat_tip", "", "thesis' Euler 500, compiled", ours, peers, seed)]
 
 
@@ -147,7 +147,7 @@ def base_frame(seed: int, report: Report) -> list[Row]:
     for case in cases:
         away = AWAY * float(np.linalg.norm(case.force_base_N)) * direction(rng)
         start = case.force_tip_N + away
-        warm.append(Ours(case, lambda x, out, work, n, c=case, s=start: _warm(c.rod, c.force_base_N, s, x, out, work, n)))  # type: ignore[misc]
+        warm.append(_warm_calls(case, start))
         near.append(_bvp_warm(case, away))
     rows.append(compared("cosserat_global", "warm", "scipy solve_bvp, tol 1e-6, from 2 % away", warm, near, seed))
     rows.append(
@@ -211,31 +211,35 @@ def helical(seed: int, _report: Report) -> list[Row]:
     return rows
 
 
-def _cold_side(case: Case) -> Ours:
-    return Ours(case, lambda x, out, work, n: _cold(case.rod, case.force_base_N, x, out, work, n))
+def _cold_side(case: SpatialCase) -> SolveCalls:
+    return SolveCalls(case, lambda x, out, work, n: _cold(case.rod, case.force_base_N, x, out, work, n))
 
 
-def _bvp_cold(case: Case) -> Peer:
+def _bvp_cold(case: SpatialCase) -> SolvePeer:
     def run() -> Array | None:
         found = boundary_value.solve(case.rod, case.force_base_N, boundary_value.unloaded(case.rod), BVP_TOLERANCE)
         return found.y[:3, -1] if found.success else None
 
-    return Peer(case, run)
+    return SolvePeer(case, run)
 
 
-def _bvp_warm(case: Case, away: Array) -> Peer:
+def _warm_calls(case: SpatialCase, start: Array) -> SolveCalls:
+    return SolveCalls(case, lambda x, out, work, n: _warm(case.rod, case.force_base_N, start, x, out, work, n))
+
+
+def _bvp_warm(case: SpatialCase, away: Array) -> SolvePeer:
     guess = boundary_value.solve(case.rod, case.force_base_N + away, boundary_value.unloaded(case.rod), BVP_TOLERANCE)
 
     def run() -> Array | None:
         found = boundary_value.solve(case.rod, case.force_base_N, (guess.x, guess.y), BVP_TOLERANCE)
         return found.y[:3, -1] if found.success else None
 
-    return Peer(case, run)
+    return SolvePeer(case, run)
 
 
-def _fixed_point(case: Case) -> Peer:
+def _fixed_point(case: SpatialCase) -> SolvePeer:
     def run() -> Array | None:
         found = algorithm_3_1(case.rod, case.force_base_N, TENSION_N, ELEMENTS, ORIENTATION_THRESHOLD)
         return found.position_m if found.converged else None
 
-    return Peer(case, run)
+    return SolvePeer(case, run)

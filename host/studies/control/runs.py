@@ -211,7 +211,7 @@ def pose_to_step(rig: Rig, seed: int) -> float:
     return after[0] * 1e-6 - arrival_ns * 1e-9 if arrival_ns and after else float("nan")
 
 
-class Foretold(NamedTuple):
+class PredictedTarget(NamedTuple):
     """RMS errors (m) of the wall's place AHEAD_S ahead: the predictor's, and what it is compared with."""
 
     predictor_m: float
@@ -222,7 +222,7 @@ class Foretold(NamedTuple):
 
 def foretell(
     rig: Rig, seed: int, beat: HeartConfig, by_pose: bool, seconds: float = 60.0, after_s: float = 10.0
-) -> Foretold:
+) -> PredictedTarget:
     """The predictor on the simulated heart, by forces, or by poses (rate and noise of the rig, 2 ms jitter, 5 % lost)."""
     parameters, rng = tick_parameters(rig)[0], np.random.default_rng([seed, 40])
     config = parameters.wall.by_pose if by_pose else parameters.wall.by_force
@@ -240,7 +240,7 @@ def foretell(
     truth, kept = wall[times + round(AHEAD_S * 1000)], times > after_s * 1000
     linear = np.append(samples[0], samples[1:] + AHEAD_S * np.diff(samples) / (np.diff(times) * 1e-3))
     guesses = (foretold[:, 0], samples, linear, foretold[:, 1])
-    return Foretold(*(float(np.sqrt(np.mean((guess[kept] - truth[kept]) ** 2))) for guess in guesses))
+    return PredictedTarget(*(float(np.sqrt(np.mean((guess[kept] - truth[kept]) ** 2))) for guess in guesses))
 
 
 def _wall_motion(beat: HeartConfig, seed: int, seconds: float) -> Array:

@@ -9,9 +9,9 @@ from scipy.optimize import minimize
 
 from host.mechanics import pcar
 from host.report.figure_page import Section, verdict
-from host.report.style import MUTED, Picture
-from host.studies.reproduction.drawing import Curve, Panel, panels
-from host.studies.reproduction.thesis_control import PERIOD_S, Gains, Run, Setting, cost, heart, hybrid, step_figures
+from host.report.style import MUTED, ReportFigure
+from host.studies.reproduction.drawing import Panel, PlotLine, panels
+from host.studies.reproduction.thesis_control import PERIOD_S, Gains, Setting, ThesisRun, cost, heart, hybrid, step_figures
 from protocol.catheter import load_catheter
 
 FORCE_N = 0.25
@@ -58,19 +58,19 @@ def _convergence() -> Section:
         arcs = pcar.arcs_of(catheter, float(insertion), float(curvature))
         found = pcar.solve(arcs, (0.0, -float(run.force_N[index])))
         line = pcar.shape(arcs, found.curvature_per_m)
-        shapes.append(Curve(line[:, 0] * 1e3, line[:, 1] * 1e3, label))
+        shapes.append(PlotLine(line[:, 0] * 1e3, line[:, 1] * 1e3, label))
     t = np.arange(60)
-    wall = Curve([shapes[0].x.max() - 12, shapes[0].x.max() + 12], [run.wall_m[0] * 1e3] * 2, "wall", MUTED)
+    wall = PlotLine([shapes[0].x.max() - 12, shapes[0].x.max() + 12], [run.wall_m[0] * 1e3] * 2, "wall", MUTED)
     figure = panels(
         "Shape, force and position",
         "Shapes and responses.",
         "Start and end shape; force across, place along, and the commands.",
         [
             Panel("x, mm", "y, mm", [*shapes, wall], equal=True),
-            Panel("iteration", "force, N", [Curve(t, run.force_N, "force")], level=FORCE_N),
-            Panel("iteration", "x, mm", [Curve(t, run.tip_m[:, 0] * 1e3, "tip along the wall")]),
-            Panel("iteration", "insertion, mm", [Curve(t, run.joint[:, 1] * 1e3, "insertion")]),
-            Panel("iteration", "curvature, 1/m", [Curve(t, run.joint[:, 0], "curvature")]),
+            Panel("iteration", "force, N", [PlotLine(t, run.force_N, "force")], level=FORCE_N),
+            Panel("iteration", "x, mm", [PlotLine(t, run.tip_m[:, 0] * 1e3, "tip along the wall")]),
+            Panel("iteration", "insertion, mm", [PlotLine(t, run.joint[:, 1] * 1e3, "insertion")]),
+            Panel("iteration", "curvature, 1/m", [PlotLine(t, run.joint[:, 0], "curvature")]),
         ],
     )
     figures = step_figures(run, FORCE_N)
@@ -95,7 +95,7 @@ def _convergence() -> Section:
     )
 
 
-def _sweep(base: Gains, name: str, factors: tuple[float, ...]) -> dict[float, Run]:
+def _sweep(base: Gains, name: str, factors: tuple[float, ...]) -> dict[float, ThesisRun]:
     return {factor: hybrid(FORCE_N, 120, base.scaled(**{name: factor})) for factor in factors}
 
 
@@ -132,7 +132,7 @@ def _gain_effects() -> list[Section]:
                     "iteration",
                     "force, N",
                     [
-                        Curve(np.arange(60), np.minimum(run.force_N[:60], 0.6), f"{name} × {factor:g}")
+                        PlotLine(np.arange(60), np.minimum(run.force_N[:60], 0.6), f"{name} × {factor:g}")
                         for factor, run in runs[name].items()
                     ],
                     level=FORCE_N,
@@ -145,7 +145,7 @@ def _gain_effects() -> list[Section]:
     return out
 
 
-def _claims(names: tuple[str, ...], runs: dict[str, dict[float, Run]]) -> dict[str, bool]:
+def _claims(names: tuple[str, ...], runs: dict[str, dict[float, ThesisRun]]) -> dict[str, bool]:
     """Each statement of the thesis on these gains, and whether `runs` bear it out."""
     said: dict[str, bool] = {}
     for name in names:
@@ -164,7 +164,7 @@ def _claims(names: tuple[str, ...], runs: dict[str, dict[float, Run]]) -> dict[s
     return said
 
 
-def _numbers(names: tuple[str, ...], runs: dict[str, dict[float, Run]]) -> str:
+def _numbers(names: tuple[str, ...], runs: dict[str, dict[float, ThesisRun]]) -> str:
     parts = []
     for name in names:
         steps = [(factor, step_figures(run, FORCE_N)) for factor, run in runs[name].items()]
@@ -190,9 +190,9 @@ def _effect_section(
     number: str,
     names: tuple[str, ...],
     title: str,
-    runs: dict[str, dict[float, Run]],
-    printed: dict[str, dict[float, Run]],
-    figure: Picture,
+    runs: dict[str, dict[float, ThesisRun]],
+    printed: dict[str, dict[float, ThesisRun]],
+    figure: ReportFigure,
 ) -> Section:
     claims, there = _claims(names, runs), _claims(names, printed)
     agree = sum(claims.values())
@@ -239,7 +239,12 @@ def _optimum(best: Gains) -> Section:
         "Step responses for three forces.",
         "Left our minimum of (7.4), right the printed gains.",
         [
-            Panel("iteration", "force, N", [Curve(t, runs[force][k].force_N, f"{force} N") for force in forces], title=title)
+            Panel(
+                "iteration",
+                "force, N",
+                [PlotLine(t, runs[force][k].force_N, f"{force} N") for force in forces],
+                title=title,
+            )
             for k, title in enumerate(("our minimum", "printed gains"))
         ],
         3.1,
@@ -282,7 +287,7 @@ def _stiffness(best: Gains) -> Section:
             Panel(
                 "iteration",
                 "force, N",
-                [Curve(np.arange(600), np.minimum(run.force_N, 0.5), name) for name, run in growing.items()],
+                [PlotLine(np.arange(600), np.minimum(run.force_N, 0.5), name) for name, run in growing.items()],
                 level=0.2,
             )
         ],
@@ -305,7 +310,7 @@ def _heart() -> list[Section]:
     """7.15 and 7.16: the beating wall, three forces, compared with a catheter that does not move."""
     forces, n = (0.1, 0.2, 0.3), 600
     shown = slice(n - 160, n)
-    stiller: dict[float, tuple[Run, Run]] = {}
+    stiller: dict[float, tuple[ThesisRun, ThesisRun]] = {}
     for force in forces:
         rest = hybrid(force, 200).joint[-1]
         stiller[force] = (
@@ -322,8 +327,8 @@ def _heart() -> list[Section]:
                 "time, s",
                 "across, mm",
                 [
-                    Curve(run.time_s[shown], run.wall_m[shown] * 1e3, "wall"),
-                    Curve(run.time_s[shown], run.tip_m[shown, 1] * 1e3, "tip"),
+                    PlotLine(run.time_s[shown], run.wall_m[shown] * 1e3, "wall"),
+                    PlotLine(run.time_s[shown], run.tip_m[shown, 1] * 1e3, "tip"),
                 ],
             )
         ],
@@ -340,8 +345,8 @@ def _heart() -> list[Section]:
                     curve
                     for force in forces
                     for curve in (
-                        Curve(run.time_s[shown], stiller[force][0].force_N[shown], f"{force} N"),
-                        Curve(run.time_s[shown], stiller[force][1].force_N[shown], "", MUTED, "--"),
+                        PlotLine(run.time_s[shown], stiller[force][0].force_N[shown], f"{force} N"),
+                        PlotLine(run.time_s[shown], stiller[force][1].force_N[shown], "", MUTED, "--"),
                     )
                 ],
             )
@@ -398,7 +403,7 @@ def _bode(points: int) -> Section:
             late = run.force_N[n // 2 :]
             row.append(float(np.sqrt(2.0) * np.std(late)))
         table[factor] = np.array(row)
-        curves.append(Curve(frequencies, 20 * np.log10(table[factor] / 0.001), f"K_pf × {factor:g}"))
+        curves.append(PlotLine(frequencies, 20 * np.log10(table[factor] / 0.001), f"K_pf × {factor:g}"))
     figure = panels(
         "Magnitude over frequency",
         "Force amplitude over the frequency of the wall.",

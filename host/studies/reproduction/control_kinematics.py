@@ -9,7 +9,7 @@ import numpy as np
 from host.report.figure_page import Section, verdict
 from host.report.style import MEASURED, MUTED, TRUTH
 from host.studies.control import baselines
-from host.studies.reproduction.drawing import Curve, Panel, panels
+from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from realtime.control.inverse_kinematics import FOLD_BEND, FOLD_REACH
 
 LENGTH_M = 0.070
@@ -41,10 +41,13 @@ def _workspace() -> Section:
             Panel(
                 "x, mm",
                 "y, mm",
-                [Curve(along * 1e3, across * 1e3, "tip"), Curve(folds[0] * 1e3, folds[1] * 1e3, "singular", TRUTH, "o")],
+                [
+                    PlotLine(along * 1e3, across * 1e3, "tip"),
+                    PlotLine(folds[0] * 1e3, folds[1] * 1e3, "singular", TRUTH, "o"),
+                ],
                 equal=True,
             ),
-            Panel("bend, rad", "det J, m²", [Curve(bend, determinant, "")], level=0.0),
+            Panel("bend, rad", "det J, m²", [PlotLine(bend, determinant, "")], level=0.0),
         ],
     )
     says = (
@@ -75,11 +78,11 @@ def _polynomials() -> list[Section]:
         places.append((across, bend, polynomial))
     rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     curves = [
-        Curve(across * 1e3, curvature, "inverse of (7.2)" if k == 0 else "", MUTED)
+        PlotLine(across * 1e3, curvature, "inverse of (7.2)" if k == 0 else "", MUTED)
         for k, (across, curvature, _) in enumerate(fits)
     ]
     curves += [
-        Curve(across * 1e3, polynomial(across), "polynomials, 9th order" if k == 0 else "", TRUTH, "--")
+        PlotLine(across * 1e3, polynomial(across), "polynomials, 9th order" if k == 0 else "", TRUTH, "--")
         for k, (across, _, polynomial) in enumerate(fits)
     ]
     first = panels(
@@ -105,8 +108,8 @@ def _polynomials() -> list[Section]:
                 "x, mm",
                 "y, mm",
                 [
-                    Curve(exact[0] * 1e3, exact[1] * 1e3, "wanted", MEASURED),
-                    Curve(fitted[0] * 1e3, fitted[1] * 1e3, "by polynomial", TRUTH, "--"),
+                    PlotLine(exact[0] * 1e3, exact[1] * 1e3, "wanted", MEASURED),
+                    PlotLine(fitted[0] * 1e3, fitted[1] * 1e3, "by polynomial", TRUTH, "--"),
                 ],
                 equal=True,
             )
@@ -163,9 +166,9 @@ def _near_singularity() -> Section:
             Panel(
                 "x, mm",
                 "y, mm",
-                [Curve(path.tip_m[:, 0] * 1e3, path.tip_m[:, 1] * 1e3, name) for name, path in paths.items()],
+                [PlotLine(path.tip_m[:, 0] * 1e3, path.tip_m[:, 1] * 1e3, name) for name, path in paths.items()],
             ),
-            Panel("iteration", "curvature, 1/m", [Curve(t, path.joint[:, 0], name) for name, path in paths.items()]),
+            Panel("iteration", "curvature, 1/m", [PlotLine(t, path.joint[:, 0], name) for name, path in paths.items()]),
         ],
         3.3,
     )

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from host.report.figure_page import Section, verdict
-from host.studies.reproduction.drawing import Curve, Panel, panels
+from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from host.studies.reproduction.thesis_position import IntegralGains, Navigation, faster, navigate, unloaded_tip
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
@@ -40,8 +40,8 @@ def _paths(runs: list[Navigation]) -> Section:
                 "along, mm",
                 "across, mm",
                 [
-                    *(Curve(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"goal {k}") for k, run in enumerate(runs, 1)),
-                    *(Curve([run.goal_m[2] * 1e3], [-run.goal_m[1] * 1e3], "", None, "o") for run in runs),
+                    *(PlotLine(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"goal {k}") for k, run in enumerate(runs, 1)),
+                    *(PlotLine([run.goal_m[2] * 1e3], [-run.goal_m[1] * 1e3], "", None, "o") for run in runs),
                 ],
             ),
             *(
@@ -49,7 +49,7 @@ def _paths(runs: list[Navigation]) -> Section:
                     "time, s",
                     f"{name}, mm",
                     [
-                        Curve(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * 1e3, f"goal {k}")
+                        PlotLine(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * 1e3, f"goal {k}")
                         for k, run in enumerate(runs, 1)
                     ],
                     level=0.0,
@@ -99,7 +99,7 @@ def _commands(runs: list[Navigation]) -> Section:
                 "time, s",
                 name,
                 [
-                    Curve(run.time_s, (run.stage[:, axis] - run.stage[0, axis]) * scale, f"goal {k}")
+                    PlotLine(run.time_s, (run.stage[:, axis] - run.stage[0, axis]) * scale, f"goal {k}")
                     for k, run in enumerate(runs, 1)
                 ],
             )
@@ -140,7 +140,7 @@ def _gain(runs: dict[float, Navigation]) -> Section:
                     "time, s",
                     f"{name}, mm",
                     [
-                        Curve(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * sign * 1e3, f"× {factor:g}")
+                        PlotLine(run.time_s, (run.tip_m[:, axis] - run.goal_m[axis]) * sign * 1e3, f"× {factor:g}")
                         for factor, run in runs.items()
                     ],
                     level=0.0,
@@ -150,7 +150,7 @@ def _gain(runs: dict[float, Navigation]) -> Section:
             Panel(
                 "along, mm",
                 "across, mm",
-                [Curve(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"× {factor:g}") for factor, run in runs.items()],
+                [PlotLine(run.tip_m[:, 2] * 1e3, -run.tip_m[:, 1] * 1e3, f"× {factor:g}") for factor, run in runs.items()],
             ),
         ],
     )

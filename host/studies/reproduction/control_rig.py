@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from host.report.figure_page import Section, verdict
 from host.report.style import MUTED
-from host.studies.reproduction.drawing import Curve, Panel, panels
+from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
 from protocol.topics import Message
 from sim.board import Board
@@ -52,7 +52,7 @@ ACROSS = Configuration("force across, position along", (0.0, -0.008, 0.029), (0.
 AXIAL = Configuration("force along, position across", (0.0, -0.0107, 0.025), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 
 
-class Run(NamedTuple):
+class RigRun(NamedTuple):
     """One experiment from first contact on: time (s), force into the plate (N), tip across the plate from its target (m),
     stages (n, 3)."""
 
@@ -99,7 +99,7 @@ def experiment(
     seed: int,
     shift_m: float = 0.0,
     board: str = "native",
-) -> Run:
+) -> RigRun:
     """Touch the plate and hold `wanted_N`, in lock step with the firmware; `shift_m` brings the plate closer."""
     point = np.array(where.point_m) - shift_m * np.array(where.into)
     tissue = TissueConfig(point_m=tuple(point), normal=tuple(-np.array(where.into)), friction=FRICTION)
@@ -125,11 +125,11 @@ def _cut(
     point: Array,
     contact: bool,
     hold_s: float,
-) -> Run:
+) -> RigRun:
     states = [m for m in heard["state"] if m.mode == "contact"]  # type: ignore[attr-defined]
     if not contact or not states:
         empty = np.zeros(0)
-        return Run(label, False, empty, empty, empty, empty, np.zeros((0, 3)), wanted_N)
+        return RigRun(label, False, empty, empty, empty, empty, np.zeros((0, 3)), wanted_N)
     start_s = states[0].stamp_ns * 1e-9
 
     def window(messages: Sequence[Message], before_s: float) -> list[Message]:
@@ -142,7 +142,7 @@ def _cut(
     tip_s = np.array([m.stamp_ns for m in tips]) * 1e-9 - start_s
     off = (np.array([m.tip_m for m in tips]) - point) @ np.array(where.along)  # type: ignore[attr-defined]
     columns = [[m.command_insertion_m, m.command_roll_rad, m.command_knob_rad] for m in stages]  # type: ignore[attr-defined]
-    return Run(
+    return RigRun(
         label,
         True,
         time_s,
@@ -154,11 +154,11 @@ def _cut(
     )
 
 
-def _force_panel(runs: Sequence[Run], title: str = "") -> Panel:
+def _force_panel(runs: Sequence[RigRun], title: str = "") -> Panel:
     return Panel(
         "time since contact, s",
         "force, N",
-        [Curve(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact],
+        [PlotLine(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact],
         title=title,
         level=runs[0].wanted_N,
     )
@@ -169,7 +169,7 @@ def _smooth(force_N: Array) -> Array:
     return np.convolve(force_N, np.full(10, 0.1), "same") if force_N.size > 10 else force_N
 
 
-def _held(runs: Sequence[Run]) -> tuple[bool, str]:
+def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
     """Whether all came to their force, and how well, in words."""
     said, good = [], True
     for run in runs:
@@ -209,18 +209,18 @@ def _first(rig: Rig, hold_s: float, board: str) -> Section:
             Panel(
                 "time since contact, s",
                 "along, mm from target",
-                [Curve(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
+                [PlotLine(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
                 level=0.0,
             ),
             Panel(
                 "time since contact, s",
                 "insertion, mm",
-                [Curve(run.stage_s, run.stage[:, 0] * 1e3, run.label) for run in runs if run.contact],
+                [PlotLine(run.stage_s, run.stage[:, 0] * 1e3, run.label) for run in runs if run.contact],
             ),
             Panel(
                 "time since contact, s",
                 "knob, °",
-                [Curve(run.stage_s, np.degrees(run.stage[:, 2]), run.label) for run in runs if run.contact],
+                [PlotLine(run.stage_s, np.degrees(run.stage[:, 2]), run.label) for run in runs if run.contact],
             ),
         ],
     )
@@ -291,7 +291,7 @@ def _gain_effects(rig: Rig, hold_s: float, board: str, quick: bool, progress: Ca
     return out
 
 
-def _judge(runs: Sequence[Run], kind: str) -> tuple[bool, str]:
+def _judge(runs: Sequence[RigRun], kind: str) -> tuple[bool, str]:
     if not all(run.contact and run.late().size for run in runs):
         return False, "; ".join(f"{run.label}: {'contact' if run.contact else 'no contact'}" for run in runs)
     spread = [float(_smooth(run.late()).std()) * 1e3 for run in runs]
@@ -306,7 +306,7 @@ def _judge(runs: Sequence[Run], kind: str) -> tuple[bool, str]:
     return holds[kind], says
 
 
-def _rise_s(run: Run) -> float:
+def _rise_s(run: RigRun) -> float:
     """Time at which 80 % of the requested force are reached; infinite where never."""
     there = np.flatnonzero(_smooth(run.force_N) > 0.8 * run.wanted_N)
     return float(run.time_s[there[0]]) if there.size else float("inf")
@@ -324,7 +324,7 @@ def _second(rig: Rig, hold_s: float, board: str, count: int) -> Section:
             Panel(
                 "time since contact, s",
                 "across, mm from target",
-                [Curve(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
+                [PlotLine(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
                 level=0.0,
             ),
         ],
@@ -343,7 +343,7 @@ def _second(rig: Rig, hold_s: float, board: str, count: int) -> Section:
 def _forces(rig: Rig, hold_s: float, board: str) -> Section:
     runs = [experiment(rig, AXIAL, f"{force} N", force, hold_s, 1, board=board) for force in (0.2, 0.25, 0.3)]
     held, said = _held(runs)
-    levels = [Curve([0, hold_s], [run.wanted_N] * 2, "", MUTED, "--") for run in runs]
+    levels = [PlotLine([0, hold_s], [run.wanted_N] * 2, "", MUTED, "--") for run in runs]
     figure = panels(
         "Three forces",
         "Force for three desired forces.",
@@ -352,7 +352,7 @@ def _forces(rig: Rig, hold_s: float, board: str) -> Section:
             Panel(
                 "time since contact, s",
                 "force, N",
-                [*[Curve(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact], *levels],
+                [*[PlotLine(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact], *levels],
             )
         ],
         3.0,

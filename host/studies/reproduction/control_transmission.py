@@ -15,8 +15,8 @@ from host.commissioning.sweep_fits import Run, fit_knob
 from host.recordings.recording import Recording
 from host.recordings.writer import new_recording_path
 from host.report.figure_page import Section, verdict
-from host.report.style import ESTIMATED, MEASURED, TRUTH, Picture
-from host.studies.reproduction.drawing import Curve, Panel, panels
+from host.report.style import ESTIMATED, MEASURED, TRUTH, ReportFigure
+from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control.inverse_kinematics import FOLD_BEND
 
@@ -33,7 +33,7 @@ def sections(directory: Path, quick: bool, board: str = "native") -> tuple[list[
     return [_insertion(found, loops[:2]), _roll(found, loops[2:4]), _knob(found), *_curves(found)], found
 
 
-def _insertion(found: Characterization, loops: list[Picture]) -> Section:
+def _insertion(found: Characterization, loops: list[ReportFigure]) -> Section:
     width, slope = found.insertion.width, found.insertion.slope
     spread = found.insertion.per_run.std(axis=0, ddof=1)
     holds = abs(width.value - 0.0031) < 6e-4 and abs(slope.value - 1.0) < 0.1
@@ -52,7 +52,7 @@ def _insertion(found: Characterization, loops: list[Picture]) -> Section:
     )
 
 
-def _roll(found: Characterization, loops: list[Picture]) -> Section:
+def _roll(found: Characterization, loops: list[ReportFigure]) -> Section:
     slope, gap = found.roll.slope, found.roll_backlash_rad
     spread = float(found.roll.per_run[:, 1].std(ddof=1))
     says = (
@@ -146,7 +146,7 @@ def _said(errors: dict[str, CurveErrors]) -> str:
 
 def _curve_pictures(
     train: KnobSweep, sines: SineKinematics, curve: tuple[np.ndarray, np.ndarray], length: float, fold_rad: float
-) -> tuple[Picture, Picture]:
+) -> tuple[ReportFigure, ReportFigure]:
     half = train.knob_rad > 0
     step = max(1, int(half.sum()) // 900)
     knob, lateral, axial = (column[half][::step] for column in (train.knob_rad, train.lateral_m, train.axial_m))
@@ -163,10 +163,10 @@ def _curve_pictures(
                 "knob, °",
                 "across, mm",
                 [
-                    Curve(knob * _DEG, lateral * 1e3, "measured", MEASURED, "."),
-                    Curve(sines.below_fold(reach) * _DEG, reach * 1e3, "curve 2", TRUTH),
-                    Curve(sines.past_fold(past) * _DEG, past * 1e3, "curve 1", "#5b8c5a"),
-                    Curve(
+                    PlotLine(knob * _DEG, lateral * 1e3, "measured", MEASURED, "."),
+                    PlotLine(sines.below_fold(reach) * _DEG, reach * 1e3, "curve 2", TRUTH),
+                    PlotLine(sines.past_fold(past) * _DEG, past * 1e3, "curve 1", "#5b8c5a"),
+                    PlotLine(
                         places * _DEG,
                         length * 0.5 * bend * np.sinc(bend / (2 * np.pi)) ** 2 * 1e3,
                         "monotone",
@@ -187,9 +187,9 @@ def _curve_pictures(
                 "knob, °",
                 "along, mm",
                 [
-                    Curve(knob * _DEG, axial * 1e3, "measured", MEASURED, "."),
-                    Curve(places * _DEG, sines.along(places) * 1e3, "curve 3", TRUTH),
-                    Curve(places * _DEG, length * np.sinc(bend / np.pi) * 1e3, "monotone", ESTIMATED, "--"),
+                    PlotLine(knob * _DEG, axial * 1e3, "measured", MEASURED, "."),
+                    PlotLine(places * _DEG, sines.along(places) * 1e3, "curve 3", TRUTH),
+                    PlotLine(places * _DEG, length * np.sinc(bend / np.pi) * 1e3, "monotone", ESTIMATED, "--"),
                 ],
             )
         ],

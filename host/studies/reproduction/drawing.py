@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from host.report.style import ESTIMATED, MEASURED, MUTED, TRUTH, WANTED, Picture, legend_above, picture, thinned
+from host.report.style import ESTIMATED, MEASURED, MUTED, TRUTH, WANTED, ReportFigure, legend_above, report_figure, thinned
 
 CYCLE = (MEASURED, ESTIMATED, TRUTH, "#5b8c5a", "#7d5ba6", MUTED)
 
 
-class Curve(NamedTuple):
+class PlotLine(NamedTuple):
     """One line (or points, `style` "."); colour None takes the next of the cycle."""
 
     x: Any
@@ -28,7 +28,7 @@ class Panel(NamedTuple):
 
     x_label: str
     y_label: str
-    curves: Sequence[Curve]
+    curves: Sequence[PlotLine]
     title: str = ""
     equal: bool = False
     log_x: bool = False
@@ -36,7 +36,7 @@ class Panel(NamedTuple):
     level: float | None = None
 
 
-def panels(title: str, alt: str, caption: str, parts: Sequence[Panel], height_in: float = 2.9) -> Picture:
+def panels(title: str, alt: str, caption: str, parts: Sequence[Panel], height_in: float = 2.9) -> ReportFigure:
     """The panels side by side, on a narrow screen below each other."""
     across = min(len(parts), 3)
     rows = -(-len(parts) // across)
@@ -46,7 +46,7 @@ def panels(title: str, alt: str, caption: str, parts: Sequence[Panel], height_in
             axes = figure.add_subplot(*((len(parts), 1) if narrow else (rows, across)), place + 1)
             _draw(axes, part, narrow, len(parts) == 1)
 
-    return picture(draw, height_in * rows, height_in * len(parts), title, alt, caption)
+    return report_figure(draw, height_in * rows, height_in * len(parts), title, alt, caption)
 
 
 def _draw(axes: Any, part: Panel, narrow: bool, alone: bool) -> None:

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from host.estimation.planar import estimate, two_stage
 from host.mechanics.pcar import arcs_of, point_at, shape, solve
 from host.report.figure_page import Section, verdict
-from host.report.style import picture
+from host.report.style import report_figure
 from host.studies.reproduction.fine_planar import fine_shape
 from protocol.catheter import Catheter, load_catheter
 
@@ -57,7 +57,7 @@ def section(
     """A section with at most one picture, whose caption ends with how our numbers were made."""
     if draw is None:
         return Section(id, title, thesis, f"{ours}. {made}", verdict(good), says, (), rows)
-    shown = picture(draw, height_in, 1.2 * height_in, title, caption or title, f"{caption}. {made}")
+    shown = report_figure(draw, height_in, 1.2 * height_in, title, caption or title, f"{caption}. {made}")
     return Section(id, title, thesis, ours, verdict(good), says, (shown,), rows)
 
 

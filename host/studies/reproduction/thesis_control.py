@@ -62,7 +62,7 @@ class Setting:
         return self.bend_rad / (load_catheter(self.catheter).distal_length_m + self.insertion_m)
 
 
-class Run(NamedTuple):
+class ThesisRun(NamedTuple):
     """A row an iteration: force across (N), tip (m), joints (curvature 1/m, insertion m), wall (m)."""
 
     force_N: Array
@@ -204,7 +204,7 @@ def hybrid(
     stiffness: Callable[[Array], Array] | None = None,
     still: bool = False,
     start_joint: Array | None = None,
-) -> Run:
+) -> ThesisRun:
     """The external hybrid controller of Fig. 7.1 against a wall along x, `force_N` across it, the tip's x kept.
 
     `wall_motion` (m over s, outwards positive), `stiffness` (factor of EI over iterations). `still`: the joints stay where
@@ -243,7 +243,7 @@ def hybrid(
         tip,
         joints,
     )
-    return Run(force, tip, joints, np.asarray(wall, float))
+    return ThesisRun(force, tip, joints, np.asarray(wall, float))
 
 
 def heart(
@@ -258,7 +258,7 @@ def cost(gains: Gains, forces_N: tuple[float, ...] = (0.1, 0.2, 0.3), iterations
     return float(np.mean([np.abs(hybrid(force, iterations, gains).force_N - force).sum() for force in forces_N]))
 
 
-class Step(NamedTuple):
+class ThesisStep(NamedTuple):
     """Figures of a step response: overshoot (N), iterations to stay within 5 %, error over the last tenth (N), ringing
     (N)."""
 
@@ -268,11 +268,11 @@ class Step(NamedTuple):
     ringing_N: float
 
 
-def step_figures(run: Run, force_N: float) -> Step:
+def step_figures(run: ThesisRun, force_N: float) -> ThesisStep:
     """Of `run` with `force_N` wanted; settling is the run's length where it never settles."""
     outside = np.flatnonzero(np.abs(run.force_N - force_N) > 0.05 * force_N)
     late = run.force_N[-max(8, run.force_N.size // 10) :]
-    return Step(
+    return ThesisStep(
         float(max(run.force_N.max() - force_N, 0.0)),
         int(outside[-1] + 1 if outside.size else 0),
         float(abs(late.mean() - force_N)),
