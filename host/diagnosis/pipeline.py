@@ -170,7 +170,7 @@ def diagnose(
     pool = [c for c in pool if c.effect.id not in left_out]
     found = search(problem, pool, tell)
     floor = np.array([n.sigma for n in problem.noise])
-    tell("looking at what is left", 0.0)
+    tell("examining the residual", 0.0)
     rest = explain_rest(problem, found, floor, tell)
     tell("weighing what stands in their place", 0.0)
     standing = beside_unlisted(standings(problem, found, floor), rest)

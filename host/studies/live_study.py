@@ -98,7 +98,7 @@ class LiveRow:
         if self.first is None:
             score = f"no alarm; largest score {self.highest:.2f} of 1"
             return f"| {name} | {job} | {size} | {self.residual_ratio:.1f} | {score} | | |"
-        others = re.search(r"\((?:indistinguishable from|as well may be) (.*?)\)", self.first["words"])
+        others = re.search(r"\(indistinguishable from (.*?)\)", self.first["words"])
         named = f"{self.first['subsystem']}: {self.first['effect'].replace('_', ' ')}"
         told = others[1].replace("_", " ") if others else ""
         return f"| {name} | {job} | {size} | {self.residual_ratio:.1f} | {self.delay_s:.1f} | {named} | {told} |"

@@ -23,7 +23,7 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         "steps_lost",
         ACTION_RETRACT,
         True,
-        "encoder and steps have parted: retracting; look for a jam or a loose encoder plug, clear, and home the axes",
+        "encoder and steps disagree: retracting; look for a jam or a loose encoder plug, clear, and home the axes",
     ),
     ("force_disagrees", ACTION_RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
     (

@@ -134,7 +134,7 @@ class OperatorCommands:
     def _force(self, command: Command) -> str:
         """Set another force for the present contact target; nothing else changes, so that the count stays."""
         if not self._record.armed or self._record.kind != CommandKind.CONTACT:
-            return "force: found no contact asked for, wanted target contact before"
+            return "force: found no contact target, wanted the command target contact before"
         problem = self._too_much(command)
         if not problem and command.force_N is not None:
             self._record.force_N = command.force_N

@@ -49,7 +49,7 @@ class Design:
         return (
             f"{self.excitation.channel.replace('_', ' ')}: {self.excitation.words}{held}. "
             f"Predicted separation of {self.candidate.name} and {self.other.name}: {self.separation:.3g} in units of "
-            f"what is left; these recordings: {self.had:.2g}.{doubt}"
+            f"the remaining residual; these recordings: {self.had:.2g}.{doubt}"
         )
 
 

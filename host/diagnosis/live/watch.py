@@ -175,7 +175,7 @@ class Watch:
         others = ", ".join(s.name for s in suspects[1:])
         words = (
             f"{subsystem}: probably {effect}, which explains {explained:.0%}"
-            + (f" (as well may be {others})" if others else "")
+            + (f" (indistinguishable from {others})" if others else "")
             + f"; {channel} has left the twin for {since_s:.1f} s"
         )
         return Alarm(

@@ -77,7 +77,7 @@ def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Re
     """Looks at the rest, and adds an equation to `found.best` where one earns its place."""
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
-    tell("is the rest foretold by anything", 0.0)
+    tell("testing whether the residual is predictable", 0.0)
     places = foretell(problem, found.best, floor)
     rest = _rest(problem, found, floor, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
