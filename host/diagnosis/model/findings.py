@@ -360,7 +360,9 @@ def _excitation(recordings: list[Recording], paths: list[Pair], columns: dict[st
         name = columns[path.output if path.law else path.input]
         if tones and all(tone > 0.0 for tone in tones) and max(tones) < 1.1 * min(tones):
             says = f"Column {name} is one sinusoid of {tones[0]:.3g} Hz: effects that differ in how they depend on "
-            says += "frequency (delay, lag, viscous friction, mass, stiffness) cannot be told apart. Record two frequencies "
+            says += (
+                "frequency (delay, lag, viscous friction, mass, stiffness) are indistinguishable. Record two frequencies "
+            )
             says += "a decade apart, and steps."
             findings.append(Finding("excitation", name, says))
         if not any(_turns(recording, path.output if path.law else path.input) for recording in recordings):
