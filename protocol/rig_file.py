@@ -34,7 +34,7 @@ Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class Stage(_Section):
+class StageSection(_Section):
     """One stepper axis. `unit` is m for insertion and rad for roll and knob."""
 
     steps_per_unit: Annotated[float, Field(gt=0, le=1e7)]
@@ -48,7 +48,7 @@ class Stage(_Section):
     home_speed_unit_per_s: Annotated[float, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
-    def _ordered(self) -> Stage:
+    def _ordered(self) -> StageSection:
         if self.min_unit >= self.max_unit:
             raise ValueError("min_unit below max_unit")
         if self.max_speed_unit_per_s * self.steps_per_unit > 20_000:
@@ -60,19 +60,19 @@ class Stage(_Section):
         return self
 
 
-class Stages(_Section):
-    insertion: Stage
-    roll: Stage
-    knob: Stage
+class StagesSection(_Section):
+    insertion: StageSection
+    roll: StageSection
+    knob: StageSection
 
 
-class Catheter(_Section):
+class CatheterSection(_Section):
     name: str
     distal_length_m: Annotated[float, Field(gt=0.01, le=0.3)]
     max_curvature_per_m: Annotated[float, Field(gt=0, le=100)]
 
 
-class Transmission(_Section):
+class TransmissionSection(_Section):
     """Handle to distal end, as characterized on this rig (thesis 6.2)."""
 
     catheter: str
@@ -84,7 +84,7 @@ class Transmission(_Section):
     curvature_per_m: list[float]
 
     @model_validator(mode="after")
-    def _monotone_curve(self) -> Transmission:
+    def _monotone_curve(self) -> TransmissionSection:
         if len(self.knob_rad) != len(self.curvature_per_m) or len(self.knob_rad) < 3:
             raise ValueError("knob_rad and curvature_per_m of one length, at least 3")
         if any(b <= a for a, b in zip(self.knob_rad, self.knob_rad[1:], strict=False)):
@@ -115,7 +115,7 @@ class Tracker(_Section):
         return self
 
 
-class ForceSensor(_Section):
+class ForceSensorSection(_Section):
     """ATI Nano17 behind a Net F/T box; `base_from_sensor_wxyz` turns its reading into the force on the tissue."""
 
     address: str
@@ -127,7 +127,7 @@ class ForceSensor(_Section):
     base_from_sensor_wxyz: Quaternion
 
     @model_validator(mode="after")
-    def _unit(self) -> ForceSensor:
+    def _unit(self) -> ForceSensorSection:
         if abs(math.hypot(*self.base_from_sensor_wxyz) - 1) > 1e-3:
             raise ValueError("base_from_sensor_wxyz of unit length")
         return self
@@ -171,7 +171,7 @@ class Pins(_Section):
         return board_pins.build_of(board_pins.definitions(**self.model_dump()))
 
 
-class Board(_Section):
+class BoardSection(_Section):
     port: str
     baud: Annotated[int, Field(gt=9600, le=1_000_000)]
     setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
@@ -179,7 +179,7 @@ class Board(_Section):
     pins: Pins = Pins.model_validate({})
 
 
-class Control(_Section):
+class ControlSection(_Section):
     """Gains in physical units per second: they hold at any loop rate."""
 
     loop_hz: Annotated[int, Field(ge=100, le=4000)]
@@ -210,7 +210,7 @@ class Control(_Section):
     play_sd_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
 
     @model_validator(mode="after")
-    def _stable(self) -> Control:
+    def _stable(self) -> ControlSection:
         if self.position_gain_per_s / self.loop_hz > 0.5:
             raise ValueError("position_gain_per_s at most half of loop_hz, beyond it the loop is unstable")
         return self
@@ -269,13 +269,13 @@ class Rig(_Section):
     """All of it. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
-    catheter: Catheter
-    stages: Stages
-    transmission: Transmission
+    catheter: CatheterSection
+    stages: StagesSection
+    transmission: TransmissionSection
     tracker: Tracker
-    force_sensor: ForceSensor
-    board: Board
-    control: Control
+    force_sensor: ForceSensorSection
+    board: BoardSection
+    control: ControlSection
     safety: Safety
     zenoh: Zenoh
     network: NetworkAccess = NetworkAccess()
@@ -314,7 +314,7 @@ class Rig(_Section):
                 )
         return self
 
-    def stage(self, axis: int) -> Stage:
+    def stage(self, axis: int) -> StageSection:
         """The stage of axis 0 insertion, 1 roll or 2 knob."""
         return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
 

@@ -78,7 +78,7 @@ class Tracked:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class AuroraFrame:
     """One measurement frame and the time from which replies can carry it."""
 
     number: int
@@ -91,7 +91,7 @@ class Refused(Exception):
 
 
 @dataclass
-class Port:
+class AuroraPort:
     """A port handle and the tool behind it; `defect`: error code with which PINIT fails (an unreadable SROM: 1E)."""
 
     handle: str
@@ -120,7 +120,7 @@ class Port:
 
 
 @dataclass(frozen=True)
-class Answer:
+class AuroraAnswer:
     """Reply, the time that the command takes, and whether the device restarts instead of replying."""
 
     reply: str | bytes
@@ -131,7 +131,7 @@ class Answer:
 class Console:
     """The interpreter's state: mode, speed, ports, latched system status."""
 
-    def __init__(self, ports: dict[str, Port], config: AuroraEmulatorConfig) -> None:
+    def __init__(self, ports: dict[str, AuroraPort], config: AuroraEmulatorConfig) -> None:
         self.ports, self.config = ports, config
         self.reset()
 
@@ -148,7 +148,7 @@ class Console:
         if self._next_baud is not None:
             self.baud, self._next_baud = self._next_baud, None
 
-    def execute(self, line: bytes, frame: Frame | None) -> Answer:
+    def execute(self, line: bytes, frame: AuroraFrame | None) -> AuroraAnswer:
         """Carry out one command line (without its CR). `frame` is the newest measured one, for BX and TX."""
         try:
             name, parameters = _split(line)
@@ -157,13 +157,13 @@ class Console:
             if self.mode not in _MODES[name]:
                 raise Refused(SYSTEM_NOT_INITIALISED if self.mode == "power_up" else WRONG_MODE)
             if name in ("BX", "TX"):
-                return Answer(self._poses(name, parameters, frame))
+                return AuroraAnswer(self._poses(name, parameters, frame))
             if name == "RESET":
-                return Answer("", power_cycle=True)
+                return AuroraAnswer("", power_cycle=True)
             handler: Callable[[str], str] = getattr(self, f"_{name.lower()}")
-            return Answer(handler(parameters), self.config.init_s if name == "INIT" else 0.0)
+            return AuroraAnswer(handler(parameters), self.config.init_s if name == "INIT" else 0.0)
         except Refused as refused:
-            return Answer(f"ERROR{refused}")
+            return AuroraAnswer(f"ERROR{refused}")
 
     def _init(self, parameters: str) -> str:
         self.mode = "setup"
@@ -194,7 +194,7 @@ class Console:
         return "1"
 
     def _phsr(self, parameters: str) -> str:
-        chosen: dict[str, Callable[[Port], bool]] = {
+        chosen: dict[str, Callable[[AuroraPort], bool]] = {
             "00": lambda port: True,
             "01": lambda port: port.stale,
             "02": lambda port: port.occupied and not port.initialised,
@@ -261,7 +261,7 @@ class Console:
         self.mode = "setup"
         return "OKAY"
 
-    def _port(self, handle: str) -> Port:
+    def _port(self, handle: str) -> AuroraPort:
         if len(handle) != 2:
             raise Refused(PARAMETERS)
         if handle not in self.ports:
@@ -270,7 +270,7 @@ class Console:
             raise Refused(NOT_ALLOCATED)
         return self.ports[handle]
 
-    def _poses(self, name: str, parameters: str, frame: Frame | None) -> str | bytes:
+    def _poses(self, name: str, parameters: str, frame: AuroraFrame | None) -> str | bytes:
         option = _number(parameters or "0001", 4)
         if not option & 0x0001 or option & ~0x0801:
             raise Refused(OUT_OF_RANGE)
@@ -304,7 +304,7 @@ def _number(text: str, digits: int) -> int:
 _MEASURED_BITS = {"out_of_volume": 0x40, "partly": 0x80, "broken": 0x100}
 
 
-def _status(port: Port, tracked: Tracked | None) -> int:
+def _status(port: AuroraPort, tracked: Tracked | None) -> int:
     flags = tracked.flags if tracked else frozenset()
     return port.status | sum(_MEASURED_BITS[flag] for flag in flags)
 
@@ -315,7 +315,7 @@ def _pose_sent(tracked: Tracked | None, outside: bool) -> tuple[float, ...] | No
     return tracked.pose
 
 
-Tools = list[tuple[Port, "Tracked | None"]]
+Tools = list[tuple[AuroraPort, "Tracked | None"]]
 
 
 def _bx(tools: Tools, number: int, outside: bool, system_status: int) -> bytes:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from realtime.drivers.ndi_protocol import crc16
-from sim.aurora_commands import AuroraEmulatorConfig, Console, Frame, Port, Tracked
+from sim.aurora_commands import AuroraEmulatorConfig, AuroraFrame, AuroraPort, Console, Tracked
 from sim.rotation import quaternion_of_vector, quaternion_product
-from sim.sensor_faults import Fault, active, checked, strongest
+from sim.sensor_faults import SensorFault, active, checked, strongest
 from sim.sensor_noise import MarkovNoise, generators
 
 if TYPE_CHECKING:
@@ -32,10 +32,14 @@ class AuroraEmulator:
     Times only go forward from call to call. The same seed and calls give the same bytes.
     """
 
-    def __init__(self, config: AuroraEmulatorConfig | None = None, seed: int = 0, faults: Sequence[Fault] = ()) -> None:
+    def __init__(
+        self, config: AuroraEmulatorConfig | None = None, seed: int = 0, faults: Sequence[SensorFault] = ()
+    ) -> None:
         self.config = config or AuroraEmulatorConfig()
         self.faults = checked(faults, FAULT_KINDS)
-        self.ports = {handle: Port(handle, serial=f"{0x34801000 + i:08X}") for i, handle in enumerate(self.config.handles)}
+        self.ports = {
+            handle: AuroraPort(handle, serial=f"{0x34801000 + i:08X}") for i, handle in enumerate(self.config.handles)
+        }
         self.frame_number = 0
         noise_rng, self._delay_rng, self._fault_rng, self._bit_rng = generators(seed, 4)
         size = 3 * len(self.config.handles)
@@ -44,7 +48,7 @@ class AuroraEmulator:
         self._turn_noise = MarkovNoise(noise_rng, size, c.orientation_noise_rad, c.noise_correlation_s)
         self._quality_rng = noise_rng
         self._samples = 0
-        self._frames: deque[Frame] = deque(maxlen=FRAMES_KEPT)
+        self._frames: deque[AuroraFrame] = deque(maxlen=FRAMES_KEPT)
         self._last: dict[str, Tracked] = {}
         self._console = Console(self.ports, c)
         self._host_baud = 9600
@@ -129,7 +133,7 @@ class AuroraEmulator:
         available_ns = frame_time_ns + round((c.latency_s + jitter_s + late_s) * 1e9)
         if self._frames:
             available_ns = max(available_ns, self._frames[-1].available_ns)
-        self._frames.append(Frame(self.frame_number, available_ns, tools))
+        self._frames.append(AuroraFrame(self.frame_number, available_ns, tools))
         self._last = tools
 
     def _spoilt(
@@ -196,7 +200,7 @@ class AuroraEmulator:
             self._send(answer.reply, due_ns + round(answer.takes_s * 1e9))
             self._console.settle()
 
-    def _frame_at(self, time_ns: int) -> Frame | None:
+    def _frame_at(self, time_ns: int) -> AuroraFrame | None:
         """The newest frame whose data are ready at that time."""
         for frame in reversed(self._frames):
             if frame.available_ns <= time_ns:

@@ -158,7 +158,7 @@ def ensure_built(kind: str, build: Build = USUAL_BUILD) -> Path:
     return program
 
 
-class Board:
+class SimulatedBoard:
     """A simulated board. Time is microseconds since this object was made; it goes on through resets.
 
     kind: "avr" runs the ELF in simavr, "native" the same core compiled for the host, "auto" the better one there is.

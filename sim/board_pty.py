@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sim.board import Board, BoardSlice
+from sim.board import BoardSlice, SimulatedBoard
 
 SLICE_US = 1000
 
@@ -39,7 +39,7 @@ class BoardPty:
     open and close it. A pty has no DTR line: opening it does not reset the board, Board.reset() does.
     """
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: SimulatedBoard) -> None:
         self.board = board
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)

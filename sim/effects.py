@@ -27,7 +27,7 @@ _SIZE = {"insertion": 1e-3, "roll": 0.1, "knob": 0.07, "shape": 1.5}  # a middli
 _BIG = 1e9
 
 
-class Parameter(NamedTuple):
+class PlantedParameter(NamedTuple):
     """One number of an effect: name with unit, default, least and greatest value."""
 
     name: str
@@ -37,7 +37,7 @@ class Parameter(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Effect:
+class PlantedEffect:
     """One planted effect. Parameters left out take the catalogue's default; before `start_s` nothing happens."""
 
     id: str
@@ -51,157 +51,182 @@ class Effect:
         return {"id": self.id, "subsystem": self.port, "start_s": self.start_s, "parameters": values}
 
 
-def _axis_parameters(port: str) -> dict[str, tuple[Parameter, ...]]:
+def _axis_parameters(port: str) -> dict[str, tuple[PlantedParameter, ...]]:
     """Effects that act on a motion: on a stage's way to the catheter, or on the curvature the wires ask for."""
     unit, load, size = _UNIT[port], _LOAD[port], _SIZE[port]
     stiffness_unit, k = _STIFFNESS[port]
     gain, source = {"insertion": (1e-3, 1.0), "roll": (20.0, 0.0), "knob": (15.0, 0.0), "shape": (300.0, 0.0)}[port]
-    stiffness = Parameter(f"stiffness_{stiffness_unit}", k, 1e-6, _BIG)
-    force = Parameter(load, k * size, 0.0, _BIG)
-    time_constant = Parameter("time_constant_s", 0.05, 1e-4, 1e3)
+    stiffness = PlantedParameter(f"stiffness_{stiffness_unit}", k, 1e-6, _BIG)
+    force = PlantedParameter(load, k * size, 0.0, _BIG)
+    time_constant = PlantedParameter("time_constant_s", 0.05, 1e-4, 1e3)
 
-    def length(name: str, times: float, least: float = 0.0) -> Parameter:
-        return Parameter(f"{name}_{unit}", times * size, least, _BIG)
+    def length(name: str, times: float, least: float = 0.0) -> PlantedParameter:
+        return PlantedParameter(f"{name}_{unit}", times * size, least, _BIG)
 
     return {
         "backlash": (length("width", 1.0),),
         "dead_zone": (length("centre", 0.0, -_BIG), length("half_width", 0.7)),
         "coulomb_friction": (force, stiffness),
         "presliding_friction": (force, length("distance", 1.0, 1e-9), stiffness),
-        "load_dependent_friction": (Parameter("coefficient", 0.03, 0.0, 2.0),)
+        "load_dependent_friction": (PlantedParameter("coefficient", 0.03, 0.0, 2.0),)
         if port == "knob"
-        else (Parameter("coefficient", 0.5, 0.0, 5.0), stiffness),
+        else (PlantedParameter("coefficient", 0.5, 0.0, 5.0), stiffness),
         "stribeck_friction": (
-            Parameter(f"static_{load}", k * size, 0.0, _BIG),
-            Parameter(f"kinetic_{load}", 0.5 * k * size, 0.0, _BIG),
-            Parameter(f"speed_{unit}_per_s", 3.0 * size, 1e-9, _BIG),
+            PlantedParameter(f"static_{load}", k * size, 0.0, _BIG),
+            PlantedParameter(f"kinetic_{load}", 0.5 * k * size, 0.0, _BIG),
+            PlantedParameter(f"speed_{unit}_per_s", 3.0 * size, 1e-9, _BIG),
             stiffness,
         ),
-        "viscous_friction": (Parameter(f"{load}_s_per_{unit}", 0.05 * k, 0.0, _BIG), stiffness),
+        "viscous_friction": (PlantedParameter(f"{load}_s_per_{unit}", 0.05 * k, 0.0, _BIG), stiffness),
         "rate_lag": (time_constant,),
-        "latency": (Parameter("delay_s", 0.03, 0.0, 1.0),),
-        "clock_drift": (Parameter("rate", 0.001, 0.0, 0.1),),
+        "latency": (PlantedParameter("delay_s", 0.03, 0.0, 1.0),),
+        "clock_drift": (PlantedParameter("rate", 0.001, 0.0, 0.1),),
         "compliance": (
-            Parameter(
+            PlantedParameter(
                 f"compliance_{unit}_per_{load.rpartition('_')[2]}",
                 size / {"insertion": 0.2, "roll": 1e-3, "knob": 5.0, "shape": 0.2}[port],
                 0.0,
                 _BIG,
             ),
         ),
-        "nonlinear_stiffness": (stiffness, Parameter("cubic_per_square", 1.0 / size**2, 0.0, _BIG)),
-        "creep_relaxation": (Parameter("share", 0.1, 0.0, 0.95), Parameter("time_constant_s", 1.0, 1e-3, 1e4)),
-        "plastic_set": (length("yield", 4.0), Parameter("share", 0.2, 0.0, 1.0)),
-        "softening": (Parameter("rate_per_s", 0.003, 0.0, 1.0),),
+        "nonlinear_stiffness": (stiffness, PlantedParameter("cubic_per_square", 1.0 / size**2, 0.0, _BIG)),
+        "creep_relaxation": (PlantedParameter("share", 0.1, 0.0, 0.95), PlantedParameter("time_constant_s", 1.0, 1e-3, 1e4)),
+        "plastic_set": (length("yield", 4.0), PlantedParameter("share", 0.2, 0.0, 1.0)),
+        "softening": (PlantedParameter("rate_per_s", 0.003, 0.0, 1.0),),
         "asymmetry": (
-            Parameter("ratio", 0.85, 0.0, 5.0),
+            PlantedParameter("ratio", 0.85, 0.0, 5.0),
             length("centre", {"insertion": 6.0, "knob": 8.0}.get(port, 0.0), -_BIG),
         ),
-        "static_nonlinearity": (length("scale", 8.0, 1e-9), Parameter("share", 0.15, -0.5, 0.5)),
+        "static_nonlinearity": (length("scale", 8.0, 1e-9), PlantedParameter("share", 0.15, -0.5, 0.5)),
         "saturation": (length("limit", 9.0, 1e-9),),
-        "coupling": (Parameter("gain", gain, -_BIG, _BIG), Parameter("source", source, 0.0, 2.0)),
+        "coupling": (PlantedParameter("gain", gain, -_BIG, _BIG), PlantedParameter("source", source, 0.0, 2.0)),
         "periodic_disturbance": (
             length("amplitude", 0.3),
-            Parameter("frequency_Hz", 1.3, 0.0, 200.0),
-            Parameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG),
-            Parameter("phase_rad", 0.0, -_BIG, _BIG),
+            PlantedParameter("frequency_Hz", 1.3, 0.0, 200.0),
+            PlantedParameter(f"pitch_{unit}", 2.0 * size, 1e-9, _BIG),
+            PlantedParameter("phase_rad", 0.0, -_BIG, _BIG),
         ),
-        "resonance": (Parameter("frequency_Hz", 6.0, 0.1, 200.0), Parameter("damping_ratio", 0.15, 0.001, 2.0)),
+        "resonance": (
+            PlantedParameter("frequency_Hz", 6.0, 0.1, 200.0),
+            PlantedParameter("damping_ratio", 0.15, 0.001, 2.0),
+        ),
     }
 
 
-_DIRECTION = (Parameter("x", 0.0, -_BIG, _BIG), Parameter("y", -1.0, -_BIG, _BIG), Parameter("z", 0.0, -_BIG, _BIG))
+_DIRECTION = (
+    PlantedParameter("x", 0.0, -_BIG, _BIG),
+    PlantedParameter("y", -1.0, -_BIG, _BIG),
+    PlantedParameter("z", 0.0, -_BIG, _BIG),
+)
 _ON_SHAPE = {
-    "coulomb_friction": (Parameter("moment_Nm", 2e-4, 0.0, 1.0),),
-    "presliding_friction": (Parameter("moment_Nm", 3e-4, 0.0, 1.0), Parameter("curvature_per_m", 3.0, 1e-6, 1e3)),
-    "viscous_friction": (Parameter("time_constant_s", 0.05, 0.0, 10.0),),
-    "nonlinear_stiffness": (Parameter("cubic_m2", 0.002, 0.0, 10.0),),
-    "creep_relaxation": (Parameter("share", 0.15, 0.0, 5.0), Parameter("time_constant_s", 2.0, 1e-3, 1e4)),
-    "plastic_set": (Parameter("yield_per_m", 8.0, 0.0, 1e3), Parameter("share", 0.3, 0.0, 1.0)),
-    "softening": (Parameter("rate_per_s", 0.005, 0.0, 1.0), Parameter("floor", 0.5, 0.05, 1.0)),
-    "asymmetry": (Parameter("ratio", 0.8, 0.1, 10.0),),
-    "gravity_load": (Parameter("weight_N_per_m", 0.05, 0.0, 100.0), Parameter("tip_weight_N", 0.01, 0.0, 10.0), *_DIRECTION),
+    "coulomb_friction": (PlantedParameter("moment_Nm", 2e-4, 0.0, 1.0),),
+    "presliding_friction": (
+        PlantedParameter("moment_Nm", 3e-4, 0.0, 1.0),
+        PlantedParameter("curvature_per_m", 3.0, 1e-6, 1e3),
+    ),
+    "viscous_friction": (PlantedParameter("time_constant_s", 0.05, 0.0, 10.0),),
+    "nonlinear_stiffness": (PlantedParameter("cubic_m2", 0.002, 0.0, 10.0),),
+    "creep_relaxation": (PlantedParameter("share", 0.15, 0.0, 5.0), PlantedParameter("time_constant_s", 2.0, 1e-3, 1e4)),
+    "plastic_set": (PlantedParameter("yield_per_m", 8.0, 0.0, 1e3), PlantedParameter("share", 0.3, 0.0, 1.0)),
+    "softening": (PlantedParameter("rate_per_s", 0.005, 0.0, 1.0), PlantedParameter("floor", 0.5, 0.05, 1.0)),
+    "asymmetry": (PlantedParameter("ratio", 0.8, 0.1, 10.0),),
+    "gravity_load": (
+        PlantedParameter("weight_N_per_m", 0.05, 0.0, 100.0),
+        PlantedParameter("tip_weight_N", 0.01, 0.0, 10.0),
+        *_DIRECTION,
+    ),
     "flow_drag": (
-        Parameter("speed_m_per_s", 0.4, 0.0, 5.0),
-        Parameter("pulsatility", 0.6, 0.0, 2.0),
-        Parameter("frequency_Hz", 1.2, 0.0, 20.0),
+        PlantedParameter("speed_m_per_s", 0.4, 0.0, 5.0),
+        PlantedParameter("pulsatility", 0.6, 0.0, 2.0),
+        PlantedParameter("frequency_Hz", 1.2, 0.0, 20.0),
         *_DIRECTION,
     ),
     "second_contact": (
-        Parameter("place_m", 0.012, 0.0, 0.3),
-        Parameter("clearance_m", 0.0008, -_BIG, _BIG),
-        Parameter("stiffness_N_per_m", 100.0, 0.0, 1e5),
+        PlantedParameter("place_m", 0.012, 0.0, 0.3),
+        PlantedParameter("clearance_m", 0.0008, -_BIG, _BIG),
+        PlantedParameter("stiffness_N_per_m", 100.0, 0.0, 1e5),
         *_DIRECTION,
     ),
 }
 _ON_CONTACT = {
-    "contact_nonlinear": (Parameter("exponent", 1.5, 1.0, 4.0), Parameter("exponential_depth_m", 0.0, 0.0, 1.0)),
-    "contact_viscous": (
-        Parameter("hunt_crossley_s_per_m", 20.0, 0.0, 1e4),
-        Parameter("relaxing_N_per_m", 300.0, 0.0, 1e5),
-        Parameter("relaxation_s", 0.3, 1e-3, 100.0),
+    "contact_nonlinear": (
+        PlantedParameter("exponent", 1.5, 1.0, 4.0),
+        PlantedParameter("exponential_depth_m", 0.0, 0.0, 1.0),
     ),
-    "contact_friction": (Parameter("coefficient", 0.2, 0.0, 3.0), Parameter("bristle_N_per_m", 2000.0, 1.0, 1e6)),
-    "softening": (Parameter("rate_per_s", 0.01, 0.0, 1.0), Parameter("floor", 0.3, 0.05, 1.0)),
+    "contact_viscous": (
+        PlantedParameter("hunt_crossley_s_per_m", 20.0, 0.0, 1e4),
+        PlantedParameter("relaxing_N_per_m", 300.0, 0.0, 1e5),
+        PlantedParameter("relaxation_s", 0.3, 1e-3, 100.0),
+    ),
+    "contact_friction": (
+        PlantedParameter("coefficient", 0.2, 0.0, 3.0),
+        PlantedParameter("bristle_N_per_m", 2000.0, 1.0, 1e6),
+    ),
+    "softening": (PlantedParameter("rate_per_s", 0.01, 0.0, 1.0), PlantedParameter("floor", 0.3, 0.05, 1.0)),
     "periodic_disturbance": (
-        Parameter("amplitude_m", 0.0003, 0.0, 0.01),
-        Parameter("frequency_Hz", 5.0, 0.0, 100.0),
-        Parameter("phase_rad", 0.0, -_BIG, _BIG),
+        PlantedParameter("amplitude_m", 0.0003, 0.0, 0.01),
+        PlantedParameter("frequency_Hz", 5.0, 0.0, 100.0),
+        PlantedParameter("phase_rad", 0.0, -_BIG, _BIG),
     ),
 }
 
 
-def _vector(unit: str, x: float, y: float, z: float) -> tuple[Parameter, ...]:
-    return tuple(Parameter(f"{axis}_{unit}", value, -_BIG, _BIG) for axis, value in zip("xyz", (x, y, z), strict=True))
+def _vector(unit: str, x: float, y: float, z: float) -> tuple[PlantedParameter, ...]:
+    return tuple(
+        PlantedParameter(f"{axis}_{unit}", value, -_BIG, _BIG) for axis, value in zip("xyz", (x, y, z), strict=True)
+    )
 
 
-def _sensor_parameters(unit: str, size: float) -> dict[str, tuple[Parameter, ...]]:
+def _sensor_parameters(unit: str, size: float) -> dict[str, tuple[PlantedParameter, ...]]:
     """Effects on a reading; `size` is a middling error in `unit` (m for poses, N for forces)."""
-    axis = Parameter("axis", 0.0, 0.0, 2.0)
+    axis = PlantedParameter("axis", 0.0, 0.0, 2.0)
     return {
-        "rate_lag": (Parameter("time_constant_s", 0.05, 1e-4, 100.0),),
-        "latency": (Parameter("delay_s", 0.05, 0.0, 0.8),),
-        "clock_drift": (Parameter("rate", 0.002, 0.0, 0.1),),
-        "creep_relaxation": (Parameter("share", 0.1, 0.0, 0.95), Parameter("time_constant_s", 3.0, 1e-3, 1e4)),
-        "sensor_drift": (*_vector(f"{unit}_per_s", 0.02 * size, 0.0, 0.0), Parameter("time_constant_s", 120.0, 0.1, 1e6)),
+        "rate_lag": (PlantedParameter("time_constant_s", 0.05, 1e-4, 100.0),),
+        "latency": (PlantedParameter("delay_s", 0.05, 0.0, 0.8),),
+        "clock_drift": (PlantedParameter("rate", 0.002, 0.0, 0.1),),
+        "creep_relaxation": (PlantedParameter("share", 0.1, 0.0, 0.95), PlantedParameter("time_constant_s", 3.0, 1e-3, 1e4)),
+        "sensor_drift": (
+            *_vector(f"{unit}_per_s", 0.02 * size, 0.0, 0.0),
+            PlantedParameter("time_constant_s", 120.0, 0.1, 1e6),
+        ),
         "periodic_disturbance": (
-            Parameter(f"amplitude_{unit}", 0.5 * size, 0.0, _BIG),
-            Parameter("frequency_Hz", 3.1, 0.0, 500.0),
+            PlantedParameter(f"amplitude_{unit}", 0.5 * size, 0.0, _BIG),
+            PlantedParameter("frequency_Hz", 3.1, 0.0, 500.0),
             axis,
         ),
-        "sensor_scale": (Parameter("gain", 1.05, -10.0, 10.0),),
+        "sensor_scale": (PlantedParameter("gain", 1.05, -10.0, 10.0),),
         "sensor_bias": _vector(unit, size, 0.0, 0.0),
         "sensor_misalignment": _vector("rad", 0.0, 0.05, 0.0),
         "rectified_sensor": (axis,),
-        "saturation": (Parameter(f"limit_{unit}", 10.0 * size, 0.0, _BIG),),
-        "quantization": (Parameter(f"step_{unit}", size, 1e-12, _BIG),),
-        "dropout": (Parameter("share", 0.05, 0.0, 1.0), Parameter("burst", 3.0, 1.0, 1000.0)),
-        "outlier": (Parameter("share", 0.01, 0.0, 1.0), Parameter(f"size_{unit}", 10.0 * size, 0.0, _BIG)),
+        "saturation": (PlantedParameter(f"limit_{unit}", 10.0 * size, 0.0, _BIG),),
+        "quantization": (PlantedParameter(f"step_{unit}", size, 1e-12, _BIG),),
+        "dropout": (PlantedParameter("share", 0.05, 0.0, 1.0), PlantedParameter("burst", 3.0, 1.0, 1000.0)),
+        "outlier": (PlantedParameter("share", 0.01, 0.0, 1.0), PlantedParameter(f"size_{unit}", 10.0 * size, 0.0, _BIG)),
     }
 
 
 _ON_POSE = _sensor_parameters("m", 1e-3) | {
     "field_distortion": (
-        Parameter("amplitude_m", 0.002, 0.0, 0.1),
+        PlantedParameter("amplitude_m", 0.002, 0.0, 0.1),
         *_vector("m", 0.03, 0.0, 0.03),
-        Parameter("reach_m", 0.03, 1e-4, 1.0),
+        PlantedParameter("reach_m", 0.03, 1e-4, 1.0),
     )
 }
 _ON_BASE = {
     "base_motion": (
         *_vector("m", 0.0, 0.001, 0.0),
         *_vector("rad", 0.02, 0.0, 0.0),
-        Parameter("frequency_Hz", 0.0, 0.0, 20.0),
-        Parameter("rise_s", 2.0, 1e-3, 1e4),
+        PlantedParameter("frequency_Hz", 0.0, 0.0, 20.0),
+        PlantedParameter("rise_s", 2.0, 1e-3, 1e4),
     )
 }
-_MISSED = {"missed_steps": (Parameter("steps", 200.0, -1e6, 1e6), Parameter("every_s", 0.0, 0.0, 1e6))}
+_MISSED = {"missed_steps": (PlantedParameter("steps", 200.0, -1e6, 1e6), PlantedParameter("every_s", 0.0, 0.0, 1e6))}
 
-CATALOGUE: dict[str, dict[str, tuple[Parameter, ...]]] = {
+CATALOGUE: dict[str, dict[str, tuple[PlantedParameter, ...]]] = {
     "insertion": _axis_parameters("insertion") | _MISSED,
     "roll": _axis_parameters("roll")
     | _MISSED
-    | {"whip": (Parameter("amplitude_rad", 0.35, 0.0, 3.0), Parameter("phase_rad", 0.0, -_BIG, _BIG))},
+    | {"whip": (PlantedParameter("amplitude_rad", 0.35, 0.0, 3.0), PlantedParameter("phase_rad", 0.0, -_BIG, _BIG))},
     "knob": _axis_parameters("knob") | _MISSED,
     "shape": {
         name: parameters
@@ -216,7 +241,7 @@ CATALOGUE: dict[str, dict[str, tuple[Parameter, ...]]] = {
 }
 
 
-def describe(effect_id: str, port: str) -> tuple[Parameter, ...]:
+def describe(effect_id: str, port: str) -> tuple[PlantedParameter, ...]:
     """Parameters of an effect at a port. Raises ValueError where there is no such pair."""
     if port not in CATALOGUE:
         raise ValueError(f"effect port: found {port!r}, wanted one of {', '.join(PORTS)}")
@@ -225,7 +250,7 @@ def describe(effect_id: str, port: str) -> tuple[Parameter, ...]:
     return CATALOGUE[port][effect_id]
 
 
-def _values(effect: Effect) -> list[float]:
+def _values(effect: PlantedEffect) -> list[float]:
     """Parameters in the catalogue's order, defaults filled in. Raises ValueError for unknown names and bad values."""
     known = describe(effect.id, effect.port)
     where = f"effect {effect.id}@{effect.port}"
@@ -243,7 +268,7 @@ def _values(effect: Effect) -> list[float]:
     return values
 
 
-def parse(text: str) -> Effect:
+def parse(text: str) -> PlantedEffect:
     """The effect of a command line: ID@PORT, then maybe : and NAME=VALUE joined by commas; start_s is one of the names.
 
     `backlash@insertion:width_m=0.002,start_s=25`. Raises ValueError for what is not in the catalogue.
@@ -257,12 +282,12 @@ def parse(text: str) -> Effect:
             values[key.strip()] = float(value)
         except ValueError:
             raise ValueError(f"effect {name}: found {item!r}, wanted NAME=NUMBER") from None
-    effect = Effect(effect_id, port, {k: v for k, v in values.items() if k != "start_s"}, values.get("start_s", 0.0))
+    effect = PlantedEffect(effect_id, port, {k: v for k, v in values.items() if k != "start_s"}, values.get("start_s", 0.0))
     pack([effect])
     return effect
 
 
-def pack(effects: Sequence[Effect]) -> np.ndarray:
+def pack(effects: Sequence[PlantedEffect]) -> np.ndarray:
     """Effects as the kernels' records, fresh states. Raises ValueError as `describe` and for parameters out of bounds."""
     records = np.zeros(len(effects), EFFECT).view(np.recarray)
     for record, effect in zip(records, effects, strict=True):

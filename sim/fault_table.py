@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.fault_run import MS, FaultyScenario
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 Rng = np.random.Generator
 Inject = Callable[[FaultyScenario, float, float], None]
@@ -68,19 +68,19 @@ def _span(run: FaultyScenario, seconds: float) -> tuple[int, int]:
 
 
 def _on_line(kind: str) -> Inject:
-    return lambda run, size, seconds: run.noise.add(Fault(kind, *_span(run, seconds), value=size))
+    return lambda run, size, seconds: run.noise.add(SensorFault(kind, *_span(run, seconds), value=size))
 
 
 def _on_tracker(kind: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
-        run.world.tracker.faults.append(Fault(kind, *_span(run, seconds), value=size))
+        run.world.tracker.faults.append(SensorFault(kind, *_span(run, seconds), value=size))
 
     return inject
 
 
 def _on_force(kind: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
-        run.world.force_box.faults.append(Fault(kind, *_span(run, seconds), value=size))
+        run.world.force_box.faults.append(SensorFault(kind, *_span(run, seconds), value=size))
 
     return inject
 

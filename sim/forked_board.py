@@ -14,9 +14,9 @@ from sim.board import (
     _REPLY,
     BUILD_DIR,
     FIRMWARE_DIR,
-    Board,
     BoardSlice,
     BoardUnavailable,
+    SimulatedBoard,
     resolve_kind,
     slice_of,
 )
@@ -25,7 +25,7 @@ BOARD_SRC = Path(__file__).parent / "board_src"
 _BATCH = 100  # requests in flight: a few kB, which a pipe always holds
 
 
-class LibraryBoard(Board):
+class LibraryBoard(SimulatedBoard):
     """The native board without a child process: the same firmware, answers and edges, some ten times faster.
 
     A fork copies its state with the process. Raises BoardUnavailable where it cannot be compiled.
@@ -58,7 +58,7 @@ class LibraryBoard(Board):
         return os.getpid()
 
 
-class ReplayedBoard(Board):
+class ReplayedBoard(SimulatedBoard):
     """As `Board`, in a child; keeps what it was asked, so that `after_fork` can bring a new child to the same state."""
 
     def __init__(self, kind: str, mcu: str = "atmega2560") -> None:

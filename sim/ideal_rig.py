@@ -27,7 +27,7 @@ _LISTEN_S = 0.3
 _FORCE_DELAY_NS = 1_000_000
 
 
-class Trace(NamedTuple):
+class IdealTrace(NamedTuple):
     """What happened, a row a tick: time since the start (s), true force into the wall (N), true tip (m), the wall's motion
     (m), stages (m, rad, rad), phase."""
 
@@ -38,16 +38,16 @@ class Trace(NamedTuple):
     stage: Array
     phase: NDArray[np.int64]
 
-    def since_contact(self) -> Trace:
+    def since_contact(self) -> IdealTrace:
         """From the first tick in contact on, its time zero; empty where there was none."""
         touched = np.flatnonzero(self.phase == Phase.CONTACT)
         first = touched[0] if touched.size else self.time_s.size
         late = self.rows(slice(first, None))
         return late._replace(time_s=late.time_s - (late.time_s[0] if late.time_s.size else 0.0))
 
-    def rows(self, which: Any) -> Trace:
+    def rows(self, which: Any) -> IdealTrace:
         """Some of the rows: a mask, an index or a slice."""
-        return Trace(
+        return IdealTrace(
             self.time_s[which],
             self.force_N[which],
             self.tip_m[which],
@@ -98,23 +98,23 @@ class IdealRig:
         if target_m is not None:
             command.target_m[:] = target_m
 
-    def press(self, force_N: float, target_m: Array, seconds: float) -> Trace:
+    def press(self, force_N: float, target_m: Array, seconds: float) -> IdealTrace:
         """Approach the wall towards `target_m` (3,), hold `force_N` (N); all of it for `seconds`."""
         self._command(CommandKind.CONTACT, np.asarray(target_m, float), force_N)
         return self.run(seconds)
 
-    def go(self, target_m: Array, seconds: float) -> Trace:
+    def go(self, target_m: Array, seconds: float) -> IdealTrace:
         """Position control towards `target_m` (3,) for `seconds`."""
         self._command(CommandKind.POSITION, np.asarray(target_m, float))
         return self.run(seconds)
 
-    def run(self, seconds: float) -> Trace:
+    def run(self, seconds: float) -> IdealTrace:
         """So many seconds; the trace of them."""
         self._rows = []
         for _ in range(round(seconds * 1e9 / self._period_ns)):
             self._step()
         table = np.array(self._rows).reshape(-1, 10)
-        return Trace(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5], table[:, 6:9], table[:, 9].astype(np.int64))
+        return IdealTrace(table[:, 0], table[:, 1], table[:, 2:5], table[:, 5], table[:, 6:9], table[:, 9].astype(np.int64))
 
     def _step(self) -> None:
         self._now_ns += self._period_ns

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from realtime.core.lines import FromRig, ToRig
-from sim.sensor_faults import Fault, active, checked, strongest
+from sim.sensor_faults import SensorFault, active, checked, strongest
 
 # bit_errors: `value` is the rate per bit of the board's line, both ways; drop, duplicate, reorder: `value` is the chance
 # per frame of the board's line, both ways; cut: nothing passes on the board's line; flood_in: all that arrives from the
@@ -29,13 +29,13 @@ class LineNoise:
     """The cables, as bad as the faults in `faults` say. Same seed and bytes, same damage."""
 
     def __init__(self, seed: int) -> None:
-        self.faults: list[Fault] = []
+        self.faults: list[SensorFault] = []
         self.counts = LineCounts()
         self._rng = np.random.default_rng(seed)
         self._late: dict[str, bytes] = {"out": b"", "in": b""}
         self._part = b""
 
-    def add(self, fault: Fault) -> None:
+    def add(self, fault: SensorFault) -> None:
         """One more fault. Raises ValueError for a kind that is not of FAULT_KINDS."""
         self.faults += checked([fault], FAULT_KINDS)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.sensor_faults import Fault, active, checked, strongest
+from sim.sensor_faults import SensorFault, active, checked, strongest
 
 # silent: no samples; broken: a gauge's wire is off and its amplifier at the rail (`value`: which); drift: the zero of all
 # gauges moves by `value` V/s; gone: the card does not answer.
@@ -34,7 +34,9 @@ class Nano17EmulatorConfig:
 class Nano17Emulator:
     """The transducer, its amplifiers and the card. `sample` at each 1/rate_hz; `read` what has been sampled since."""
 
-    def __init__(self, config: Nano17EmulatorConfig | None = None, seed: int = 0, faults: Sequence[Fault] = ()) -> None:
+    def __init__(
+        self, config: Nano17EmulatorConfig | None = None, seed: int = 0, faults: Sequence[SensorFault] = ()
+    ) -> None:
         self.config = config or Nano17EmulatorConfig()
         self.faults = checked(faults, FAULT_KINDS)
         self._rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.sensor_faults import Fault, active, checked, strongest
+from sim.sensor_faults import SensorFault, active, checked, strongest
 from sim.sensor_noise import MarkovNoise, generators
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class NetFtEmulatorConfig:
 class NetFtEmulator:
     """The box. `sample` is due at each `next_sample_ns`; `feed` each datagram; `read` the datagrams arrived by now."""
 
-    def __init__(self, config: NetFtEmulatorConfig | None = None, seed: int = 0, faults: Sequence[Fault] = ()) -> None:
+    def __init__(self, config: NetFtEmulatorConfig | None = None, seed: int = 0, faults: Sequence[SensorFault] = ()) -> None:
         self.config = c = config or NetFtEmulatorConfig()
         self.faults = checked(faults, FAULT_KINDS)
         self.streaming = False

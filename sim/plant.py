@@ -11,7 +11,7 @@ import numpy as np
 
 from sim import catheter_chain, effects, heart, knob, plant_step, sensor_effects, tissue, vessel
 from sim.catheter_chain import CATHETERS, CatheterConfig
-from sim.effects import Effect
+from sim.effects import PlantedEffect
 from sim.heart import HeartConfig
 from sim.knob import KnobConfig
 from sim.tissue import TissueConfig
@@ -35,7 +35,7 @@ class PlantConfig:
     heart: HeartConfig = field(default_factory=HeartConfig)
     tool_offsets_m: tuple[float, ...] = (0.0, 0.030)
     start_stage: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[PlantedEffect, ...] = ()
 
 
 class Measured(NamedTuple):

@@ -16,7 +16,7 @@ from types import FrameType
 
 from protocol.rig_file import load_rig
 from realtime.loop.service_notify import ServiceNotifier
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.effects import parse
 from sim.plant import Plant, PlantConfig
 from sim.sensor_servers import AuroraPty, NetFtUdp
@@ -146,7 +146,7 @@ def main(arguments: list[str] | None = None) -> int:
     offsets_m = (0.0, rig.tracker.shaft_sensor_offset_m)
     wall = TissueConfig(point_m=(0.0, 0.0, 10.0)) if options.free else TissueConfig()
     plant = Plant(PlantConfig(tool_offsets_m=offsets_m, tissue=wall, effects=tuple(options.effect)), options.seed)
-    with Board(options.board) as board:
+    with SimulatedBoard(options.board) as board:
         world = World(rig, plant, board, options.seed)
         world.advance(SLICE_NS, b"")
         server = RigServer(world)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Fault:
+class SensorFault:
     """Something wrong from start_ns to stop_ns. `kind` is one of the emulator's, which says what `value` means;
     `handle`: of this tool only (Aurora)."""
 
@@ -18,7 +18,7 @@ class Fault:
     value: float = 0.0
 
 
-def checked(faults: Iterable[Fault], kinds: Sequence[str]) -> list[Fault]:
+def checked(faults: Iterable[SensorFault], kinds: Sequence[str]) -> list[SensorFault]:
     """The faults as a list. Raises ValueError for a kind that is not among `kinds`."""
     faults = list(faults)
     for fault in faults:
@@ -27,11 +27,11 @@ def checked(faults: Iterable[Fault], kinds: Sequence[str]) -> list[Fault]:
     return faults
 
 
-def active(faults: Iterable[Fault], time_ns: int, kind: str | None = None) -> list[Fault]:
+def active(faults: Iterable[SensorFault], time_ns: int, kind: str | None = None) -> list[SensorFault]:
     """Those of `kind` (None: any) that last at `time_ns`."""
     return [f for f in faults if f.start_ns <= time_ns < f.stop_ns and kind in (None, f.kind)]
 
 
-def strongest(faults: Iterable[Fault], time_ns: int, kind: str) -> float:
+def strongest(faults: Iterable[SensorFault], time_ns: int, kind: str) -> float:
     """The largest value among the active faults of `kind`, 0 without any."""
     return max((fault.value for fault in active(faults, time_ns, kind)), default=0.0)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.effect_codes import PORTS
-from sim.effects import Effect
+from sim.effects import PlantedEffect
 
 Array = np.ndarray
 
@@ -55,10 +55,10 @@ class _Trouble:
         return now_s >= self.until_s or abs(self.lost) >= abs(self.steps)
 
 
-class Stages:
+class SimulatedStages:
     """Positions of the stages from step edges; loses steps where an effect `missed_steps`, a jam or a slip says so."""
 
-    def __init__(self, config: StagesConfig | None = None, effects: Sequence[Effect] = ()) -> None:
+    def __init__(self, config: StagesConfig | None = None, effects: Sequence[PlantedEffect] = ()) -> None:
         """At step zero, at rest. Of `effects` only missed_steps is used here; the plant takes the others."""
         self.config = config or StagesConfig()
         self._per_unit = np.array(self.config.steps_per_unit)

@@ -11,10 +11,10 @@ from protocol.rig_file import Rig
 from realtime.core.intake import quaternion_product, rotation
 from realtime.core.lines import FromRig, ToRig
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, Pose
-from sim.board import CPU_HZ, STEP_TIMER_CYCLES, Board, BoardSlice
+from sim.board import CPU_HZ, STEP_TIMER_CYCLES, BoardSlice, SimulatedBoard
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
 from sim.plant import Plant, PlantConfig
-from sim.stages import Stages, StagesConfig
+from sim.stages import SimulatedStages, StagesConfig
 
 # Tools of the plant, in the order of its tool_offsets_m.
 TIP, SHAFT = 0, 1
@@ -31,7 +31,7 @@ class World:
     `digest` is a hash of all step edges and all true poses so far.
     """
 
-    def __init__(self, rig: Rig, plant: Plant, board: Board, seed: int) -> None:
+    def __init__(self, rig: Rig, plant: Plant, board: SimulatedBoard, seed: int) -> None:
         self.rig, self.plant, self.board = rig, plant, board
         self.now_ns = 0
         self.edges = np.zeros(3, np.int64)
@@ -60,7 +60,7 @@ class World:
             seed=2 * seed + 2,
         )
         self._digest = hashlib.sha256()
-        self.stages = Stages(
+        self.stages = SimulatedStages(
             StagesConfig(
                 steps_per_unit=tuple(rig.stage(axis).steps_per_unit for axis in range(3)),  # type: ignore[arg-type]
                 encoder_counts_per_step=tuple(  # type: ignore[arg-type]

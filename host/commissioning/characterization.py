@@ -23,7 +23,7 @@ from protocol.rig_file import Rig, load_rig, parse_rig
 from protocol.topics import Message
 from realtime.core.lines import FromRig
 from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.tissue import TissueConfig
 from sim.world import World, simulated_plant
 
@@ -118,7 +118,10 @@ def record_simulated(
     RuntimeError where the sweeps were broken off.
     """
     plant = simulated_plant(rig, seed, tissue=_NO_WALL, **plant_changes)
-    with Board(board) as made, RecordingWriter(path, header_of(rig, "virtual", seed, {"job": "characterize"})) as recording:
+    with (
+        SimulatedBoard(board) as made,
+        RecordingWriter(path, header_of(rig, "virtual", seed, {"job": "characterize"})) as recording,
+    ):
         world = World(rig, plant, made, seed)
 
         def publish(topic: str, message: Message) -> None:

@@ -10,7 +10,7 @@ from protocol.serial_frames import Fault, Mcu
 from realtime.core.board_intake import axis_limits
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
-from realtime.drivers.stepper_board import FAULT_ADVICE, BoardStatus, EventKind, LinkPhase, StepperBoardLink
+from realtime.drivers.stepper_board import FAULT_ADVICE, BoardEventKind, BoardStatus, LinkPhase, StepperBoardLink
 from realtime.drivers.transport import Transport, open_serial
 
 STATUS_HZ, BRING_UP_S = 200.0, 5.0
@@ -76,9 +76,9 @@ def _read_board(link: StepperBoardLink, transport: Transport, seconds: float, re
         if (now_ns - begin_ns > BRING_UP_S * 1e9 and not ready_ns) or (ready_ns and now_ns - ready_ns > seconds * 1e9):
             break
         for event in link.feed(transport.read(), now_ns):
-            if event.kind is EventKind.STATUS:
+            if event.kind is BoardEventKind.STATUS:
                 statuses += bool(ready_ns)
-            elif event.kind in (EventKind.FAULT, EventKind.MISMATCH, EventKind.REFUSED, EventKind.RESET):
+            elif event.kind in (BoardEventKind.FAULT, BoardEventKind.MISMATCH, BoardEventKind.REFUSED, BoardEventKind.RESET):
                 report.problems.append(event.message)
         if link.phase is LinkPhase.READY and not ready_ns:
             ready_ns, first = now_ns, link.status

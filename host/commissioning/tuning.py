@@ -22,7 +22,7 @@ from protocol.rig_file import Rig, parse_rig
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
 from sim.heart import HeartConfig
-from sim.ideal_rig import IdealRig, Trace
+from sim.ideal_rig import IdealRig, IdealTrace
 from sim.plant import PlantConfig
 from sim.vessel import VesselConfig
 
@@ -88,7 +88,7 @@ def with_gains(rig: Rig, gains: dict[str, float]) -> Rig:
 
 def response(
     rig: Rig, force_N: float, seconds: float, seed: int = 0, extra_delay_s: float = 0.0, config: PlantConfig | None = None
-) -> Trace:
+) -> IdealTrace:
     """Contact and after: the tip presses `force_N` on a still wall, the trace from first contact on, `seconds` at most."""
     config = config or still_wall(rig)
     bench = IdealRig(rig, config, seed, extra_delay_s=extra_delay_s)
@@ -97,7 +97,7 @@ def response(
     return trace.rows(keep)
 
 
-def cost_of(trace: Trace, force_N: float, seconds: float) -> float:
+def cost_of(trace: IdealTrace, force_N: float, seconds: float) -> float:
     """Mean absolute force error (N) of one response; the part it spent out of contact counts as FAILED_N."""
     held = trace.phase == Phase.CONTACT
     wanted = max(1, round(seconds / max(_period_s(trace), 1e-9)))
@@ -106,7 +106,7 @@ def cost_of(trace: Trace, force_N: float, seconds: float) -> float:
     return float(error.sum() / wanted + FAILED_N * missing)
 
 
-def _period_s(trace: Trace) -> float:
+def _period_s(trace: IdealTrace) -> float:
     return float(np.median(np.diff(trace.time_s))) if trace.time_s.size > 1 else 0.001
 
 
@@ -123,7 +123,7 @@ def criterion(
     )
 
 
-def _rings(trace: Trace, force_N: float) -> bool:
+def _rings(trace: IdealTrace, force_N: float) -> bool:
     if trace.time_s.size < 1000 or np.any(trace.phase != Phase.CONTACT):
         return True
     late = trace.force_N[trace.time_s > trace.time_s[-1] - 1.0]
@@ -131,7 +131,7 @@ def _rings(trace: Trace, force_N: float) -> bool:
     return bool(np.std(late - trend) > RINGING_N or np.max(trace.force_N) > 2.2 * force_N + 0.1)
 
 
-def _frequency_Hz(trace: Trace) -> float:
+def _frequency_Hz(trace: IdealTrace) -> float:
     """Strongest frequency of the force's last 1.5 s."""
     late = trace.force_N[trace.time_s > trace.time_s[-1] - 1.5]
     late = (late - late.mean()) * np.hanning(late.size)
@@ -157,7 +157,7 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
     seconds = 2.5
     config = still_wall(rig)
 
-    def trial(factor: float, delay_s: float) -> Trace:
+    def trial(factor: float, delay_s: float) -> IdealTrace:
         scaled = {key: value * (factor if key in GAINS[:1] + GAINS[2:] else 1.0) for key, value in gains.items()}
         return response(_unchecked(rig, scaled), force_N, seconds, extra_delay_s=delay_s, config=config)
 

@@ -29,7 +29,7 @@ from host.estimation.spatial_kernels import (
     FOUND,
     LARGEST_STD_N,
     RESIDUAL,
-    PoseSample,
+    MeasuredPose,
     Scratch,
     Search,
     Sensors,
@@ -266,7 +266,7 @@ def _quick(
     )
 
 
-def _careful(problem: PoseSample, length_m: float, limits: Limits, x: Array) -> SpatialEstimate:
+def _careful(problem: MeasuredPose, length_m: float, limits: Limits, x: Array) -> SpatialEstimate:
     """The estimate of any sample: several answers, a surface prior, measured covariances, poses that no force explains."""
     scratch = new_scratch(len(problem.stations))
     case, largest = problem.case, limits.largest_N
@@ -307,7 +307,9 @@ def equal_sensors(case: int, position_std_m: float, orientation_std_rad: float) 
     return whitening(C), chi_square_limit(max(rows - 3, 0), FAIR_DEVIATIONS), GATE**2 * rows
 
 
-def sample(rod: Array, case: int, sensors: Sequence[PoseSensor], prior: SurfacePrior | None, roll_rad: float) -> PoseSample:
+def sample(
+    rod: Array, case: int, sensors: Sequence[PoseSensor], prior: SurfacePrior | None, roll_rad: float
+) -> MeasuredPose:
     """The checked sample, with the handle's roll taken out. Raises InputError naming the key."""
     count = checked_case(case)
     used = list(sensors)[:count]
@@ -347,7 +349,7 @@ def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:
 
 
 def _all_solutions(
-    problem: PoseSample, largest: float, acceptable: float, x: Array, scratch: Scratch
+    problem: MeasuredPose, largest: float, acceptable: float, x: Array, scratch: Scratch
 ) -> tuple[bool, float, int, Array]:
     """Every force found, smallest first; x (3,) and the scratch are left at that one, or at the best try."""
     found = np.zeros((MOST_SOLUTIONS, 3))

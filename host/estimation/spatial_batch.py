@@ -12,7 +12,7 @@ from host.estimation.sensor_noise import UNIT_TOLERANCE, ORIENTATION_STD_rad, PO
 from host.estimation.spatial import LARGEST_FORCE_N, equal_sensors, start_grid
 from host.estimation.spatial_kernels import (
     QUICK,
-    PoseSample,
+    MeasuredPose,
     Scratch,
     Search,
     Sensors,
@@ -48,7 +48,7 @@ class BatchEstimate(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def estimate_next(
-    p: PoseSample, limits: Search, length_m: float, known: bool, x: Array, covariance: Array, s: Scratch
+    p: MeasuredPose, limits: Search, length_m: float, known: bool, x: Array, covariance: Array, s: Scratch
 ) -> tuple[bool, float, float]:
     """One sample, from the last force x (3,) if that is `known`, else from none. Returns (converged, residual, cost).
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, PoseSample, residuals
+from host.estimation.spatial_residuals import MOST_ROWS, ROWS_OF_CASE, SCRATCH, MeasuredPose, residuals
 from host.mechanics.base_force import solve_cold
 from host.mechanics.branch import CONVERGED
 from host.mechanics.cosserat_kernels import (
@@ -52,7 +52,7 @@ class Sensors(NamedTuple):
 
     case: int
     offsets: Array  # (k,) arc lengths back from the tip, m
-    whitening: Array  # (m, m), see `PoseSample`
+    whitening: Array  # (m, m), see `MeasuredPose`
     length_m: float  # of the distal shaft, which scales the thesis' residual
 
 
@@ -103,7 +103,7 @@ def new_scratch(sensors: int) -> Scratch:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cost_at(p: PoseSample, x: Array, bend: float, tangents: bool, s: Scratch) -> float:
+def cost_at(p: MeasuredPose, x: Array, bend: float, tangents: bool, s: Scratch) -> float:
     """|W (measured - modelled)|^2 at the force x (3,) in N; fills s.raw, s.z and, with `tangents`, s.raw_A, s.A."""
     sweep(p.rod, x, p.stations, bend, ALL_TANGENTS if tangents else POSE, s.rows, s.sweep)
     residuals(p, s.rows, tangents, s.raw, s.raw_A, s.residual)
@@ -130,7 +130,7 @@ def cost_at(p: PoseSample, x: Array, bend: float, tangents: bool, s: Scratch) ->
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cost_on_branch(p: PoseSample, force: Array, s: Scratch) -> float:
+def cost_on_branch(p: MeasuredPose, force: Array, s: Scratch) -> float:
     """`cost_at` with tangents by a force (3,) in the base frame, of the equilibrium that grows from the unloaded shape.
 
     Leaves the force as the tip sees it in s.vectors[3]; 1e300 where the branch folds back. The pose is a far smoother
@@ -185,7 +185,7 @@ def damped_step(damping: float, s: Scratch) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def descend(
-    p: PoseSample, largest_N: float, bend: float, close: float, close_N: float, x: Array, s: Scratch
+    p: MeasuredPose, largest_N: float, bend: float, close: float, close_N: float, x: Array, s: Scratch
 ) -> tuple[bool, float, int]:
     """Move x (3,) until a step is below close_N or the share `close` of x. Returns (settled, cost before it, sweeps).
 
@@ -223,13 +223,13 @@ def descend(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def goal_of(p: PoseSample) -> float:
+def goal_of(p: MeasuredPose) -> float:
     """Expected error of the force, N, at which the search stops."""
     return GOAL_N if p.bend >= QUICK else CAREFUL_GOAL_N
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refine(p: PoseSample, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def refine(p: MeasuredPose, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """Fine phase: Broyden steps of x (3,), in place, from the kept sensitivities. Returns (settled, cost, sweeps).
 
     Stops where the error left, guessed from how fast the steps shrink, is below `goal_of`; the residuals s.raw and s.z
@@ -285,7 +285,7 @@ def unweighted(case: int, length_m: float, s: Scratch) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate(p: PoseSample, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def estimate(p: MeasuredPose, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """From the guess x (3,), in place, to the force that explains the sample best nearby. (settled, cost, sweeps).
 
     Where the chord steps do not shrink (poses that hardly determine the force, or a force beyond `largest_N`, which is
@@ -304,7 +304,7 @@ def estimate(p: PoseSample, largest_N: float, x: Array, s: Scratch) -> tuple[boo
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def search(p: PoseSample, largest_N: float, starts: Array, acceptable: float, found: Array, s: Scratch) -> tuple[int, int]:
+def search(p: MeasuredPose, largest_N: float, starts: Array, acceptable: float, found: Array, s: Scratch) -> tuple[int, int]:
     """Forces that explain the sample, from the starts (n, 3) and on the unloaded branch: found (k, 3). (count, sweeps).
 
     A force counts where its cost is below `acceptable` and it differs from those before by more than noise; k are kept.
@@ -336,7 +336,7 @@ def search(p: PoseSample, largest_N: float, starts: Array, acceptable: float, fo
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def estimate_on_branch(p: PoseSample, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def estimate_on_branch(p: MeasuredPose, largest_N: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """`estimate` among the equilibria that grow from the unloaded shape, from no force; x (3,) written, tip frame.
 
     Slower by the equilibria it solves, but it arrives where the tip-frame force is too sensitive to search for.
@@ -351,7 +351,7 @@ def estimate_on_branch(p: PoseSample, largest_N: float, x: Array, s: Scratch) ->
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def best_of(p: PoseSample, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
+def best_of(p: MeasuredPose, largest_N: float, starts: Array, fair: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """From x (3,) and, while the cost stays above `fair`, from the starts (n, 3) and on the unloaded branch.
 
     The branch is tried after the first 26 starts: it is the surer way, but as dear as all of them. Returns (settled,
@@ -380,8 +380,8 @@ def best_of(p: PoseSample, largest_N: float, starts: Array, fair: float, x: Arra
 @njit(cache=True, error_model="numpy", nogil=True)
 def sample_of(
     rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, bend: float, prior: Array
-) -> PoseSample:
-    """`PoseSample` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
+) -> MeasuredPose:
+    """`MeasuredPose` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
     total = rod[6] + rod[7]
     stations, inside = np.minimum(offsets, total), np.maximum(offsets - total, 0.0)
     used = rod
@@ -390,7 +390,7 @@ def sample_of(
         last = stations[stations.shape[0] - 1]
         used[6] = min(rod[6], last)
         used[7] = max(0.0, last - rod[6])
-    return PoseSample(used, rod, stations, inside, case, positions, quaternions, W, bend, prior)
+    return MeasuredPose(used, rod, stations, inside, case, positions, quaternions, W, bend, prior)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

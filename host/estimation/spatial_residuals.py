@@ -18,7 +18,7 @@ MOST_ROWS = 11  # nine of case 4 and two of a surface prior
 SCRATCH = 45  # see `_views`
 
 
-class PoseSample(NamedTuple):
+class MeasuredPose(NamedTuple):
     """One sample: the measured poses, where the sensors are, and the noise."""
 
     rod: Array  # (9,) record of the rod, cut off behind the last sensor in cases 5 and 6 without a prior
@@ -103,7 +103,7 @@ def _views(scratch: Array) -> tuple[Array, Array, Array, Array, Array, Array, Ar
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def residuals(p: PoseSample, rows: Array, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
+def residuals(p: MeasuredPose, rows: Array, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
     """Set z (m,) = measured minus modelled, A (m, 3) = the model's sensitivity to the tip-frame force (if `tangents`).
 
     Arguments: rows (k + 1, 48) of a sweep, sensors then base; scratch (45,). Rows of z, per case:
@@ -140,7 +140,7 @@ def residuals(p: PoseSample, rows: Array, tangents: bool, z: Array, A: Array, sc
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _relative_turn(p: PoseSample, rows: Array, j: int, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
+def _relative_turn(p: MeasuredPose, rows: Array, j: int, tangents: bool, z: Array, A: Array, scratch: Array) -> None:
     """Set three rows of z = error of the orientation of sensor j relative to sensor 0, in its frame; A its sensitivity."""
     row0, row, q0, q, at = rows[0], rows[j], p.quaternions[0], p.quaternions[j], 3 * (j - 1)
     _, error, conj, R, turn, _, model = _views(scratch)

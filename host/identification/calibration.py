@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.identification.parameters import CatheterParameter
-from host.identification.robust_fit import Fit, Objective, ShapeModel, gauss_newton, nelder_mead, noise_scale
+from host.identification.robust_fit import Objective, RobustFit, ShapeModel, gauss_newton, nelder_mead, noise_scale
 from protocol.catheter import Catheter
 from protocol.errors import InputError
 
@@ -57,7 +57,7 @@ class Calibration:
     catheter: Catheter  # the start catheter with the fitted values
     x: Array
     parameters: list[FittedParameter]
-    fits: list[Fit]  # on the same objective
+    fits: list[RobustFit]  # on the same objective
     noise_m: float  # robust, per axis
     rms_m: float
     max_m: float

@@ -73,7 +73,7 @@ class PlanarModel(ParametricModel):
         return position, derivatives
 
     def _derivatives(
-        self, x: Array, arcs: Arcs, recording: RecordedShape, shape: sensitivities.Shape, station: Array
+        self, x: Array, arcs: Arcs, recording: RecordedShape, shape: sensitivities.PlanarShape, station: Array
     ) -> Array:
         n = arcs.length_m.size
         length_by = self._length_by(arcs, recording)

@@ -15,7 +15,7 @@ from host.mechanics.pcar_kernels import Load, Shaft
 Array = NDArray[np.float64]
 
 
-class Shape(NamedTuple):
+class PlanarShape(NamedTuple):
     """Arcs laid out in the plane, x + iy."""
 
     length: Array  # (n,) m
@@ -25,7 +25,7 @@ class Shape(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shape_of(length: Array, kappa: Array) -> Shape:
+def shape_of(length: Array, kappa: Array) -> PlanarShape:
     """Lay out the arcs of these lengths (m) and curvatures (1/m), each (n,), from the sheath's exit."""
     n = length.size
     node, turn = np.empty(n + 1, dtype=np.complex128), np.empty(n + 1, dtype=np.complex128)
@@ -34,7 +34,7 @@ def shape_of(length: Array, kappa: Array) -> Shape:
         re0, im0, _, _, _, _, cosine, sine = phi(kappa[i] * length[i])
         node[i + 1] = node[i] + length[i] * turn[i] * complex(re0, im0)
         turn[i + 1] = turn[i] * complex(cosine, sine)
-    return Shape(length, kappa, node, turn)
+    return PlanarShape(length, kappa, node, turn)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -57,7 +57,7 @@ def curvature_response(
     external: Load,
     distal: NDArray[np.bool_],
     length_by: Array,
-    shape: Shape,
+    shape: PlanarShape,
     work: Array,
     response: Array,
 ) -> None:
@@ -104,7 +104,7 @@ def curvature_response(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_positions(shape: Shape, station: Array, position: Array) -> None:
+def marker_positions(shape: PlanarShape, station: Array, position: Array) -> None:
     """Positions (m, 2), written, of the points at arc lengths `station` (m,) from the base."""
     length, kappa, node, turn = shape.length, shape.kappa, shape.node, shape.turn
     for j in range(station.size):
@@ -115,7 +115,7 @@ def marker_positions(shape: Shape, station: Array, position: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def marker_jacobian(shape: Shape, station: Array, length_by: Array, response: Array, jacobian: Array) -> None:
+def marker_jacobian(shape: PlanarShape, station: Array, length_by: Array, response: Array, jacobian: Array) -> None:
     """Derivatives (m, 2, n + q + 1) of the marker positions; arguments as above. The markers stay at their arc length."""
     length, kappa, node, turn = shape.length, shape.kappa, shape.node, shape.turn
     n, q = length_by.shape

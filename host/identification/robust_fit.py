@@ -56,7 +56,7 @@ LOSSES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
 
 
 @dataclass(frozen=True)
-class Fit:
+class RobustFit:
     """Where a search ended."""
 
     x: Array
@@ -111,14 +111,14 @@ class Objective:
         return total, gradient, matrix, parts
 
 
-def gauss_newton(objective: Objective, start: Array, steps: int = STEPS) -> Fit:
+def gauss_newton(objective: Objective, start: Array, steps: int = STEPS) -> RobustFit:
     """Damped Gauss-Newton with reweighting, from `start`. The damping follows Levenberg, in the model's scale."""
     begin, before = time.perf_counter(), objective.evaluations
     scale = objective.model.scale()
     x, damping, converged = start.copy(), FIRST_DAMPING, False
     linear = objective.linearize(x)
     if linear is None:
-        return Fit(x, math.inf, 1, time.perf_counter() - begin, False, "gauss-newton")
+        return RobustFit(x, math.inf, 1, time.perf_counter() - begin, False, "gauss-newton")
     value, gradient, matrix, _ = linear
     for _ in range(steps):
         scaled = matrix * np.outer(scale, scale)
@@ -140,10 +140,10 @@ def gauss_newton(objective: Objective, start: Array, steps: int = STEPS) -> Fit:
             damping = max(damping * 8.0, 1e-6)
             if damping > 1e12:
                 break
-    return Fit(x, value, objective.evaluations - before, time.perf_counter() - begin, converged, "gauss-newton")
+    return RobustFit(x, value, objective.evaluations - before, time.perf_counter() - begin, converged, "gauss-newton")
 
 
-def nelder_mead(objective: Objective, start: Array) -> Fit:
+def nelder_mead(objective: Objective, start: Array) -> RobustFit:
     """The thesis' search (2.3.1): the simplex of Nelder and Mead, without derivatives."""
     from scipy.optimize import minimize
 
@@ -155,7 +155,7 @@ def nelder_mead(objective: Objective, start: Array) -> Fit:
         method="Nelder-Mead",
         options={"xatol": 1e-6, "fatol": 1e-6, "maxiter": 4000, "maxfev": 4000, "adaptive": start.size > 4},
     )
-    return Fit(
+    return RobustFit(
         found.x * scale,
         float(found.fun),
         objective.evaluations - before,

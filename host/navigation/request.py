@@ -83,7 +83,7 @@ class PlanRequest(Request):
     period_s: Annotated[float, Field(gt=0, le=1)] = 0.02
 
 
-class Answer(NamedTuple):
+class PlanAnswer(NamedTuple):
     """A plan: one row for each period, at rest at both ends.
 
     `clearance_m` is the smallest on the path, measured from the catheter's surface.
@@ -149,7 +149,7 @@ def _obstacle(item: Any, folder: Path) -> Obstacle:
     return mesh
 
 
-def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> Answer | None:
+def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> PlanAnswer | None:
     """The fastest found way of the tip to the goal; None where `request.samples` found none. Mesh files are in `folder`.
 
     Raises InputError: goal inside an obstacle, out of reach, reachable only in contact; start not free; a mesh not usable.
@@ -196,7 +196,7 @@ def _goals(request: PlanRequest, rig: Rig, world: _World) -> list[Array]:
     return free
 
 
-def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> Answer:
+def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> PlanAnswer:
     """Time over the way; where the spline through it cuts a corner too close, again with the points nearer together."""
     for spacing in (SPACING_M, 0.5 * SPACING_M, 0.2 * SPACING_M):
         dense = _dense(way, world.reach.scale_m, spacing)
@@ -206,7 +206,7 @@ def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> Answer:
         if clear >= 0.5 * request.clearance_m or len(world.surroundings.obstacles) == 0:
             break
     tips = np.array([shape.tip(world.reach, row) for row in joint])
-    return Answer(timed.time_s, timed.stage, joint, tips, float(clear), world.surroundings.questions, len(way))
+    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), world.surroundings.questions, len(way))
 
 
 def joints_at(rig: Rig, stage: Array) -> Array:

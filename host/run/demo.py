@@ -14,7 +14,7 @@ from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.effects import parse
 from sim.scenario import TARGET_M, ContactJob, Outcome, Scenario
 from sim.world import World, simulated_plant
@@ -61,7 +61,7 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
     rig = load_rig(settings.rig_file)
     service = EstimationService(load_estimator(settings.estimator, rig))
     plant = simulated_plant(rig, settings.seed, effects=tuple(map(parse, settings.effects)))
-    with Board(settings.board) as board:
+    with SimulatedBoard(settings.board) as board:
         world = World(rig, plant, board, settings.seed)
         path = new_recording_path(settings.directory, "demo")
         notes = {"board": board.kind, "job": f"hold {settings.force_N} N for {settings.hold_s} s"}

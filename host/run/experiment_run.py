@@ -17,7 +17,7 @@ from protocol.errors import InputError
 from protocol.rig_file import Rig
 from protocol.topics import Message, RigState
 from protocol.zenoh_session import Session
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.effects import parse
 from sim.scenario import Scenario
 from sim.world import World, simulated_plant
@@ -63,7 +63,10 @@ def run_simulated(script: Script, rig: Rig, directory: Path, board: str, seed: i
         found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
         raise InputError("--effect", found, wanted) from None
     target = new_recording_path(directory, "experiment")
-    with Board(board) as made, RecordingWriter(target, header_of(rig, "virtual", seed, {"job": script.says})) as recording:
+    with (
+        SimulatedBoard(board) as made,
+        RecordingWriter(target, header_of(rig, "virtual", seed, {"job": script.says})) as recording,
+    ):
         world = World(rig, plant, made, seed)
 
         def record(topic: str, message: Message) -> None:

@@ -25,8 +25,8 @@ from host.diagnosis.live.watch import Watch
 from host.run.experiment_run import VirtualDesk
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Alarm, Message
-from sim.board import Board
-from sim.effects import Effect, describe, parse
+from sim.board import SimulatedBoard
+from sim.effects import PlantedEffect, describe, parse
 from sim.scenario import TARGET_M, ContactJob, Scenario
 from sim.world import World, simulated_plant
 
@@ -117,7 +117,7 @@ def round_trip(rig: Rig, seconds: float) -> Script:
     )  # fmt: skip
 
 
-def effect_of(task: Task) -> tuple[Effect, ...]:
+def effect_of(task: Task) -> tuple[PlantedEffect, ...]:
     """The effect that `task` plants, at its size; nothing where it plants none. Raises ValueError for an unknown one."""
     if not task.planted:
         return ()
@@ -134,7 +134,7 @@ def run(task: Task, board: str = "native") -> LiveRow:
     """The watch on one run of the simulated rig."""
     rig = load_rig(SIMULATED_RIG)
     watch, alarms, scores = Watch(rig), [], [0.0]
-    with Board(board) as made:
+    with SimulatedBoard(board) as made:
         world = World(rig, simulated_plant(rig, task.seed, effects=effect_of(task)), made, task.seed)
 
         def heard(topic: str, message: Message) -> None:

@@ -19,7 +19,7 @@ from host.recordings.writer import RecordingWriter
 from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Message
-from sim.board import STEP_TIMER_CYCLES, Board, resolve_kind
+from sim.board import STEP_TIMER_CYCLES, SimulatedBoard, resolve_kind
 from sim.forked_board import LibraryBoard
 from sim.scenario import TARGET_M, ContactJob, Scenario
 from sim.world import World, simulated_plant
@@ -63,9 +63,9 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def _board(kind: str) -> Board:
+def _board(kind: str) -> SimulatedBoard:
     """The native board in this process, the AVR one in its own; the campaign's keeps what it was asked, and would grow."""
-    return LibraryBoard() if resolve_kind(kind) == "native" else Board(kind)
+    return LibraryBoard() if resolve_kind(kind) == "native" else SimulatedBoard(kind)
 
 
 def soak(

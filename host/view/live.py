@@ -34,7 +34,7 @@ DEPTHS = {
 }
 
 
-class Press(Request):
+class ButtonPress(Request):
     """A button pressed on the page. All but stop must have been confirmed there."""
 
     button: Literal["arm", "hold", "stop", "disarm", "clear"]
@@ -87,7 +87,7 @@ class LiveRig:
     def act(self, text: str) -> dict[str, Any]:
         """Send the command of a `Press`. What is malformed or not confirmed is never sent."""
         try:
-            press = Press.model_validate_json(text)
+            press = ButtonPress.model_validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "message"

@@ -26,7 +26,7 @@ HISTORY_S = 20.0
 MIN_SPEED, MAX_SPEED = 0.05, 50.0
 
 
-class Control(Request):
+class ReplayControl(Request):
     """What the page asks of the player; what is not named stays as it is."""
 
     play: bool | None = None
@@ -186,7 +186,7 @@ class Replay:
     def act(self, text: str) -> dict[str, Any]:
         """Carry out a `Control`; a recording has nothing that could move."""
         try:
-            asked = Control.model_validate_json(text)
+            asked = ReplayControl.model_validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
             return refusal(f"{'.'.join(map(str, first['loc'])) or 'message'}: {first['msg']}")

@@ -62,7 +62,7 @@ Joint = tuple[float, float, float]  # insertion (m), roll (rad), knob (rad)
 Point = tuple[float, float, float]  # m
 
 
-class Field(NamedTuple):
+class RecordField(NamedTuple):
     """One field: "f8", "i8" or the class of a nested record; unit; meaning; shape, () for a scalar."""
 
     kind: Any
@@ -73,22 +73,22 @@ class Field(NamedTuple):
 
 def real(unit: str, doc: str, *shape: int) -> Any:
     """Declare a float of 64 bits, or an array of them."""
-    return Field("f8", unit, doc, shape)
+    return RecordField("f8", unit, doc, shape)
 
 
 def whole(unit: str, doc: str, *shape: int) -> Any:
     """Declare an integer of 64 bits, or an array of them."""
-    return Field("i8", unit, doc, shape)
+    return RecordField("i8", unit, doc, shape)
 
 
 def part(record: type, doc: str) -> Any:
     """Declare a nested record."""
-    return Field(record, "", doc)
+    return RecordField(record, "", doc)
 
 
-def fields_of(record: type) -> dict[str, Field]:
+def fields_of(record: type) -> dict[str, RecordField]:
     """Return the fields of a declared class by name, in the order of declaration."""
-    return {name: field for name, field in vars(record).items() if isinstance(field, Field)}
+    return {name: field for name, field in vars(record).items() if isinstance(field, RecordField)}
 
 
 def dtype_of(record: type) -> np.dtype[np.void]:

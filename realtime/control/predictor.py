@@ -7,13 +7,13 @@ import math
 from numba import njit
 
 from realtime.control.declare import Floats
-from realtime.control.records import Pose, PredictorParams, PredictorState
+from realtime.control.records import PoseRecord, PredictorParams, PredictorState
 
 ACCEPTED, REJECTED, NOTHING_NEW = 1, -1, 0
 
 
 @njit(cache=True)
-def plausible(config: PredictorParams, state: PredictorState, pose: Pose) -> bool:
+def plausible(config: PredictorParams, state: PredictorState, pose: PoseRecord) -> bool:
     """Whether a pose may be used: finite, inside the workspace, unit quaternion, not faster than the limit allows."""
     norm = 0.0
     for i in range(4):
@@ -37,7 +37,7 @@ def plausible(config: PredictorParams, state: PredictorState, pose: Pose) -> boo
 
 
 @njit(cache=True)
-def _restart(config: PredictorParams, state: PredictorState, pose: Pose) -> None:
+def _restart(config: PredictorParams, state: PredictorState, pose: PoseRecord) -> None:
     state.started = 1
     for i in range(3):
         state.position_m[i] = pose.position_m[i]
@@ -48,7 +48,7 @@ def _restart(config: PredictorParams, state: PredictorState, pose: Pose) -> None
 
 
 @njit(cache=True)
-def apply(config: PredictorParams, state: PredictorState, pose: Pose) -> int:
+def apply(config: PredictorParams, state: PredictorState, pose: PoseRecord) -> int:
     """Take in `pose` (record POSE) at the time it was measured. Returns ACCEPTED, REJECTED or NOTHING_NEW.
 
     One scalar filter per axis, all three with the same covariance (p00, p01, p11 in m2, m2/s, m2/s2): white

@@ -24,7 +24,7 @@ HISTORY_POINTS = 192
 # --- inputs ---
 
 
-class Pose:
+class PoseRecord:
     """A tracker pose, in the base frame."""
 
     count: int = whole("", "rises by one with each pose")
@@ -44,7 +44,7 @@ class Force:
     covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
 
 
-class Board:
+class BoardRecord:
     """The stepper board's newest status."""
 
     count: int = whole("", "rises by one with each status")
@@ -57,7 +57,7 @@ class Board:
     ready: int = whole("", "1 when the board takes set-points")
 
 
-class Command:
+class CommandRecord:
     """What the operator wants, and what the supervision found."""
 
     count: int = whole("", "rises by one with each command that the loop has to act on")
@@ -74,12 +74,12 @@ class Inputs:
     """All that the tick reads of the world."""
 
     now_ns: int = whole("ns", "time of this tick")
-    tip: Pose = part(Pose, "newest pose of the tip")
-    shaft: Pose = part(Pose, "newest pose of the shaft")
+    tip: PoseRecord = part(PoseRecord, "newest pose of the tip")
+    shaft: PoseRecord = part(PoseRecord, "newest pose of the shaft")
     sensor: Force = part(Force, "newest reading of the force sensor")
     estimate: Force = part(Force, "newest converged estimate")
-    board: Board = part(Board, "newest status of the board")
-    command: Command = part(Command, "newest command")
+    board: BoardRecord = part(BoardRecord, "newest status of the board")
+    command: CommandRecord = part(CommandRecord, "newest command")
 
 
 # --- parameters and state of the control blocks ---
@@ -451,7 +451,7 @@ class Outputs:
     play_m: float = real("m", "width of the backlash learned")
 
 
-POSE, FORCE, BOARD, COMMAND, INPUTS = map(dtype_of, (Pose, Force, Board, Command, Inputs))
+POSE, FORCE, BOARD, COMMAND, INPUTS = map(dtype_of, (PoseRecord, Force, BoardRecord, CommandRecord, Inputs))
 PREDICTOR_PARAMS, PREDICTOR_STATE = dtype_of(PredictorParams), dtype_of(PredictorState)
 BANK, BEAT = dtype_of(Bank), dtype_of(Beat)
 TARGET_PARAMS, TARGET_STATE = dtype_of(TargetParams), dtype_of(TargetState)

@@ -45,7 +45,7 @@ from realtime.control.codes import (
 )
 from realtime.control.constraint_frame import dot
 from realtime.control.declare import Floats, Point, ReadFloats
-from realtime.control.records import N_AXES, Command, Inputs, Outputs, Params, State
+from realtime.control.records import N_AXES, CommandRecord, Inputs, Outputs, Params, State
 
 # Contact begins after this long above the threshold, and is lost after this long below half of it.
 _CONTACT_NS = 3_000_000
@@ -202,7 +202,7 @@ def _enter(params: Params, state: State, phase: int, tip_m: ReadFloats) -> None:
 
 
 @njit(cache=True)
-def _sensible(params: Params, command: Command) -> bool:
+def _sensible(params: Params, command: CommandRecord) -> bool:
     """Whether a command may be acted on: finite target in the workspace, unit normal, force below the limit."""
     config, square = params.predictor, 0.0
     for i in range(3):
@@ -242,7 +242,7 @@ def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, 
 
 
 @njit(cache=True)
-def _follow_command(params: Params, state: State, command: Command, tip_m: ReadFloats) -> None:
+def _follow_command(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
     """Set the phase that a new command wants of the armed loop."""
     if command.kind == COMMAND_HOLD:
         _enter(params, state, PHASE_HOLD, tip_m)
@@ -294,7 +294,7 @@ def _retract(params: Params, state: State, tip_m: ReadFloats) -> None:
 
 
 @njit(cache=True)
-def _approach_target(command: Command) -> Point:
+def _approach_target(command: CommandRecord) -> Point:
     target_m, normal = command.target_m, command.normal
     return (
         target_m[0] - _SEARCH_m * normal[0],
@@ -304,7 +304,7 @@ def _approach_target(command: Command) -> Point:
 
 
 @njit(cache=True)
-def _control_thesis(params: Params, state: State, command: Command, tip_m: ReadFloats, force_N: float) -> None:
+def _control_thesis(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats, force_N: float) -> None:
     """Run the thesis' law (Figs. 6.12, 7.1): PI loops around the inverse kinematics, force PI outside."""
     hy, period_s, goal_m = state.hybrid, params.period_s, state.hybrid.goal_m
     step_m = params.hybrid.approach_speed_m_per_s * period_s

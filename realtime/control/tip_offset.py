@@ -6,7 +6,7 @@ from numba import njit
 
 from realtime.control import free_tip
 from realtime.control.declare import Point, ReadFloats
-from realtime.control.records import KinematicsParams, Pose, TipOffsetParams, TipOffsetState
+from realtime.control.records import KinematicsParams, PoseRecord, TipOffsetParams, TipOffsetState
 
 # Across the normal a loaded catheter may be moved this far from where it touched; more would not bring the tip back.
 _AUTHORITY_m = 0.004
@@ -60,7 +60,7 @@ def apply(
     kinematics: KinematicsParams,
     state: TipOffsetState,
     joint: ReadFloats,
-    pose: Pose,
+    pose: PoseRecord,
     normal: ReadFloats,
     touching: bool,
     free: bool,

@@ -15,7 +15,7 @@ from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import telemetry
 from realtime.core.lines import FromRig, SensorClients, ToRig
-from realtime.core.rig_core import Arrived, Leaving, Request, RigCore, Tick
+from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
 from realtime.loop.native_loop import HISTOGRAM_WORDS, WORK_BIN_NS, count_in
 
 Publish = Callable[[str, Message], None]
@@ -76,7 +76,7 @@ class LockstepLoop:
 
     def request(self, name: str, payload: bytes) -> Reply | None:
         """Answer what commander `name` asks, at the time of the newest period."""
-        return self._step_core(self.now_ns, Arrived(requests=[Request(name, payload)])).replies[0]
+        return self._step_core(self.now_ns, Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
     def estimate_at(self, estimate: ForceEstimate) -> None:
         """Queue a force estimate that arrives at its `published_ns`."""

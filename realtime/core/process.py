@@ -16,7 +16,7 @@ from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import telemetry
 from realtime.core.lines import force_config, tracker_config
-from realtime.core.rig_core import Arrived, Leaving, Request, RigCore, Tick
+from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
 from realtime.drivers.board_port import RETRY_S, BoardPort
 from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
 from realtime.drivers.transport import open_serial
@@ -119,7 +119,7 @@ class RealtimeProcess:
 
     def request(self, name: str, payload: bytes) -> Reply | None:
         """Answer what commander `name` asks; called on a thread of zenoh's."""
-        return self._step(Arrived(requests=[Request(name, payload)])).replies[0]
+        return self._step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
     def counts(self) -> CommandCounts:
         """Return who holds the lease, and what became of the commands so far."""

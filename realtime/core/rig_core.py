@@ -25,22 +25,22 @@ from realtime.core.board_intake import axis_limits, board_message, take_status
 from realtime.core.command_gate import CommandGate, for_the_record
 from realtime.core.intake import Intake
 from realtime.core.operator_commands import OperatorCommands
-from realtime.core.supervision import Finding, Supervision
+from realtime.core.supervision import Supervision, SupervisionFinding
 from realtime.drivers.aurora import PoseSample
 from realtime.drivers.device_events import DeviceEvent
-from realtime.drivers.device_events import EventKind as DeviceEventKind
+from realtime.drivers.device_events import DeviceEventKind as DeviceEventKind
 from realtime.drivers.net_ft import ForceSample
-from realtime.drivers.stepper_board import EventKind, StepperBoardLink
+from realtime.drivers.stepper_board import BoardEventKind, StepperBoardLink
 
 # A longer time between two ticks than this is logged.
 LONGEST_GAP_NS = 10_000_000
 # A cause that comes and goes, as a stale pose may at every frame, is logged again after this time without it.
 CAUSE_QUIET_NS = 1_000_000_000
-_BOARD_ERRORS = (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
+_BOARD_ERRORS = (BoardEventKind.FAULT, BoardEventKind.RESET, BoardEventKind.MISMATCH)
 _DEVICE_LEVELS = {DeviceEventKind.LOST: "warning", DeviceEventKind.WARNING: "warning", DeviceEventKind.ERROR: "error"}
 
 
-class Request(NamedTuple):
+class CommandRequest(NamedTuple):
     """What commander `name` asked, as the bytes that came on its key."""
 
     name: str
@@ -76,7 +76,7 @@ class Arrived:
     forces: Sequence[ForceSample] = ()
     device_events: Sequence[DeviceEvent] = ()
     estimates: Sequence[ForceEstimate] = ()
-    requests: Sequence[Request] = ()
+    requests: Sequence[CommandRequest] = ()
     log_lines: Sequence[Log] = ()
     loop_runs: bool = True
 
@@ -228,7 +228,7 @@ class RigCore:
     def _take_board(self, data: bytes, lost: str) -> None:
         board = self._records["board"]
         for event in self.link.feed(data, self.now_ns):
-            if event.kind is EventKind.STATUS:
+            if event.kind is BoardEventKind.STATUS:
                 take_status(board, self.link, self.now_ns)
                 self._leaving.changed.add("board")
                 if self.phase is not Phase.DISARMED and board.ready:
@@ -300,7 +300,7 @@ class RigCore:
             forces_N = {"force sensor": self._records["sensor"].force_N, "model": record.force_N}
             self._report(self.supervision.forces(forces_N, self.now_ns))
 
-    def _report(self, finding: Finding | None) -> None:
+    def _report(self, finding: SupervisionFinding | None) -> None:
         """Hand a finding of the supervision to the tick, and log it."""
         if finding is None:
             return
@@ -311,7 +311,7 @@ class RigCore:
 
     # --- commanders ---
 
-    def _take_request(self, request: Request) -> None:
+    def _take_request(self, request: CommandRequest) -> None:
         command, reply = self.gate.answer(request.name, request.payload)
         for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
             self._publish(topic, message)

@@ -27,7 +27,7 @@ _ESTIMATE_PERIOD_S = 0.025
 HOST_SILENT_NS, HOST_LATE_NS = 250_000_000, 200_000_000
 
 
-class Finding(NamedTuple):
+class SupervisionFinding(NamedTuple):
     """What a check found. `cause` is a bit of `realtime.control.safety`, 0 where the finding is only logged."""
 
     cause: int
@@ -46,7 +46,7 @@ class StepCheck:
         """Take the difference at the next status as right; for arming."""
         self._difference_at_rest, self._since_ns = None, None
 
-    def check(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> Finding | None:
+    def check(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> SupervisionFinding | None:
         """Compare steps (3,) with counts (3,); return a finding once they have differed for STEPS_APART_NS."""
         difference = np.asarray(encoder_counts) / self._ratio - np.asarray(position_steps)
         if self._difference_at_rest is None:
@@ -60,7 +60,7 @@ class StepCheck:
             self._since_ns = now_ns
         if now_ns - self._since_ns < STEPS_APART_NS:
             return None
-        return Finding(safety.STEPS_LOST, f"{AXES[axis]}: encoder and steps are {lost[axis]:.0f} steps apart")
+        return SupervisionFinding(safety.STEPS_LOST, f"{AXES[axis]}: encoder and steps are {lost[axis]:.0f} steps apart")
 
 
 class ForceCheck:
@@ -84,7 +84,7 @@ class ForceCheck:
         self._difference_N[:] = 0.0
         self._last_ns = None
 
-    def check(self, first_N: Vector, second_N: Vector, now_ns: int) -> Finding | None:
+    def check(self, first_N: Vector, second_N: Vector, now_ns: int) -> SupervisionFinding | None:
         """Take in a pair of readings (3,) N in the base frame. A pair with a NaN is left out."""
         difference_N = np.asarray(first_N, float) - np.asarray(second_N, float)
         if not np.all(np.isfinite(difference_N)):
@@ -94,7 +94,7 @@ class ForceCheck:
         self._difference_N += (1.0 - math.exp(-dt_s / self._average_s)) * (difference_N - self._difference_N)
         if not np.linalg.norm(self._difference_N) > self._apart_N:
             return None
-        return Finding(self.cause, f"{self.first} and {self.second} are more than {self._apart_N} N apart")
+        return SupervisionFinding(self.cause, f"{self.first} and {self.second} are more than {self._apart_N} N apart")
 
 
 class HostCheck:
@@ -104,22 +104,22 @@ class HostCheck:
         self._answered_ns: int | None = None
         self._complaint = ""
 
-    def answered(self, stamp_ns: int, now_ns: int) -> Finding | None:
+    def answered(self, stamp_ns: int, now_ns: int) -> SupervisionFinding | None:
         """Take in an estimate for a pose of `stamp_ns` that arrived at `now_ns` (ns)."""
         self._answered_ns = now_ns
         late = now_ns - stamp_ns > HOST_LATE_NS
         limit_ms = HOST_LATE_NS * 1e-6
         return self._new(f"estimates are more than {limit_ms:.0f} ms old: the model process is slow" if late else "")
 
-    def overdue(self, now_ns: int) -> Finding | None:
+    def overdue(self, now_ns: int) -> SupervisionFinding | None:
         """Return a finding when the last estimate is too long ago; nothing before the first estimate."""
         if self._answered_ns is None or now_ns - self._answered_ns <= HOST_SILENT_NS:
             return None
         return self._new(f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process is silent")
 
-    def _new(self, complaint: str) -> Finding | None:
+    def _new(self, complaint: str) -> SupervisionFinding | None:
         before, self._complaint = self._complaint, complaint
-        return Finding(0, complaint) if complaint and complaint != before else None
+        return SupervisionFinding(0, complaint) if complaint and complaint != before else None
 
 
 class Supervision:
@@ -137,13 +137,13 @@ class Supervision:
             check.restart()
         self.causes = 0
 
-    def status(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> Finding | None:
+    def status(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> SupervisionFinding | None:
         """Check a board's status while armed; steps and counts (3,). Return a new finding."""
         if self.causes & safety.STEPS_LOST:
             return None
         return self._kept(self.steps.check(position_steps[:N_AXES], encoder_counts[:N_AXES], now_ns))
 
-    def forces(self, forces_N: Mapping[str, Vector], now_ns: int) -> Finding | None:
+    def forces(self, forces_N: Mapping[str, Vector], now_ns: int) -> SupervisionFinding | None:
         """Compare the sources in contact: name -> force (3,) N on the tissue, base frame. Return a new finding."""
         found = None
         for check in self.force_checks:
@@ -151,15 +151,15 @@ class Supervision:
                 found = self._kept(check.check(forces_N[check.first], forces_N[check.second], now_ns)) or found
         return found
 
-    def host_answered(self, stamp_ns: int, now_ns: int) -> Finding | None:
+    def host_answered(self, stamp_ns: int, now_ns: int) -> SupervisionFinding | None:
         """Take in that an estimate for a pose of `stamp_ns` arrived. Return a new finding."""
         return self._kept(self.host.answered(stamp_ns, now_ns))
 
-    def host_overdue(self, now_ns: int) -> Finding | None:
+    def host_overdue(self, now_ns: int) -> SupervisionFinding | None:
         """Check at every step that estimates keep coming. Return a new finding."""
         return self._kept(self.host.overdue(now_ns))
 
-    def _kept(self, finding: Finding | None) -> Finding | None:
+    def _kept(self, finding: SupervisionFinding | None) -> SupervisionFinding | None:
         if finding is not None:
             self.causes |= finding.cause
         return finding

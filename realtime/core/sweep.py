@@ -26,14 +26,14 @@ from realtime.core.intake import Intake
 from realtime.core.lines import FromRig, SensorClients, ToRig
 from realtime.core.lockstep import Publish
 from realtime.drivers.aurora import PoseSample
-from realtime.drivers.stepper_board import EventKind, LinkPhase, StepperBoardLink
+from realtime.drivers.stepper_board import BoardEventKind, LinkPhase, StepperBoardLink
 
 # Between sweeps the stages move at these speeds (m/s, rad/s, rad/s), then rest.
 MOVE_SPEED = (0.010, 0.8, 0.8)
 REST_S = 0.5
 DEVICES_WITHIN_S = 15.0
 ARMED_WITHIN_S = 1.0
-_LOST = (EventKind.FAULT, EventKind.RESET, EventKind.MISMATCH)
+_LOST = (BoardEventKind.FAULT, BoardEventKind.RESET, BoardEventKind.MISMATCH)
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ class SweepLoop:
 
     def _take_board(self, data: bytes, now_ns: int) -> None:
         for event in self.link.feed(data, now_ns):
-            if event.kind is EventKind.STATUS:
+            if event.kind is BoardEventKind.STATUS:
                 take_status(self._board, self.link, now_ns)
                 self._publish_stage()
             elif event.kind in _LOST:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from realtime.drivers import ndi_protocol as ndi
-from realtime.drivers.aurora_session import AuroraConfig, LineAction, SessionFailed, Step, enumerate_and_start, set_up
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.aurora_session import AuroraConfig, LineAction, SessionFailed, SessionStep, enumerate_and_start, set_up
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.frame_clock import FrameClock
 from realtime.drivers.pose_sample import NO_FLAGS, PoseFlag, PoseSample, flag_words, flags_of
 
@@ -73,7 +73,7 @@ class AuroraClient:
         self._events: list[DeviceEvent] = []
         self._actions: list[LineAction] = []
         self._out = b""
-        self._session: Generator[Step, str | None, dict[str, ndi.ToolInfo]] | None = None
+        self._session: Generator[SessionStep, str | None, dict[str, ndi.ToolInfo]] | None = None
         self._deadline_ns: int | None = None
         self._pausing = False
         self._baud = 9600
@@ -141,13 +141,13 @@ class AuroraClient:
 
     # Session: the scripts of aurora_session, one reply or time-out at a time.
 
-    def event(self, kind: EventKind, text: str, now_ns: int | None = None) -> None:
+    def event(self, kind: DeviceEventKind, text: str, now_ns: int | None = None) -> None:
         """Note an event, an error that only repeats the last one once; for the session's scripts."""
-        self._counters.warnings += kind is EventKind.WARNING
-        self._counters.errors += kind is EventKind.ERROR
-        if kind is EventKind.ERROR and text == self._last_error:
+        self._counters.warnings += kind is DeviceEventKind.WARNING
+        self._counters.errors += kind is DeviceEventKind.ERROR
+        if kind is DeviceEventKind.ERROR and text == self._last_error:
             return
-        self._last_error = text if kind is EventKind.ERROR else ""
+        self._last_error = text if kind is DeviceEventKind.ERROR else ""
         self._events.append(DeviceEvent(self._now_ns if now_ns is None else now_ns, "aurora", kind, text))
 
     def line(self, action: LineAction) -> None:
@@ -156,7 +156,7 @@ class AuroraClient:
         self._reader.clear()
         self._actions.append(action)
 
-    def _start_session(self, script: Generator[Step, str | None, dict[str, ndi.ToolInfo]], now_ns: int) -> None:
+    def _start_session(self, script: Generator[SessionStep, str | None, dict[str, ndi.ToolInfo]], now_ns: int) -> None:
         self._session = script
         self._counters.sessions += 1
         self._reader.clear()
@@ -171,7 +171,7 @@ class AuroraClient:
             self._session, self.tools = None, done.value
             self._begin_tracking()
             self.phase = "tracking"
-            kind = EventKind.RECONNECTED if self._was_tracking else EventKind.TRACKING
+            kind = DeviceEventKind.RECONNECTED if self._was_tracking else DeviceEventKind.TRACKING
             self._was_tracking = True
             self.event(kind, f"tools {', '.join(self.tools)} at {self._baud} baud, {self.firmware}")
         except (SessionFailed, ndi.ProtocolError) as failed:
@@ -182,7 +182,7 @@ class AuroraClient:
             self._deadline_ns = now_ns + round(step.wait_s * 1e9)
 
     def _fail(self, why: str, now_ns: int, retry_s: float) -> None:
-        self.event(EventKind.LOST if self.tracking else EventKind.ERROR, why, now_ns)
+        self.event(DeviceEventKind.LOST if self.tracking else DeviceEventKind.ERROR, why, now_ns)
         self.phase, self._session, self._out = "waiting", None, b""
         self._deadline_ns = now_ns + round(retry_s * 1e9)
 
@@ -219,7 +219,7 @@ class AuroraClient:
         wire_ns = self._wire_ns(_REPLY_BYTES + _REPLY_BYTES_PER_TOOL * max(len(self.tools), 4))
         self._flight = _Flight(now_ns, now_ns + round(self.config.poll_timeout_s * 1e9) + wire_ns)
 
-    def _tracked(self, reply: ndi.Reply, now_ns: int) -> list[PoseSample]:
+    def _tracked(self, reply: ndi.NdiReply, now_ns: int) -> list[PoseSample]:
         self._flight, self._timeouts = None, 0
         self._next_poll_ns = now_ns
         text = reply.text
@@ -278,7 +278,7 @@ class AuroraClient:
                 if self._strange_in_row < _STRANGE_IN_ROW:
                     return None
                 text = f"frame counter went from {self._frame} to {newest}: learning its clock again"
-                self.event(EventKind.WARNING, text, now_ns)
+                self.event(DeviceEventKind.WARNING, text, now_ns)
                 self.clock.reset()
                 self._frame = None
                 self._tool_frames.clear()
@@ -319,7 +319,7 @@ class AuroraClient:
         self._counters.missing += missing
         if flags != self._tool_flags.get(tool.handle, NO_FLAGS):
             self._tool_flags[tool.handle] = flags
-            self.event(EventKind.WARNING, f"tool {tool.handle}: {flag_words(flags)}", now_ns)
+            self.event(DeviceEventKind.WARNING, f"tool {tool.handle}: {flag_words(flags)}", now_ns)
         return PoseSample(tool.handle, frame, stamp_ns, now_ns, position, quaternion, tool.error_m, missing, flags)
 
     def _is_frozen(self, handle: str, numbers: tuple[float, ...]) -> bool:
@@ -333,10 +333,10 @@ class AuroraClient:
         first, risen = self._system_status is None, status & ~(self._system_status or 0)
         self._system_status = status
         if risen:
-            self.event(EventKind.WARNING, ndi.system_words(risen) or f"system status {risen:04X}", now_ns)
+            self.event(DeviceEventKind.WARNING, ndi.system_words(risen) or f"system status {risen:04X}", now_ns)
         # What stands since before the ports were last read is no change.
         if not first and risen & (ndi.PORT_OCCUPIED | ndi.PORT_UNOCCUPIED):
-            self.event(EventKind.LOST, "a tool was plugged in or unplugged; reading the ports again", now_ns)
+            self.event(DeviceEventKind.LOST, "a tool was plugged in or unplugged; reading the ports again", now_ns)
             self._start_session(enumerate_and_start(self, stop_first=True), now_ns)
 
 

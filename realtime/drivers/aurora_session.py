@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from realtime.drivers import ndi_protocol as ndi
-from realtime.drivers.device_events import EventKind
+from realtime.drivers.device_events import DeviceEventKind
 
 POWER_UP_BAUD = 9600
 BREAK_S = 0.25
@@ -26,7 +26,7 @@ class LineAction:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SessionStep:
     """Send these bytes and wait for a text reply at most `wait_s`; or, with `pause`, wait that long for nothing."""
 
     phase: str
@@ -81,7 +81,7 @@ class SessionClient(Protocol):
     def line(self, action: LineAction) -> None:
         """Queue a change of the line for the transport."""
 
-    def event(self, kind: EventKind, text: str, now_ns: int | None = None) -> None:
+    def event(self, kind: DeviceEventKind, text: str, now_ns: int | None = None) -> None:
         """Report an event of the device."""
 
 
@@ -89,8 +89,8 @@ class SessionFailed(Exception):
     """Bringing up went wrong; the text says at which command and why."""
 
 
-Script = Generator[Step, str | None, dict[str, ndi.ToolInfo]]
-_Part = Generator[Step, str | None, str]
+Script = Generator[SessionStep, str | None, dict[str, ndi.ToolInfo]]
+_Part = Generator[SessionStep, str | None, str]
 
 
 def set_up(client: SessionClient) -> Script:
@@ -100,7 +100,7 @@ def set_up(client: SessionClient) -> Script:
     client.firmware = (yield from _command(client, "initialising", "VER", "0")).split("\n")[0].strip()
     if client.config.baud != POWER_UP_BAUD:
         yield from _command(client, "initialising", "COMM", f"{ndi.BAUD_CODES[client.config.baud]}0000", attempts=1)
-        yield Step("initialising", b"", COMM_SETTLE_S, pause=True)
+        yield SessionStep("initialising", b"", COMM_SETTLE_S, pause=True)
         client.line(LineAction(client.config.baud))
     if client.config.beeps:
         yield from _command(client, "initialising", "BEEP", str(client.config.beeps))
@@ -127,28 +127,28 @@ def enumerate_and_start(client: SessionClient, stop_first: bool) -> Script:
         tools[handle] = info
     absent = [handle for handle in client.config.tools if handle not in tools]
     if absent:
-        client.event(EventKind.ERROR, f"wanted tools not plugged in: {', '.join(absent)}")
+        client.event(DeviceEventKind.ERROR, f"wanted tools not plugged in: {', '.join(absent)}")
     if not tools:
         raise SessionFailed("no tool to track")
     yield from _command(client, "starting", "TSTART")
     return tools
 
 
-def _reset(client: SessionClient) -> Generator[Step, str | None, None]:
+def _reset(client: SessionClient) -> Generator[SessionStep, str | None, None]:
     """A serial break resets the device whatever its speed and mode; where the adapter swallows breaks, ask in words."""
     client.line(LineAction(POWER_UP_BAUD, BREAK_S))
-    if (yield Step("resetting", b"", client.config.reset_timeout_s)) == "RESET":
+    if (yield SessionStep("resetting", b"", client.config.reset_timeout_s)) == "RESET":
         return
     for baud in dict.fromkeys((client.config.baud, POWER_UP_BAUD)):
         client.line(LineAction(baud))
-        if (yield Step("resetting", ndi.command("RESET", "0"), client.config.reply_timeout_s)) == "RESET":
+        if (yield SessionStep("resetting", ndi.command("RESET", "0"), client.config.reply_timeout_s)) == "RESET":
             if baud != POWER_UP_BAUD:
                 client.line(LineAction(POWER_UP_BAUD))
             return
     raise SessionFailed("no answer to a reset: is the Aurora switched on, and is this its port?")
 
 
-def _initialise_tools(client: SessionClient) -> Generator[Step, str | None, None]:
+def _initialise_tools(client: SessionClient) -> Generator[SessionStep, str | None, None]:
     """PINIT until no handle waits: initialising a tool with two sensors brings up a second handle."""
     refused: set[str] = set()
     while True:
@@ -164,13 +164,13 @@ def _initialise_tools(client: SessionClient) -> Generator[Step, str | None, None
             try:
                 yield from _command(client, "initialising tools", "PINIT", handle)
             except SessionFailed as failed:
-                client.event(EventKind.ERROR, str(failed))
+                client.event(DeviceEventKind.ERROR, str(failed))
 
 
 def _command(client: SessionClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
     """One command and its reply. Silence (a damaged command or reply) is answered by asking again."""
     for _ in range(attempts):
-        reply = yield Step(phase, ndi.command(name, parameters), client.config.reply_timeout_s)
+        reply = yield SessionStep(phase, ndi.command(name, parameters), client.config.reply_timeout_s)
         if reply is None:
             continue
         if reply.startswith("ERROR"):
@@ -178,6 +178,6 @@ def _command(client: SessionClient, phase: str, name: str, parameters: str = "",
                 continue
             raise SessionFailed(f"{name} {parameters}: {ndi.words(reply)}")
         if reply.startswith("WARNING"):
-            client.event(EventKind.WARNING, f"{name} {parameters}: {ndi.words(reply)}")
+            client.event(DeviceEventKind.WARNING, f"{name} {parameters}: {ndi.words(reply)}")
         return reply
     raise SessionFailed(f"{name} {parameters}: no answer in {attempts} attempts of {client.config.reply_timeout_s} s")

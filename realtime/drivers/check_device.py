@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from realtime.drivers.aurora import AuroraConfig
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import RDT_PORT, ForceSample, NetFtConfig
 from realtime.drivers.net_ft_calibration import fetch_calibration
 from realtime.drivers.pose_sample import PoseSample
@@ -131,7 +131,7 @@ def _run(thread: SensorThread, samples: list[Any], seconds: float, report: Devic
     if samples:
         time.sleep(seconds)
     thread.stop()
-    report.problems += [event.text for event in report.events if event.kind is EventKind.ERROR]
+    report.problems += [event.text for event in report.events if event.kind is DeviceEventKind.ERROR]
     if not samples:
         report.problems.append(f"no sample within {START_UP_S:g} s")
     return bool(samples)

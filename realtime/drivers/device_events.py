@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 
-class EventKind(Enum):
+class DeviceEventKind(Enum):
     """TRACKING: samples flow for the first time. RECONNECTED: they flow again; hold, and come back disarmed."""
 
     TRACKING = "tracking"
@@ -22,5 +22,5 @@ class DeviceEvent:
 
     stamp_ns: int
     device: str
-    kind: EventKind
+    kind: DeviceEventKind
     text: str

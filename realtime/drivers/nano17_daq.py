@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import ForceSample
 from realtime.drivers.net_ft_calibration import NEWTON_METRES_PER, NEWTONS_PER
 
@@ -172,7 +172,7 @@ class Nano17Client:
             self._refuse("a reading beyond ten times the range", now_ns)
             return None
         if self._bad:
-            self._events.append(DeviceEvent(now_ns, "nano17", EventKind.RECONNECTED, "readings are good again"))
+            self._events.append(DeviceEvent(now_ns, "nano17", DeviceEventKind.RECONNECTED, "readings are good again"))
             self._bad = ""
         if self._bias_left:
             self._bias_sum += wrench
@@ -184,7 +184,7 @@ class Nano17Client:
     def _refuse(self, why: str, now_ns: int) -> None:
         if why != self._bad:
             self._bad = why
-            self._events.append(DeviceEvent(now_ns, "nano17", EventKind.WARNING, why))
+            self._events.append(DeviceEvent(now_ns, "nano17", DeviceEventKind.WARNING, why))
 
 
 class NidaqmxReader:
@@ -251,7 +251,7 @@ class Nano17Thread(threading.Thread):
                     reader.close()
             except OSError as error:
                 if str(error) != told:
-                    self._on_event(DeviceEvent(self._now_ns(), "nano17", EventKind.LOST, str(error)))
+                    self._on_event(DeviceEvent(self._now_ns(), "nano17", DeviceEventKind.LOST, str(error)))
                 told = str(error)
                 self._halt.wait(RETRY_S)
 

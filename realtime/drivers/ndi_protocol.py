@@ -142,7 +142,7 @@ def command(name: str, parameters: str = "") -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class NdiReply:
     """One whole, undamaged reply without its CRC: `text` or `binary`; n_bytes as it was on the wire."""
 
     text: str | None
@@ -161,10 +161,10 @@ class ReplyReader:
         """Forget what is half received."""
         self._buffer.clear()
 
-    def feed(self, data: bytes) -> list[Reply]:
+    def feed(self, data: bytes) -> list[NdiReply]:
         """Replies completed by `data`, in order."""
         self._buffer += data
-        replies: list[Reply] = []
+        replies: list[NdiReply] = []
         while self._buffer:
             taken, reply = self._next()
             if taken == 0:
@@ -176,7 +176,7 @@ class ReplyReader:
                 replies.append(reply)
         return replies
 
-    def _next(self) -> tuple[int, Reply | None]:
+    def _next(self) -> tuple[int, NdiReply | None]:
         """(bytes used, reply or None when these bytes are damage); (0, None) when more bytes are needed."""
         buffer = self._buffer
         if buffer[0] == BINARY_START[0]:
@@ -190,9 +190,9 @@ class ReplyReader:
             return _until_start(buffer, max(end, 1)), None
         body = bytes(buffer[: max(end - 4, 0)])
         good = end >= 4 and bytes(buffer[end - 4 : end]) == b"%04X" % crc16(body)
-        return end + 1, Reply(body.decode("ascii"), None, end + 1) if good else None
+        return end + 1, NdiReply(body.decode("ascii"), None, end + 1) if good else None
 
-    def _next_binary(self) -> tuple[int, Reply | None]:
+    def _next_binary(self) -> tuple[int, NdiReply | None]:
         buffer = self._buffer
         if len(buffer) < 6:
             return (0, None) if BINARY_START.startswith(bytes(buffer[:2])) else (_until_start(buffer, 1), None)
@@ -204,7 +204,7 @@ class ReplyReader:
         body = bytes(buffer[6 : 6 + length])
         if int.from_bytes(buffer[6 + length : 8 + length], "little") != crc16(body):
             return _until_start(buffer, 1), None
-        return 8 + length, Reply(None, body, 8 + length)
+        return 8 + length, NdiReply(None, body, 8 + length)
 
 
 def _until_start(buffer: bytearray, at_least: int) -> int:

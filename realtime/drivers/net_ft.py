@@ -8,7 +8,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.frame_clock import FrameClock
 from realtime.drivers.net_ft_calibration import NetFtCalibration
 
@@ -52,7 +52,7 @@ STATUS_WORDS = {
 }
 
 
-class Command(IntEnum):
+class NetFtCommand(IntEnum):
     """RDT commands."""
 
     STOP = 0x0000
@@ -119,7 +119,7 @@ class NetFtCounters:
     silences: int = 0
 
 
-def request(command: Command, count: int = 0) -> bytes:
+def request(command: NetFtCommand, count: int = 0) -> bytes:
     """An 8-byte RDT request; `count` records, 0 for without end."""
     return REQUEST.pack(HEADER, command, count)
 
@@ -180,16 +180,16 @@ class NetFtClient:
         """The request that starts the stream; the box counts records from 1 again."""
         self._counters.requests += 1
         self._wanted = True
-        return request(Command.START_REALTIME)
+        return request(NetFtCommand.START_REALTIME)
 
     def stop(self) -> bytes:
         """The request that ends the stream."""
         self._wanted = self._streaming = False
-        return request(Command.STOP)
+        return request(NetFtCommand.STOP)
 
     def bias(self) -> bytes:
         """The request that makes the present load the new zero (software bias); only while nothing touches."""
-        return request(Command.SET_BIAS)
+        return request(NetFtCommand.SET_BIAS)
 
     def outgoing(self, now_ns: int) -> bytes:
         """A request to send now, or nothing. Also where silence is noticed."""
@@ -206,7 +206,7 @@ class NetFtClient:
     def lost(self, now_ns: int, why: str) -> None:
         """The stream has ended, or its socket has gone."""
         if self._streaming:
-            self._event(EventKind.LOST, why, now_ns)
+            self._event(DeviceEventKind.LOST, why, now_ns)
         self._streaming, self._asked_ns = False, None
         self._restart()
 
@@ -224,7 +224,7 @@ class NetFtClient:
         stamp_ns = self._stamp(ft_sequence, now_ns)
         if status != self._status:
             self._status = status
-            self._event(EventKind.WARNING, f"status {status:08X}: {status_words(status)}", now_ns)
+            self._event(DeviceEventKind.WARNING, f"status {status:08X}: {status_words(status)}", now_ns)
         if is_fault(status):
             self._counters.status_errors += 1
             return None
@@ -238,7 +238,9 @@ class NetFtClient:
             return None
         if not self._streaming:
             self._streaming = True
-            self._event(EventKind.RECONNECTED if self._streamed else EventKind.TRACKING, "records arrive", now_ns)
+            self._event(
+                DeviceEventKind.RECONNECTED if self._streamed else DeviceEventKind.TRACKING, "records arrive", now_ns
+            )
             self._streamed = True
         self._counters.samples += 1
         return ForceSample(stamp_ns, now_ns, force_N, torque_Nm, sequence, status, lost)
@@ -283,7 +285,7 @@ class NetFtClient:
         run = run + 1 if counts == before else 0
         self._same = (counts, run)
         if run == self.config.frozen_after > 0:
-            self._event(EventKind.WARNING, f"the same reading {run} times in a row: frozen", now_ns)
+            self._event(DeviceEventKind.WARNING, f"the same reading {run} times in a row: frozen", now_ns)
         return 0 < self.config.frozen_after <= run
 
     def _stamp(self, ft_sequence: int, now_ns: int) -> int:
@@ -291,5 +293,5 @@ class NetFtClient:
         self._ft = near + (ft_sequence - near + _MODULUS // 2) % _MODULUS - _MODULUS // 2
         return self.clock.observe(self._ft, now_ns) - round(self.config.latency_s * 1e9)
 
-    def _event(self, kind: EventKind, text: str, now_ns: int) -> None:
+    def _event(self, kind: DeviceEventKind, text: str, now_ns: int) -> None:
         self._events.append(DeviceEvent(now_ns, "net_ft", kind, text))

@@ -45,7 +45,7 @@ class LinkPhase(enum.Enum):
     RESET = "reset"  # the processor started anew: restart() once the operator knows
 
 
-class EventKind(enum.Enum):
+class BoardEventKind(enum.Enum):
     """What happened on the link."""
 
     IDENTIFIED = "identified"
@@ -102,7 +102,7 @@ class BoardStatus(NamedTuple):
 class LinkEvent(NamedTuple):
     """One event: its kind, host time of arrival, a line for people, the command it answers ("" for none)."""
 
-    kind: EventKind
+    kind: BoardEventKind
     stamp_ns: int
     message: str
     command: str = ""
@@ -262,7 +262,7 @@ class StepperBoardLink:
             self.phase = LinkPhase.MISMATCH
             return [
                 LinkEvent(
-                    EventKind.MISMATCH,
+                    BoardEventKind.MISMATCH,
                     now_ns,
                     (
                         f"board: found protocol {identity.protocol_hash:#010x}, firmware {major}.{minor}; wanted "
@@ -277,7 +277,7 @@ class StepperBoardLink:
             self._sent_ns = None
             events.append(
                 LinkEvent(
-                    EventKind.IDENTIFIED,
+                    BoardEventKind.IDENTIFIED,
                     now_ns,
                     (
                         f"board: {Mcu(identity.mcu).name.lower()}, firmware {major}.{minor}, "
@@ -296,9 +296,9 @@ class StepperBoardLink:
         self.status = status
         fault = Fault(status.fault)
         if fault != self._fault and fault != Fault.NONE:
-            events.append(LinkEvent(EventKind.FAULT, now_ns, f"board fault {fault.name}: {FAULT_ADVICE[fault]}"))
+            events.append(LinkEvent(BoardEventKind.FAULT, now_ns, f"board fault {fault.name}: {FAULT_ADVICE[fault]}"))
         self._fault = fault
-        events.append(LinkEvent(EventKind.STATUS, now_ns, ""))
+        events.append(LinkEvent(BoardEventKind.STATUS, now_ns, ""))
         return events
 
     def _check_boot(self, boot_count: int, now_ns: int) -> list[LinkEvent]:
@@ -309,7 +309,7 @@ class StepperBoardLink:
         self.clock.restart()
         return [
             LinkEvent(
-                EventKind.RESET,
+                BoardEventKind.RESET,
                 now_ns,
                 (f"board was reset: found start {boot_count}, wanted {known}; its positions are lost, home the axes again"),
             )
@@ -325,11 +325,11 @@ class StepperBoardLink:
             message_text = f"board refused {frame.name}: {result.name}"
             if self.status is not None:
                 message_text += f" (it is {BoardState(self.status.state).name}, fault {Fault(self.status.fault).name})"
-            return [LinkEvent(EventKind.REFUSED, now_ns, message_text, frame.name)]
-        events = [LinkEvent(EventKind.ACK, now_ns, f"board accepted {frame.name}", frame.name)]
+            return [LinkEvent(BoardEventKind.REFUSED, now_ns, message_text, frame.name)]
+        events = [LinkEvent(BoardEventKind.ACK, now_ns, f"board accepted {frame.name}", frame.name)]
         if frame.name == "CONFIGURE":
             self._configured.add(pending.axis)
             if self.phase is LinkPhase.CONFIGURE and len(self._configured) == len(AXES):
                 self.phase = LinkPhase.READY
-                events.append(LinkEvent(EventKind.READY, now_ns, "board ready"))
+                events.append(LinkEvent(BoardEventKind.READY, now_ns, "board ready"))
         return events

@@ -18,7 +18,7 @@ from sim import axis_effects
 from sim.concealed.menu import Dish
 from sim.concealed.rig import Session
 from sim.concealed.signals import KINDS, signal
-from sim.effects import Effect, pack
+from sim.effects import PlantedEffect, pack
 from sim.friction_effects import bouc_wen
 
 Array = np.ndarray
@@ -289,7 +289,7 @@ def _transmission(
     case: GenericCase, planted: Sequence[Planted], time: Array, wanted: Array, closed: bool, i: int
 ) -> tuple[Array, Array]:
     p, dt = case.nominal, case.period_s
-    records = [Effect(d.id, d.port, values) for d, values in planted if d.id != "unlisted"]
+    records = [PlantedEffect(d.id, d.port, values) for d, values in planted if d.id != "unlisted"]
     rng = np.random.default_rng([case.seed, i])
     noise = rng.standard_normal((len(time), 2)) * case.sigma
 

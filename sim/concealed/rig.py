@@ -14,7 +14,7 @@ import numpy as np
 from sim.catheter_chain import CatheterConfig
 from sim.concealed import nominal
 from sim.concealed.signals import KINDS, QUIET_S, presses, signal
-from sim.effects import Effect
+from sim.effects import PlantedEffect
 from sim.heart import HeartConfig
 from sim.knob import KnobConfig
 from sim.plant import Plant, PlantConfig
@@ -128,7 +128,7 @@ def _mixed(rng: np.random.Generator, knob: float, deep: float, bent: bool) -> Ar
     return np.asarray((1.0 - share) * first + share * second)
 
 
-def plant(case: RigCase, effects: Sequence[Effect]) -> Plant:
+def plant(case: RigCase, effects: Sequence[PlantedEffect]) -> Plant:
     """The simulated plant without any of its habits: what is planted is all that is missing from the nominal chain."""
     p = case.nominal
     rigidity = (p[6], p[6], nominal.TORSION_TO_BENDING * p[6])
@@ -168,7 +168,7 @@ def commands(case: RigCase) -> tuple[Array, list[slice]]:
 
 
 def simulate(
-    case: RigCase, effects: Sequence[Effect] = (), distortion: Distortion | None = None, replay: Array | None = None
+    case: RigCase, effects: Sequence[PlantedEffect] = (), distortion: Distortion | None = None, replay: Array | None = None
 ) -> Session:
     """Run the session. `distortion` stands between handle and rig; `replay` (n, 3) gives the handle instead of control."""
     reference, where = commands(case)

@@ -17,7 +17,7 @@ from sim.concealed.generic import GenericCase
 from sim.concealed.menu import Dish
 from sim.concealed.rig import RigCase, Session
 from sim.concealed.signals import coloured, lost
-from sim.effects import Effect
+from sim.effects import PlantedEffect
 
 Array = np.ndarray
 _HANDLE = ("handle_insertion_m", "handle_roll_rad", "handle_knob_rad")
@@ -51,7 +51,9 @@ class System:
         """The session with `planted` in it, without noise. `replay`: recorded inputs instead of excitation and control."""
         if isinstance(self.case, GenericCase):
             return concealed_generic.simulate(self.case, [(p.dish, p.parameters) for p in planted], replay)
-        effects = [Effect(p.dish.id, p.dish.port, p.parameters, p.start_s) for p in planted if p.dish.id != "unlisted"]
+        effects = [
+            PlantedEffect(p.dish.id, p.dish.port, p.parameters, p.start_s) for p in planted if p.dish.id != "unlisted"
+        ]
         strange = [p for p in planted if p.dish.id == "unlisted"]
         return concealed_rig.simulate(
             self.case, effects, Warp(strange) if strange else None, None if replay is None else self._bridged(replay)

@@ -18,7 +18,7 @@ from protocol.topics import Message
 from realtime.core.lines import FromRig, ToRig
 from realtime.core.sweep import Sweep, SweepLoop
 from realtime.core.sweep_ports import RigPorts, run_sweeps
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.tissue import TissueConfig
 from sim.world import World, simulated_plant
 
@@ -59,7 +59,7 @@ class Bench:
 
     def __init__(self, rig: Rig, wall: TissueConfig = FREE) -> None:
         self.heard: list[str] = []
-        self.board = Board("native")
+        self.board = SimulatedBoard("native")
         self.world = World(rig, simulated_plant(rig, 1, tissue=wall), self.board, 1)
         self.ports, self.loop = WorldPorts(self.world), SweepLoop(rig, SHORT, self._publish)
 

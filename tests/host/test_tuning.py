@@ -17,7 +17,7 @@ from host.commissioning.tuning import (
 from protocol.enums import Phase
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
-from sim.ideal_rig import IdealRig, Trace
+from sim.ideal_rig import IdealRig, IdealTrace
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def present(rig: Rig) -> dict[str, float]:
     return {name: float(getattr(rig.control, name)) for name in GAINS}
 
 
-def flat(force_N: float, phase: int, n: int = 1000) -> Trace:
-    return Trace(
+def flat(force_N: float, phase: int, n: int = 1000) -> IdealTrace:
+    return IdealTrace(
         np.arange(n) * 1e-3, np.full(n, force_N), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.full(n, phase)
     )
 

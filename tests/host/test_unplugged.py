@@ -24,7 +24,7 @@ from realtime.drivers.stepper_board import LinkPhase
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 from sim.world import World
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import until
@@ -50,7 +50,7 @@ def test_a_sensor_unplugged_in_contact_and_back_leaves_the_rig_disarmed(device: 
         assert run.run(10.0, lambda: run.phase == Phase.CONTACT)
         run.run(0.5)
         begin_ns = run.now_ns
-        getattr(run.world, device).faults.append(Fault("silent", begin_ns, begin_ns + 1_500_000_000))
+        getattr(run.world, device).faults.append(SensorFault("silent", begin_ns, begin_ns + 1_500_000_000))
         assert run.run(0.2, lambda: run.loop.outputs[0].action >= SafetyAction.HOLD)
         run.run(1.0)
         at_rest = run.world.edges.copy()

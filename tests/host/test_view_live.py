@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from host.run.commander import Acknowledgement, Commander
-from host.view.live import LiveRig, Press
+from host.view.live import ButtonPress, LiveRig
 from host.view.server import ADDRESS
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Command, ForceEstimate, ForceSensor, Pose, Reply, RigState, Stage, encode, key
@@ -159,7 +159,7 @@ def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
     view._command = lambda button: sent.append(button) or Acknowledgement(True, "", "accepted")
     answer = view.act(text)
     try:
-        press = Press.model_validate_json(text)
+        press = ButtonPress.model_validate_json(text)
         allowed = press.confirmed or press.button == "stop"
     except ValueError:
         allowed = False

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realtime.drivers.aurora import AuroraClient, AuroraConfig
-from realtime.drivers.device_events import EventKind
+from realtime.drivers.device_events import DeviceEventKind
 from realtime.drivers.pose_sample import PoseFlag, PoseSample
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig, exchange
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 VECTORS = json.loads((Path(__file__).parent / "vectors" / "aurora.json").read_text(encoding="utf-8"))
 MS = 1_000_000
@@ -27,7 +27,7 @@ class Bench:
         self,
         client: AuroraConfig | None = None,
         device: AuroraEmulatorConfig = QUIET,
-        faults: tuple[Fault, ...] = (),
+        faults: tuple[SensorFault, ...] = (),
         step_ns: int = MS,
         seed: int = 3,
     ) -> None:
@@ -50,7 +50,7 @@ class Bench:
             self.samples += exchange(self.client, self.emulator, self.now_ns)
         return self.samples[first:]
 
-    def kinds(self) -> list[EventKind]:
+    def kinds(self) -> list[DeviceEventKind]:
         return [event.kind for event in self.client.take_events()]
 
 
@@ -86,7 +86,7 @@ def test_the_recorded_session_brings_the_client_up_byte_for_byte() -> None:
     assert [(action.baud, action.break_s > 0) for action in actions] == [(9600, True), (921600, False)]
     assert client.outgoing(now_ns + MS) == VECTORS["poll"].encode("ascii")
     events = client.take_events()
-    assert [event.kind for event in events] == [EventKind.WARNING, EventKind.TRACKING]
+    assert [event.kind for event in events] == [DeviceEventKind.WARNING, DeviceEventKind.TRACKING]
     assert events[0].text == "PINIT 0B: warning 01: possible hardware fault"
 
 
@@ -158,7 +158,7 @@ def test_an_error_to_a_poll_is_told_in_words_and_starts_anew(code: int) -> None:
     text = b"ERROR%02X" % code
     assert answer_poll(client, text + b"%04X\r" % crc16(text), now_ns + 25 * MS) == []
     (event,) = client.take_events()
-    assert event.kind is EventKind.LOST and ERROR_WORDS[code] in event.text
+    assert event.kind is DeviceEventKind.LOST and ERROR_WORDS[code] in event.text
     client.outgoing(now_ns + 2000 * MS)
     assert client.phase == "resetting"
 
@@ -171,7 +171,7 @@ def test_an_error_to_a_poll_is_told_in_words_and_starts_anew(code: int) -> None:
 def test_every_speed_and_reply_brings_poses(baud: int, reply: str) -> None:
     bench = Bench(AuroraConfig(baud=baud, reply=reply))
     samples = bench.run(5.0)
-    assert bench.kinds() == [EventKind.TRACKING]
+    assert bench.kinds() == [DeviceEventKind.TRACKING]
     assert bench.emulator.baud == baud and bench.client.firmware.startswith("AURORA")
     assert {sample.tool for sample in samples} == {"0A", "0B"}
     for sample in samples:
@@ -188,7 +188,7 @@ def test_only_the_wanted_tools_are_enabled_and_absent_ones_are_named() -> None:
     bench = Bench(AuroraConfig(tools=("0B", "0C")))
     assert {sample.tool for sample in bench.run(2.5)} == {"0B"}
     assert not bench.emulator.ports["0A"].enabled
-    assert any("0C" in event.text and event.kind is EventKind.ERROR for event in bench.client.take_events())
+    assert any("0C" in event.text and event.kind is DeviceEventKind.ERROR for event in bench.client.take_events())
 
 
 def test_an_adapter_that_swallows_breaks_is_reset_in_words_whatever_the_speed() -> None:
@@ -197,11 +197,13 @@ def test_an_adapter_that_swallows_breaks_is_reset_in_words_whatever_the_speed() 
     bench.emulator.serial_break = lambda now_ns: None  # type: ignore[method-assign]
     bench.client.lost(bench.now_ns, "the program was started anew while the device tracks at 921600 baud")
     assert bench.run(5.0)
-    assert bench.kinds()[-1] is EventKind.RECONNECTED
+    assert bench.kinds()[-1] is DeviceEventKind.RECONNECTED
 
 
 def test_a_device_that_is_not_there_is_asked_for_ever() -> None:
-    bench = Bench(AuroraConfig(reset_timeout_s=0.2, reply_timeout_s=0.2, retry_s=0.2), faults=(Fault("silent", 0, 10**18),))
+    bench = Bench(
+        AuroraConfig(reset_timeout_s=0.2, reply_timeout_s=0.2, retry_s=0.2), faults=(SensorFault("silent", 0, 10**18),)
+    )
     bench.emulator.serial_break = lambda now_ns: None  # type: ignore[method-assign]
     assert bench.run(20.0) == []
     assert bench.client.counters.sessions > 10
@@ -223,12 +225,12 @@ def test_a_tool_that_cannot_be_initialised_is_named_and_the_other_tracked() -> N
     bench = Bench()
     bench.emulator.ports["0B"].defect = "1E"
     assert {sample.tool for sample in bench.run(3.0)} == {"0A"}
-    texts = [event.text for event in bench.client.take_events() if event.kind is EventKind.ERROR]
+    texts = [event.text for event in bench.client.take_events() if event.kind is DeviceEventKind.ERROR]
     assert texts == ["PINIT 0B: error 1E: SROM of the tool could not be read", "wanted tools not plugged in: 0B"]
 
 
 def test_bring_up_survives_damaged_replies() -> None:
-    bench = Bench(AuroraConfig(reply_timeout_s=0.3), faults=(Fault("bit_errors", 0, 10**18, value=3e-4),))
+    bench = Bench(AuroraConfig(reply_timeout_s=0.3), faults=(SensorFault("bit_errors", 0, 10**18, value=3e-4),))
     assert bench.run(10.0)
     assert bench.client.counters.damaged > 0
 
@@ -321,7 +323,7 @@ def test_one_strange_frame_number_is_not_believed(key: str) -> None:
     ],
 )
 def test_flags_reach_the_samples_and_are_told_once(kind: str, flags: PoseFlag) -> None:
-    fault = Fault(kind, 4_000 * MS, 5_000 * MS, handle="0A")
+    fault = SensorFault(kind, 4_000 * MS, 5_000 * MS, handle="0A")
     bench = Bench(faults=(fault,))
     samples = bench.run(6.0)
     for sample in samples:
@@ -329,12 +331,12 @@ def test_flags_reach_the_samples_and_are_told_once(kind: str, flags: PoseFlag) -
         assert sample.flags == (flags if inside else 0)
         assert sample.missing == (inside and kind != "partly")
         assert np.isnan(sample.position_m).all() == sample.missing
-    texts = [event.text for event in bench.client.take_events() if event.kind is EventKind.WARNING]
+    texts = [event.text for event in bench.client.take_events() if event.kind is DeviceEventKind.WARNING]
     assert len(texts) == 2 and texts[0].startswith("tool 0A: ") and texts[1] == "tool 0A: in view"
 
 
 def test_a_frozen_pose_under_new_frame_numbers_is_found_and_passes_no_more() -> None:
-    fault = Fault("frozen", 4_000 * MS, 6_000 * MS, handle="0A")
+    fault = SensorFault("frozen", 4_000 * MS, 6_000 * MS, handle="0A")
     bench = Bench(faults=(fault,))
     samples = [sample for sample in bench.run(8.0) if sample.tool == "0A"]
     frozen = [sample for sample in samples if sample.flags & PoseFlag.FROZEN]
@@ -346,9 +348,9 @@ def test_a_frozen_pose_under_new_frame_numbers_is_found_and_passes_no_more() -> 
 
 
 def test_silence_is_noticed_and_the_device_found_again() -> None:
-    bench = Bench(faults=(Fault("silent", 4_000 * MS, 6_000 * MS),))
+    bench = Bench(faults=(SensorFault("silent", 4_000 * MS, 6_000 * MS),))
     samples = bench.run(10.0)
-    assert bench.kinds() == [EventKind.TRACKING, EventKind.LOST, EventKind.RECONNECTED]
+    assert bench.kinds() == [DeviceEventKind.TRACKING, DeviceEventKind.LOST, DeviceEventKind.RECONNECTED]
     gap = np.diff([sample.arrival_ns for sample in samples])
     assert np.sum(gap > 100 * MS) == 1
     assert samples[-1].arrival_ns > 9_900 * MS
@@ -359,7 +361,7 @@ def test_a_device_switched_off_and_on_is_found_again() -> None:
     bench.run(4.0)
     bench.emulator.power_cycle(bench.now_ns)
     assert bench.run(4.0)
-    assert bench.kinds() == [EventKind.TRACKING, EventKind.LOST, EventKind.RECONNECTED]
+    assert bench.kinds() == [DeviceEventKind.TRACKING, DeviceEventKind.LOST, DeviceEventKind.RECONNECTED]
 
 
 def test_a_tool_pulled_leaves_the_other_and_comes_back() -> None:
@@ -380,7 +382,7 @@ def test_the_last_tool_pulled_is_waited_for() -> None:
     assert not bench.run(2.0)
     bench.emulator.plug("0A")
     assert bench.run(4.0)
-    assert bench.kinds()[-1] is EventKind.RECONNECTED
+    assert bench.kinds()[-1] is DeviceEventKind.RECONNECTED
 
 
 # Damage.

@@ -14,7 +14,7 @@ from realtime.control.configure import tick_parameters
 from realtime.control.records import BACKLASH_STATE, HISTORY, HYBRID_STATE, new
 from realtime.core.intake import rotation
 from sim.heart import HeartConfig
-from sim.ideal_rig import IdealRig, Trace
+from sim.ideal_rig import IdealRig, IdealTrace
 from sim.plant import PlantConfig
 from sim.tissue import TissueConfig
 from sim.vessel import VesselConfig
@@ -47,11 +47,11 @@ def bench(rig: Rig, heart: HeartConfig, seed: int = 0, normal: tuple = (0.0, 0.0
     )  # type: ignore[arg-type]
 
 
-def pressed(rig: Rig, heart: HeartConfig, seconds: float = 10.0, seed: int = 0) -> Trace:
+def pressed(rig: Rig, heart: HeartConfig, seconds: float = 10.0, seed: int = 0) -> IdealTrace:
     return bench(rig, heart, seed).press(WANTED_N, WALL_m, seconds).since_contact()
 
 
-def rms_N(trace: Trace, after_s: float = 4.0) -> float:
+def rms_N(trace: IdealTrace, after_s: float = 4.0) -> float:
     kept = trace.force_N[trace.time_s > after_s]
     assert kept.size > 1000
     return float(np.sqrt(np.mean((kept - WANTED_N) ** 2)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realtime.drivers.device_events import EventKind
+from realtime.drivers.device_events import DeviceEventKind
 from realtime.drivers.nano17_daq import (
     Nano17Calibration,
     Nano17Client,
@@ -16,13 +16,13 @@ from realtime.drivers.nano17_daq import (
     parse_calibration_file,
 )
 from sim.nano17_emulator import Nano17Emulator, Nano17EmulatorConfig
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 MS = 1_000_000
 VECTORS = json.loads((Path(__file__).parent / "vectors" / "nano17_daq.json").read_text(encoding="utf-8"))
 
 
-def pair(noise_V: float = 0.0, **faults: Fault) -> tuple[Nano17Client, Nano17Emulator]:
+def pair(noise_V: float = 0.0, **faults: SensorFault) -> tuple[Nano17Client, Nano17Emulator]:
     emulator = Nano17Emulator(Nano17EmulatorConfig(noise_V=noise_V), seed=3, faults=list(faults.values()))
     c = emulator.config
     calibration = Nano17Calibration(
@@ -66,10 +66,13 @@ def test_bias_makes_the_present_load_the_zero() -> None:
 
 
 def test_a_wire_that_is_off_gives_no_sample_and_is_told_once() -> None:
-    client, emulator = pair(wire=Fault("broken", 3 * MS, 6 * MS, value=2))
+    client, emulator = pair(wire=SensorFault("broken", 3 * MS, 6 * MS, value=2))
     assert len(read(client, emulator, 8)) == 5
     events = client.take_events()
-    assert [event.kind for event in events] == [EventKind.WARNING, EventKind.RECONNECTED] and "gauge 2" in events[0].text
+    assert [event.kind for event in events] == [
+        DeviceEventKind.WARNING,
+        DeviceEventKind.RECONNECTED,
+    ] and "gauge 2" in events[0].text
     assert client.rejected == 3
 
 
@@ -171,4 +174,4 @@ def test_the_thread_opens_a_card_that_was_gone_again() -> None:
             break
         thread.join(0.01)
     thread.stop()
-    assert samples and len(opened) >= 2 and told[0].kind is EventKind.LOST
+    assert samples and len(opened) >= 2 and told[0].kind is DeviceEventKind.LOST

@@ -16,7 +16,7 @@ def vector_bytes(vector: dict) -> bytes:
     return bytes.fromhex(vector["hex"]) if "hex" in vector else vector["text"].encode("ascii")
 
 
-def read_one(data: bytes) -> ndi.Reply:
+def read_one(data: bytes) -> ndi.NdiReply:
     replies = ndi.ReplyReader().feed(data)
     assert len(replies) == 1
     assert replies[0].n_bytes == len(data)

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realtime.drivers.device_events import EventKind
+from realtime.drivers.device_events import DeviceEventKind
 from realtime.drivers.net_ft import (
     STATUS_WORDS,
-    Command,
     ForceSample,
     NetFtClient,
+    NetFtCommand,
     NetFtConfig,
     is_fault,
     request,
@@ -23,7 +23,7 @@ from realtime.drivers.net_ft import (
 )
 from realtime.drivers.net_ft_calibration import NetFtCalibration, parse_calibration
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig, exchange
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 VECTORS = json.loads((Path(__file__).parent / "vectors" / "net_ft.json").read_text(encoding="utf-8"))
 MS = 1_000_000
@@ -38,7 +38,9 @@ def record(sequence: int, status: int = 0, fz: int = 1000, ft_sequence: int | No
 class Bench:
     """Client and emulator in virtual time; Fz tells the time of sampling in units of 1 N/s."""
 
-    def __init__(self, device: NetFtEmulatorConfig | None = None, faults: tuple[Fault, ...] = (), seed: int = 4) -> None:
+    def __init__(
+        self, device: NetFtEmulatorConfig | None = None, faults: tuple[SensorFault, ...] = (), seed: int = 4
+    ) -> None:
         self.emulator = NetFtEmulator(device or NetFtEmulatorConfig(force_noise_N=0.0, torque_noise_Nm=0.0), seed, faults)
         self.client = NetFtClient(NetFtConfig(parse_calibration(self.emulator.page())))
         self.now_ns = 0
@@ -53,7 +55,7 @@ class Bench:
             self.samples += exchange(self.client, self.emulator, self.now_ns)
         return self.samples[first:]
 
-    def kinds(self) -> list[EventKind]:
+    def kinds(self) -> list[DeviceEventKind]:
         return [event.kind for event in self.client.take_events()]
 
 
@@ -64,7 +66,7 @@ def force_at(time_ns: int) -> np.ndarray:
 
 @pytest.mark.parametrize("vector", VECTORS["requests"], ids=lambda vector: vector["command"])
 def test_requests_have_the_bytes_of_the_vectors(vector: dict) -> None:
-    assert request(Command[vector["command"]]).hex() == vector["hex"]
+    assert request(NetFtCommand[vector["command"]]).hex() == vector["hex"]
 
 
 def test_the_recorded_datagrams_mean_what_the_vectors_say() -> None:
@@ -163,11 +165,11 @@ def test_every_status_bit_has_words_and_only_a_latched_monitor_is_no_fault() -> 
 
 @pytest.mark.parametrize(("kind", "words"), [("saturated", "saturated"), ("broken", "excitation")])
 def test_faulty_records_are_not_used_and_told_in_words(kind: str, words: str) -> None:
-    bench = Bench(faults=(Fault(kind, 500 * MS, 700 * MS),))
+    bench = Bench(faults=(SensorFault(kind, 500 * MS, 700 * MS),))
     stamps = np.array([sample.stamp_ns for sample in bench.run(1.0)])
     assert not np.any((stamps > 501 * MS) & (stamps < 699 * MS))
     assert bench.client.counters.status_errors == pytest.approx(200, abs=2)
-    texts = [event.text for event in bench.client.take_events() if event.kind is EventKind.WARNING]
+    texts = [event.text for event in bench.client.take_events() if event.kind is DeviceEventKind.WARNING]
     assert len(texts) == 2 and words in texts[0] and "good" in texts[1]
 
 
@@ -178,7 +180,7 @@ def test_a_load_over_the_range_that_does_not_saturate_is_still_told() -> None:
 
 
 def test_a_frozen_reading_under_new_sequence_numbers_is_found_and_passes_no_more() -> None:
-    bench = Bench(faults=(Fault("frozen", 500 * MS, 700 * MS),))
+    bench = Bench(faults=(SensorFault("frozen", 500 * MS, 700 * MS),))
     stamps = np.array([sample.stamp_ns for sample in bench.run(1.0)])
     assert not np.any((stamps > 552 * MS) & (stamps < 699 * MS)) and np.any(stamps > 900 * MS)
     assert bench.client.counters.frozen == pytest.approx(150, abs=15)
@@ -195,9 +197,9 @@ def test_bias_makes_the_present_load_zero() -> None:
 
 
 def test_silence_is_told_once_and_the_stream_asked_for_until_it_comes() -> None:
-    bench = Bench(faults=(Fault("silent", 1_000 * MS, 3_000 * MS),))
+    bench = Bench(faults=(SensorFault("silent", 1_000 * MS, 3_000 * MS),))
     samples = bench.run(5.0)
-    assert bench.kinds() == [EventKind.TRACKING, EventKind.LOST, EventKind.RECONNECTED]
+    assert bench.kinds() == [DeviceEventKind.TRACKING, DeviceEventKind.LOST, DeviceEventKind.RECONNECTED]
     assert bench.client.counters.silences == 1 and bench.client.counters.requests > 5
     assert samples[-1].stamp_ns > 4_990 * MS
 
@@ -207,7 +209,7 @@ def test_a_box_switched_off_and_on_is_found_again() -> None:
     bench.run(1.0)
     bench.emulator.power_cycle()
     assert len(bench.run(2.0)) > 1500
-    assert bench.kinds() == [EventKind.TRACKING, EventKind.LOST, EventKind.RECONNECTED]
+    assert bench.kinds() == [DeviceEventKind.TRACKING, DeviceEventKind.LOST, DeviceEventKind.RECONNECTED]
 
 
 def test_stop_ends_the_stream_and_start_begins_it() -> None:
@@ -265,7 +267,7 @@ def test_shuffled_doubled_and_cut_datagrams_never_go_back_or_lie(arrivals: list[
 @given(st.integers(0, 2**32), st.sampled_from([1e-4, 1e-3, 1e-2]))
 @settings(derandomize=True, deadline=None, max_examples=15)
 def test_flipped_bits_do_not_upset_the_stream(seed: int, rate: float) -> None:
-    bench = Bench(faults=(Fault("bit_errors", 500 * MS, 1_500 * MS, value=rate),), seed=seed)
+    bench = Bench(faults=(SensorFault("bit_errors", 500 * MS, 1_500 * MS, value=rate),), seed=seed)
     samples = bench.run(2.5)
     limit = CONFIG.wild_ratio * np.array([12.0, 12.0, 17.0])
     assert all(np.all(np.abs(sample.force_N) <= limit) for sample in samples)

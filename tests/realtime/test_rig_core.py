@@ -13,11 +13,11 @@ from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply, encode
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, new
-from realtime.core.rig_core import CAUSE_QUIET_NS, Arrived, Leaving, Request, RigCore, Tick
+from realtime.core.rig_core import CAUSE_QUIET_NS, Arrived, CommandRequest, Leaving, RigCore, Tick
 from realtime.core.supervision import STEPS_APART, STEPS_APART_NS
 from realtime.core.telemetry import loop_message
 from realtime.drivers.aurora import PoseSample
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import ForceSample
 from realtime.drivers.stepper_board import LinkPhase
 from realtime.loop.native_loop import HISTOGRAM_WORDS
@@ -97,7 +97,7 @@ class Bench:
             }
             | fields
         )
-        reply = self.step(Arrived(requests=[Request("console", encode(command))])).replies[0]
+        reply = self.step(Arrived(requests=[CommandRequest("console", encode(command))])).replies[0]
         assert reply is not None
         return reply
 
@@ -218,7 +218,7 @@ def test_another_force_is_no_new_command_to_the_tick(core: Bench) -> None:
 
 def test_a_device_that_returns_disarms(core: Bench) -> None:
     core.armed()
-    event = DeviceEvent(core.now_ns, "aurora", EventKind.RECONNECTED, "tools 0A, 0B")
+    event = DeviceEvent(core.now_ns, "aurora", DeviceEventKind.RECONNECTED, "tools 0A, 0B")
     leaving = core.step(Arrived(device_events=[event]))
     assert not core.core.commands.armed and leaving.changed == {"command"} and len(leaving.frames) == 1
     assert core.inputs[0].command.kind == CommandKind.HOLD
@@ -238,7 +238,7 @@ def test_while_the_loop_does_not_run_only_a_stop_is_accepted(core: Bench) -> Non
             action=action,
             target="none",
         )
-        replies = core.step(Arrived(requests=[Request("console", encode(command))], loop_runs=False)).replies
+        replies = core.step(Arrived(requests=[CommandRequest("console", encode(command))], loop_runs=False)).replies
         assert replies[0] is not None and replies[0].result == result
 
 

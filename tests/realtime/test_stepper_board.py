@@ -13,9 +13,9 @@ from realtime.drivers.stepper_board import (
     FAULT_ADVICE,
     RETRY_NS,
     AxisLimits,
+    BoardEventKind,
     BoardIdentity,
     BoardStatus,
-    EventKind,
     LinkEvent,
     LinkPhase,
     StepperBoardLink,
@@ -71,7 +71,7 @@ class Peer:
         return self.send("STATUS", **blank | {"boot_count": self.identity["boot_count"]} | fields)
 
 
-def kinds(events: list[LinkEvent]) -> list[EventKind]:
+def kinds(events: list[LinkEvent]) -> list[BoardEventKind]:
     return [event.kind for event in events]
 
 
@@ -88,7 +88,7 @@ def test_bring_up_and_arm() -> None:
     assert peer.heard == ["HELLO", "CONFIGURE", "CONFIGURE", "CONFIGURE"]
     assert link.identity == BoardIdentity(**peer.identity)
     events = link.feed(peer.answer(link.arm()), 9 * MS)
-    assert [(e.kind, e.command) for e in events] == [(EventKind.ACK, "ARM")]
+    assert [(e.kind, e.command) for e in events] == [(BoardEventKind.ACK, "ARM")]
     assert not link.armed
     link.feed(peer.status(state=BoardState.ARMED), 10 * MS)
     assert link.armed
@@ -112,7 +112,7 @@ def test_a_board_that_starts_late_is_greeted_at_its_first_word() -> None:
 def test_another_protocol_or_firmware_is_refused(identity: dict[str, int]) -> None:
     link, peer = StepperBoardLink(LIMITS), Peer(**identity)
     events = link.feed(peer.answer(link.advance(0)), MS)
-    assert kinds(events) == [EventKind.MISMATCH] and "flash this version's firmware" in events[0].message
+    assert kinds(events) == [BoardEventKind.MISMATCH] and "flash this version's firmware" in events[0].message
     assert link.phase is LinkPhase.MISMATCH
     assert link.advance(10 * RETRY_NS) == b""
     with pytest.raises(ValueError, match="wanted ready"):
@@ -130,7 +130,7 @@ def test_a_refused_command_says_why() -> None:
     link.feed(peer.status(state=BoardState.FAULT, fault=Fault.ESTOP), 7 * MS)
     peer.refuse["CLEAR_FAULT"] = Result.CAUSE_PRESENT
     events = link.feed(peer.answer(link.clear_fault(Fault.ESTOP)), 8 * MS)
-    assert kinds(events) == [EventKind.REFUSED]
+    assert kinds(events) == [BoardEventKind.REFUSED]
     assert events[0].message == "board refused CLEAR_FAULT: CAUSE_PRESENT (it is FAULT, fault ESTOP)"
 
 
@@ -155,10 +155,10 @@ def test_a_fault_is_told_once_with_advice() -> None:
     events = []
     for ms in range(10, 60, 5):
         events += link.feed(peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), ms * MS)
-    told = [e for e in events if e.kind is EventKind.FAULT]
+    told = [e for e in events if e.kind is BoardEventKind.FAULT]
     assert len(told) == 1 and FAULT_ADVICE[Fault.DEADMAN] in told[0].message
     link.feed(peer.status(), 60 * MS)
-    assert EventKind.FAULT in kinds(link.feed(peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), 65 * MS))
+    assert BoardEventKind.FAULT in kinds(link.feed(peer.status(state=BoardState.FAULT, fault=Fault.DEADMAN), 65 * MS))
 
 
 def test_every_fault_has_advice() -> None:
@@ -169,7 +169,7 @@ def test_a_reset_is_a_fault_that_ends_the_session() -> None:
     link, peer = ready()
     link.feed(peer.status(state=BoardState.RUNNING), 10 * MS)
     events = link.feed(peer.status(boot_count=4) + peer.status(boot_count=4), 15 * MS)
-    assert kinds(events).count(EventKind.RESET) == 1
+    assert kinds(events).count(BoardEventKind.RESET) == 1
     assert "found start 4, wanted 3" in events[0].message
     assert link.phase is LinkPhase.RESET and link.advance(10 * RETRY_NS) == b""
     with pytest.raises(ValueError, match="wanted ready"):
@@ -224,7 +224,7 @@ def test_any_portions_and_any_noise_before(sizes: list[int], noise: bytes) -> No
         size = sizes[turn % len(sizes)]
         events += link.feed(stream[at : at + size], MS)
         at, turn = at + size, turn + 1
-    assert kinds(events) == [EventKind.IDENTIFIED, EventKind.STATUS]
+    assert kinds(events) == [BoardEventKind.IDENTIFIED, BoardEventKind.STATUS]
     assert link.status is not None and link.status.last_setpoint == 9
 
 
@@ -245,7 +245,7 @@ def test_a_board_that_lost_power_with_its_plug_is_not_believed() -> None:
     link.unplugged()
     peer.identity["boot_count"] += 1
     events = link.feed(peer.answer(link.advance(1000 * MS)), 1000 * MS)
-    assert kinds(events) == [EventKind.RESET] and "home the axes again" in events[0].message
+    assert kinds(events) == [BoardEventKind.RESET] and "home the axes again" in events[0].message
     assert link.phase is LinkPhase.RESET
     link.unplugged()
     assert link.phase is LinkPhase.RESET

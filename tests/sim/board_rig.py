@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from protocol.board_pins import Build
-from realtime.drivers.stepper_board import AxisLimits, BoardStatus, EventKind, LinkPhase, StepperBoardLink
-from sim.board import USUAL_BUILD, Board, BoardSlice
+from realtime.drivers.stepper_board import AxisLimits, BoardEventKind, BoardStatus, LinkPhase, StepperBoardLink
+from sim.board import USUAL_BUILD, BoardSlice, SimulatedBoard
 
 LIMITS = (
     AxisLimits(16_000, 640_000, -(10**6), 10**6),
@@ -31,7 +31,7 @@ class BoardRig:
     """Runs a Board in slices of 1 ms with a StepperBoardLink on its UART."""
 
     def __init__(self, kind: str, mcu: str = "atmega2560", build: Build = USUAL_BUILD) -> None:
-        self.board = Board(kind, mcu, build)
+        self.board = SimulatedBoard(kind, mcu, build)
         self.link = StepperBoardLink(LIMITS)
         self.time_us = 0
         self.position = np.zeros(3, np.int64)  # by the edges
@@ -60,7 +60,7 @@ class BoardRig:
 
     def _take(self, piece: bytes, arrival_ns: int) -> None:
         for event in self.link.feed(piece, arrival_ns):
-            if event.kind is not EventKind.STATUS:
+            if event.kind is not BoardEventKind.STATUS:
                 self.events.append(event.message)
             elif self.link.status is not None:
                 self.accepted.add(self.link.status.last_setpoint)

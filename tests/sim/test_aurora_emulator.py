@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from realtime.drivers import ndi_protocol as ndi
 from sim.aurora_emulator import FAULT_KINDS, AuroraEmulator, AuroraEmulatorConfig
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 VECTORS = json.loads((Path(__file__).parents[1] / "realtime" / "vectors" / "aurora.json").read_text(encoding="utf-8"))
 MS = 1_000_000
@@ -22,7 +22,9 @@ QUIET = {"position_noise_m": 0.0, "orientation_noise_rad": 0.0, "frame_jitter_s"
 class Console:
     """Sends one command at a time and reads its whole reply."""
 
-    def __init__(self, config: AuroraEmulatorConfig | None = None, faults: tuple[Fault, ...] = (), seed: int = 1) -> None:
+    def __init__(
+        self, config: AuroraEmulatorConfig | None = None, faults: tuple[SensorFault, ...] = (), seed: int = 1
+    ) -> None:
         self.device = AuroraEmulator(config or AuroraEmulatorConfig(**QUIET), seed, faults)
         self.now_ns = 0
         self.baud = 9600
@@ -181,7 +183,7 @@ def test_replies_leave_one_after_the_other() -> None:
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
 def test_a_frame_can_be_had_after_its_latency_and_not_before(late_s: float) -> None:
-    emulator = AuroraEmulator(AuroraEmulatorConfig(**QUIET), 1, [Fault("late", 0, MS, value=late_s)])
+    emulator = AuroraEmulator(AuroraEmulatorConfig(**QUIET), 1, [SensorFault("late", 0, MS, value=late_s)])
     emulator.sample(0, [STILL, STILL])
     ready_ns = 25 * MS + round(late_s * 1e9)
     assert emulator._frame_at(ready_ns - 1) is None
@@ -190,7 +192,7 @@ def test_a_frame_can_be_had_after_its_latency_and_not_before(late_s: float) -> N
 
 
 def test_poses_outside_the_volume_are_sent_only_when_asked_for() -> None:
-    console = Console(AuroraEmulatorConfig(handles=("0A",), **QUIET), (Fault("out_of_volume", 0, 10**18),))
+    console = Console(AuroraEmulatorConfig(handles=("0A",), **QUIET), (SensorFault("out_of_volume", 0, 10**18),))
     console.start()
     for option, state in (("0001", ndi.HandleState.MISSING), ("0801", ndi.HandleState.VALID)):
         (binary,) = ndi.ReplyReader().feed(console.send(ndi.command("BX", option)))
@@ -217,7 +219,7 @@ def test_a_pulled_tool_is_stale_until_freed_and_new_when_plugged() -> None:
 
 
 def test_frozen_poses_come_under_new_frame_numbers() -> None:
-    emulator = AuroraEmulator(seed=2, faults=[Fault("frozen", 100 * MS, 200 * MS, handle="0A")])
+    emulator = AuroraEmulator(seed=2, faults=[SensorFault("frozen", 100 * MS, 200 * MS, handle="0A")])
     seen = []
     for _ in range(12):
         emulator.sample(emulator.next_frame_ns, [STILL, STILL])
@@ -261,7 +263,7 @@ def test_dropouts_and_wild_poses_come_as_often_as_stated() -> None:
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str) -> None:
-    fault = Fault(kind, 8_000 * MS, 9_000 * MS, value={"wild": 0.05, "bit_errors": 0.02, "late": 0.5}.get(kind, 0.0))
+    fault = SensorFault(kind, 8_000 * MS, 9_000 * MS, value={"wild": 0.05, "bit_errors": 0.02, "late": 0.5}.get(kind, 0.0))
     console = Console(faults=(fault,))
     console.start()
     console.wait((fault.start_ns - console.now_ns) * 1e-9 - 0.3)
@@ -290,7 +292,7 @@ def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str) -> None:
 
 def test_an_unknown_fault_and_a_wrong_number_of_poses_are_refused() -> None:
     with pytest.raises(ValueError, match="gremlin"):
-        AuroraEmulator(faults=[Fault("gremlin", 0, 1)])
+        AuroraEmulator(faults=[SensorFault("gremlin", 0, 1)])
     with pytest.raises(ValueError, match="poses: found 1, wanted 2"):
         AuroraEmulator().sample(0, [STILL])
     with pytest.raises(ValueError, match="out of range"):

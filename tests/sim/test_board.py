@@ -16,7 +16,7 @@ from protocol.serial_codec import encode
 from protocol.serial_frames import DEADMAN_US, STOP_US, Fault, InputBit, Reject
 from realtime.drivers.stepper_board import LinkPhase
 from sim import board as board_module
-from sim.board import Board, BoardUnavailable, ensure_built, resolve_kind
+from sim.board import BoardUnavailable, SimulatedBoard, ensure_built, resolve_kind
 from tests.sim.board_rig import EVERY_BOARD, LIMITS, BoardRig, ramped_moves
 
 
@@ -324,15 +324,15 @@ def test_bad_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="board kind: found 'steel'"):
         resolve_kind("steel")
     with pytest.raises(ValueError, match="mcu: found 'z80'"):
-        Board("native", "z80")
-    with Board("native") as board:
+        SimulatedBoard("native", "z80")
+    with SimulatedBoard("native") as board:
         board.exchange(2000)
         with pytest.raises(ValueError, match="until_us: found 1000"):
             board.exchange(1000)
 
 
 def test_a_dead_child_is_one_line() -> None:
-    board = Board("native")
+    board = SimulatedBoard("native")
     os.kill(board.pid, signal.SIGKILL)
     with pytest.raises(BoardUnavailable, match=r"board native: the child process \d+ died"):
         for k in range(1, 100):

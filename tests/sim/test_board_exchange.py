@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from protocol.serial_codec import StreamDecoder
-from realtime.drivers.stepper_board import EventKind, StepperBoardLink
-from sim.board import Board
+from realtime.drivers.stepper_board import BoardEventKind, StepperBoardLink
+from sim.board import SimulatedBoard
 from tests.references.make_board_exchange import PATH, exchange
 from tests.sim.board_rig import EVERY_BOARD, LIMITS, BoardRig
 
@@ -33,7 +33,7 @@ def test_the_client_understands_what_was_recorded() -> None:
             told += [
                 event
                 for event in link.feed(bytes.fromhex(piece["hex"]), piece["at_us"] * 1000)
-                if event.kind is not EventKind.STATUS
+                if event.kind is not BoardEventKind.STATUS
             ]
     assert [event.message for event in told] == RECORDED["events"]
     status = link.status
@@ -67,7 +67,7 @@ def test_every_board_answers_the_recorded_commands_alike(kind: tuple[str, str]) 
 def _answers_of(kind: str, mcu: str) -> list[tuple[bytes, int]]:
     """What a board answers to the recorded bytes, each in its millisecond."""
     said: list[tuple[bytes, int]] = []
-    with Board(kind, mcu) as board:
+    with SimulatedBoard(kind, mcu) as board:
         by_time, limits = {turn["at_us"]: turn for turn in TURNS}, 0
         for at_us in range(1000, max(by_time) + 20_000, 1000):
             turn = by_time.get(at_us, {"to_board": "", "limit_bits": limits})

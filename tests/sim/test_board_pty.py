@@ -8,14 +8,14 @@ import pytest
 from protocol.serial_frames import BAUD
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 from realtime.drivers.transport import open_serial
-from sim.board import Board, BoardSlice
+from sim.board import BoardSlice, SimulatedBoard
 from sim.board_pty import BoardInputs, BoardPty, run_paced
 from tests.sim.board_rig import LIMITS
 
 
 @pytest.fixture
 def pty() -> Iterator[BoardPty]:
-    with BoardPty(Board("native")) as pty:
+    with BoardPty(SimulatedBoard("native")) as pty:
         yield pty
 
 

@@ -10,7 +10,7 @@ from protocol.board_pins import SWITCHES
 from protocol.enums import BoardState
 from protocol.rig_file import Pins
 from protocol.serial_frames import Fault, InputBit
-from sim.board import BUILD_DIR, Board
+from sim.board import BUILD_DIR, SimulatedBoard
 from tests.sim.board_rig import BoardRig
 
 
@@ -119,5 +119,5 @@ def test_another_polarity_is_a_build_of_its_own() -> None:
     usual, other = Pins.model_validate({}).build(), Pins.model_validate({"enable_active": "high"}).build()
     assert usual.folder == BUILD_DIR.name and not usual.variables
     assert other.folder != usual.folder and "-DBOARD_ENABLE_ACTIVE_LOW=0" in other.variables[1]
-    with Board("native", build=Pins.model_validate({"keep_enabled": True}).build()) as board:
+    with SimulatedBoard("native", build=Pins.model_validate({"keep_enabled": True}).build()) as board:
         assert not board.exchange(1000).enabled

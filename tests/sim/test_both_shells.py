@@ -21,7 +21,7 @@ from realtime.loop.loop_thread import NativeLoop
 from sim.forked_board import LibraryBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 from sim.world import World
 from tests.realtime.conftest import RIG_FILE
 
@@ -126,7 +126,7 @@ def eventful(run: Recorded) -> None:
     run.command("target", "position", target_m=(0.0, 0.0, 0.5))
     run.run(0.5)
     now_ns = run.world.now_ns
-    run.world.tracker.faults.append(Fault("silent", now_ns, now_ns + 1_500_000_000))
+    run.world.tracker.faults.append(SensorFault("silent", now_ns, now_ns + 1_500_000_000))
     run.run(1.0)
     run.command("arm")
     run.run(5.0, lambda: run.phase == Phase.DISARMED)

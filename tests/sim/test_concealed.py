@@ -18,7 +18,7 @@ from sim.concealed.menu import MENU, UNLISTED
 from sim.concealed.signals import KINDS, QUIET_S, coloured, lost, presses, signal, windows
 from sim.concealed.suite import Plan
 from sim.concealed.system import Planted
-from sim.effects import Effect, pack
+from sim.effects import PlantedEffect, pack
 
 GENERIC = ("transmission", "axis", "impedance")
 
@@ -76,7 +76,7 @@ def test_a_rig_without_effects_is_the_nominal_one(closed: bool) -> None:
 def test_feedback_hides_a_standing_effect() -> None:
     case = concealed_rig.draw(np.random.default_rng(4), True)
     shift = [
-        Effect(
+        PlantedEffect(
             "base_motion", "base", {"x_m": 0.0, "y_m": 0.001, "z_m": 0.0, "x_rad": 0.0, "frequency_Hz": 0.0, "rise_s": 0.5}
         )
     ]
@@ -133,7 +133,7 @@ def test_a_mode_faster_than_the_recordings_is_refused() -> None:
 def test_every_dish_is_in_the_catalogue_at_every_size(kind: str) -> None:
     for dish in MENU[kind]:
         for size in (0.3 if dish.id == "resonance" else 0.02, 1.0, 8.0):
-            pack([Effect(dish.id, dish.port, dish.make(size))])
+            pack([PlantedEffect(dish.id, dish.port, dish.make(size))])
             assert set(dish.compared) <= set(dish.make(size))
 
 

@@ -4,12 +4,12 @@ import os
 
 import numpy as np
 
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.forked_board import ForkableBoard, LibraryBoard, ReplayedBoard, forkable_board
 from tests.sim.test_scenario import scenario
 
 
-def brought_up(board: Board) -> tuple[str, int]:
+def brought_up(board: SimulatedBoard) -> tuple[str, int]:
     run = scenario(board, 4)
     assert run.arm()
     run.command("target", "position", target_m=(0.0, -0.0107, 0.021))
@@ -18,7 +18,7 @@ def brought_up(board: Board) -> tuple[str, int]:
 
 
 def test_the_library_gives_the_same_edges_as_the_child() -> None:
-    with Board("native") as child, LibraryBoard() as library:
+    with SimulatedBoard("native") as child, LibraryBoard() as library:
         expected, edges = brought_up(child)
         assert edges > 100
         assert brought_up(library) == (expected, edges)

@@ -3,7 +3,7 @@
 from protocol.serial_codec import StreamDecoder, encode
 from realtime.core.lines import FromRig, ToRig
 from sim.line_noise import LineNoise
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 FOREVER = 1 << 60
 
@@ -14,7 +14,7 @@ def frames(count: int) -> bytes:
 
 def through(kind: str, value: float, data: bytes, seed: int = 1) -> tuple[bytes, LineNoise]:
     noise = LineNoise(seed)
-    noise.add(Fault(kind, 0, FOREVER, value=value))
+    noise.add(SensorFault(kind, 0, FOREVER, value=value))
     return noise.outgoing(ToRig(board=data), 1).board, noise
 
 
@@ -25,7 +25,7 @@ def test_a_good_cable_passes_all_bytes_as_they_are() -> None:
 
 def test_a_fault_ends_when_it_ends() -> None:
     noise = LineNoise(1)
-    noise.add(Fault("cut", 10, 20))
+    noise.add(SensorFault("cut", 10, 20))
     assert noise.outgoing(ToRig(board=frames(2)), 15).board == b""
     assert noise.outgoing(ToRig(board=frames(2)), 20).board == frames(2)
 
@@ -52,7 +52,7 @@ def test_bit_errors_come_at_their_rate_and_the_same_for_the_same_seed() -> None:
 
 def test_a_flood_multiplies_and_a_frame_in_parts_arrives_whole() -> None:
     noise = LineNoise(1)
-    noise.add(Fault("flood_in", 0, FOREVER, value=10.0))
+    noise.add(SensorFault("flood_in", 0, FOREVER, value=10.0))
     data = frames(3)
     first = noise.incoming(FromRig(board=data[:7], force=[b"r"]), 1)
     second = noise.incoming(FromRig(board=data[7:]), 2)

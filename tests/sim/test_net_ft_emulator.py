@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from realtime.drivers.net_ft_calibration import parse_calibration
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 
 VECTORS = json.loads((Path(__file__).parents[1] / "realtime" / "vectors" / "net_ft.json").read_text(encoding="utf-8"))
 MS = 1_000_000
@@ -121,7 +121,7 @@ def test_beyond_the_range_the_gauges_saturate_and_the_status_says_so() -> None:
 )
 def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str, value: float) -> None:
     config = NetFtEmulatorConfig(force_noise_N=0.001)
-    device = NetFtEmulator(config, 5, [Fault(kind, 1_000 * MS, 2_000 * MS, value=value)])
+    device = NetFtEmulator(config, 5, [SensorFault(kind, 1_000 * MS, 2_000 * MS, value=value)])
     device.feed(START, 0)
     before, during, after = run(device, 1.0), run(device, 1.0), run(device, 1.0)
     for calm in (before, after):
@@ -147,7 +147,7 @@ def test_a_fault_lasts_as_long_as_it_is_asked_for(kind: str, value: float) -> No
 
 def test_the_same_seed_gives_the_same_datagrams() -> None:
     def datagrams(seed: int) -> list[tuple[int, ...]]:
-        device = NetFtEmulator(NetFtEmulatorConfig(), seed, [Fault("reorder", 0, 10**9, value=0.1)])
+        device = NetFtEmulator(NetFtEmulatorConfig(), seed, [SensorFault("reorder", 0, 10**9, value=0.1)])
         device.feed(START, 0)
         return run(device, 0.5)
 
@@ -166,4 +166,4 @@ def test_an_impossible_rate_or_fault_is_refused() -> None:
     with pytest.raises(ValueError, match="rate_hz"):
         NetFtEmulatorConfig(rate_hz=999.0)
     with pytest.raises(ValueError, match="gremlin"):
-        NetFtEmulator(faults=[Fault("gremlin", 0, 1)])
+        NetFtEmulator(faults=[SensorFault("gremlin", 0, 1)])

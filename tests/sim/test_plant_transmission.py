@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sim import vessel
-from sim.effects import Effect
+from sim.effects import PlantedEffect
 from sim.plant import Plant, PlantConfig
-from sim.stages import Stages, StagesConfig
+from sim.stages import SimulatedStages, StagesConfig
 from sim.tissue import TissueConfig
 from sim.vessel import VesselConfig
 
@@ -107,7 +107,7 @@ def test_changeover_holds_the_curvature_after_a_stop_and_only_there() -> None:
 
 
 def test_stage_positions_are_edges_over_steps_per_unit() -> None:
-    stages = Stages()
+    stages = SimulatedStages()
     for _ in range(100):
         position = stages.advance(1e-3, [0] * 16 + [1, 2, 2], [1] * 16 + [-1, 1, 1])
     assert position == pytest.approx([1600 / 320000, -100 * 2 * np.pi / 12800, 200 * 2 * np.pi / 12800])
@@ -115,7 +115,7 @@ def test_stage_positions_are_edges_over_steps_per_unit() -> None:
 
 
 def test_screw_error_repeats_every_turn_and_hides_from_the_encoder() -> None:
-    stages = Stages(StagesConfig(screw_error_unit=(2e-5, 0.0, 0.0)))
+    stages = SimulatedStages(StagesConfig(screw_error_unit=(2e-5, 0.0, 0.0)))
     errors = []
     for _ in range(1280):
         position = stages.advance(1e-3, [0], [1])
@@ -125,14 +125,14 @@ def test_screw_error_repeats_every_turn_and_hides_from_the_encoder() -> None:
 
 
 def test_a_heavy_rotor_lags_and_rings_then_arrives() -> None:
-    stages = Stages(StagesConfig(rotor_Hz=(40.0, 0.0, 0.0)))
+    stages = SimulatedStages(StagesConfig(rotor_Hz=(40.0, 0.0, 0.0)))
     track = [stages.advance(1e-3, [0] * (16 if n < 50 else 0), [1] * (16 if n < 50 else 0))[0] for n in range(400)]
     assert track[10] < 11 * 16 / 320000 - 1e-5
     assert max(track) > 800 / 320000 + 1e-6
     assert track[-1] == pytest.approx(800 / 320000, abs=1e-9)
 
 
-def gaps_of(stages: Stages, slices: int, edges: list[int]) -> list[float]:
+def gaps_of(stages: SimulatedStages, slices: int, edges: list[int]) -> list[float]:
     """Steps that the insertion rotor is behind its field, after each of so many milliseconds with these edges."""
     gaps = []
     for _ in range(slices):
@@ -142,7 +142,7 @@ def gaps_of(stages: Stages, slices: int, edges: list[int]) -> list[float]:
 
 
 def test_a_jammed_rotor_stands_until_its_time_or_its_steps_are_over_and_loses_what_is_commanded_only() -> None:
-    stages = Stages()
+    stages = SimulatedStages()
     stages.jam(0, 1000.0, 0.05)
     assert gaps_of(stages, 20, []) == [0.0] * 20
     assert gaps_of(stages, 20, [1, 1]) == [2.0 * k for k in range(1, 21)]
@@ -154,7 +154,7 @@ def test_a_jammed_rotor_stands_until_its_time_or_its_steps_are_over_and_loses_wh
 
 @pytest.mark.parametrize("steps", [-100.0, 100.0])
 def test_a_slipping_rotor_falls_back_at_its_speed_and_no_further(steps: float) -> None:
-    stages = Stages()
+    stages = SimulatedStages()
     stages.slip(0, steps, 1.0, 0.025)
     gaps = gaps_of(stages, 30, [1])
     assert gaps[:3] == [np.sign(steps) * k * 8.0 for k in (1, 2, 3)] and gaps[-1] == steps
@@ -163,7 +163,7 @@ def test_a_slipping_rotor_falls_back_at_its_speed_and_no_further(steps: float) -
 
 
 def test_missed_steps_part_command_and_encoder_for_good() -> None:
-    stages = Stages(effects=(Effect("missed_steps", "insertion", {"steps": 37.0}, start_s=0.05),))
+    stages = SimulatedStages(effects=(PlantedEffect("missed_steps", "insertion", {"steps": 37.0}, start_s=0.05),))
     gaps = []
     for _ in range(200):
         stages.advance(1e-3, [0, 0], [1, 1])

@@ -11,7 +11,7 @@ from protocol.enums import Phase
 from protocol.rig_file import load_rig
 from protocol.topics import Message
 from realtime.core.lines import ToRig
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
 from sim.world import World
@@ -21,7 +21,7 @@ TARGET = ContactJob(target_m=(0.0, -0.0107, 0.025), hold_s=3.0)
 HERE = Path(__file__).parents[2]
 
 
-def scenario(board: Board, seed: int = 1, heard: dict[str, list[Message]] | None = None) -> Scenario:
+def scenario(board: SimulatedBoard, seed: int = 1, heard: dict[str, list[Message]] | None = None) -> Scenario:
     rig = load_rig(RIG_FILE)
     plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), seed)
 
@@ -34,11 +34,11 @@ def scenario(board: Board, seed: int = 1, heard: dict[str, list[Message]] | None
 
 @pytest.fixture
 def board():  # type: ignore[no-untyped-def]
-    with Board("native") as made:
+    with SimulatedBoard("native") as made:
         yield made
 
 
-def test_the_tip_comes_to_the_wall_and_holds(board: Board) -> None:
+def test_the_tip_comes_to_the_wall_and_holds(board: SimulatedBoard) -> None:
     heard: dict[str, list[Message]] = {}
     run = scenario(board, heard=heard)
     outcome = run.press(TARGET)
@@ -103,13 +103,13 @@ def rest_after(run: Scenario, seconds: float) -> float:
     return (last_ns - begin_ns) * 1e-9
 
 
-def test_without_the_computer_the_stages_rest_within_100_ms(board: Board) -> None:
+def test_without_the_computer_the_stages_rest_within_100_ms(board: SimulatedBoard) -> None:
     run = scenario(board)
     in_contact(run)
     assert rest_after(run, 0.5) <= 0.100
 
 
-def test_a_reset_board_stops_the_loop_until_an_operator_clears_it(board: Board) -> None:
+def test_a_reset_board_stops_the_loop_until_an_operator_clears_it(board: SimulatedBoard) -> None:
     run = scenario(board)
     in_contact(run)
     board.reset()
@@ -121,7 +121,7 @@ def test_a_reset_board_stops_the_loop_until_an_operator_clears_it(board: Board) 
     assert any("reset" in fault for fault in run.loop.core.board_errors)
 
 
-def test_the_emergency_stop_holds_everything(board: Board) -> None:
+def test_the_emergency_stop_holds_everything(board: SimulatedBoard) -> None:
     run = scenario(board)
     in_contact(run)
     run.world.estop = True

@@ -12,7 +12,7 @@ from realtime.control import safety
 from sim.forked_board import forkable_board
 from sim.plant import Plant, PlantConfig
 from sim.scenario import ContactJob, Scenario
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 from sim.world import World
 from tests.realtime.conftest import RIG_FILE
 
@@ -78,7 +78,7 @@ class Job:
     def fail(self, sensor: str, kind: str, seconds: float) -> None:
         """From now on, for `seconds`."""
         box = self.world.force_box if sensor == "force" else self.world.tracker
-        box.faults.append(Fault(kind, self.world.now_ns, self.world.now_ns + round(seconds * 1e9)))
+        box.faults.append(SensorFault(kind, self.world.now_ns, self.world.now_ns + round(seconds * 1e9)))
 
     @property
     def phase(self) -> int:
@@ -149,7 +149,7 @@ def test_a_short_gap_in_the_poses_is_bridged(phase: str) -> None:
 def test_wild_poses_are_told_and_not_followed() -> None:
     job = Job("hold")
     box = job.world.tracker
-    box.faults.append(Fault("wild", job.world.now_ns, job.world.now_ns + 60_000_000, value=0.1))
+    box.faults.append(SensorFault("wild", job.world.now_ns, job.world.now_ns + 60_000_000, value=0.1))
     force_N = job.go(0.6)
     assert "pose_rejected" in job.causes and job.phase in (Phase.CONTACT, Phase.RETRACT)
     assert np.max(np.abs(force_N - JOB.force_N)) < 0.2

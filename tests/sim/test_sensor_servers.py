@@ -11,7 +11,7 @@ import pytest
 
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import check_aurora, check_net_ft
-from realtime.drivers.device_events import DeviceEvent, EventKind
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import ForceSample, NetFtConfig
 from realtime.drivers.net_ft_calibration import fetch_calibration
 from realtime.drivers.pose_sample import PoseSample
@@ -19,7 +19,7 @@ from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
 from realtime.drivers.transport import open_serial
 from sim.aurora_emulator import AuroraEmulator, AuroraEmulatorConfig
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
-from sim.sensor_faults import Fault
+from sim.sensor_faults import SensorFault
 from sim.sensor_servers import AuroraPty, NetFtUdp, SensorServers
 from tests.waiting import until
 
@@ -35,8 +35,8 @@ class Rig:
     poses: list[PoseSample] = field(default_factory=list)
     forces: list[ForceSample] = field(default_factory=list)
 
-    def kinds(self, device: str) -> list[EventKind]:
-        kept = (EventKind.TRACKING, EventKind.LOST, EventKind.RECONNECTED)
+    def kinds(self, device: str) -> list[DeviceEventKind]:
+        kept = (DeviceEventKind.TRACKING, DeviceEventKind.LOST, DeviceEventKind.RECONNECTED)
         return [event.kind for event in list(self.events) if event.device == device and event.kind in kept]
 
 
@@ -70,10 +70,10 @@ def test_an_aurora_on_a_pty_is_read_unplugged_and_found_again(rig: Rig, tmp_path
     assert rig.aurora.emulator.baud == 921600
     with rig.servers.lock:
         rig.aurora.unplug()
-    until(lambda: EventKind.LOST in rig.kinds("aurora"), "the loss to be noticed")
+    until(lambda: DeviceEventKind.LOST in rig.kinds("aurora"), "the loss to be noticed")
     with rig.servers.lock:
         rig.aurora.plug()
-    until(lambda: EventKind.RECONNECTED in rig.kinds("aurora"), "the device to be found again")
+    until(lambda: DeviceEventKind.RECONNECTED in rig.kinds("aurora"), "the device to be found again")
     count = len(rig.poses)
     until(lambda: len(rig.poses) > count + 20, "poses after the reconnection")
     thread.stop()
@@ -96,10 +96,10 @@ def test_a_net_ft_box_is_read_biased_unplugged_and_found_again(rig: Rig) -> None
     until(lambda: abs(rig.forces[-1].force_N[2]) < 0.03, "the bias")
     with rig.servers.lock:
         rig.net_ft.unplug()
-    until(lambda: EventKind.LOST in rig.kinds("net_ft"), "the loss to be noticed")
+    until(lambda: DeviceEventKind.LOST in rig.kinds("net_ft"), "the loss to be noticed")
     with rig.servers.lock:
         rig.net_ft.plug()
-    until(lambda: EventKind.RECONNECTED in rig.kinds("net_ft"), "the box to be found again")
+    until(lambda: DeviceEventKind.RECONNECTED in rig.kinds("net_ft"), "the box to be found again")
     thread.stop()
     assert thread.error is None and not thread.is_alive()
 
@@ -125,7 +125,7 @@ def test_a_port_that_is_not_there_is_tried_for_ever(tmp_path: Path) -> None:
     until(lambda: thread.failures >= 2, "two attempts")
     thread.stop()
     assert thread.error is None and not thread.is_alive()
-    assert all(event.kind is EventKind.ERROR and "nothing" in event.text for event in events)
+    assert all(event.kind is DeviceEventKind.ERROR and "nothing" in event.text for event in events)
 
 
 def test_what_a_callback_raises_ends_the_thread_and_is_kept(rig: Rig) -> None:
@@ -154,8 +154,8 @@ def test_check_device_finds_good_devices_good(rig: Rig, tmp_path: Path) -> None:
 
 
 def test_check_device_names_what_is_wrong(rig: Rig, tmp_path: Path) -> None:
-    rig.aurora.emulator.faults.append(Fault("missing", 0, 10**19, handle="0B"))
-    rig.net_ft.emulator.faults.append(Fault("drop", 0, 10**19, value=0.2))
+    rig.aurora.emulator.faults.append(SensorFault("missing", 0, 10**19, handle="0B"))
+    rig.net_ft.emulator.faults.append(SensorFault("drop", 0, 10**19, value=0.2))
     config = AuroraConfig(tools=("0A", "0B", "0C"), poll_timeout_s=2.0)
     aurora = check_aurora(lambda: open_serial(str(tmp_path / "aurora"), 9600), config, 1.0)
     assert not aurora.good

@@ -21,7 +21,7 @@ from host.estimation.sensor_noise import (
 from host.estimation.spatial import FAIR_DEVIATIONS, LARGEST_FORCE_N, start_grid
 from host.estimation.spatial_kernels import (
     QUICK,
-    PoseSample,
+    MeasuredPose,
     Scratch,
     best_of,
     cost_at,
@@ -46,7 +46,7 @@ NO_STARTS, NO_PRIOR = np.zeros((0, 3)), np.zeros((0, 3))
 
 
 @njit(cache=True, nogil=True)
-def _estimates(p: PoseSample, start: Array, starts: Array, fair: float, x: Array, s: Scratch, repeats: int) -> None:
+def _estimates(p: MeasuredPose, start: Array, starts: Array, fair: float, x: Array, s: Scratch, repeats: int) -> None:
     for _ in range(repeats):
         x[:] = start
         best_of(p, LARGEST_FORCE_N, starts, fair, x, s)
@@ -66,7 +66,7 @@ def unweighted(case: int) -> Array:
     return np.diag([1.0 / LENGTH_m] * positions + [0.5] * (rows - positions))
 
 
-def problem(case: int, sample: SpatialCase, positions: Array, quaternions: Array, W: Array) -> PoseSample:
+def problem(case: int, sample: SpatialCase, positions: Array, quaternions: Array, W: Array) -> MeasuredPose:
     """The sample as the kernels take it, from poses of all three sensors."""
     count = int(SENSORS_OF_CASE[case])
     return sample_of(
@@ -84,7 +84,7 @@ def problem(case: int, sample: SpatialCase, positions: Array, quaternions: Array
 class EstimateCalls:
     """One sample on our side; `force` is what the last run left."""
 
-    def __init__(self, p: PoseSample, start: Array, fair: float) -> None:
+    def __init__(self, p: MeasuredPose, start: Array, fair: float) -> None:
         self.p, self.start, self.fair, self.force = p, start, fair, np.zeros(3)
         self.starts, self.scratch = start_grid(LARGEST_FORCE_N), new_scratch(len(p.stations))
 
@@ -95,7 +95,7 @@ class EstimateCalls:
 class EstimatePeer:
     """The same sample for scipy: Levenberg-Marquardt of MINPACK with differences, on our model at our accuracy."""
 
-    def __init__(self, p: PoseSample, start: Array) -> None:
+    def __init__(self, p: MeasuredPose, start: Array) -> None:
         self.p, self.start, self.force, self.scratch = p, start, np.zeros(3), new_scratch(len(p.stations))
         self.rows = int(ROWS_OF_CASE[p.case])
 

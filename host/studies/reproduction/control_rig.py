@@ -13,7 +13,7 @@ from host.report.style import MUTED
 from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
 from protocol.topics import Message
-from sim.board import Board
+from sim.board import SimulatedBoard
 from sim.heart import HeartConfig
 from sim.scenario import ContactJob, Scenario
 from sim.tissue import TissueConfig
@@ -110,7 +110,7 @@ def experiment(
         if topic in heard:
             heard[topic].append(message)
 
-    with Board(board) as made:
+    with SimulatedBoard(board) as made:
         scenario = Scenario(rig, World(rig, plant, made, seed), publish)
         job = ContactJob(tuple(point), where.into, force_N=wanted_N, hold_s=hold_s, approach_s=8.0)
         outcome = scenario.press(job)

@@ -10,7 +10,7 @@ from host.diagnosis.live.watch import Watch, watch
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 from protocol.zenoh_session import Session
-from sim.effects import Effect, parse
+from sim.effects import PlantedEffect, parse
 from sim.plant import Plant, PlantConfig
 from tests.waiting import free_port, until
 
@@ -20,7 +20,7 @@ STEP_NS = 1_000_000
 Heard = tuple[int, str, Message]
 
 
-def messages(effects: tuple[Effect, ...], seconds: float, seed: int = 1) -> Iterator[Heard]:
+def messages(effects: tuple[PlantedEffect, ...], seconds: float, seed: int = 1) -> Iterator[Heard]:
     """What a rig under a hand that moves all axes in front of the wall and onto it would publish, with its arrival (ns)."""
     plant = Plant(PlantConfig(tool_offsets_m=(0.0, RIG.tracker.shaft_sensor_offset_m), effects=effects), seed)
     rng, frame = np.random.default_rng(seed), 0
@@ -71,7 +71,7 @@ def _pose(plant: Plant, tool: int, now: int, frame: int, rng: np.random.Generato
     )
 
 
-def alarms(effects: tuple[Effect, ...], seconds: float = END_S, seed: int = 1) -> list[Alarm]:
+def alarms(effects: tuple[PlantedEffect, ...], seconds: float = END_S, seed: int = 1) -> list[Alarm]:
     watcher, found = Watch(RIG), []
     for _, topic, message in sorted(messages(effects, seconds, seed), key=lambda heard: heard[0]):
         watcher.hear(topic, message)
@@ -147,7 +147,9 @@ def test_watch_publishes_what_it_finds() -> None:
 
 
 def test_effects_of_the_command_line() -> None:
-    assert parse("backlash@insertion:width_m=0.002,start_s=25") == Effect("backlash", "insertion", {"width_m": 0.002}, 25.0)
+    assert parse("backlash@insertion:width_m=0.002,start_s=25") == PlantedEffect(
+        "backlash", "insertion", {"width_m": 0.002}, 25.0
+    )
     with pytest.raises(ValueError, match="found 'width', wanted NAME=NUMBER"):
         parse("backlash@insertion:width")
     with pytest.raises(ValueError, match="found parameter 'wide_m'"):
