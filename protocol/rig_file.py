@@ -61,12 +61,16 @@ class StageSection(_Section):
 
 
 class StagesSection(_Section):
+    """The three stepper axes."""
+
     insertion: StageSection
     roll: StageSection
     knob: StageSection
 
 
 class CatheterSection(_Section):
+    """The catheter in the handle: `name` of its file, exposed length and largest curvature that the knob makes."""
+
     name: str
     distal_length_m: Annotated[float, Field(gt=0.01, le=0.3)]
     max_curvature_per_m: Annotated[float, Field(gt=0, le=100)]
@@ -172,6 +176,8 @@ class Pins(_Section):
 
 
 class BoardSection(_Section):
+    """The stepper board: its serial port, how far ahead set-points are sent, how long they hold, its pins."""
+
     port: str
     baud: Annotated[int, Field(gt=9600, le=1_000_000)]
     setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
@@ -217,6 +223,8 @@ class ControlSection(_Section):
 
 
 class Safety(_Section):
+    """Limits of force, silence, speed and place. `HARD_*` bound them: no rig file can widen those."""
+
     over_force_N: Annotated[float, Field(gt=0, le=HARD_MAX_FORCE_N)]
     hold_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
     stop_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
@@ -237,6 +245,8 @@ class Safety(_Section):
 
 
 class Zenoh(_Section):
+    """Zenoh endpoints: where the model process listens, where the others connect."""
+
     listen: list[str]
     connect: list[str]
 

@@ -55,7 +55,9 @@ def _with_memory(e, x: float, load: float, curvature: float, time_s: float, dt_s
 
 
 @njit(cache=True)
-def _elastic(e, x: float, load: float, stage: Array, time_s: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
+def _elastic(  # type: ignore[no-untyped-def]  # noqa: C901 - one branch for each effect
+    e, x: float, load: float, stage: Array, time_s: float, dt_s: float
+) -> float:
     """Elastic and static effects, disturbances, resonance."""
     if e.port == code.SHAPE and (
         e.code in (code.NONLINEAR_STIFFNESS, code.CREEP_RELAXATION, code.PLASTIC_SET, code.SOFTENING, code.ASYMMETRY)

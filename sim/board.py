@@ -118,7 +118,7 @@ def _missing_tools(kind: str) -> list[str]:
 
 
 def resolve_kind(kind: str) -> str:
-    """ "avr" or "native". "auto" is avr where its tools are there, else native with one line on standard error.
+    """Return "avr" or "native"; "auto" is avr where its tools are installed, else native with one line on standard error.
 
     Raises ValueError for another kind.
     """

@@ -59,7 +59,7 @@ class LibraryBoard(SimulatedBoard):
 
 
 class ReplayedBoard(SimulatedBoard):
-    """As `Board`, in a child; keeps what it was asked, so that `after_fork` can bring a new child to the same state."""
+    """A `SimulatedBoard` in a child process. It keeps its inputs, so that `after_fork` can replay them in a new child."""
 
     def __init__(self, kind: str, mcu: str = "atmega2560") -> None:
         self._asked: list[bytes] = []

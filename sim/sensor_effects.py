@@ -168,7 +168,9 @@ def _dropped(e, rig, tool: int) -> bool:  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _reading(e, rig, at: int, x: Array, n: int) -> None:  # type: ignore[no-untyped-def]
+def _reading(  # type: ignore[no-untyped-def]  # noqa: C901 - one branch for each effect
+    e, rig, at: int, x: Array, n: int
+) -> None:
     """Effects on the first n numbers of the reading x (m or N); `at` is where this reading's memory begins."""
     since = rig.time_s - e.start_s
     if e.code == code.RATE_LAG or e.code == code.CREEP_RELAXATION:

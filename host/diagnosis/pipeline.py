@@ -239,6 +239,7 @@ def _figures(full: Problem, found: Found) -> Figures:
 
 
 def rms(parts: list[Array]) -> float:
+    """Return the RMS of all finite samples of `parts`, NaN where there are none."""
     together = np.concatenate(parts)
     together = together[np.isfinite(together)]
     return float(np.sqrt(np.mean(together**2))) if together.size else float("nan")

@@ -381,7 +381,7 @@ def best_of(p: MeasuredPose, largest_N: float, starts: Array, fair: float, x: Ar
 def sample_of(
     rod: Array, offsets: Array, case: int, positions: Array, quaternions: Array, W: Array, bend: float, prior: Array
 ) -> MeasuredPose:
-    """`MeasuredPose` of checked arrays: stations cut off at the base, the rod behind the last sensor if no more is needed."""
+    """Make a `MeasuredPose` of checked arrays: stations end at the base, or at the last sensor if that is enough."""
     total = rod[6] + rod[7]
     stations, inside = np.minimum(offsets, total), np.maximum(offsets - total, 0.0)
     used = rod

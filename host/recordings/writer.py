@@ -92,6 +92,7 @@ class GuardedFile:
         self.error: OSError | None = None
 
     def write(self, data: bytes) -> int:
+        """Write all of `data`, or keep the error; return its length, as a file does."""
         view = memoryview(data)
         try:
             while self.error is None and len(view):
@@ -102,6 +103,7 @@ class GuardedFile:
         return len(data)
 
     def tell(self) -> int:
+        """Return the number of bytes written so far."""
         return self._position
 
     def flush(self) -> None:
@@ -125,6 +127,7 @@ class GuardedFile:
         os.ftruncate(self._fd, self._whole)
 
     def close(self) -> None:
+        """Close the file."""
         os.close(self._fd)
 
 

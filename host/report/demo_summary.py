@@ -20,16 +20,20 @@ class FinishedRun(Protocol):
     """What is known of a run in addition to its recording: how it ended, and what the loop and the board counted."""
 
     @property
-    def recording(self) -> Path: ...
+    def recording(self) -> Path:
+        """Path of the recording."""
 
     @property
-    def outcome(self) -> Any: ...
+    def outcome(self) -> Any:
+        """How the scenario ended (`sim.scenario.Outcome`)."""
 
     @property
-    def counts(self) -> Mapping[str, Any]: ...
+    def counts(self) -> Mapping[str, Any]:
+        """Counters of the loop and the board, by name."""
 
     @property
-    def interrupted(self) -> str: ...
+    def interrupted(self) -> str:
+        """Name of the signal that ended the run, empty if none did."""
 
 
 def demo_result(recording: Recording, run: FinishedRun, report: Path) -> dict[str, Any]:

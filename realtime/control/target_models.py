@@ -187,6 +187,7 @@ def innovation_variance(state: TargetState, m: int, noise_m2: float, travel_m: f
 
 @njit(cache=True)
 def correct(state: TargetState, m: int, innovation: float, spread: float) -> None:
+    """Correct model `m` by an innovation (m) of variance `spread` (m2): gain, state and covariance of the Kalman filter."""
     x, P, cross = state.x[m], state.P[m], state.cross
     n = 2 if m == LOCAL else N
     for i in range(n):

@@ -136,7 +136,7 @@ def crc16(data: bytes) -> int:
 
 
 def command(name: str, parameters: str = "") -> bytes:
-    """Bytes of a command with its CRC, e.g. command("INIT") = b"INIT:E3A5\\r"."""
+    r"""Return the bytes of a command with its CRC, e.g. b"INIT:E3A5\r" for INIT."""
     body = f"{name}:{parameters}".encode("ascii")
     return body + b"%04X\r" % crc16(body)
 

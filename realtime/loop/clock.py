@@ -68,9 +68,11 @@ class Clock:
 
     @property
     def is_virtual(self) -> bool:
+        """Whether time is handed out by `advance_to`."""
         return bool(self.words[KIND] == VIRTUAL)
 
     def now_ns(self) -> int:
+        """Return the time in ns."""
         return int(self.words[NOW]) if self.is_virtual else time.monotonic_ns()
 
     def advance_to(self, time_ns: int) -> None:

@@ -55,7 +55,7 @@ class NativeLoop:
     `lateness` and `work` are histograms (see `realtime.loop.latency`); whole once the loop has stopped.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - the records of the tick, and the ports of its loop by name
         self,
         tick: Callable[..., None],
         params: np.ndarray,

@@ -125,6 +125,7 @@ class Warp:
         self._play = math.nan
 
     def __call__(self, handle: Array, dt_s: float) -> Array:
+        """Return the handle positions (3,) that reach the rig in this step."""
         if self._last.size == 0:
             self._last = handle.copy()
         self._rate += ((handle - self._last) / dt_s - self._rate) * (1.0 - math.exp(-dt_s / 0.01))

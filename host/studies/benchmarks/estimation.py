@@ -89,6 +89,7 @@ class EstimateCalls:
         self.starts, self.scratch = start_grid(LARGEST_FORCE_N), new_scratch(len(p.stations))
 
     def __call__(self, repeats: int) -> None:
+        """Estimate the sample's force `repeats` times in compiled code."""
         _estimates(self.p, self.start, self.starts, self.fair, self.force, self.scratch, repeats)
 
 
@@ -104,6 +105,7 @@ class EstimatePeer:
         return self.scratch.z[: self.rows].copy()
 
     def __call__(self) -> None:
+        """Estimate the sample's force once."""
         self.force = least_squares(self._residual, self.start, method="lm", x_scale=0.1, max_nfev=400).x
 
 

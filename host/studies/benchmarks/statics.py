@@ -70,6 +70,7 @@ class SolveCalls:
         self._run = run
 
     def __call__(self, repeats: int) -> object:
+        """Solve the case `repeats` times in compiled code."""
         self.outcome = self._run(self.x, self.out, self.work, repeats)
         return self.outcome
 
@@ -87,6 +88,7 @@ class SolvePeer:
         self.position: Array | None = None
 
     def __call__(self) -> object:
+        """Solve the case once."""
         with np.errstate(all="ignore"):
             self.position = self._run()
         return self.position

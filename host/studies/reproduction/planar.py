@@ -41,7 +41,7 @@ FORCES_N, CURVATURES_PER_M = (0.15, 0.25, 0.35), (10.0, 20.0, 30.0)
 INSERTION_m = 0.0413
 
 
-def section(
+def section(  # noqa: PLR0913 - the fields of one figure, by name
     id: str,
     title: str,
     good: bool,

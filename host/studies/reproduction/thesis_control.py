@@ -84,7 +84,7 @@ class _Rod(NamedTuple):
 
 
 @njit(cache=True)
-def _shape(
+def _shape(  # noqa: PLR0913 - a kernel: plain arrays
     rod: _Rod,
     curvature: float,
     insertion_m: float,
@@ -157,7 +157,7 @@ def planar_inverse(x: float, y: float, length_m: float, last_curvature: float) -
 
 
 @njit(cache=True)
-def _run(
+def _run(  # noqa: PLR0913 - a kernel: plain arrays
     rod: _Rod,
     length_m: float,
     gains: Array,
