@@ -71,7 +71,22 @@ def find_files(spec: NominalSpec, named: list[str], data_folder: str | None) -> 
 def read_tables(spec: NominalSpec, sources: Sequence[Path | Table]) -> list[Table]:
     """Read those of `sources` that are files. Raises InputError."""
     read = rig_rows if spec.recorded_rig else read_table
-    return [source if isinstance(source, Table) else Table(source.name, read(source), source) for source in sources]
+    tables = [source if isinstance(source, Table) else Table(source.name, read(source), source) for source in sources]
+    return [part for table in tables for part in _separated(table, spec.data.by)]
+
+
+def _separated(table: Table, by: str | None) -> list[Table]:
+    """The recordings of one table: a new value of column `by` begins a new one, named after it."""
+    if by is None:
+        return [table]
+    if by not in table.columns:
+        raise InputError("data.by", by, f"a column of {table.name}: {', '.join(sorted(table.columns))}")
+    key = table.columns[by]
+    edges = [0, *(np.flatnonzero(key[1:] != key[:-1]) + 1), key.size]
+    return [
+        replace(table, name=f"{table.name} {by}={key[a]:g}", columns={name: v[a:b] for name, v in table.columns.items()})
+        for a, b in itertools.pairwise(int(edge) for edge in edges)
+    ]
 
 
 def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:

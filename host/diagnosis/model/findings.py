@@ -48,13 +48,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Pair:
-    """One input and the output that it drives, by a gain or by the terms `law` of input = m a + c v + k x."""
+    """One input and the output that it drives, by a gain or by the terms `law` of input = m a + c v + k x.
+
+    related: whether the nominal model connects the two at all (an impedance may follow its load alone).
+    """
 
     input: str
     output: str
     law: tuple[str, ...] = ()
     reads: str = "position"
     gain: float | None = None  # what the nominal model says of it
+    related: bool = True
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ def pairs_of(spec: NominalSpec) -> list[Pair]:
         found.append(Pair(spec.axis.input, spec.axis.output, law, spec.axis.reads))
     if spec.impedance is not None:
         law = tuple(term for term in spec.impedance.terms if term in ("mass", "damping", "stiffness"))
-        found.append(Pair(spec.impedance.output, spec.impedance.input, law))
+        found.append(Pair(spec.impedance.output, spec.impedance.input, law, related=bool(law)))
     return found
 
 
@@ -174,6 +178,8 @@ def _compared(
             says = f"Column {columns[name]} is a copy of column {output_column}: it cannot explain it, and is left out."
             findings.append(Finding("alias", columns[name], says))
             recordings = [_with(recording, name, np.zeros(recording.n)) for recording in recordings]
+    if not path.related:
+        return recordings
     if path.law:
         return _by_law(recordings, path, columns, findings)
     return _by_gain(recordings, path, columns, findings)
@@ -257,18 +263,19 @@ def _lead(recording: Recording, path: Pair) -> float:
     """Samples by which the output comes before the input, by the residual of a gain at each shift; 0 if it does not."""
     x, y = fill(recording.channels[path.input]), fill(recording.channels[path.output])
     most = min(x.size // 10, 200)
-    error = {}
-    for lag in range(0, most):
-        a, b = x[lag:], y[: y.size - lag]
-        a, b = a - a.mean(), b - b.mean()
-        spread = float(a @ a)
-        error[lag] = float(b @ b) - float(a @ b) ** 2 / spread if spread > 0.0 else float(b @ b)
-        error[lag] /= a.size
-    best = min(error, key=lambda lag: error[lag])
-    back = x[: x.size - 1], y[1:]  # were it merely late, a shift the other way would do no worse
-    a, b = back[0] - back[0].mean(), back[1] - back[1].mean()
-    later = (float(b @ b) - float(a @ b) ** 2 / max(float(a @ a), 1e-300)) / a.size
-    return float(best) if error[best] < 0.5 * min(error[0], later) else 0.0
+    if most < LEADS + 1:
+        return 0.0
+    leads = [_left(x[lag:], y[: y.size - lag]) for lag in range(most)]
+    lags = [_left(x[: x.size - lag], y[lag:]) for lag in range(most)]  # merely late, it would do no worse that way
+    best = int(np.argmin(leads))
+    return float(best) if leads[best] < 0.5 * min(leads[0], *lags) else 0.0
+
+
+def _left(x: Array, y: Array) -> float:
+    """Variance of `y` (n,) that a positive gain on `x` (n,) leaves: one that lags by half a period is no lead."""
+    a, b = x - x.mean(), y - y.mean()
+    across, spread = max(float(a @ b), 0.0), float(a @ a)
+    return (float(b @ b) - (across**2 / spread if spread > 0.0 else 0.0)) / a.size
 
 
 def regression(recording: Recording, path: Pair, exchanged: bool = False) -> tuple[Array, Array, float]:

@@ -39,6 +39,7 @@ class DataSpec(Request):
     heldout: list[str] | None = None
     pieces: list[PieceSpec] = []
     lead_rows: int = Field(default=0, ge=0)
+    by: str | None = None  # column of a file in which several recordings follow each other: a new value begins a new one
 
 
 class ParameterSpec(Request):

@@ -80,7 +80,7 @@ def next_step(result: Diagnosis) -> str:
     named = effects(result)
     if result.stopped_early:
         return "Diagnose again with a longer time budget: the search was stopped before its end."
-    first = next((finding for finding in result.findings if finding.id != "excitation"), None)
+    first = next((f for f in result.findings if f.id != "excitation" and (f.id, f.channel) != ("clock", "time")), None)
     if first is not None:
         return f"Put the data right first ({first.id}: {first.channel}), then diagnose again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]
@@ -92,7 +92,7 @@ def next_step(result: Diagnosis) -> str:
         return f"Record a further motion that shows {words(unsure[0]['id'])}, and diagnose again: it is not sure yet."
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
-    unseen = next((finding for finding in result.findings), None)
+    unseen = next((finding for finding in result.findings if finding.id == "excitation"), None)
     return unseen.says if unseen is not None else "Nothing: the nominal model explains these recordings."
 
 

@@ -1,0 +1,151 @@
+"""Arrays as people have them, through the public function: the truth is stated, or what cannot be told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from host.diagnosis import diagnose
+from host.diagnosis.estimation.evidence import Gain
+from host.diagnosis.estimation.rules import RULES
+from host.diagnosis.model.operators import lag, shift
+from host.diagnosis.selection.posterior import posterior
+
+Array = np.ndarray
+GEAR = {
+    "name": "gear",
+    "kind": "transmission",
+    "data": {"time": "t"},
+    "channels": {"motor": {"column": "m", "unit": "rad"}, "tip": {"column": "y", "unit": "rad"}},
+    "link": [{"subsystem": "gear", "input": "motor", "output": "tip"}],
+}
+STAGE = {
+    "name": "stage",
+    "kind": "axis",
+    "data": {"time": "t"},
+    "channels": {"force": {"column": "f", "unit": "N"}, "position": {"column": "x", "unit": "m"}},
+    "axis": {"subsystem": "stage", "input": "force", "output": "position", "terms": ["mass", "damping", "offset"]},
+}
+
+
+def sines(rng: np.random.Generator, t: Array, hertz: tuple[float, ...], size: float) -> tuple[Array, Array, Array]:
+    """Sum of sines of amplitude size / f: position, speed, acceleration."""
+    out = np.zeros((3, t.size))
+    for f in hertz:
+        angle, w = 2.0 * np.pi * f * t + rng.uniform(0.0, 2.0 * np.pi), 2.0 * np.pi * f
+        out += size / f * np.array([np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)])
+    return out[0], out[1], out[2]
+
+
+def stage(rng: np.random.Generator, seconds: float = 20.0) -> dict[str, Array]:
+    """0.5 kg and 3 N s/m, cut from motion; 2 um and 2 mN of noise."""
+    t = np.arange(0.0, seconds, 0.01)
+    x, v, a = sines(rng, t, (0.31, 0.73, 1.37, 2.11), 0.02)
+    return {"t": t, "x": x + 2e-6 * rng.normal(size=t.size), "f": 0.5 * a + 3.0 * v + 2e-3 * rng.normal(size=t.size)}
+
+
+def gear(rng: np.random.Generator, change: Any = lambda x, t: x, gain: float = 1.0, noise: float = 1e-3) -> dict[str, Array]:
+    """A gear recorded for 30 s at 50 Hz."""
+    t = np.arange(0.0, 30.0, 0.02)
+    x, _, _ = sines(rng, t, (0.11, 0.23, 0.37, 0.71), 0.1)
+    return {"t": t, "m": x, "y": gain * change(x, t) + 0.02 + noise * rng.normal(size=t.size)}
+
+
+def ids(content: dict[str, Any]) -> set[str]:
+    return {finding["id"] for finding in content["data_findings"]}
+
+
+@pytest.mark.parametrize("seconds", [20.0, 7.0])
+def test_a_mass_and_a_damper_are_a_mass_and_a_damper(seconds: float) -> None:
+    rng = np.random.default_rng(1)
+    content = diagnose([stage(rng, seconds), stage(rng, seconds)], STAGE).as_dict()
+    found = content["fit"]["nominal_parameters"]
+    assert content["verdict"] == "nothing_missing" and content["effects"] == [] and content["data_findings"] == []
+    assert found["mass_N_s2_per_m"]["value"] == pytest.approx(0.5, rel=0.003)
+    assert found["damping_N_s_per_m"]["value"] == pytest.approx(3.0, rel=0.003)
+
+
+def test_a_reversed_force_is_a_sign_not_physics() -> None:
+    rng = np.random.default_rng(2)
+    runs = [{**run, "f": -run["f"]} for run in (stage(rng), stage(rng))]
+    content = diagnose(runs, STAGE).as_dict()
+    assert ids(content) == {"sign"} and content["verdict"] == "nothing_missing"
+    assert content["fit"]["nominal_parameters"]["mass_N_s2_per_m"]["value"] == pytest.approx(0.5, rel=0.01)
+
+
+def test_exchanged_columns_are_said_to_be() -> None:
+    rng = np.random.default_rng(3)
+    runs = [{**run, "f": run["x"], "x": run["f"]} for run in (stage(rng), stage(rng))]
+    assert "swapped" in ids(diagnose(runs, STAGE).as_dict())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "wanted"),
+    [
+        (lambda run: {**run, "y": np.full_like(run["y"], np.nan)}, "missing"),
+        (lambda run: {**run, "y": np.full_like(run["y"], 3.0)}, "constant"),
+        (lambda run: {**run, "y": 2.0 * run["m"]}, "alias"),
+    ],
+)
+def test_a_channel_that_says_nothing_gives_no_verdict_on_physics(spoil: Any, wanted: str) -> None:
+    rng = np.random.default_rng(4)
+    runs = [gear(rng) for _ in range(2)]
+    for run in runs:
+        run["m"] = run["m"] + 1e-4 * rng.normal(size=run["m"].size)
+    content = diagnose([spoil(run) for run in runs], GEAR).as_dict()
+    assert ids(content) == {wanted} and content["verdict"] == "mismatch_not_identified" and content["effects"] == []
+
+
+@pytest.mark.parametrize(("gain", "wanted"), [(-1.0, {"sign"}), (180.0 / np.pi, {"unit"}), (1e-3, {"unit"}), (1.0, set())])
+def test_sign_and_unit_of_a_gear(gain: float, wanted: set[str]) -> None:
+    rng = np.random.default_rng(5)
+    runs = [gear(rng, gain=gain, noise=1e-3 * abs(gain)) for _ in range(2)]
+    content = diagnose(runs, GEAR).as_dict()
+    assert ids(content) == wanted and content["verdict"] == "nothing_missing"
+
+
+def test_an_output_that_comes_first_is_a_clock() -> None:
+    rng = np.random.default_rng(6)
+    runs = [gear(rng, lambda x, t: np.interp(t + 0.2, t, x)) for _ in range(2)]
+    assert ids(diagnose(runs, GEAR).as_dict()) == {"clock"}
+
+
+def delayed(x: Array, t: Array) -> Array:
+    return np.interp(t - 0.09, t, x)
+
+
+def lagged(x: Array, t: Array) -> Array:
+    return lag(x, 0.02, 0.2, -0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "effect", "key", "value"),
+    [(delayed, "latency", "delay_s", 0.09), (lagged, "rate_lag", "time_constant_s", 0.2)],
+)
+def test_effects_with_memory_begin_in_motion(change: Any, effect: str, key: str, value: float) -> None:
+    rng = np.random.default_rng(7)
+    (found,) = diagnose([gear(rng, change) for _ in range(3)], GEAR).effects
+    assert found["id"] == effect and found["probability"] > 0.5
+    assert found["parameters"][key]["value"] == pytest.approx(value, rel=0.02)
+
+
+def test_a_delay_line_begins_where_the_recording_does() -> None:
+    x = np.sin(np.arange(200) * 0.05)
+    known = np.sin((np.arange(200) - 4.0) * 0.05)
+    late = shift(x, 0.01, np.full(200, 0.04), known[0] - x[0])
+    assert late[0] == pytest.approx(known[0]) and np.max(np.abs(late - known)) < 1e-3
+
+
+def gain(log_likelihood: float, p_value: float = 1e-6) -> Gain:
+    return Gain(log_likelihood, p_value, 0.5, independent=np.array([500.0]), log_ratio=np.array([log_likelihood / 250.0]))
+
+
+def test_probabilities_add_up_and_follow_the_evidence() -> None:
+    sure = posterior(gain(200.0), gain(100.0), 2, [], 0.0, RULES)
+    assert sure.effect + sure.nothing + sure.none == pytest.approx(1.0) and sure.effect > RULES.confident
+    weak = posterior(gain(5.0, 0.1), gain(2.0, 0.1), 2, [], 0.0, RULES)
+    assert weak.effect < RULES.confident < sure.effect
+    stand_in = posterior(gain(200.0), gain(100.0), 2, [], 0.6, RULES)
+    assert stand_in.none > 0.9
