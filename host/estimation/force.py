@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from host.estimation import planar
 from host.estimation.planar import PlanarEstimate, RecordingEstimate
 from host.estimation.sensor_noise import PoseSensor, SurfacePrior
-from host.estimation.spatial import SpatialEstimate, checked_case, estimate_cosserat
+from host.estimation.spatial import ONE_TO_ONE, SpatialEstimate, checked_case, estimate_cosserat, quieter_than_noise
 from host.estimation.spatial_batch import BatchEstimate, estimate_batch
+from host.estimation.spatial_residuals import ROWS_OF_CASE
 from host.mechanics.pcar import arcs_of
 from protocol.catheter import Catheter
 from protocol.errors import InputError
@@ -124,20 +125,39 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
             )
         _only_one(previous_force_N=previous_force_N, prior=prior, roll_rad=roll_rad or None, thorough=thorough or None)
         used = sensors[: checked_case(case)]
-        return estimate_batch(
-            catheter,
-            insertion_m,
-            curvature_per_m,
-            case,
+        poses = Poses(
             [sensor[0] for sensor in used],
             _stacked("position_m", [sensor[1] for sensor in used], 3),
             _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
-            ordered=ordered,
-            workers=workers,
         )
+        found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
+        if not ordered and case in ONE_TO_ONE:
+            _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
+        return found
     if model != "pcar":
         raise InputError("model", model, "cosserat or pcar")
     return _planar(catheter, insertion_m, curvature_per_m, sensors, prior, thorough, workers)
+
+
+class Poses(NamedTuple):
+    """Arc lengths back from the tip (k), positions (n, k, 3) and quaternions (n, k, 4) of n samples."""
+
+    offsets_m: list[float]
+    positions_m: Array
+    quaternions_wxyz: Array
+
+
+def _search_again(
+    found: BatchEstimate, catheter: Catheter, insertion_m: ArrayLike, curvature_per_m: ArrayLike, case: int, poses: Poses
+) -> None:
+    """Repeat, one by one, the samples whose poses are more exact than the sensors' noise; see `quieter_than_noise`."""
+    n = len(found.force_N)
+    insertion, curvature = np.broadcast_to(insertion_m, n), np.broadcast_to(curvature_per_m, n)
+    for i in np.flatnonzero(found.converged & quieter_than_noise(found.chi_square, int(ROWS_OF_CASE[case]) - 3)):
+        sensors = list(zip(poses.offsets_m, poses.positions_m[i], poses.quaternions_wxyz[i], strict=True))
+        one = estimate_cosserat(catheter, float(insertion[i]), float(curvature[i]), case, sensors)
+        found.force_N[i], found.covariance_N2[i] = one.force_N, one.covariance_N2
+        found.converged[i], found.residual[i], found.chi_square[i] = one.converged, one.residual, one.chi_square
 
 
 def _many(sensors: Sequence[Any]) -> bool:

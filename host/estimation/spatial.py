@@ -119,12 +119,22 @@ class SpatialEstimate:
     @property
     def quieter_than_noise(self) -> bool:
         """Whether the residual is not zero and yet far below what the sensors' noise leaves (chance 0.001)."""
-        freedom = self.degrees_of_freedom
-        return freedom > 0 and TINY * (freedom + 3) < self.chi_square < chi_square_limit(freedom, -ODD_DEVIATIONS)
+        return bool(quieter_than_noise(self.chi_square, self.degrees_of_freedom))
 
     def _principal(self) -> tuple[Array, Array]:
         values, directions = np.linalg.eigh(0.5 * (self.covariance_N2 + self.covariance_N2.T))
         return values, directions
+
+
+def quieter_than_noise(chi_square: ArrayLike, freedom: int) -> Array:
+    """Whether residuals are not zero and yet far below what noise leaves: another force may explain the poses exactly.
+
+    chi_square: (n,) or one number; freedom: number of residuals above the three of the force. Chance 0.001 by noise.
+    """
+    chi_square = np.asarray(chi_square)
+    if freedom <= 0:
+        return np.zeros(chi_square.shape, bool)
+    return (TINY * (freedom + 3) < chi_square) & (chi_square < chi_square_limit(freedom, -ODD_DEVIATIONS))
 
 
 @lru_cache(maxsize=32)

@@ -117,14 +117,11 @@ def test_estimates_find_the_force_one_by_one_and_many_at_once() -> None:
         [(s, shapes.station_positions_m[:, j], shapes.station_quaternions_wxyz[:, j]) for j, s in enumerate(OFFSETS_m)],
         case=4,
     )
-    # a batch takes the first force whose residual noise explains: on so soft a catheter another one may do so too
-    right = np.abs(many.force_N - shapes.force_tip_N).max(axis=1) < 1e-6
-    assert many.converged.all() and right.sum() >= 18 and (many.chi_square < 1.0).all()
+    assert many.converged.all() and np.abs(many.force_N - shapes.force_tip_N).max() < 1e-6
     for i in range(20):
         one = sd.estimate_force(LIVEWIRE, 0.01, 10.0, sensors(forces[i]), case=4)
         assert one.converged and np.abs(one.force_N - shapes.force_tip_N[i]).max() < 1e-6
-        if right[i]:
-            np.testing.assert_allclose(one.covariance_N2, many.covariance_N2[i], rtol=1e-2)
+        np.testing.assert_allclose(one.covariance_N2, many.covariance_N2[i], rtol=1e-2)
 
 
 def test_a_pose_sensor_is_a_tuple_with_perhaps_its_covariances() -> None:
