@@ -104,9 +104,9 @@ class Gear(ode.Link):
     """Servo joint behind a gear or belt: motor angle in, load angle out."""
 
     name = "gear"
-    outputs = ("load_rad",)
-    effects = _GEAR_EFFECTS
-    outside = _GEAR_OUTSIDE
+    outputs: tuple[str, ...] = ("load_rad",)
+    effects: tuple[Plantable, ...] = _GEAR_EFFECTS
+    outside: tuple[Plantable, ...] = _GEAR_OUTSIDE
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
         """Draw ratio, sampling and noise; the servo's loop is about the motor and reads no load encoder."""
@@ -261,8 +261,8 @@ _SLIDER_OUTSIDE = (
 class Slider(ode.Axis):
     """Slide on a floor, moved by a force: joint friction, contact friction, actuator dynamics, a hanging mass."""
 
-    effects = _SLIDER_EFFECTS
-    outside = _SLIDER_OUTSIDE
+    effects: tuple[Plantable, ...] = _SLIDER_EFFECTS
+    outside: tuple[Plantable, ...] = _SLIDER_OUTSIDE
 
     def __init__(self, sprung: bool) -> None:
         """Choose between a slide with a spring and a free one."""
@@ -386,9 +386,9 @@ class Pad(ode.Press):
     """Stamp pressed on a sprung pad by a servo: motion in, servo force out; a second wall, joint friction, a Maxwell arm."""
 
     name = "pad"
-    outputs = ("force_N",)
-    effects = _PAD_EFFECTS
-    outside = (
+    outputs: tuple[str, ...] = ("force_N",)
+    effects: tuple[Plantable, ...] = _PAD_EFFECTS
+    outside: tuple[Plantable, ...] = (
         Plantable("unlisted", _PAD, lambda s, c: {"size": 0.3 * s}, says="force goes with place and speed's size"),
         Plantable("unlisted", _PAD, lambda s, c: {"size": 0.5 * s}, says="damping grows with the place squared"),
     )
