@@ -1,8 +1,8 @@
-"""Where in its cycle an uneven heart is: a Bayes filter on a grid of phases and rates, and the wave that it learns.
+"""Phase of an irregular heart beat: a Bayes filter on a grid of phases and rates, with a learned waveform.
 
-A beat that comes early or lasts long turns the phase by more than a linearized filter stands, and a single one tells
-nothing of strength. Here the wave is one curve over the phase (harmonics, learned slowly), and phase and rate are a
-grid of possibilities: each moves on at its rate, rates change about once a beat, each sample weighs them.
+A beat that comes early or lasts long shifts the phase by more than a linearized filter can follow. Here the waveform is
+one curve over the phase (harmonics, learned slowly), and the probability of phase and rate is kept on a grid. Each grid
+cell advances at its rate, the rate changes about once a beat, and each sample corrects the probabilities.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from realtime.control.declare import Tensor
 from realtime.control.records import BEAT_HARMONICS, BEAT_PHASES, BEAT_RATES, Beat
 
 PARTS = 2 * BEAT_HARMONICS
-# Rates on the grid, relative to the mean one, and how likely a beat has each: mostly near the mean, any at times.
+# Rates on the grid, relative to the mean rate, and their probabilities: a bell around the mean, and a uniform share.
 RATIO = np.linspace(0.55, 1.60, BEAT_RATES)
 _NEAR, _ANY = 0.12, 0.15
 _BELL = np.exp(-0.5 * ((RATIO - 1.0) / _NEAR) ** 2)
@@ -27,15 +27,15 @@ WAVE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=2).reshape(BEAT_PHASES, P
 
 _CHANGES_PER_BEAT = 1.0
 _MEMORY_S = 15.0  # of the wave
-_FIRST_SAMPLES = 20.0  # that the first guess of the wave counts for; higher harmonics are held at zero by more
+_FIRST_SAMPLES = 20.0  # weight of the first guess of the wave, in samples; the zero of higher harmonics weighs more
 _FIRST_SPREAD_rad = 0.5
-_MODEL_m = 1e-4  # what no wave of these harmonics describes
-_WILD = 1e-4  # likelihood that any sample has under any phase
+_MODEL_m = 1e-4  # model error of the wave, standard deviation
+_WILD = 1e-4  # likelihood that any sample has at any phase, so that an outlier excludes no phase
 
 
 @njit(cache=True)
 def start(state: Beat, cosine_m: float, sine_m: float) -> None:
-    """Begin with a plain wave; `cosine_m`, `sine_m`: its pair (p, q) now, as `frequency_bank.pair` tells it."""
+    """Start with one harmonic; `cosine_m`, `sine_m` (m): its pair (p, q) now, from `frequency_bank.pair`."""
     size_m, phase = math.hypot(cosine_m, sine_m), math.atan2(sine_m, cosine_m)
     for a in range(PARTS):
         state.wave_m[a] = size_m if a == 0 else 0.0
@@ -52,12 +52,12 @@ def start(state: Beat, cosine_m: float, sine_m: float) -> None:
     for i in range(BEAT_PHASES):
         for j in range(BEAT_RATES):
             state.share[i, j] /= total
-    _sum_up(state)
+    _set_moments(state)
 
 
 @njit(cache=True)
 def ahead(moment_m: Tensor, mean_rate: float, ahead_s: float) -> float:
-    """The beat's part of the position (m) `ahead_s` later (or earlier), from `moment_m` (rates, harmonics, 2)."""
+    """Return the beat's share of the position (m) `ahead_s` from now (or before), from `moment_m` (rates, harmonics, 2)."""
     value = 0.0
     for j in range(BEAT_RATES):
         turn = mean_rate * RATIO[j] * ahead_s
@@ -71,7 +71,7 @@ def ahead(moment_m: Tensor, mean_rate: float, ahead_s: float) -> float:
 
 @njit(cache=True)
 def variance(state: Beat) -> float:
-    """Variance (m2) of the beat's part now, over the possibilities."""
+    """Return the variance (m2) of the beat's share of the position now, over the grid."""
     mean = square = 0.0
     for i in range(BEAT_PHASES):
         share, wave_m = 0.0, 0.0
@@ -86,7 +86,7 @@ def variance(state: Beat) -> float:
 
 @njit(cache=True)
 def propagate(state: Beat, mean_rate: float, dt_s: float) -> None:
-    """All possibilities move on by `dt_s`; some change to another rate. mean_rate: rad/s."""
+    """Advance the probabilities by `dt_s`: each cell moves at its rate, a share of it changes the rate. mean_rate: rad/s."""
     stay = math.exp(-_CHANGES_PER_BEAT * dt_s * mean_rate / (2.0 * math.pi))
     for j in range(BEAT_RATES):
         cells = mean_rate * RATIO[j] * dt_s * BEAT_PHASES / (2.0 * math.pi)
@@ -102,12 +102,12 @@ def propagate(state: Beat, mean_rate: float, dt_s: float) -> None:
             total += state.moved[i, j]
         for j in range(BEAT_RATES):
             state.share[i, j] = stay * state.moved[i, j] + (1.0 - stay) * total * LIKELY[j]
-    _sum_up(state)
+    _set_moments(state)
 
 
 @njit(cache=True)
 def correct(state: Beat, value_m: float, noise_m2: float, dt_s: float) -> None:
-    """Weigh the possibilities by a sample of the beat's part, `value_m` of variance `noise_m2`, and learn the wave."""
+    """Correct the probabilities by a sample of the beat's share, `value_m` of variance `noise_m2`, and learn the wave."""
     total, keep = 0.0, math.exp(-dt_s / _MEMORY_S)
     for i in range(BEAT_PHASES):
         off_m = value_m
@@ -133,12 +133,12 @@ def correct(state: Beat, value_m: float, noise_m2: float, dt_s: float) -> None:
     for a in range(PARTS):
         state.information[a, a] += 1e-3 * dt_s
     _solve(state)
-    _sum_up(state)
+    _set_moments(state)
 
 
 @njit(cache=True)
 def _solve(state: Beat) -> None:
-    """wave_m from information wave_m = projected_m, by Cholesky factors of the lower half of `information`."""
+    """Solve information wave_m = projected_m for wave_m, by Cholesky factors of the lower half of `information`."""
     L, x = state.factor, state.wave_m
     for a in range(PARTS):
         for b in range(a + 1):
@@ -159,8 +159,8 @@ def _solve(state: Beat) -> None:
 
 
 @njit(cache=True)
-def _sum_up(state: Beat) -> None:
-    """The moments (rates, harmonics, cosine and sine) from which `ahead` foretells."""
+def _set_moments(state: Beat) -> None:
+    """Set the moments (rates, harmonics, cosine and sine) from which `ahead` predicts."""
     for j in range(BEAT_RATES):
         for h in range(BEAT_HARMONICS):
             c = s = 0.0

@@ -1,4 +1,4 @@
-"""From the rig file to the tick's parameter record."""
+"""Conversion of the rig file into the tick's parameter record."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from realtime.control.inverse_kinematics import fitted_knob_curve
 from realtime.control.records import PARAMS, new
 from realtime.control.stage_limiter import crossing_time_s
 
-# The board answers at 200 Hz; three missed answers and a margin.
+# The board sends STATUS at 200 Hz; this is three missed messages and a margin.
 BOARD_TIMEOUT_S = 0.030
-# Offsets from the axis below this multiple of the tracker noise say nothing about the roll.
+# Below this multiple of the tracker's noise, an offset from the axis does not determine the roll.
 AXIS_RADIUS_SIGMA = 4.0
-# Forecasts of the wall are judged this far ahead; samples further off than this many sigma are wild.
+# Predictions of the wall are scored this far ahead.
 HORIZON_S = 0.040
-# Squared acceleration (m2/s3) of the local model: follows a heart of 1 mm at 2 Hz without knowing it; or stands in its
-# middle, which is better than following where samples are few, noisy and late.
+# Squared acceleration (m2/s3) of the local model. With the first it follows a heart beat of 1 mm at 2 Hz. With the second
+# it stays at the mean, which is better than following when samples are few, noisy and late.
 FOLLOWING2, STANDING2 = 1e-3, 1e-7
+# A sample further than this many standard deviations from every model is rejected.
 GATE_SIGMA = 5.0
 
 
@@ -30,7 +31,7 @@ def _fill(record: np.record, **fields: Any) -> None:
 
 
 def _fill_predictive(p: np.record, rig: Rig) -> None:
-    """Parameters of the predictive law and of the two predictors of the wall."""
+    """Fill the parameters of the predictive law and of the predictors of the wall."""
     control, insertion = rig.control, rig.stages.insertion
     crossing_s = crossing_time_s(
         rig.transmission.insertion_backlash_m, insertion.max_speed_unit_per_s, insertion.max_accel_unit_per_s2
@@ -79,7 +80,7 @@ def _fill_predictive(p: np.record, rig: Rig) -> None:
 
 
 def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
-    """The PARAMS record of `rig`; `force_source` is `sensor` or `estimate`. Raises ValueError otherwise."""
+    """Return the PARAMS record of `rig`; `force_source` is `sensor` or `estimate`. Raises ValueError otherwise."""
     if force_source not in ForceSource.labels():
         raise ValueError(f"force_source: found {force_source!r}, wanted {' or '.join(ForceSource.labels())}")
     params = new(PARAMS)

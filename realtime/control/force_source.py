@@ -1,4 +1,4 @@
-"""Which force closes the loop: the sensor's or the model's estimate; handed over when the sensor falls silent or parts."""
+"""Choice of the force that closes the loop: the sensor's or the estimate, which replaces a sensor that fails in contact."""
 
 from __future__ import annotations
 
@@ -9,26 +9,33 @@ from realtime.control.constraint_frame import to_base
 from realtime.control.declare import ReadFloats
 from realtime.control.records import FORCE_RING, Force, ForceSourceState, Inputs, Params
 
-# A reading above this is no contact force, whatever the sensor says.
+# A reading above this is not plausible as a contact force.
 _RANGE_N = 20.0
-# The sensor is taken for frozen after so many equal readings in a row: its noise is many counts.
+# After this many equal readings in a row the sensor counts as frozen: its noise is many counts.
 _FROZEN = 25
 # Estimates are used no older than this on arrival, and for this long after (two frames of the tracker and a margin).
 _ESTIMATE_AGE_NS, _ESTIMATE_LIFE_NS = 150_000_000, 75_000_000
-# Sensor and estimate are compared over _APART of the estimates; they have parted where their mean square difference is
-# more than _PARTED times what it was in good times, learned over _LEARN estimates, and more than _LEAST_N.
-_APART, _LEARN, _LEARNED, _PARTED, _LEAST_N = 10.0, 200.0, 30, 6.0, 0.03
-# Back to the sensor when it has been good for this long.
+# Sensor and estimate are compared over _DIFFERENCE estimates. They disagree when their mean square difference exceeds
+# _DISAGREE times its usual value, which is learned over _LEARN estimates, and _LEAST_N squared.
+_DIFFERENCE, _LEARN, _LEARNED, _DISAGREE, _LEAST_N = 10.0, 200.0, 30, 6.0, 0.03
+# The loop returns to the sensor when it has been good for this long.
 _BACK_S = 0.5
-# Smoothing of estimates where a touch is looked for.
+# Smoothing of estimates while contact is being detected.
 _SMOOTH_S = 0.08
 
 
 @njit(cache=True)
 def start(params: Params, state: ForceSourceState) -> None:
-    """As at arming: the source of the parameters, nothing known of how sensor and estimate agree."""
+    """Start, at arming, with the source of the parameters; the difference of sensor and estimate is unknown."""
     state.source = params.force_source
-    state.pairs, state.bias_N, state.apart_N2, state.usual_N2, state.good_s, state.smooth_N = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    state.pairs, state.bias_N, state.difference_N2, state.usual_difference_N2, state.good_s, state.smooth_N = (
+        0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 @njit(cache=True)
@@ -39,13 +46,13 @@ def _plausible(force: Force) -> bool:
 
 @njit(cache=True)
 def compression(force_N: ReadFloats, normal: ReadFloats) -> float:
-    """Compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
+    """Return the compression (N): force on the tissue against the wall's outward `normal` (unit, towards the tip)."""
     return -(force_N[0] * normal[0] + force_N[1] * normal[1] + force_N[2] * normal[2])
 
 
 @njit(cache=True)
 def _take_sensor(state: ForceSourceState, sensor: Force, normal: ReadFloats) -> bool:
-    """A new reading of the sensor; False where it is not one."""
+    """Take in a new reading of the sensor. Return whether it is plausible."""
     if not _plausible(sensor):
         return False
     normal_N = compression(state.reading_N, normal)
@@ -59,7 +66,7 @@ def _take_sensor(state: ForceSourceState, sensor: Force, normal: ReadFloats) -> 
 
 @njit(cache=True)
 def _sensor_at(state: ForceSourceState, stamp_ns: int) -> int:
-    """Place in the ring of the sensor's reading at `stamp_ns` (within 2 ms), or -1."""
+    """Return the place in the ring of the sensor's reading at `stamp_ns` (within 2 ms), or -1."""
     for k in range(FORCE_RING):
         place = (state.head - k) % FORCE_RING
         if abs(state.ring_ns[place] - stamp_ns) <= 2_000_000:
@@ -71,7 +78,7 @@ def _sensor_at(state: ForceSourceState, stamp_ns: int) -> int:
 
 @njit(cache=True)
 def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats, now_ns: int, touching: bool) -> bool:
-    """A new estimate; False where it is not one. In contact it is compared with the sensor at its time."""
+    """Take in a new estimate; in contact, compare it with the sensor at its time. Return whether it is plausible."""
     noise_N2 = 0.0
     for i in range(3):
         for j in range(3):
@@ -88,37 +95,37 @@ def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats,
 
 
 @njit(cache=True)
-def _compare(state: ForceSourceState, apart_N: float) -> None:
-    off_N = apart_N - state.bias_N if state.pairs > 0 else 0.0
-    state.apart_N2 += (off_N * off_N - state.apart_N2) / _APART
-    if parted(state):
+def _compare(state: ForceSourceState, difference_N: float) -> None:
+    off_N = difference_N - state.bias_N if state.pairs > 0 else 0.0
+    state.difference_N2 += (off_N * off_N - state.difference_N2) / _DIFFERENCE
+    if disagree(state):
         return
     state.pairs += 1
-    state.bias_N += (apart_N - state.bias_N) / min(state.pairs, _LEARN)
-    state.usual_N2 += (off_N * off_N - state.usual_N2) / min(max(state.pairs - 1, 1), _LEARN)
+    state.bias_N += (difference_N - state.bias_N) / min(state.pairs, _LEARN)
+    state.usual_difference_N2 += (off_N * off_N - state.usual_difference_N2) / min(max(state.pairs - 1, 1), _LEARN)
 
 
 @njit(cache=True)
-def parted(state: ForceSourceState) -> bool:
-    """Whether sensor and estimate differ by more than they use to."""
-    return state.pairs > _LEARNED and state.apart_N2 > max(_PARTED * state.usual_N2, _LEAST_N**2)
+def disagree(state: ForceSourceState) -> bool:
+    """Whether sensor and estimate differ by more than usual."""
+    return state.pairs > _LEARNED and state.difference_N2 > max(_DISAGREE * state.usual_difference_N2, _LEAST_N**2)
 
 
 @njit(cache=True)
 def _choose(params: Params, state: ForceSourceState, now_ns: int, touching: bool) -> bool:
-    """Hand over where needed; returns whether the source has changed."""
+    """Choose the source. Return whether it has changed."""
     if params.force_source == SOURCE_ESTIMATE or not touching:
         changed = state.source != params.force_source
         state.source = params.force_source
         return changed
-    silent = now_ns - state.arrival_ns[SOURCE_SENSOR] > params.safety.force_timeout_ns // 2
-    bad = silent or state.equal >= _FROZEN or parted(state)
+    overdue = now_ns - state.arrival_ns[SOURCE_SENSOR] > params.safety.force_timeout_ns // 2
+    bad = overdue or state.equal >= _FROZEN or disagree(state)
     state.good_s = 0.0 if bad else state.good_s + params.period_s
-    other = now_ns - state.arrival_ns[SOURCE_ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
-    if state.source == SOURCE_SENSOR and bad and other:
+    usable = now_ns - state.arrival_ns[SOURCE_ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
+    if state.source == SOURCE_SENSOR and bad and usable:
         state.source = SOURCE_ESTIMATE
         return True
-    if state.source == SOURCE_ESTIMATE and (not other or state.good_s > _BACK_S):
+    if state.source == SOURCE_ESTIMATE and (not usable or state.good_s > _BACK_S):
         state.source = SOURCE_SENSOR
         return True
     return False
@@ -128,14 +135,23 @@ def _choose(params: Params, state: ForceSourceState, now_ns: int, touching: bool
 def apply(
     params: Params, state: ForceSourceState, inputs: Inputs, frame_wxyz: ReadFloats, normal: ReadFloats, touching: bool
 ) -> int:
-    """Take in what has come of both. Returns how many readings of either were refused.
+    """Take in the new readings of sensor and estimate, and choose the source.
 
-    frame_wxyz: the tip's measured orientation, used where the sensor sits on the tip; normal: outward, unit.
+    Afterwards `fresh` is 1 if the chosen source has a new reading: `stamp_ns`, `value_N` (compression), `spread_N2`.
+    `force_N` (3,) and `age_from_ns` belong to the chosen source. `changed` is 1 in the tick of a handover.
 
-    Afterwards: `fresh` is 1 where the chosen source has a new reading: `stamp_ns`, `value_N` (compression), `spread_N2`;
-    `force_N` (3,) and `age_from_ns` belong to the chosen source; `changed` is 1 in the tick of a handover.
+    Args:
+        params: parameters of the tick.
+        state: the choice, and what is learned of both sources.
+        inputs: newest reading and newest estimate.
+        frame_wxyz: (4,), the tip's measured orientation, used if the sensor is mounted on the tip.
+        normal: (3,), outward normal of the wall, unit.
+        touching: whether the loop is in contact.
+
+    Returns:
+        Number of readings that were rejected.
     """
-    refused, new = 0, -1
+    rejected, new = 0, -1
     if inputs.sensor.count != state.seen[SOURCE_SENSOR]:
         state.seen[SOURCE_SENSOR] = inputs.sensor.count
         for i in range(3):
@@ -145,13 +161,13 @@ def apply(
         if _take_sensor(state, inputs.sensor, normal):
             new = SOURCE_SENSOR
         else:
-            refused += 1
+            rejected += 1
     estimated = False
     if inputs.estimate.count != state.seen[SOURCE_ESTIMATE]:
         state.seen[SOURCE_ESTIMATE] = inputs.estimate.count
         estimated = _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching)
         if not estimated and params.force_source == SOURCE_ESTIMATE:
-            refused += 1
+            rejected += 1
     state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0
     state.fresh = 0
     if state.source == SOURCE_SENSOR and new == SOURCE_SENSOR:
@@ -163,7 +179,7 @@ def apply(
         _set(state, inputs.estimate, inputs.estimate.force_N, state.normal_N[SOURCE_ESTIMATE] - bias_N, state.noise_N2)
         dt_s = min(max((state.stamp_ns - before_ns) * 1e-9, 0.0), _SMOOTH_S)
         state.smooth_N += dt_s / (dt_s + _SMOOTH_S) * (state.value_N - state.smooth_N)
-    return refused
+    return rejected
 
 
 @njit(cache=True)

@@ -33,7 +33,7 @@ def apply(config: KinematicsParams, joint: ReadFloats) -> Point:
 
 @njit(cache=True)
 def remember(state: History, time_ns: int, joint: ReadFloats, flank: float) -> None:
-    """Note that the joints (3,) are, or will be, `joint` at `time_ns`, the gap pushed at `flank`; times must rise."""
+    """Store the joints (3,) at `time_ns`, now or in the future, with the side of the gap that pushes; times must rise."""
     if state.count > 0 and time_ns - state.time_ns[state.head] < SPACING_NS - 100_000:
         return
     state.head = (state.head + 1) % HISTORY_POINTS
@@ -46,7 +46,7 @@ def remember(state: History, time_ns: int, joint: ReadFloats, flank: float) -> N
 
 @njit(cache=True)
 def joint_at(state: History, time_ns: int) -> tuple[Joint, float]:
-    """Return the joints at `time_ns`, linear between notes, and the flank, +-1; a flank of 0.0: further back than noted."""
+    """Return the joints at `time_ns`, interpolated, and the flank, +-1; a flank of 0.0: before the oldest entry."""
     if state.count == 0:
         return (0.0, 0.0, 0.0), 0.0
     k = state.head

@@ -1,4 +1,4 @@
-"""Where in frequency a signal moves: leaky Fourier sums on a geometric grid, for finding a heart or breath rate."""
+"""Spectrum of a signal: leaky Fourier sums on a geometric grid of frequencies, to find a heart or breath rate."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ STEP_S = 0.020
 
 @njit(cache=True)
 def start(bank: Bank, low_Hz: float, high_Hz: float, memory_s: float, level: float) -> None:
-    """Forget everything; look between `low_Hz` and `high_Hz` over the last two `memory_s` or so. `level`: first guess
-    of the mean (unit of the signal)."""
+    """Start empty, between `low_Hz` and `high_Hz`, with a window of about two `memory_s`.
+
+    level: first guess of the mean (unit of the signal).
+    """
     bank.low_Hz, bank.high_Hz, bank.memory_s, bank.since_s, bank.level = low_Hz, high_Hz, memory_s, 0.0, level
     for k in range(POINTS):
         bank.phase_rad[k] = 0.0
@@ -28,13 +30,13 @@ def start(bank: Bank, low_Hz: float, high_Hz: float, memory_s: float, level: flo
 
 @njit(cache=True)
 def frequency_Hz(bank: Bank, place: float) -> float:
-    """Frequency (Hz) at a place on the grid, 0 to POINTS - 1, fractions allowed."""
+    """Return the frequency (Hz) at a place on the grid, 0 to POINTS - 1, fractions allowed."""
     return bank.low_Hz * (bank.high_Hz / bank.low_Hz) ** (place / (POINTS - 1))
 
 
 @njit(cache=True)
 def amplitude(bank: Bank, point: int) -> float:
-    """Amplitude (unit of the signal) near grid point number `point`."""
+    """Return the amplitude (unit of the signal) near grid point number `point`."""
     return 2.0 * math.hypot(bank.second[point, 0], bank.second[point, 1])
 
 
@@ -64,10 +66,11 @@ def apply(bank: Bank, value: float, dt_s: float) -> None:
 
 @njit(cache=True)
 def peak(bank: Bank) -> tuple[float, float]:
-    """(frequency in Hz, amplitude) of the strongest motion inside the grid; (0, 0) where there is none but at its edge.
+    """Return frequency (Hz) and amplitude of the strongest motion inside the grid; (0, 0) if it is at the edge.
 
-    Where half the frequency also moves by a third as much, that is taken: the strongest may be a second harmonic. Asked
-    only after several periods of it, when leakage from the strongest has died out.
+    If the amplitude at half the frequency is more than a third of it, half the frequency is returned, because the
+    strongest motion may be a second harmonic. This is tested only after several periods of half the frequency, when
+    the leakage of the strongest motion has decayed.
     """
     best = 0
     for k in range(1, POINTS - 1):
@@ -87,13 +90,13 @@ def peak(bank: Bank) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def pair(bank: Bank, heard_Hz: float) -> tuple[float, float]:
-    """(cosine, sine) part now of the motion at `heard_Hz`, from the nearest grid point: value = cosine part, turning."""
-    place = (POINTS - 1) * math.log(heard_Hz / bank.low_Hz) / math.log(bank.high_Hz / bank.low_Hz)
+def pair(bank: Bank, rate_Hz: float) -> tuple[float, float]:
+    """Return the pair (p, q) of the motion at `rate_Hz` now, from the nearest grid point; p is its share of the value."""
+    place = (POINTS - 1) * math.log(rate_Hz / bank.low_Hz) / math.log(bank.high_Hz / bank.low_Hz)
     k = min(max(round(place), 0), POINTS - 1)
     c, s = math.cos(bank.phase_rad[k]), math.sin(bank.phase_rad[k])
     re, im = 2.0 * bank.second[k, 0], 2.0 * bank.second[k, 1]
-    lag = 2.0 * math.atan(2.0 * math.pi * (heard_Hz - frequency_Hz(bank, k)) * bank.memory_s)
+    lag = 2.0 * math.atan(2.0 * math.pi * (rate_Hz - frequency_Hz(bank, k)) * bank.memory_s)
     re, im = re * math.cos(lag) - im * math.sin(lag), re * math.sin(lag) + im * math.cos(lag)
     return re * c - im * s, re * s + im * c
 

@@ -11,13 +11,13 @@ from realtime.control import inverse_kinematics
 from realtime.control.declare import Floats, Point, ReadFloats
 from realtime.control.records import N_AXES, HybridParams, HybridState, KinematicsParams
 
-# Greatest joint error acted on (m, rad, rad), and greatest stored integral, both against windup.
+# Limits of the joint error (m, rad, rad) and of the force integral, both against windup.
 _ERROR_LIMIT = (0.010, 0.5, 0.5)
 _FORCE_INTEGRAL_LIMIT_N_s = 0.5
 
 
 class Aim(NamedTuple):
-    """What the tip is to do: be at (3,) m; in contact press with a force (N) against the outward normal (3,)."""
+    """Set-point of the tip: position (3,) m, and in contact a force (N) against the outward normal (3,)."""
 
     target_m: ReadFloats
     normal: ReadFloats
@@ -41,7 +41,7 @@ def move_goal(goal_m: Floats, target_m: ReadFloats, step_m: float) -> None:
 def tip_error(
     config: HybridParams, state: HybridState, tip_m: ReadFloats, aim: Aim, force_N: float, period_s: float
 ) -> Point:
-    """Return the wanted displacement of the tip (m), from its position (3,) and the measured compression (N).
+    """Return the requested displacement of the tip (m), from its position (3,) and the measured compression (N).
 
     The selection matrix S = normal normal^T takes the normal direction from the force loop,
     delta = K_pf e + K_if integral(e), and leaves the others to the position loop.
@@ -77,7 +77,7 @@ def apply(
     """Advance the joint command (body insertion m, roll rad, knob rad) of `state` by one tick.
 
     The inverse kinematics is called twice (Fig. 6.12), on the branch nearest to the last command: for the predicted tip
-    (3,) and for the wanted one, `error_m` (3,) further; their difference is the joint error of the PI controller.
+    (3,) and for the requested one, `error_m` (3,) further; their difference is the joint error of the PI controller.
     """
     goal_m = (tip_m[0] + error_m[0], tip_m[1] + error_m[1], tip_m[2] + error_m[2])
     measured = inverse_kinematics.apply_nearest(kinematics, tip_m, state.joint)

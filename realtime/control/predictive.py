@@ -1,10 +1,10 @@
-"""The predictive law: set-points that put the free tip on the predicted wall, pressed in by the force wanted.
+"""The predictive law: set-points that press the free tip into the predicted wall with the requested force.
 
 External hybrid control (thesis Fig. 7.1), written for the point where the tip would be without contact (the free tip).
 Across the wall's normal (I - S, S = n n^T) a slow integral on the measured position moves it (`tip_offset`). Along the
-normal it follows b = wall + compliance * wanted force. Wall and compliance come from `wall_observer`, which compares the
-measured force with what the stages really did: its level is the integral of the force error, and because it uses the
-predicted motion, not the commanded one, it does not wind up while the gap is crossed or a limit holds.
+normal it follows b = wall + compliance * requested force. Wall and compliance come from `wall_observer`, which compares the
+measured force with the executed motion of the stages: its level is the integral of the force error, and because it uses the
+predicted motion, not the commanded one, it does not wind up while the gap is crossed or a limit is active.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from realtime.control.records import (
     WallState,
 )
 
-# Speeds of the joints are taken over this time; a reversal is judged over this much more than a crossing.
+# Speeds of the joints are differences over this time. A reversal is planned over a crossing and this time after it.
 _SLOPE_S = 0.005
-_LATER_S = 0.060
+_AFTER_CROSSING_S = 0.060
 # The free tip is never moved further than this from where it is predicted to be, or from where it touched.
 _REACH_m = 0.012
 # After this long without force in contact, the wall is searched for.
 _AWAY_S = 0.050
-# Least share of the wanted force while the wall's motion is not known yet: enough to keep contact. Without a force sensor
-# the motion is known later, and a loss of contact is detected late.
+# Least share of the requested force while the wall's motion is unknown: enough to keep contact. Without a force sensor
+# the motion is learned more slowly, and a loss of contact is detected late.
 _LEAST_SHARE, _LEAST_SHARE_BLIND = 0.65, 0.9
 _SURE_SIGMA = 2.0
-# A reversal must be worth so many standard deviations of the predictions.
+# A reversal is planned if the motion back exceeds this many standard deviations of the predictions.
 _DEPTH_SIGMA = 1.0
-# At rest no reversal is worth a crossing of the gap.
+# At rest no reversal is planned: this depth is never reached.
 _NEVER_m = 1.0
 
 
 class Move(NamedTuple):
-    """Where the moving goal goes to (3,) m, how fast at most (m/s), and for how long (s)."""
+    """Target (3,) m of the moving goal, greatest speed (m/s), and period (s)."""
 
     target_m: ReadFloats
     speed_m_per_s: float
@@ -53,11 +53,11 @@ class Move(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What the law knows of the contact in this tick.
+    """The contact in this tick.
 
     normal: (3,), outward; offset_m: (3,), of the tip; depth_m: of the predicted free tip along the inward normal;
-    wanted_N: force wanted; loose: no force is felt; blind: there is no force sensor; execute_ns: when the set-point is
-    reached.
+    wanted_N: requested force; loose: the force is below the threshold; blind: there is no force sensor; execute_ns: when
+    the set-point is reached.
     """
 
     normal: ReadFloats
@@ -156,7 +156,7 @@ def _prediction_sd_m(wall: TargetState) -> float:
 def _force_setpoint(
     config: PredictiveParams, state: PredictiveState, contact: Contact, prediction_sd_N: float, period_s: float
 ) -> float:
-    """Return the force set-point (N): less than the wanted force while predictions are poor, reached by a slew."""
+    """Return the force set-point (N): below the requested force while predictions are poor, limited in rate."""
     least = _LEAST_SHARE_BLIND if contact.blind else _LEAST_SHARE
     wanted_N = contact.wanted_N
     sure_N = wanted_N + config.force_margin_N - _SURE_SIGMA * prediction_sd_N
@@ -225,7 +225,7 @@ def press(
         hybrid.joint[axis] = joint[axis]
     crossing_s = config.reversal_share * config.crossing_s
     for k in range(3):
-        ahead_s = _SLOPE_S if k == 0 else (crossing_s if k == 1 else crossing_s + _LATER_S)
+        ahead_s = _SLOPE_S if k == 0 else (crossing_s if k == 1 else crossing_s + _AFTER_CROSSING_S)
         out = state.speed if k == 0 else (state.joint_at_crossing if k == 1 else state.joint_after_crossing)
         wall_m = target_predictor.at(wall, contact.execute_ns + round(ahead_s * 1e9))
         depth_m = min(max((wall_m + press_m) / (1.0 + stiffer), least_m), most_m)

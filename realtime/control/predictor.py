@@ -1,4 +1,4 @@
-"""Pose stream of 40 Hz, 25 ms late, to a tip position and velocity that are now: a constant-velocity Kalman filter."""
+"""Tip predictor: position and velocity now, from poses at 40 Hz that are 25 ms late; a constant-velocity Kalman filter."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def apply(config: PredictorParams, state: PredictorState, pose: PoseRecord) -> i
 
 @njit(cache=True)
 def predict(state: PredictorState, now_ns: int, out_m: Floats) -> None:
-    """The tip position (3,) m at `now_ns`, written into `out_m`; the velocity is trusted for 60 ms at most."""
+    """Write the tip position (3,) m at `now_ns` into `out_m`; it is extrapolated by 60 ms at most."""
     ahead_s = min(max((now_ns - state.stamp_ns) * 1e-9, 0.0), 0.060)
     for i in range(3):
         out_m[i] = state.position_m[i] + ahead_s * state.velocity_m_per_s[i]

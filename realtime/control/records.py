@@ -58,20 +58,20 @@ class BoardRecord:
 
 
 class CommandRecord:
-    """What the operator wants, and what the supervision found."""
+    """Command of the operator, and causes from the supervision."""
 
     count: int = whole("", "rises by one with each command that the loop has to act on")
     kind: int = whole("", "a CommandKind")
     armed: int = whole("", "1 when the loop is to be armed")
-    target_m: Floats = real("m", "tip position wanted", 3)
+    target_m: Floats = real("m", "requested tip position", 3)
     normal: Floats = real("", "outward normal of the wall, unit, towards the tip", 3)
-    force_N: float = real("N", "force wanted along the inward normal")
+    force_N: float = real("N", "requested force along the inward normal")
     clear: int = whole("", "rises by one when the operator clears latched causes")
     watch: int = whole("", "causes that the supervision found, a bit set of `safety.CAUSES`")
 
 
 class Inputs:
-    """All that the tick reads of the world."""
+    """All inputs of the tick."""
 
     now_ns: int = whole("ns", "time of this tick")
     tip: PoseRecord = part(PoseRecord, "newest pose of the tip")
@@ -100,7 +100,7 @@ class PredictorState:
     """Tip predictor (`predictor`)."""
 
     started: int = whole("", "1 after the first accepted pose")
-    seen: int = whole("", "count of the newest pose that was looked at")
+    seen: int = whole("", "count of the newest pose that was processed")
     stamp_ns: int = whole("ns", "when the newest accepted pose was measured")
     accepted_ns: int = whole("ns", "when the newest accepted pose arrived")
     position_m: Floats = real("m", "filtered position at stamp_ns", 3)
@@ -176,8 +176,8 @@ class TargetState:
     bank_n: int = whole("", "how many they are")
     heart_bank: Bank = part(Bank, "search for the heart's rate")
     breath_bank: Bank = part(Bank, "search for the breath's rate")
-    last_heart_Hz: float = real("Hz", "the bank's peak at the last look")
-    agreed: int = whole("", "looks in a row that agreed on the peak; negative: wait")
+    last_heart_Hz: float = real("Hz", "the bank's peak at the last check")
+    agreed: int = whole("", "checks in a row with the same peak; negative: wait")
     rejected: int = whole("", "samples rejected since the start; only for telemetry")
     rejected_s: float = real("s", "how long samples have been rejected in a row")
     beat: Beat = part(Beat, "the phased model's beat")
@@ -278,7 +278,7 @@ class WallParams:
     """Observation of the wall by force and by pose (`wall_observer`)."""
 
     compliance_m_per_N: float = real("m/N", "assumed compliance of catheter and tissue in series")
-    play_noise_m: float = real("m", "error that the backlash leaves, standard deviation")
+    play_noise_m: float = real("m", "error after backlash compensation, standard deviation")
     position_noise_m: float = real("m", "noise of the tracker, standard deviation")
     by_force: TargetParams = part(TargetParams, "predictor fed by the force sensor")
     by_estimate: TargetParams = part(TargetParams, "predictor fed by estimates of the force")
@@ -304,7 +304,7 @@ class PredictiveParams:
     force_margin_N: float = real("N", "prediction error that does not reduce the force set-point")
     crossing_s: float = real("s", "time the stage needs to cross the gap")
     reversal_share: float = real("", "share of it by which a reversal is planned ahead")
-    reversal_depth_m: float = real("m", "least way back that is worth a reversal")
+    reversal_depth_m: float = real("m", "shortest motion back for which a reversal is planned")
     slow_approach_share: float = real("", "share of the approach speed without a force sensor")
 
 
@@ -313,7 +313,7 @@ class PredictiveState:
 
     goal_speed_m_per_s: float = real("m/s", "speed of the moving goal")
     touch_depth_m: float = real("m", "depth of the free tip when contact began")
-    reversal_depth_m: float = real("m", "way back that is worth a reversal now")
+    reversal_depth_m: float = real("m", "shortest motion back for which a reversal is planned now")
     force_setpoint_N: float = real("N", "force to press with now")
     away_s: float = real("s", "how long the contact has been lost")
     speed: Floats = real("m/s, rad/s", "speed of the joint command", N_AXES)
@@ -325,7 +325,7 @@ class ForceSourceState:
     """Choice between force sensor and estimate (`force_source`); pairs are [sensor, estimate]."""
 
     source: int = whole("", "a ForceSource: which one closes the loop")
-    seen: Ints = whole("", "count of the newest reading that was looked at", 2)
+    seen: Ints = whole("", "count of the newest reading that was processed", 2)
     arrival_ns: Ints = whole("ns", "when the newest plausible reading arrived", 2)
     normal_N: Floats = real("N", "its compression", 2)
     noise_N2: float = real("N^2", "variance of the newest estimate along the normal")
@@ -335,8 +335,8 @@ class ForceSourceState:
     ring_N: Floats = real("N", "their compression", FORCE_RING)
     pairs: int = whole("", "estimates that were compared with the sensor")
     bias_N: float = real("N", "mean of estimate minus sensor")
-    apart_N2: float = real("N^2", "mean square of their difference lately")
-    usual_N2: float = real("N^2", "mean square of their difference in good times")
+    difference_N2: float = real("N^2", "recent mean square of their difference")
+    usual_difference_N2: float = real("N^2", "usual mean square of their difference")
     good_s: float = real("s", "how long the sensor has been good")
     smooth_N: float = real("N", "compression of the source, smoothed if it is the estimate")
     changed: int = whole("", "1 in the tick of a handover; only for telemetry")
@@ -372,7 +372,7 @@ class SafetyParams:
 
 
 class Params:
-    """All that the rig file fixes."""
+    """All parameters, from the rig file."""
 
     period_s: float = real("s", "time between ticks")
     setpoint_lead_ns: int = whole("ns", "a set-point is executed this long after its tick")
@@ -393,7 +393,7 @@ class Params:
 
 
 class State:
-    """All that the tick remembers."""
+    """All state of the tick."""
 
     ticks: int = whole("", "ticks so far")
     phase: int = whole("", "a Phase")
@@ -420,7 +420,7 @@ class State:
 
 
 class Outputs:
-    """What the tick decides, and what telemetry shows of it."""
+    """Set-point of the tick, and its telemetry."""
 
     now_ns: int = whole("ns", "time of this tick")
     valid: int = whole("", "1 when the set-point is to be sent")
@@ -435,7 +435,7 @@ class Outputs:
     goal_m: Floats = real("m", "moving goal of the tip", 3)
     force_N: Floats = real("N", "force of the source, base frame", 3)
     normal_force_N: float = real("N", "compression that the loop works with")
-    wanted_force_N: float = real("N", "compression wanted")
+    wanted_force_N: float = real("N", "requested compression")
     phase: int = whole("", "a Phase")
     action: int = whole("", "a SafetyAction")
     cause: int = whole("", "causes that stand or are latched, a bit set of `safety.CAUSES`")

@@ -1,4 +1,4 @@
-"""The failsafe decision: one pure function from what is wrong to what is done about it."""
+"""The failsafe decision: a pure function from the causes that stand to the safety action."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from numba import njit
 
 from realtime.control.codes import ACTION_HOLD, ACTION_NONE, ACTION_RETRACT, ACTION_STOP, ACTION_WARN
 
-# (bit, action, latches until the operator clears it, what to tell the operator)
+# (name, action, whether it latches until the operator clears it, message for the operator)
 CAUSES: tuple[tuple[str, int, bool, str], ...] = (
     ("pose_rejected", ACTION_WARN, False, "a pose was not finite, out of the workspace or too fast; it was not used"),
     ("force_rejected", ACTION_WARN, False, "a force reading was not finite or out of the sensor's range; it was not used"),
@@ -30,7 +30,7 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         "force_handover",
         ACTION_WARN,
         False,
-        "the force sensor is silent, frozen or off: the model's estimate closes the loop",
+        "the force sensor sends nothing, is frozen or disagrees with the estimate: the estimate closes the loop",
     ),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
@@ -59,7 +59,7 @@ _STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
 
 @njit(cache=True)
 def action_of(flags: int) -> int:
-    """The strongest action that any cause in the bit set `flags` asks for."""
+    """Return the strongest action of the causes in the bit set `flags`."""
     if flags & _STOP_BITS:
         return ACTION_STOP
     if flags & _RETRACT_BITS:
@@ -73,7 +73,7 @@ def action_of(flags: int) -> int:
 
 @njit(cache=True)
 def decide(flags: int, latched: int, clear: bool) -> tuple[int, int]:
-    """What to do now.
+    """Return the safety action and the latched causes.
 
     flags: causes that stand at this tick (bit set of CAUSES); latched: those kept from earlier ticks;
     clear: the operator clears. Returns (action, latched). A cause that still stands is never cleared,
@@ -85,12 +85,12 @@ def decide(flags: int, latched: int, clear: bool) -> tuple[int, int]:
     return action_of(flags | latched), latched
 
 
-def in_words(flags: int) -> list[str]:
-    """The sentences of all causes in the bit set `flags`, strongest first."""
+def messages(flags: int) -> list[str]:
+    """Return the messages of all causes in the bit set `flags`, strongest first."""
     standing = [cause for index, cause in enumerate(CAUSES) if flags & (1 << index)]
     return [cause[3] for cause in sorted(standing, key=lambda cause: -cause[1])]
 
 
 def names(flags: int) -> list[str]:
-    """The names of all causes in the bit set `flags`."""
+    """Return the names of all causes in the bit set `flags`."""
     return [cause[0] for index, cause in enumerate(CAUSES) if flags & (1 << index)]

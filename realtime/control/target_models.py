@@ -1,6 +1,6 @@
-"""Models of one wall's motion as Kalman filters: local, steady, restless, phased; with harmonics that rotate.
+"""Models of the wall's motion as Kalman filters: local, steady, restless, phased; with rotating harmonics.
 
-In rotating coordinates each harmonic is a pair (p, q) of which p is its part of the position; no amplitude is singular
+In rotating coordinates each harmonic is a pair (p, q), p is its share of the position, and zero is not singular
 (Yuen, Novotny and Howe 2008 use polar ones). Rates are states too: an extended filter, whose F has 2 x 2 blocks only.
 """
 
@@ -13,8 +13,8 @@ from numba import njit
 from realtime.control.declare import Floats, Matrix
 from realtime.control.records import BREATH_HARMONICS, HEART_HARMONICS, TARGET_MODELS, TARGET_N, TargetState
 
-# State of one model (m, m/s, rad/s, 1, m): level, its speed, pairs (p, q) of each harmonic, both rates, by what share
-# the contact is stiffer than assumed, and by how much half the play is less than believed.
+# State of one model (m, m/s, rad/s, 1, m): level, its speed, pairs (p, q) of each harmonic, both rates, the relative
+# error of the assumed stiffness of the contact, and by how much half the backlash is below the assumed value.
 LEVEL, SPEED, HEART = 0, 1, 2
 BREATH = HEART + 2 * HEART_HARMONICS
 HEART_RATE = BREATH + 2 * BREATH_HARMONICS
@@ -26,22 +26,21 @@ PAIRS = HEART_HARMONICS + BREATH_HARMONICS
 LOCAL, STEADY, RESTLESS, PHASED = 0, 1, 2, 3
 MODELS = TARGET_MODELS
 
-# Process noise.
-# Per model, share of the level's acceleration^2, relative strength^2 (1/s), rate^2 (rad2/s3); the phased one's beat is
-# in `beat_phase`, its level and breath are here.
+# Process noise, by model: share of the level's acceleration^2, relative strength^2 (1/s), rate^2 (rad2/s3). The phased
+# model's beat is in `beat_phase`, its level and breath are here.
 _LEVEL_SHARE2 = (0.0, 1.0, 10.0, 10.0)
 _STRENGTH2 = (0.0, 1e-5, 0.03, 0.03)
 _RATE2 = (0.0, 1e-4, 10.0, 0.0)
-_FLOOR2 = 1e-13  # m2/s that each harmonic may grow by out of nothing
+_LEAST_GROWTH2 = 1e-13  # m2/s, noise of a harmonic of amplitude zero, so that it can grow
 _BREATH_RATE2 = 1e-5
-_LEVEL_MEMORY_S = 0.5  # a speed of the level dies out in this time
-_RATE_MEMORY_S = 0.3  # a restless beat comes back to the mean rate in this time
+_LEVEL_MEMORY_S = 0.5  # time constant with which a speed of the level decays
+_RATE_MEMORY_S = 0.3  # time constant with which a restless beat returns to the mean rate
 _SOFTEST, _STIFFEST = -0.6, 1.0
 
 
 @njit(cache=True)
 def position(x: Floats, ahead_s: float) -> float:
-    """Position (m) of a model's state `x` (N,) `ahead_s` later (or earlier)."""
+    """Return the position (m) of a model's state `x` (N,) `ahead_s` from now (or before)."""
     fade = math.exp(-max(ahead_s, 0.0) / _LEVEL_MEMORY_S)
     value = x[LEVEL] + x[SPEED] * (_LEVEL_MEMORY_S * (1.0 - fade) if ahead_s > 0.0 else ahead_s)
     for group in range(2):
@@ -58,7 +57,7 @@ def position(x: Floats, ahead_s: float) -> float:
 
 @njit(cache=True)
 def propagate_local(x: Floats, P: Matrix, dt_s: float, acceleration2: float) -> None:
-    """The local model (level and speed, the rest of `x` and `P` is zero) by `dt_s`; acceleration2 (m2/s3): its noise."""
+    """Advance the local model by `dt_s`; acceleration2 (m2/s3): its noise. Only level and speed of `x`, `P` are used."""
     fade = math.exp(-dt_s / _LEVEL_MEMORY_S)
     reach = _LEVEL_MEMORY_S * (1.0 - fade)
     x[LEVEL] += reach * x[SPEED]
@@ -72,7 +71,7 @@ def propagate_local(x: Floats, P: Matrix, dt_s: float, acceleration2: float) -> 
 
 @njit(cache=True)
 def _turn(x: Floats, angle: Matrix, dt_s: float) -> None:
-    """Turn all pairs of `x` by their angle in `dt_s`; cos and sin into `angle` (PAIRS, 2)."""
+    """Rotate all pairs of `x` by their angle in `dt_s`, and set `angle` (PAIRS, 2) to its cosine and sine."""
     for group in range(2):
         first, count = (0, HEART_HARMONICS) if group == 0 else (HEART_HARMONICS, BREATH_HARMONICS)
         turn = x[HEART_RATE + group] * dt_s
@@ -87,7 +86,7 @@ def _turn(x: Floats, angle: Matrix, dt_s: float) -> None:
 
 @njit(cache=True)
 def _rows(P: Matrix, x: Floats, angle: Matrix, dt_s: float, fade: float, back: float) -> None:
-    """P <- F P, by the blocks of F: level and speed, each turning pair with its rate, the heart's rate."""
+    """Set P to F P, by the blocks of F: level and speed, each rotating pair with its rate, the heart's rate."""
     reach = _LEVEL_MEMORY_S * (1.0 - fade)
     for j in range(N):
         P[LEVEL, j] += reach * P[SPEED, j]
@@ -115,9 +114,9 @@ def _transpose(P: Matrix) -> None:
 
 @njit(cache=True)
 def propagate(x: Floats, P: Matrix, angle: Matrix, model: int, dt_s: float, mean_rate: float, level2: float) -> None:
-    """A model with harmonics by `dt_s`: x <- F x, P <- F P F^T + Q.
+    """Advance a model with harmonics by `dt_s`: x <- F x, P <- F P F^T + Q.
 
-    angle (PAIRS, 2): scratch; mean_rate (rad/s): what a restless beat comes back to; level2: the level's squared
+    angle (PAIRS, 2): scratch; mean_rate (rad/s): rate to which a restless beat returns; level2: the level's squared
     acceleration (m2/s3) of the steady model.
     """
     fade = math.exp(-dt_s / _LEVEL_MEMORY_S)
@@ -143,7 +142,7 @@ def _add_noise(x: Floats, P: Matrix, model: int, dt_s: float, q: float) -> None:
         known = P[HEART_RATE, HEART_RATE] > 0.0 if k < HEART_HARMONICS else P[BREATH_RATE, BREATH_RATE] > 0.0
         if known:
             strength = 1.0 if k < HEART_HARMONICS else 0.1
-            noise = (_FLOOR2 + strength * _STRENGTH2[model] * (x[i] ** 2 + x[i + 1] ** 2)) * dt_s
+            noise = (_LEAST_GROWTH2 + strength * _STRENGTH2[model] * (x[i] ** 2 + x[i + 1] ** 2)) * dt_s
             P[i, i] += noise
             P[i + 1, i + 1] += noise
     if P[HEART_RATE, HEART_RATE] > 0.0:
@@ -154,7 +153,7 @@ def _add_noise(x: Floats, P: Matrix, model: int, dt_s: float, q: float) -> None:
 
 @njit(cache=True)
 def _set_row(state: TargetState, m: int, travel_m: float, flank: float, ago_s: float) -> None:
-    """Row of the measurement `ago_s` before the state's time: value = wall - stiffer * travel - play * flank."""
+    """Set the row of a measurement `ago_s` before the state's time: value = wall - stiffer * travel - play * flank."""
     x, row = state.x[m], state.row
     row[LEVEL], row[SPEED] = 1.0, -ago_s
     for group in range(2):
@@ -169,7 +168,7 @@ def _set_row(state: TargetState, m: int, travel_m: float, flank: float, ago_s: f
 
 @njit(cache=True)
 def innovation_variance(state: TargetState, m: int, noise_m2: float, travel_m: float, flank: float, ago_s: float) -> float:
-    """Innovation variance of model `m`; state.cross = P row^T."""
+    """Return the innovation variance (m2) of model `m`; set state.cross to P row^T."""
     P, row, cross = state.P[m], state.row, state.cross
     if m == LOCAL:
         cross[LEVEL], cross[SPEED] = P[0, 0] - ago_s * P[0, 1], P[1, 0] - ago_s * P[1, 1]

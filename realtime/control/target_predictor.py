@@ -1,10 +1,12 @@
-"""Where the wall will be: heart beat and breath learned as rotating harmonics by Kalman filters, from late, noisy samples.
+"""Prediction of the wall's motion: Kalman filters learn heart beat and breath from delayed, noisy samples.
 
-Models of the same motion run side by side and are judged by how well they foretell it (`horizon_s` ahead): a local one
-(position and speed, knows no heart), a steady one (harmonics of a heart and a breath whose rates hardly change), a
-restless one (the beat's rate and strength may change from beat to beat), and for slow streams of samples a phased one
-(`beat_phase`: one wave, its phase among many possible). The forecast is their mean, weighted by what each has been
-worth lately.
+Up to four models of the same motion run in parallel. They are averaged with weights from their recent prediction errors
+`horizon_s` ahead (model averaging):
+
+- local: position and speed only.
+- steady: harmonics of a heart beat and a breath whose rates change slowly.
+- restless: rate and strength of the beat may change from beat to beat.
+- phased, for slow streams of samples: one waveform and the probability of its phase (`beat_phase`).
 """
 
 from __future__ import annotations
@@ -44,17 +46,17 @@ from realtime.control.target_models import (
 
 ACCEPTED, REJECTED, NOTHING_NEW = 1, -1, 0
 
-_RESTART_AFTER_S = 0.1  # wild samples for this long are a new truth, not outliers
-_SMALLEST_M = 5e-5  # a peak lower than this is no heart
-_TAKE_OVER_S = 2.0
-_RANGE_m = 10.0  # nothing is further off, or wilder, than that
+_RESTART_AFTER_S = 0.1  # samples rejected for this long are accepted: the wall has moved
+_SMALLEST_M = 5e-5  # a peak of the spectrum below this is noise
+_TAKE_OVER_S = 2.0  # the steady model restarts from a restless one that was better for this long
+_RANGE_m = 10.0  # samples beyond this are not plausible
 _MEAN_RATE_S = 5.0
-_BREATHLESS = 100.0  # times the squared acceleration of a slow stream's level, while its breath is not known
+_BREATHLESS = 100.0  # factor of the squared acceleration of a slow stream's level while its breath is unknown
 
 
 @njit(cache=True)
 def start(config: TargetParams, state: TargetState, stamp_ns: int, level_m: float) -> None:
-    """Begin at `stamp_ns` with the wall at `level_m`; nothing is known of its motion."""
+    """Start at `stamp_ns` with the wall at `level_m` and its motion unknown."""
     state.started, state.time_ns, state.shot_ns = 1, stamp_ns, stamp_ns
     state.heart_found = state.breath_found = state.agreed = state.rejected = 0
     state.rejected_s = state.worse_s = state.mean_rate = state.last_heart_Hz = 0.0
@@ -76,7 +78,7 @@ def start(config: TargetParams, state: TargetState, stamp_ns: int, level_m: floa
 
 @njit(cache=True)
 def ahead(state: TargetState, ahead_s: float) -> float:
-    """The wall's position (m) `ahead_s` after the state's time: the models' forecasts by their weights."""
+    """Return the wall's position (m) `ahead_s` after the state's time: the weighted mean of the models' predictions."""
     value = 0.0
     for m in range(MODELS):
         if state.weight[m] > 1e-3:
@@ -86,14 +88,14 @@ def ahead(state: TargetState, ahead_s: float) -> float:
 
 @njit(cache=True)
 def _position(state: TargetState, m: int, ahead_s: float) -> float:
-    """Position (m) that model `m` has `ahead_s` after (or before) the state's time."""
+    """Return the position (m) by model `m`, `ahead_s` after (or before) the state's time."""
     value = target_models.position(state.x[m], ahead_s)
     return value + beat_phase.ahead(state.beat.moment_m, state.mean_rate, ahead_s) if m == PHASED else value
 
 
 @njit(cache=True)
 def _in_use(config: TargetParams, state: TargetState) -> int:
-    """How many of the models, counted in their order, run now."""
+    """Return the number of models that run now, counted in their order."""
     if state.heart_found == 0 and state.breath_found == 0:
         return 1
     return PHASED + 1 if config.by_phase != 0 and state.heart_found != 0 else PHASED
@@ -101,13 +103,13 @@ def _in_use(config: TargetParams, state: TargetState) -> int:
 
 @njit(cache=True)
 def at(state: TargetState, time_ns: int) -> float:
-    """The wall's position (m) at `time_ns`; trusted for half a second past the last sample."""
+    """Return the wall's position (m) at `time_ns`; constant from half a second after the last sample on."""
     return ahead(state, min((time_ns - state.time_ns) * 1e-9, 0.5))
 
 
 @njit(cache=True)
 def shift(state: TargetState, by_m: float) -> None:
-    """Move the wall by `by_m` in all models: it is looked for where no force can tell."""
+    """Move the wall by `by_m` (m) in all models, to search for it while no force is measured."""
     for m in range(MODELS):
         state.x[m, LEVEL] += by_m
         state.shot[m, LEVEL] += by_m
@@ -115,7 +117,7 @@ def shift(state: TargetState, by_m: float) -> None:
 
 @njit(cache=True)
 def variance_ahead(state: TargetState) -> float:
-    """Variance (m2) that forecasts of `horizon_s` have had lately, noise of the samples included."""
+    """Return the recent variance (m2) of predictions `horizon_s` ahead, with the noise of the samples."""
     value = 0.0
     for m in range(MODELS):
         value += state.weight[m] * state.score_m2[m]
@@ -124,14 +126,14 @@ def variance_ahead(state: TargetState) -> float:
 
 @njit(cache=True)
 def least_score(state: TargetState) -> float:
-    """Mean square (m2) that the best model's forecasts have been off the samples lately."""
+    """Return the recent mean square error (m2) of the best model's predictions."""
     least_m2 = min(state.score_m2[LOCAL], state.score_m2[STEADY], state.score_m2[RESTLESS])
     return min(least_m2, state.score_m2[PHASED]) if state.weight[PHASED] > 0.0 else least_m2
 
 
 @njit(cache=True)
 def rates_Hz(state: TargetState) -> tuple[float, float]:
-    """Heart and breath rate (Hz) now; 0 where not found yet."""
+    """Return heart and breath rate (Hz) now; 0 for a rate that is not found yet."""
     best = STEADY if state.weight[STEADY] >= state.weight[RESTLESS] else RESTLESS
     heart = state.x[best, HEART_RATE] / (2.0 * math.pi) if state.heart_found else 0.0
     breath = state.x[best, BREATH_RATE] / (2.0 * math.pi) if state.breath_found else 0.0
@@ -140,13 +142,13 @@ def rates_Hz(state: TargetState) -> tuple[float, float]:
 
 @njit(cache=True)
 def stiffer(state: TargetState) -> float:
-    """By what share catheter and tissue in series are stiffer than assumed, as learned."""
+    """Return the learned relative error of the stiffness, catheter and tissue in series; positive: stiffer than assumed."""
     return _learned(state, STIFFNESS)
 
 
 @njit(cache=True)
 def play(state: TargetState) -> float:
-    """By how much (m) half the play is less than believed, as learned."""
+    """Return the learned error (m) of half the backlash; positive: narrower than assumed."""
     return _learned(state, PLAY)
 
 
@@ -159,8 +161,8 @@ def _learned(state: TargetState, what: int) -> float:
 
 
 @njit(cache=True)
-def credit_play(state: TargetState, part_m: float) -> None:
-    """Half the believed play has been made less by `part_m`: that much is no longer to be learned."""
+def subtract_play(state: TargetState, part_m: float) -> None:
+    """Subtract `part_m` (m) from the learned error of half the backlash, after the assumed width was corrected by it."""
     for m in (STEADY, RESTLESS):
         state.x[m, PLAY] -= part_m
         state.shot[m, PLAY] -= part_m
@@ -181,7 +183,7 @@ def _spread(state: TargetState, m: int, noise_m2: float, travel_m: float, flank:
 
 @njit(cache=True)
 def _to_time(config: TargetParams, state: TargetState, stamp_ns: int) -> float:
-    """Bring all models up to `stamp_ns`; returns how long (s) before their time the stamp is, 0 normally."""
+    """Advance all models to `stamp_ns`. Return how long (s) the stamp is before their time, 0 normally."""
     dt_s = (stamp_ns - state.time_ns) * 1e-9
     if dt_s <= 0.0:
         return -dt_s
@@ -203,13 +205,21 @@ def _to_time(config: TargetParams, state: TargetState, stamp_ns: int) -> float:
 def apply(
     config: TargetParams, state: TargetState, stamp_ns: int, value_m: float, travel_m: float, flank: float, noise_m2: float
 ) -> int:
-    """Take in a sample as of `stamp_ns`, of variance `noise_m2`: wall = `value_m` + stiffer * `travel_m` + play * `flank`.
+    """Take in a sample: wall = `value_m` + stiffer * `travel_m` + play * `flank`.
 
-    By the force: value is where the unloaded tip would be along the wall's inward normal, less assumed compliance times
-    force; travel is how far the unloaded tip is from its recent mean; flank is +-1 (times the tip's motion per
-    insertion) for the side of the play that was last pushed. By the pose: value is where the tip is, the others are
-    zero. Samples may be up to 0.1 s older than the newest one.
-    Returns ACCEPTED, REJECTED (wild: outside gate_sigma of every model, or out of any range) or NOTHING_NEW (too old).
+    Args:
+        config: parameters.
+        state: the models.
+        stamp_ns: time of the sample, at most 0.1 s before the newest one.
+        value_m: by force: depth of the free tip along the inward normal less assumed compliance times force; by pose:
+            depth of the tip.
+        travel_m: by force: distance of the free tip from its recent mean; by pose: 0.
+        flank: by force: +1 or -1 for the side of the gap that pushed last, times the tip's motion per insertion; by
+            pose: 0.
+        noise_m2: variance of the sample.
+
+    Returns:
+        ACCEPTED, REJECTED (further than gate_sigma from every model, or not plausible) or NOTHING_NEW (too old).
     """
     if not (abs(value_m) < _RANGE_m and abs(travel_m) < _RANGE_m and abs(flank) < _RANGE_m and 0.0 < noise_m2 < _RANGE_m):
         state.rejected += 1
@@ -246,14 +256,14 @@ def apply(
             beat_phase.correct(state.beat, beat_m, noise_m2 + state.P[m, LEVEL, LEVEL], dt_s)
         target_models.correct(state, m, v, spread_m2)
     wall_m = value_m + stiffer(state) * travel_m + play(state) * flank
-    _judge(config, state, wall_m, ago_s, noise_m2)
-    _listen(config, state, wall_m, dt_s)
+    _score(config, state, wall_m, ago_s, noise_m2)
+    _find_rates(config, state, wall_m, dt_s)
     return ACCEPTED
 
 
 @njit(cache=True)
-def _judge(config: TargetParams, state: TargetState, wall_m: float, ago_s: float, noise_m2: float) -> None:
-    """Compare what each model foretold `horizon_s` ago with this sample, once a horizon; renew the weights."""
+def _score(config: TargetParams, state: TargetState, wall_m: float, ago_s: float, noise_m2: float) -> None:
+    """Once a horizon, compare each model's prediction of `horizon_s` ago with this sample, and set the weights."""
     age_s = (state.time_ns - state.shot_ns) * 1e-9 - ago_s
     if age_s < config.horizon_s - 1e-4:
         return
@@ -286,7 +296,7 @@ def _judge(config: TargetParams, state: TargetState, wall_m: float, ago_s: float
 
 @njit(cache=True)
 def _settle_rates(state: TargetState, dt_s: float) -> None:
-    """The restless model's mean rate; and where it has long been the better one, the steady one starts from it."""
+    """Follow the restless model's mean rate; restart the steady model from it when it has been better for _TAKE_OVER_S."""
     state.mean_rate += min(dt_s / _MEAN_RATE_S, 1.0) * (state.x[RESTLESS, HEART_RATE] - state.mean_rate)
     worse = state.score_m2[RESTLESS] < 0.5 * state.score_m2[STEADY]
     state.worse_s = state.worse_s + dt_s if worse else 0.0
@@ -301,8 +311,8 @@ def _settle_rates(state: TargetState, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def _listen(config: TargetParams, state: TargetState, wall_m: float, dt_s: float) -> None:
-    """Feed the frequency banks with means over STEP_S, and begin or renew the harmonics where they find a rate."""
+def _find_rates(config: TargetParams, state: TargetState, wall_m: float, dt_s: float) -> None:
+    """Feed the frequency banks with means over STEP_S, and start the harmonics of a rate that they find."""
     state.bank_value += wall_m
     state.bank_s += dt_s
     state.bank_n += 1
@@ -325,19 +335,21 @@ def _listen(config: TargetParams, state: TargetState, wall_m: float, dt_s: float
             and state.score_m2[LOCAL] < 1.2 * min(state.score_m2[STEADY], state.score_m2[RESTLESS])
         )
         if lost:
-            _begin(state, state.heart_bank, HEART, HEART_HARMONICS, HEART_RATE, heart_Hz, size_m)
+            _start_harmonics(state, state.heart_bank, HEART, HEART_HARMONICS, HEART_RATE, heart_Hz, size_m)
             state.heart_found, state.agreed = 1, -200
             state.mean_rate = 2.0 * math.pi * heart_Hz
     if state.heart_found and state.breath_found == 0 and state.breath_bank.since_s > 5.0:
         breath_Hz, size_m = frequency_bank.peak(state.breath_bank)
         if breath_Hz > 0.0 and size_m > _SMALLEST_M:
-            _begin(state, state.breath_bank, BREATH, BREATH_HARMONICS, BREATH_RATE, breath_Hz, size_m)
+            _start_harmonics(state, state.breath_bank, BREATH, BREATH_HARMONICS, BREATH_RATE, breath_Hz, size_m)
             state.breath_found = 1
 
 
 @njit(cache=True)
-def _begin(state: TargetState, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:
-    """Open the harmonics of heart or breath in all models, as `bank` heard them: at `rate_Hz`, of about `size_m`."""
+def _start_harmonics(
+    state: TargetState, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float
+) -> None:
+    """Start the harmonics of heart or breath in all models: at `rate_Hz` (Hz), amplitude about `size_m` (m), from `bank`."""
     fresh = state.heart_found == 0 and state.breath_found == 0
     for m in (STEADY, RESTLESS, PHASED):
         x, P = state.x[m], state.P[m]
@@ -351,14 +363,14 @@ def _begin(state: TargetState, bank: Bank, first: int, count: int, rate: int, ra
         if m == PHASED and rate == HEART_RATE:
             beat_phase.start(state.beat, *frequency_bank.pair(bank, rate_Hz))
         else:
-            _open(x, P, bank, first, count, rate, rate_Hz, size_m)
+            _start_pairs(x, P, bank, first, count, rate, rate_Hz, size_m)
         x[LEVEL] += before_m - _position(state, m, 0.0)
         state.score_m2[m] = 0.5 * state.score_m2[LOCAL]
 
 
 @njit(cache=True)
-def _open(x: Floats, P: Matrix, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:
-    """`count` pairs from `first` on, and their rate, in one model's state and covariance."""
+def _start_pairs(x: Floats, P: Matrix, bank: Bank, first: int, count: int, rate: int, rate_Hz: float, size_m: float) -> None:
+    """Start `count` pairs from index `first` on, and their rate, in one model's state and covariance."""
     for i in range(first, first + 2 * count):
         x[i] = 0.0
         for j in range(N):

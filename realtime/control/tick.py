@@ -92,7 +92,7 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
     if result == target_predictor.REJECTED:
         state.force_rejected += 1
     elif result == target_predictor.ACCEPTED:
-        wall_observer.hand_over_play(params.backlash, state.backlash, state.wall, dt_s)
+        wall_observer.correct_backlash(params.backlash, state.backlash, state.wall, dt_s)
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""How far the tip is from the model's free tip, learned from poses: the offset, and the error of the insertion."""
+"""Offset of the tip from the model's free tip, and error of the insertion, both learned from poses."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def _learn_insertion(
 ) -> None:
     """Learn the error of the insertion from a free tip at `position_m` (3,) and the predicted joints then.
 
-    At arming the place of the body within the backlash is unknown. The offset makes up for it in position control, but a
-    force that is estimated from the shape needs the insertion itself: 1 mm of it looks like up to 0.1 N, and it shows
-    only while nothing is touched.
+    At arming the position of the body within the backlash is unknown. In position control the offset compensates for it,
+    but a force that is estimated from the shape needs the insertion itself: 1 mm of error is up to 0.1 N. The error is
+    observable only in free space.
     """
     insertion_m = joint[0] - state.insertion_error_m
     tip_m = free_tip.apply(kinematics, (insertion_m, joint[1], joint[2]))

@@ -1,4 +1,4 @@
-"""Where the wall is and how stiff the contact, from the contact force and from the tip's poses.
+"""Position of the wall and stiffness of the contact, estimated from the contact force and from the tip's poses.
 
 The force says how far the free tip is beyond the wall: b = wall + compliance * force, with b the depth of the free tip
 along the inward normal. `target_predictor` turns such samples into the wall's motion, for the force and for the poses.
@@ -23,10 +23,10 @@ from realtime.control.records import (
 )
 from realtime.control.tip_offset import NUDGE_m
 
-# Stiffness is learned from motion about the mean of this long, so that a drift of the wall is not taken for it.
+# Stiffness is learned from motion about the mean over this time, so that a drift of the wall does not bias it.
 _MEAN_S = 1.0
 # An error of the backlash that was learned in contact is handed to `backlash` over this time.
-_PLAY_S = 2.0
+_BACKLASH_S = 2.0
 
 
 @njit(cache=True)
@@ -54,8 +54,8 @@ def take_force(
 ) -> tuple[int, float]:
     """Take in the newest reading of the force source.
 
-    Without force the wall may be anywhere beyond the tip: then only a prediction that has it nearer is corrected. The
-    variance of an estimate is taken as no more than the predictions have shown.
+    Without force the wall may be anywhere beyond the tip: then only a prediction of a nearer wall is corrected. The
+    variance of an estimate is limited to the recent prediction error.
 
     Args:
         config: compliance, noise, parameters of the predictors.
@@ -96,10 +96,10 @@ def take_force(
 
 
 @njit(cache=True)
-def hand_over_play(config: BacklashParams, gap: BacklashState, state: WallState, dt_s: float) -> None:
+def correct_backlash(config: BacklashParams, gap: BacklashState, state: WallState, dt_s: float) -> None:
     """Correct the width of the backlash by a part of the error that was learned, over `dt_s` (s)."""
-    part_m = dt_s / _PLAY_S * target_predictor.play(state.force)
-    target_predictor.credit_play(state.force, 0.5 * backlash.narrow(config, gap, 2.0 * part_m))
+    part_m = dt_s / _BACKLASH_S * target_predictor.play(state.force)
+    target_predictor.subtract_play(state.force, 0.5 * backlash.narrow(config, gap, 2.0 * part_m))
 
 
 @njit(cache=True)

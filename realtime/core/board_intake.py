@@ -16,7 +16,7 @@ OFFSET_JUMP_NS = 50_000_000
 
 
 def axis_limits(rig: Rig) -> tuple[AxisLimits, ...]:
-    """Limits of the three axes in steps, as the board enforces them. A little above the loop's own for rounding."""
+    """Return the limits of the three axes in steps that the board enforces: above the loop's own by the rounding."""
     limits = []
     for axis in range(3):
         stage = rig.stage(axis)
@@ -32,7 +32,7 @@ def axis_limits(rig: Rig) -> tuple[AxisLimits, ...]:
 
 
 def take_status(record: np.record, link: StepperBoardLink, now_ns: int) -> None:
-    """The newest STATUS of `link` into a BOARD record."""
+    """Copy the newest STATUS of `link` into a BOARD record."""
     status = link.status
     if status is None:
         return
@@ -45,14 +45,14 @@ def take_status(record: np.record, link: StepperBoardLink, now_ns: int) -> None:
     record.mcu_offset_ns = offset_ns
     record.position_steps[:] = status.position_steps
     record.encoder_counts[:] = status.encoder_counts
-    # A board that was reset, or is another one, is no longer where the loop believes it: as bad as a fault of its own.
-    strange = link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH)
-    record.state, record.fault = (BoardState.FAULT if strange else status.state), status.fault
-    record.ready = 1 if link.armed and not strange else 0
+    # The position of a board that was reset or replaced is unknown, so it counts as a fault.
+    unknown = link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH)
+    record.state, record.fault = (BoardState.FAULT if unknown else status.state), status.fault
+    record.ready = 1 if link.armed and not unknown else 0
 
 
 def board_message(link: StepperBoardLink, now_ns: int) -> BoardCounters:
-    """The newest STATUS as a message. Raises ValueError before the first."""
+    """Return the message of the newest STATUS. Raises ValueError before the first."""
     status = link.status
     if status is None:
         raise ValueError("board: found no status yet, wanted one before its message")

@@ -1,4 +1,4 @@
-"""What stands between the network and the operator's desk: who asks, under which lease, how fresh, how much."""
+"""Check of every command from the network: sender, role, lease, age, repetition and rate."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from protocol.topics import Command, CommandCounts, Reply, decode
 
 LEASE_NS = 3_000_000_000
 LONGEST_LIFE_NS = 2_000_000_000
-# How far a sender's clock may be ahead; its clock follows the stamps of the replies.
+# Greatest lead of a sender's clock; the sender sets its clock by the stamps of the replies.
 AHEAD_NS = 100_000_000
-# A flood costs its sender's commands, not the rig's time: so many at once, and so many a second.
+# Limits of one sender: commands at once, and commands a second. A flood loses its sender's commands, not the rig's time.
 BURST, RATE_PER_S = 50, 50.0
 REMEMBERED = 2000
 _SENDERS = 200
-# Of refusals, one is told in so long, with the number of the others.
-_TOLD_EVERY_NS = 500_000_000
+# In this time at most one refusal is logged, with the number of the others.
+_LOG_EVERY_NS = 500_000_000
 _NEEDS_NO_LEASE = ("clock", "take", "hold", "stop")
 
 
 @dataclass
 class Lease:
-    """The right to command: who has it, its secret, until when, and the newest sequence number under it."""
+    """The right to command: its holder, secret, expiry, and the newest sequence number under it."""
 
     holder: str = ""
     id: str = ""
@@ -34,18 +34,18 @@ class Lease:
     sequence: int = -1
 
     def active(self, now_ns: int) -> bool:
-        """Whether it stands. Also a clock that was set back ends it."""
+        """Whether the lease is valid. A clock that was set back ends it, too."""
         return self.holder != "" and 0 <= self.expires_ns - now_ns <= LEASE_NS
 
 
 class _Bucket:
-    """Lets BURST through at once and RATE_PER_S in the long run."""
+    """Limit of one sender's rate: BURST at once and RATE_PER_S in the long run (token bucket)."""
 
     def __init__(self, now_ns: int) -> None:
         self._level, self._at_ns = float(BURST), now_ns
 
-    def let(self, now_ns: int) -> bool:
-        """Whether one more may pass."""
+    def take(self, now_ns: int) -> bool:
+        """Take one token. Return whether there was one."""
         self._level = min(float(BURST), self._level + max(now_ns - self._at_ns, 0) * 1e-9 * RATE_PER_S)
         self._at_ns = now_ns
         if self._level < 1.0:
@@ -55,32 +55,35 @@ class _Bucket:
 
 
 class CommandGate:
-    """Judges what arrives on `request/NAME`. What it refuses changes nothing; what it lets through goes to `obey`.
+    """Checks what arrives on `request/NAME`, and passes accepted commands to `execute`. A refused one changes nothing.
 
-    obey(command, now_ns) -> Reply: the desk; called by one thread at a time. now_ns: the rig's clock.
-    roles: name -> role, for names that the rig file gives one; only `commander` may command. Others come from this
-    machine: the network lets no other name in. new_lease: makes a lease's secret.
+    Args:
+        now_ns: the rig's clock.
+        execute: (command, now_ns) -> Reply; carries out a command. One thread at a time calls it.
+        roles: name -> role, for the names that have one in the rig file; only `commander` may command. A name without a
+            role is a program of this computer, because the network admits no other names.
+        new_lease: makes the secret of a lease.
     """
 
     def __init__(
         self,
         now_ns: Callable[[], int],
-        obey: Callable[[Command, int], Reply],
+        execute: Callable[[Command, int], Reply],
         *,
         roles: Mapping[str, str] | None = None,
         new_lease: Callable[[], str] = lambda: secrets.token_hex(16),
     ) -> None:
-        self._now_ns, self._obey, self._new_lease = now_ns, obey, new_lease
+        self._now_ns, self._execute, self._new_lease = now_ns, execute, new_lease
         self._roles = dict(roles or {})
         self._lock = threading.Lock()
         self._lease = Lease()
         self._seen: dict[str, int] = {}
         self._buckets: dict[str, _Bucket] = {}
-        self._told_ns, self._untold = -_TOLD_EVERY_NS, 0
+        self._logged_ns, self._not_logged = -_LOG_EVERY_NS, 0
         self.counts = {"accepted": 0, "refused": 0, "expired": 0, "replayed": 0, "malformed": 0, "flooded": 0}
 
     def state(self) -> CommandCounts:
-        """Who holds the lease, and the counts."""
+        """Return the holder of the lease, and the counts."""
         with self._lock:
             now_ns = self._now_ns()
             active = self._lease.active(now_ns)
@@ -92,13 +95,14 @@ class CommandGate:
             )
 
     def answer(self, name: str, payload: bytes) -> tuple[Command | None, Reply | None]:
-        """What came on request/`name`, and the reply to it. No command: malformed; no reply either: one of a flood.
+        """Return the command in `payload`, which came on request/`name`, and the reply to it.
 
-        A stop is obeyed from every commander at any time: without a lease, late, repeated, in the midst of a flood.
+        The command is None if it is malformed, and the reply is None as well if the sender exceeds its rate. A stop is
+        carried out for every commander at any time: without a lease, late, repeated, or above the rate.
         """
         with self._lock:
             now_ns = self._now_ns()
-            if not self._let(name, now_ns) and b"stop" not in payload:
+            if not self._within_rate(name, now_ns) and b"stop" not in payload:
                 self.counts["flooded"] += 1
                 return None, None
             try:
@@ -106,57 +110,57 @@ class CommandGate:
             except ValueError as error:
                 self.counts["malformed"] += 1
                 return None, Reply(stamp_ns=now_ns, id="", result="malformed", text=str(error))
-            reply = self._judge(name, command, now_ns)
+            reply = self._check(name, command, now_ns)
             if command.action != "clock":
                 self.counts[reply.result] += 1
             return command, reply
 
-    def in_words(self, name: str, command: Command | None, reply: Reply | None) -> str:
-        """The line for the log: what `name` asked and got; empty where nothing is to be told, or too much was already."""
+    def log_line(self, name: str, command: Command | None, reply: Reply | None) -> str:
+        """Return the log line of a command and its reply; empty for a renewal, a clock reading, or above the log's rate."""
         what = f"{command.action} {command.target}".removesuffix(" none") if command else "request"
         if reply is not None and reply.result == "accepted":
-            return f"{name}: {what}: accepted" if for_the_record(command, reply) else ""
+            return f"{name}: {what}: accepted" if without_secrets(command, reply) else ""
         with self._lock:
             now_ns = self._now_ns()
-            if 0 <= now_ns - self._told_ns < _TOLD_EVERY_NS:
-                self._untold += 1
+            if 0 <= now_ns - self._logged_ns < _LOG_EVERY_NS:
+                self._not_logged += 1
                 return ""
-            more, self._untold, self._told_ns = self._untold, 0, now_ns
-        said = "not read, there are too many" if reply is None else f"{what}: {reply.result}: {reply.text}"
-        return f"{name[:40]}: {said}" + (f" (and {more} more not told)" if more else "")
+            more, self._not_logged, self._logged_ns = self._not_logged, 0, now_ns
+        result = "not read, too many commands" if reply is None else f"{what}: {reply.result}: {reply.text}"
+        return f"{name[:40]}: {result}" + (f" (and {more} more not logged)" if more else "")
 
-    def _let(self, name: str, now_ns: int) -> bool:
+    def _within_rate(self, name: str, now_ns: int) -> bool:
         if name not in self._buckets and len(self._buckets) >= _SENDERS:
             name = ""
-        return self._buckets.setdefault(name, _Bucket(now_ns)).let(now_ns)
+        return self._buckets.setdefault(name, _Bucket(now_ns)).take(now_ns)
 
-    def _judge(self, name: str, command: Command, now_ns: int) -> Reply:
-        def no(result: str, text: str) -> Reply:
+    def _check(self, name: str, command: Command, now_ns: int) -> Reply:
+        def answer(result: str, text: str) -> Reply:
             return Reply(stamp_ns=now_ns, id=command.id, result=result, text=text)
 
         if command.commander != name:
-            return no("refused", f"commander: found {command.commander}, wanted {name}, whose key it came on")
+            return answer("refused", f"commander: found {command.commander}, wanted {name}, whose key it came on")
         role = self._roles.get(name, "commander")
         if role != "commander":
-            return no("refused", f"role: found {role}, wanted commander")
+            return answer("refused", f"role: found {role}, wanted commander")
         if command.action == "stop":
-            return self._obey(command, now_ns)
+            return self._execute(command, now_ns)
         if command.action == "clock":
-            return no("accepted", "")
+            return answer("accepted", "")
         result, text = self._stale(command, now_ns)
         if not text:
             result, text = self._unleased(command, now_ns)
         if text:
-            return no(result, text)
+            return answer(result, text)
         if command.action == "take":
             return self._take(command, now_ns)
         if command.action == "release":
             self._lease = Lease()
-            return no("accepted", "")
-        return self._obey(command, now_ns)
+            return answer("accepted", "")
+        return self._execute(command, now_ns)
 
     def _stale(self, command: Command, now_ns: int) -> tuple[str, str]:
-        """Why the command is too old, too new or a repetition; no text when it is fresh."""
+        """Return a result, and why the command is too old, too new or a repetition; no text when it is none of these."""
         if now_ns > command.expires_ns:
             return "expired", f"came {(now_ns - command.expires_ns) * 1e-9:.3f} s after its expiry"
         if command.stamp_ns > now_ns + AHEAD_NS:
@@ -179,12 +183,12 @@ class CommandGate:
         return "accepted", ""
 
     def _unleased(self, command: Command, now_ns: int) -> tuple[str, str]:
-        """Why the command may not be given under the lease it names; no text when it may, or needs none."""
+        """Return a result, and why the command's lease does not permit it; no text when it does, or none is needed."""
         if command.action in _NEEDS_NO_LEASE:
             return "accepted", ""
         lease = self._lease
         if not lease.active(now_ns):
-            return "refused", "lease: found none that stands, wanted one taken before and renewed"
+            return "refused", "lease: found no valid one, wanted one taken before and renewed"
         if not self._holds(command):
             return "refused", f"lease: held by {lease.holder}, for another {(lease.expires_ns - now_ns) * 1e-9:.1f} s"
         if command.sequence <= lease.sequence:
@@ -197,7 +201,7 @@ class CommandGate:
         return command.commander == lease.holder and secrets.compare_digest(command.lease.encode(), lease.id.encode())
 
     def _take(self, command: Command, now_ns: int) -> Reply:
-        """A new lease where none stands, the same one for longer for who holds it, a refusal for all others."""
+        """Return a new lease if none is valid, the same lease renewed for its holder, and a refusal for other commanders."""
         lease = self._lease
         if lease.active(now_ns):
             if not self._holds(command):
@@ -216,8 +220,8 @@ class CommandGate:
         )
 
 
-def for_the_record(command: Command | None, reply: Reply | None) -> tuple[Command, Reply] | None:
-    """What all may read of a command and its reply: without the lease's secret. None for renewals and clock readings."""
+def without_secrets(command: Command | None, reply: Reply | None) -> tuple[Command, Reply] | None:
+    """Return a command and its reply without the lease's secret, to be published. None for renewals and clock readings."""
     if command is None or reply is None or command.action == "clock":
         return None
     if command.action == "take" and reply.result == "accepted" and reply.lease == command.lease:

@@ -87,7 +87,7 @@ class RealtimeProcess:
 
     def start(self) -> None:
         """Answer commands, compile, start the loop and all threads."""
-        # Compiling takes a minute and more without a cache on a busy machine: a commander is told so meanwhile.
+        # Without a cache, compiling takes more than a minute on a busy machine. Until then commands are refused and say so.
         self._requests = self._session.serve_requests(self.request)
         self.log("info", "starting: the loop is being compiled")
         self.loop.prepare()

@@ -22,7 +22,7 @@ from realtime.control import safety
 from realtime.control.configure import tick_parameters
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
-from realtime.core.command_gate import CommandGate, for_the_record
+from realtime.core.command_gate import CommandGate, without_secrets
 from realtime.core.intake import Intake
 from realtime.core.operator_commands import OperatorCommands
 from realtime.core.supervision import Supervision, SupervisionFinding
@@ -41,7 +41,7 @@ _DEVICE_LEVELS = {DeviceEventKind.LOST: "warning", DeviceEventKind.WARNING: "war
 
 
 class CommandRequest(NamedTuple):
-    """What commander `name` asked, as the bytes that came on its key."""
+    """A request of commander `name`: the bytes that came on its key."""
 
     name: str
     payload: bytes
@@ -64,8 +64,8 @@ class Arrived:
         board_lost: why the board's port is gone; empty while it is there.
         poses, forces, device_events: what the sensor drivers handed over.
         estimates: messages of the model process.
-        requests: what commanders asked.
-        log_lines: what the shell itself has to say; published as they are.
+        requests: requests of commanders.
+        log_lines: log lines of the shell itself; published unchanged.
         loop_runs: whether the loop ticks; while it does not, only a stop is accepted.
     """
 
@@ -220,7 +220,7 @@ class RigCore:
             if seen_ns is None or not 0 <= tick_ns - seen_ns <= CAUSE_QUIET_NS:
                 new |= bit
         if new and safety.action_of(new) >= SafetyAction.HOLD:
-            text = "; ".join(safety.in_words(new))
+            text = "; ".join(safety.messages(new))
             self._leaving.log(tick_ns, "warning", "safety", f"{SafetyAction(action).label}: {text}")
 
     # --- devices ---
@@ -281,8 +281,8 @@ class RigCore:
         force, name = ("sensor", "the force sensor") if by_sensor else ("estimate", "the model process")
         needed = {"tip": "the tracker (tip)", force: name}
         return ", ".join(
-            words
-            for field_name, words in needed.items()
+            description
+            for field_name, description in needed.items()
             if self._records[field_name].count == 0 or self.now_ns - self._records[field_name].arrival_ns > limit_ns
         )
 
@@ -313,15 +313,15 @@ class RigCore:
 
     def _take_request(self, request: CommandRequest) -> None:
         command, reply = self.gate.answer(request.name, request.payload)
-        for topic, message in zip(("command", "reply"), for_the_record(command, reply) or (), strict=False):
+        for topic, message in zip(("command", "reply"), without_secrets(command, reply) or (), strict=False):
             self._publish(topic, message)
-        line = self.gate.in_words(request.name, command, reply)
+        line = self.gate.log_line(request.name, command, reply)
         if line:
             self._log("info" if reply is not None and reply.result == "accepted" else "warning", "commander", line)
         self._leaving.replies.append(reply)
 
     def _execute(self, command: Command, now_ns: int) -> Reply:
-        """Carry out a command that the gate has let through."""
+        """Carry out a command that the command gate has accepted."""
         if command.action != "stop" and not self._loop_runs:
             text = f"{command.action}: found the loop not running yet, wanted it to: it is being compiled"
             return Reply(stamp_ns=now_ns, id=command.id, result="refused", text=text)

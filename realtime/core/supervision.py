@@ -16,11 +16,11 @@ from realtime.control.records import N_AXES
 Vector = NDArray[np.float64]
 
 # Encoder and steps: the encoder follows within a status period at full speed (80 steps); a larger difference that lasts
-# this long is no lag. 150 steps are 0.5 mm of insertion, 4 degrees of handle.
-STEPS_APART, STEPS_APART_NS = 150, 20_000_000
+# this long is an error. 150 steps are 0.5 mm of insertion, 4 degrees of handle.
+STEPS_DIFFERENCE, STEPS_DIFFERENCE_NS = 150, 20_000_000
 # Sensor and model: the planar model is 0.07 N off in contact and 0.2 N noisy at 40 Hz; averaged over a second
 # 0.25 N is beyond both.
-FORCE_APART_N, FORCE_AVERAGE_S = 0.25, 1.0
+FORCE_DIFFERENCE_N, FORCE_AVERAGE_S = 0.25, 1.0
 # The period of estimates; the first difference after a restart is weighted by it.
 _ESTIMATE_PERIOD_S = 0.025
 # A model process at 40 Hz that sends nothing for this long, or estimates for poses older than that, is logged.
@@ -47,20 +47,20 @@ class StepCheck:
         self._difference_at_rest, self._since_ns = None, None
 
     def check(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> SupervisionFinding | None:
-        """Compare steps (3,) with counts (3,); return a finding once they have differed for STEPS_APART_NS."""
+        """Compare steps (3,) with counts (3,); return a finding once they have differed for STEPS_DIFFERENCE_NS."""
         difference = np.asarray(encoder_counts) / self._ratio - np.asarray(position_steps)
         if self._difference_at_rest is None:
             self._difference_at_rest = difference
         lost = np.abs(difference - self._difference_at_rest)
         axis = int(np.argmax(lost))
-        if lost[axis] <= STEPS_APART:
+        if lost[axis] <= STEPS_DIFFERENCE:
             self._since_ns = None
             return None
         if self._since_ns is None:
             self._since_ns = now_ns
-        if now_ns - self._since_ns < STEPS_APART_NS:
+        if now_ns - self._since_ns < STEPS_DIFFERENCE_NS:
             return None
-        return SupervisionFinding(safety.STEPS_LOST, f"{AXES[axis]}: encoder and steps are {lost[axis]:.0f} steps apart")
+        return SupervisionFinding(safety.STEPS_LOST, f"{AXES[axis]}: encoder and steps differ by {lost[axis]:.0f} steps")
 
 
 class ForceCheck:
@@ -69,13 +69,13 @@ class ForceCheck:
     Args:
         first, second: names of the sources, as `Supervision.forces` gets them.
         cause: bit of `realtime.control.safety` when they disagree.
-        apart_N: allowed length of the averaged difference (N).
+        difference_limit_N: allowed length of the averaged difference (N).
         average_s: time constant of the average (s).
     """
 
-    def __init__(self, first: str, second: str, cause: int, apart_N: float, average_s: float) -> None:
+    def __init__(self, first: str, second: str, cause: int, difference_limit_N: float, average_s: float) -> None:
         self.first, self.second, self.cause = first, second, cause
-        self._apart_N, self._average_s = apart_N, average_s
+        self._limit_N, self._average_s = difference_limit_N, average_s
         self._difference_N = np.zeros(3)
         self._last_ns: int | None = None
 
@@ -92,9 +92,9 @@ class ForceCheck:
         dt_s = _ESTIMATE_PERIOD_S if self._last_ns is None else max((now_ns - self._last_ns) * 1e-9, 0.0)
         self._last_ns = now_ns
         self._difference_N += (1.0 - math.exp(-dt_s / self._average_s)) * (difference_N - self._difference_N)
-        if not np.linalg.norm(self._difference_N) > self._apart_N:
+        if not np.linalg.norm(self._difference_N) > self._limit_N:
             return None
-        return SupervisionFinding(self.cause, f"{self.first} and {self.second} are more than {self._apart_N} N apart")
+        return SupervisionFinding(self.cause, f"{self.first} and {self.second} differ by more than {self._limit_N} N")
 
 
 class HostCheck:
@@ -115,7 +115,7 @@ class HostCheck:
         """Return a finding when the last estimate is too long ago; nothing before the first estimate."""
         if self._answered_ns is None or now_ns - self._answered_ns <= HOST_SILENT_NS:
             return None
-        return self._new(f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process is silent")
+        return self._new(f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process does not answer")
 
     def _new(self, complaint: str) -> SupervisionFinding | None:
         before, self._complaint = self._complaint, complaint
@@ -127,7 +127,9 @@ class Supervision:
 
     def __init__(self, encoder_counts_per_step: tuple[float, float, float]) -> None:
         self.steps, self.host = StepCheck(encoder_counts_per_step), HostCheck()
-        self.force_checks = (ForceCheck("force sensor", "model", safety.FORCE_DISAGREES, FORCE_APART_N, FORCE_AVERAGE_S),)
+        self.force_checks = (
+            ForceCheck("force sensor", "model", safety.FORCE_DISAGREES, FORCE_DIFFERENCE_N, FORCE_AVERAGE_S),
+        )
         self.causes = 0
 
     def restart(self) -> None:

@@ -87,8 +87,8 @@ class SweepLoop:
     """Brings the devices up, arms, runs the sweeps in turn, disarms. `finished` or `problem` say how it ended.
 
     Publishes `stage` (encoders, stamped with the board's time), `pose/tip`, `pose/shaft`, and a `log` line of source
-    `sweep` with the sweep as JSON at each begin and end. A silent device, a fault, a force above safety.over_force_N or
-    `break_off` ends it: the stages brake, the board is disarmed.
+    `sweep` with the sweep as JSON at each begin and end. A device without data, a fault, a force above safety.over_force_N
+    or `break_off` ends it: the stages brake, the board is disarmed.
     """
 
     def __init__(self, rig: Rig, sweeps: Sequence[Sweep], publish: Publish) -> None:
@@ -112,7 +112,7 @@ class SweepLoop:
         self._compile()
 
     def _compile(self) -> None:
-        """Call the kernels once, on nothing: their first call takes longer than a device may be silent."""
+        """Compile the kernels by one call without effect: the first call takes longer than the time limit of a device."""
         config, nowhere = self._stage_config, new(STAGE_STATE)[0]
         stage_limiter.apply(config, nowhere, 0, 0.0, self.period_ns * 1e-9)
         stage_limiter.brake(config, nowhere, 0, self.period_ns * 1e-9)
@@ -177,26 +177,26 @@ class SweepLoop:
         return b""
 
     def _own_gap(self, now_ns: int) -> None:
-        """Before any device is blamed for it: whether this loop itself stood still."""
+        """Break off when this loop itself stood still, before a device is reported for it."""
         gap_ns, self._step_ns = now_ns - self._step_ns, now_ns
         if self._armed_ns > 0 and gap_ns > self.rig.safety.stop_after_s * 1e9:
             self.break_off(
-                f"computer: found that the sweeps' own loop stood still for {gap_ns * 1e-9:.2f} s, wanted a "
+                f"computer: found that the loop of the sweeps stood still for {gap_ns * 1e-9:.2f} s, wanted a "
                 f"turn every {self.period_ns * 1e-6:g} ms"
             )
 
     def _watch(self, now_ns: int) -> None:
         limits, status = self.rig.safety, self.link.status
         force_N = float(np.linalg.norm(self._force.force_N))
-        heard_ns = {
+        received_ns = {
             "tracker": self._pose_ns,
             "force sensor": self._force_ns,
             "board": now_ns if status is None else status.arrival_ns,
         }
-        for device, last_ns in heard_ns.items():
+        for device, last_ns in received_ns.items():
             if now_ns - last_ns > limits.stop_after_s * 1e9:
                 self.break_off(
-                    f"{device}: found it silent for {(now_ns - last_ns) * 1e-9:.2f} s, "
+                    f"{device}: found no data for {(now_ns - last_ns) * 1e-9:.2f} s, "
                     f"wanted at most {limits.stop_after_s} (safety.stop_after_s)"
                 )
         if not force_N <= limits.over_force_N:
@@ -212,7 +212,7 @@ class SweepLoop:
             sweep = self.sweeps[self.current]
             time_s = (now_ns - self._start_ns) * 1e-9
             if time_s >= sweep.seconds:
-                self._tell(now_ns, "end", sweep)
+                self._log_event(now_ns, "end", sweep)
                 self._start_ns = 0
             else:
                 self._target[:] = sweep.at(time_s)
@@ -232,9 +232,9 @@ class SweepLoop:
         elif now_ns - self._rest_ns >= REST_S * 1e9:
             self._rest_ns, self._start_ns = 0, now_ns
             self.current += 1
-            self._tell(now_ns, "begin", sweep)
+            self._log_event(now_ns, "begin", sweep)
 
-    def _tell(self, now_ns: int, event: str, sweep: Sweep) -> None:
+    def _log_event(self, now_ns: int, event: str, sweep: Sweep) -> None:
         text = json.dumps({"event": event, "number": self.current, **asdict(sweep)})
         self.publish("log", Log(stamp_ns=now_ns, level="info", source="sweep", text=text))
 

@@ -1,7 +1,7 @@
 """The sweeps on a rig's own ports: `SweepLoop` fed from serial lines and UDP, in turn, at the loop's rate.
 
-Whoever holds the board's port commands the rig: the port is opened for this process alone, so that nothing moves while
-a realtime process (or another sweep) has it, and neither gets at the board as long as the sweeps run.
+The process that holds the board's port commands the rig. The port is opened exclusively: the sweeps do not start while
+a realtime process (or another sweep) has it, and no other process reaches the board while the sweeps run.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class RigPorts:
         return line
 
     def receive(self) -> FromRig:
-        """What the devices have sent. A tracker or force box that is gone is silent, and the sweeps end by that."""
+        """Return what the devices have sent. A tracker or force box that is gone sends nothing, which ends the sweeps."""
         arriving = FromRig(board=self._board.read())
         try:
             arriving.tracker = self._tracker.read()
@@ -88,7 +88,7 @@ class RigPorts:
         return arriving
 
     def send(self, leaving: ToRig) -> None:
-        """The board first: its set-points have a time."""
+        """Send, to the board first, because its set-points have a time of execution."""
         if leaving.board:
             self._board.write(leaving.board)
         try:
@@ -154,7 +154,7 @@ def run_sweeps(
 
     clock: CLOCK_MONOTONIC unless another is given; `loop` keeps its stamps. each: called once a turn. When it returns,
     `loop.finished` or `loop.problem` say how it ended. Raises OSError when the board's line is gone: then the board, which
-    hears nothing more, stops the stages by itself.
+    receives nothing more, stops the stages by itself.
     """
     clock = clock or Clock.monotonic()
     with realtime_thread(settings), _no_collection():
@@ -167,6 +167,6 @@ def run_sweeps(
             if now_ns - due_ns > LATE_PERIODS * loop.period_ns:
                 due_ns = now_ns
             if stop():
-                loop.break_off("operator: found a wish to stop, wanted the sweeps to their end")
+                loop.break_off("operator: found a request to stop, wanted the sweeps to finish")
             ports.send(loop.step(now_ns, ports.receive()))
             each()

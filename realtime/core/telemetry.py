@@ -1,4 +1,4 @@
-"""What the loop tells the others: tick records turned into the messages of `protocol.topics`."""
+"""Telemetry: converts tick records into the messages of `protocol.topics`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY, LOOP_EVERY = 4, 2, 10, 50, 5
 
 
 def stage_message(params: np.record, board: np.record, outputs: np.record) -> Stage:
-    """Handle commands and encoders (BOARD record), and the catheter's joints as the controller has them."""
+    """Return handle commands, encoders (BOARD record), and the catheter's joints as the controller predicts them."""
     steps = params.stage.steps_per_unit
     encoder = np.asarray(board.encoder_counts) / steps
     known = board.count > 0
@@ -45,7 +45,7 @@ def stage_message(params: np.record, board: np.record, outputs: np.record) -> St
 
 
 def pose_message(record: np.record, frame: int = 0, quality_m: float | None = None) -> Pose:
-    """A POSE record (base frame) as it entered the loop."""
+    """Return the message of a POSE record (base frame)."""
     return Pose(
         stamp_ns=int(record.stamp_ns),
         arrival_ns=int(record.arrival_ns),
@@ -58,7 +58,7 @@ def pose_message(record: np.record, frame: int = 0, quality_m: float | None = No
 
 
 def force_message(record: np.record, status: int = 0) -> ForceSensor:
-    """A FORCE record of the sensor (base frame, on the tissue)."""
+    """Return the message of the sensor's FORCE record (base frame, on the tissue)."""
     return ForceSensor(
         stamp_ns=int(record.stamp_ns),
         arrival_ns=int(record.arrival_ns),
@@ -68,13 +68,13 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
 
 
 def state_message(command: np.record, outputs: np.record) -> RigState:
-    """Phase, failsafe action and its causes in words, target (COMMAND record) and tip."""
+    """Return phase, safety action, messages of its causes, target (COMMAND record) and tip."""
     pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
     return RigState(
         stamp_ns=int(outputs.now_ns),
         mode=Phase(int(outputs.phase)).label,
         safety_action=SafetyAction(int(outputs.action)).label,
-        cause="; ".join(safety.in_words(int(outputs.cause)))[:500],
+        cause="; ".join(safety.messages(int(outputs.cause)))[:500],
         target_m=tuple(map(float, command.target_m)),
         tip_m=tuple(map(float, outputs.tip_m)),
         tip_velocity_m_per_s=tuple(map(float, outputs.tip_velocity_m_per_s)),
@@ -88,8 +88,8 @@ def state_message(command: np.record, outputs: np.record) -> RigState:
 
 
 def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
-    """The message's histogram of tick times, from the loop's, as `native_loop.count_in` keeps it."""
-    work = work.copy()  # the loop's thread counts on meanwhile, which np.flatnonzero would not bear
+    """Convert the loop's histogram of tick times (`native_loop.count_in`) into that of the message."""
+    work = work.copy()  # the loop's thread counts on meanwhile; np.flatnonzero needs an array that does not change
     buckets = [0] * HISTOGRAM_BUCKETS
     for index in np.flatnonzero(work[:-1]):
         buckets[histogram_bucket(bin_edges_ns(index + 0.5, WORK_BIN_NS) * 1e-3)] += int(work[index])
@@ -97,7 +97,7 @@ def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
 
 
 def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -> LoopTiming:
-    """Histogram of tick times so far, as the compiled loop keeps it; virtual time knows no lateness."""
+    """Return the tick times so far (`work`: the loop's histogram). Virtual time has no lateness."""
     times = percentiles_us(work, WORK_BIN_NS)
     return LoopTiming(
         stamp_ns=stamp_ns,
@@ -113,7 +113,7 @@ def loop_message(stamp_ns: int, loop_hz: float, missed: int, work: np.ndarray) -
 
 
 def wall_clock_timing(stamp_ns: int, loop_hz: float, loop: NativeLoop) -> LoopTiming:
-    """The compiled loop's timing so far: tick times, how late it woke, and its longest gap."""
+    """Return the compiled loop's timing so far: tick times, lateness, and longest gap."""
     newest = loop.snapshot()
     late = percentiles_us(loop.lateness, LATENESS_BIN_NS)
     return msgspec.structs.replace(

@@ -13,25 +13,25 @@ from realtime.drivers import ndi_protocol as ndi
 from realtime.drivers.aurora_session import AuroraConfig, LineAction, SessionFailed, SessionStep, enumerate_and_start, set_up
 from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.frame_clock import FrameClock
-from realtime.drivers.pose_sample import NO_FLAGS, PoseFlag, PoseSample, flag_words, flags_of
+from realtime.drivers.pose_sample import NO_FLAGS, PoseFlag, PoseSample, describe_flags, flags_of
 
 LOST_AFTER_TIMEOUTS = 5
 # Part of a frame's period in which, after a new frame, polls can bring nothing. Well below 1: polling must come before
 # the next frame is ready, or the least delay would never be seen.
 POLL_REST = 0.4
-# Longest reply to wait for: 63 bytes a tool in TX, and the rest.
+# Longest reply to wait for: 63 bytes a tool in TX, and the system status.
 _REPLY_BYTES_PER_TOOL, _REPLY_BYTES = 72, 40
 __all__ = ["AuroraClient", "AuroraConfig", "AuroraCounters", "PoseFlag", "PoseSample"]
 
 FRAME_MODULUS = 1 << 32
-# A frame counter that goes back, or runs ahead of time by more than these frames, is believed only when it insists.
+# A frame counter that goes back, or ahead of time by more than these frames, is accepted after this many in a row.
 _JUMP_FRAMES, _STRANGE_IN_ROW = 10, 3
 _UNIT_TOLERANCE = 0.02  # of |q|; TX rounds to 1e-4, damage that passes two CRCs does not stop here by chance
 
 
 @dataclass
 class AuroraCounters:
-    """All since the client was made."""
+    """Counts since the client was made."""
 
     polls: int = 0
     poll_timeouts: int = 0
@@ -58,8 +58,8 @@ class _Flight(NamedTuple):
 class AuroraClient:
     """The driver's core. Call in turn: `line_actions` (carry them out), `outgoing` (send), `feed` (what was read).
 
-    It starts by itself, retries without end, and never raises on what the device sends; what happens is told by
-    `take_events`, `phase`, `counters`. All times are the caller's clock in ns.
+    It starts by itself, retries without end, and never raises on what the device sends. `take_events`, `phase`
+    and `counters` report what happens. All times are the caller's clock in ns.
     """
 
     def __init__(self, config: AuroraConfig | None = None) -> None:
@@ -224,7 +224,7 @@ class AuroraClient:
         self._next_poll_ns = now_ns
         text = reply.text
         if text is not None and text.startswith("ERROR"):
-            self._fail(f"{self.config.reply}: {ndi.words(text)}", now_ns, self.config.retry_s)
+            self._fail(f"{self.config.reply}: {ndi.describe_reply(text)}", now_ns, self.config.retry_s)
             return []
         if text == "RESET":
             self._fail("the device was reset or switched on again", now_ns, self.config.retry_s)
@@ -252,7 +252,7 @@ class AuroraClient:
         newest = self._newest_frame(frames, now_ns)
         if newest is None:
             return []
-        # The reply's own time on the wire is known; only what cannot be known is left to `latency_s`.
+        # The reply's time on the wire is known. `latency_s` is the delay before it.
         if newest != self._frame:
             self._frame = newest
             self._frames_seen += 1
@@ -286,7 +286,7 @@ class AuroraClient:
         return newest
 
     def _fresh(self, tool: ndi.ToolReply, newest: int) -> int | None:
-        """The tool's frame, unwrapped, if it was not told before."""
+        """Return the tool's frame, unwrapped, if it was not reported before."""
         frame = newest if tool.frame is None else _unwrap(tool.frame, newest)
         before = self._tool_frames.get(tool.handle)
         if before is not None and frame <= before:
@@ -319,7 +319,7 @@ class AuroraClient:
         self._counters.missing += missing
         if flags != self._tool_flags.get(tool.handle, NO_FLAGS):
             self._tool_flags[tool.handle] = flags
-            self.event(DeviceEventKind.WARNING, f"tool {tool.handle}: {flag_words(flags)}", now_ns)
+            self.event(DeviceEventKind.WARNING, f"tool {tool.handle}: {describe_flags(flags)}", now_ns)
         return PoseSample(tool.handle, frame, stamp_ns, now_ns, position, quaternion, tool.error_m, missing, flags)
 
     def _is_frozen(self, handle: str, numbers: tuple[float, ...]) -> bool:
@@ -329,12 +329,12 @@ class AuroraClient:
         return 0 < self.config.frozen_after <= run
 
     def _system(self, status: int, now_ns: int) -> None:
-        """Events when the system's status changes; a tool plugged in or pulled is enumerated anew."""
+        """Events when the system's status changes; a tool that is plugged in or unplugged is enumerated again."""
         first, risen = self._system_status is None, status & ~(self._system_status or 0)
         self._system_status = status
         if risen:
-            self.event(DeviceEventKind.WARNING, ndi.system_words(risen) or f"system status {risen:04X}", now_ns)
-        # What stands since before the ports were last read is no change.
+            self.event(DeviceEventKind.WARNING, ndi.describe_system_status(risen) or f"system status {risen:04X}", now_ns)
+        # A bit that was set before the ports were last read is not a change.
         if not first and risen & (ndi.PORT_OCCUPIED | ndi.PORT_UNOCCUPIED):
             self.event(DeviceEventKind.LOST, "a tool was plugged in or unplugged; reading the ports again", now_ns)
             self._start_session(enumerate_and_start(self, stop_first=True), now_ns)

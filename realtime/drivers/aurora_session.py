@@ -38,10 +38,10 @@ class SessionStep:
 @dataclass(frozen=True)
 class AuroraConfig:
     """tools: wanted port handles, () for all; latency_s: from sampling to the first byte of a reply at no waiting;
-    baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: rest of the line between a reply
-    that brought nothing new and the next poll; settle_frames: frames from which times are learnt before poses are told
-    (the first frame seen may be nearly a period old); frozen_after: frames with one and the same pose, bit for bit,
-    after which it is no measurement any more (real ones have noise), 0: never."""
+    baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: pause between a reply
+    without a new frame and the next poll; settle_frames: frames from which times are learned before poses are reported
+    (the first frame seen may be nearly a period old); frozen_after: identical poses in a row, bit for bit, after which
+    the tool counts as frozen (measurements have noise), 0: never."""
 
     tools: tuple[str, ...] = ("0A", "0B")
     rate_hz: float = 40.0
@@ -135,7 +135,7 @@ def enumerate_and_start(client: SessionClient, stop_first: bool) -> Script:
 
 
 def _reset(client: SessionClient) -> Generator[SessionStep, str | None, None]:
-    """A serial break resets the device whatever its speed and mode; where the adapter swallows breaks, ask in words."""
+    """A serial break resets the device whatever its speed and mode; where the adapter ignores breaks, send RESET."""
     client.line(LineAction(POWER_UP_BAUD, BREAK_S))
     if (yield SessionStep("resetting", b"", client.config.reset_timeout_s)) == "RESET":
         return
@@ -176,8 +176,8 @@ def _command(client: SessionClient, phase: str, name: str, parameters: str = "",
         if reply.startswith("ERROR"):
             if reply[5:7] == "04":
                 continue
-            raise SessionFailed(f"{name} {parameters}: {ndi.words(reply)}")
+            raise SessionFailed(f"{name} {parameters}: {ndi.describe_reply(reply)}")
         if reply.startswith("WARNING"):
-            client.event(DeviceEventKind.WARNING, f"{name} {parameters}: {ndi.words(reply)}")
+            client.event(DeviceEventKind.WARNING, f"{name} {parameters}: {ndi.describe_reply(reply)}")
         return reply
     raise SessionFailed(f"{name} {parameters}: no answer in {attempts} attempts of {client.config.reply_timeout_s} s")

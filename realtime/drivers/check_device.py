@@ -25,7 +25,7 @@ START_UP_S = 30.0
 
 @dataclass
 class DeviceReport:
-    """figures: name with unit -> value; problems: in words, empty when the device is fit; events: what it told."""
+    """figures: name with unit -> value; problems: one line each, empty when the device is fit; events: of its driver."""
 
     device: str
     figures: dict[str, float | str] = field(default_factory=dict)

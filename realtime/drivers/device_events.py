@@ -1,4 +1,4 @@
-"""What a sensor's driver tells besides samples: events in words, and counters."""
+"""Events of a sensor's driver: its messages apart from the samples."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class FrameClock:
         late_s: float = 1.0,
         strange_in_row: int = 10,
     ) -> None:
-        """Args: period_s: nominal time between frames; max_drift: largest clock error believed (ratio);
+        """Args: period_s: nominal time between frames; max_drift: largest clock error assumed (ratio);
         early_s, late_s: distance from the line beyond which an arrival is strange."""
         if not period_s > 0:
             raise ValueError(f"period_s: found {period_s}, wanted more than 0")
@@ -49,7 +49,7 @@ class FrameClock:
         return self._slope / self.period_ns if self._origin else 0.0
 
     def reset(self) -> None:
-        """Forget everything; the next arrival starts anew."""
+        """Forget everything; the next arrival starts again."""
         self._origin = None
 
     def observe(self, frame: int, arrival_ns: int) -> int:

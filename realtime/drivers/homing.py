@@ -71,7 +71,7 @@ class Homing:
         home = self._home
         yield from self._until(lambda: self._link.phase is LinkPhase.READY, _BRING_UP_S, "bring-up", self._bring_up)
         ready_ns = self._now_ns
-        yield from self._until(lambda: self._heard_ns() > ready_ns, _ANSWER_S, "a status")
+        yield from self._until(lambda: self._received_ns() > ready_ns, _ANSWER_S, "a status")
         if self._link.status is not None and self._link.status.fault != Fault.NONE:
             raise HomingFailed(f"{self._name}: found the board {self._said()}, wanted none; clear it first")
         if self._touched():
@@ -156,7 +156,7 @@ class Homing:
         bit = 2 * self._home.axis + (self._home.end > 0)
         return self._link.status is not None and bool(self._link.status.inputs >> bit & 1)
 
-    def _heard_ns(self) -> int:
+    def _received_ns(self) -> int:
         return 0 if self._link.status is None else self._link.status.arrival_ns
 
     def _steps(self) -> int:

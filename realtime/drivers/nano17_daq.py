@@ -18,7 +18,7 @@ from realtime.drivers.net_ft_calibration import NEWTON_METRES_PER, NEWTONS_PER
 
 GAUGES = 6
 MAX_FILE_BYTES = 65536
-# A gauge amplifier gives +-10 V; this near to the rail, a reading is no force any more.
+# A gauge amplifier gives +-10 V. A reading this near to the rail is invalid.
 RAIL_V = 9.9
 BLOCK_S, SILENT_S, RETRY_S = 0.002, 0.1, 0.5
 
@@ -30,7 +30,7 @@ class GaugeReader(Protocol):
         """All samples since the last call (n, 7: six gauges and the thermistor, V) and their rate (Hz). Raises OSError."""
 
     def close(self) -> None:
-        """Gives the card back."""
+        """Release the card."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,11 @@ def _number(text: str, key: str) -> float:
 
 
 class Nano17Client:
-    """Blocks of voltages to force samples, without I/O. A gauge at its rail, a wire that is off, or a reading far out of
-    range gives no sample and is told once; `bias` makes the mean of the next blocks the new zero."""
+    """Converts blocks of voltages into force samples, without I/O.
+
+    A gauge at its rail, a broken wire, or a reading far out of range gives no sample and is reported once. `bias` makes
+    the mean of the next samples the new zero.
+    """
 
     def __init__(self, calibration: Nano17Calibration, wild_ratio: float = 10.0) -> None:
         self.calibration = calibration
@@ -219,12 +222,12 @@ class NidaqmxReader:
         return block.reshape(-1, GAUGES + 1), self.rate_hz
 
     def close(self) -> None:
-        """Gives the card back."""
+        """Release the card."""
         self._task.close()
 
 
 class Nano17Thread(threading.Thread):
-    """Reads the card every 2 ms and hands samples on; opens it again when it is gone, and tells so."""
+    """Reads the card every 2 ms and hands samples on; reports a card that is gone, and opens it again."""
 
     def __init__(
         self,
@@ -241,7 +244,7 @@ class Nano17Thread(threading.Thread):
 
     def run(self) -> None:
         """Until `stop`."""
-        told = ""
+        reported = ""
         while not self._halt.is_set():
             try:
                 reader = self._open()
@@ -250,19 +253,19 @@ class Nano17Thread(threading.Thread):
                 finally:
                     reader.close()
             except OSError as error:
-                if str(error) != told:
+                if str(error) != reported:
                     self._on_event(DeviceEvent(self._now_ns(), "nano17", DeviceEventKind.LOST, str(error)))
-                told = str(error)
+                reported = str(error)
                 self._halt.wait(RETRY_S)
 
     def _serve(self, reader: GaugeReader) -> None:
-        heard_ns = self._now_ns()
+        received_ns = self._now_ns()
         while not self._halt.wait(BLOCK_S):
             volts, rate_hz = reader.read()
             now_ns = self._now_ns()
             if len(volts):
-                heard_ns = now_ns
-            elif now_ns - heard_ns > SILENT_S * 1e9:
+                received_ns = now_ns
+            elif now_ns - received_ns > SILENT_S * 1e9:
                 raise OSError(f"nano17: no sample for {SILENT_S} s")
             for sample in self.client.feed(volts, rate_hz, now_ns):
                 self._callback(sample)

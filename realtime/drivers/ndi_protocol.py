@@ -1,4 +1,4 @@
-"""The NDI combined API on the wire: commands, text and binary replies, their CRC-16, and the codes in words."""
+"""The NDI combined API on the wire: commands, text and binary replies, their CRC-16, and descriptions of the codes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRANSFORMS = 0x0001  # reply option of BX and TX: transforms and port status
 # PHINF options and the characters that each adds to the reply, in this order.
 PHINF_BASIC, PHINF_PART_NUMBER, PHINF_LOCATION = 0x0001, 0x0004, 0x0020
 
-ERROR_WORDS = {
+ERROR_TEXTS = {
     0x01: "command not known",
     0x02: "command too long",
     0x03: "command too short",
@@ -69,8 +69,8 @@ ERROR_WORDS = {
     0xF5: "flash could not be written",
     0xF6: "flash could not be read",
 }
-WARNING_WORDS = {0x01: "possible hardware fault"}
-SYSTEM_STATUS_WORDS = {
+WARNING_TEXTS = {0x01: "possible hardware fault"}
+SYSTEM_STATUS_TEXTS = {
     0x0001: "communication between units out of step",
     0x0004: "communication between units damaged (CRC)",
     0x0008: "recoverable processing exception",
@@ -208,17 +208,17 @@ class ReplyReader:
 
 
 def _until_start(buffer: bytearray, at_least: int) -> int:
-    """How many bytes to drop so that the rest begins with a possible binary start, or a text, or nothing."""
+    """Return how many bytes to drop, up to the next possible start of a binary reply or a text, or to the end."""
     for index in range(at_least, len(buffer)):
         if buffer[index] == BINARY_START[0] or 0x20 <= buffer[index] < 0x7F:
             return index
     return len(buffer)
 
 
-def words(reply: str) -> str:
-    """An ERROR or WARNING reply in words, e.g. "error 0C: command not allowed in the present mode"."""
+def describe_reply(reply: str) -> str:
+    """Describe an ERROR or WARNING reply, e.g. "error 0C: command not allowed in the present mode"."""
     kind, code, table = (
-        ("error", reply[5:7], ERROR_WORDS) if reply.startswith("ERROR") else ("warning", reply[7:9], WARNING_WORDS)
+        ("error", reply[5:7], ERROR_TEXTS) if reply.startswith("ERROR") else ("warning", reply[7:9], WARNING_TEXTS)
     )
     try:
         return f"{kind} {code}: {table.get(int(code, 16), 'not in the list of codes')}"
@@ -226,9 +226,9 @@ def words(reply: str) -> str:
         return f"{kind} without a code"
 
 
-def system_words(status: int) -> str:
-    """The set bits of a system status in words, joined by commas; empty when all is well."""
-    return ", ".join(text for bit, text in SYSTEM_STATUS_WORDS.items() if status & bit)
+def describe_system_status(status: int) -> str:
+    """Describe the set bits of a system status, joined by commas; empty when none is set."""
+    return ", ".join(text for bit, text in SYSTEM_STATUS_TEXTS.items() if status & bit)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""ATI Net F/T client without I/O: RDT requests out, UDP records in, forces in newtons with gaps and faults told."""
+"""ATI Net F/T client without I/O: RDT requests out, UDP records in, forces in newtons out; gaps and faults are reported."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ RECORD = struct.Struct(">IIIiiiiii")
 REQUEST = struct.Struct(">HHI")
 HEADER = 0x1234
 _MODULUS = 1 << 32
-# Error bits of a record's status; a latched monitor condition (bit 16) with the summary bit alone is no fault.
+# Error bits of a record's status; a latched monitor condition (bit 16) with only the summary bit is not a fault.
 ERROR_SUMMARY, MONITOR_CONDITION = 0x80000000, 0x00010000
-STATUS_WORDS = {
+STATUS_TEXTS = {
     0x40000000: "CPU or RAM error",
     0x20000000: "digital board error",
     0x10000000: "analog board error",
@@ -79,8 +79,8 @@ class ForceSample:
 @dataclass(frozen=True)
 class NetFtConfig:
     """ft_rate_hz: the box's internal rate, at which ft_sequence counts; latency_s: from gauge to UDP at no waiting;
-    wild_ratio: readings beyond this multiple of the rated range are not believed; frozen_after: records with the same six
-    counts after which they are no measurement any more (real ones have noise), 0: never."""
+    wild_ratio: readings beyond this multiple of the rated range are rejected; frozen_after: records with the same six
+    counts in a row after which the sensor counts as frozen (measurements have noise), 0: never."""
 
     calibration: NetFtCalibration
     ft_rate_hz: float = 7000.0
@@ -102,7 +102,7 @@ class NetFtConfig:
 
 @dataclass
 class NetFtCounters:
-    """All since the client was made. `lost`: gaps in the sequence; `old`: reordered; `strays`: not of this stream."""
+    """Counts since the client was made. `lost`: gaps in the sequence; `old`: reordered; `strays`: not of this stream."""
 
     requests: int = 0
     records: int = 0
@@ -124,9 +124,9 @@ def request(command: NetFtCommand, count: int = 0) -> bytes:
     return REQUEST.pack(HEADER, command, count)
 
 
-def status_words(status: int) -> str:
-    """A status word in words; "good" when no bit of it is set."""
-    return ", ".join(text for bit, text in STATUS_WORDS.items() if status & bit) or (
+def describe_status(status: int) -> str:
+    """Describe a status word; "good" when no bit of it is set."""
+    return ", ".join(text for bit, text in STATUS_TEXTS.items() if status & bit) or (
         "error" if status & ERROR_SUMMARY else "good"
     )
 
@@ -139,7 +139,7 @@ def is_fault(status: int) -> bool:
 class NetFtClient:
     """The driver's core: send what `outgoing`, `start`, `bias` or `stop` return, give every datagram to `feed`.
 
-    Asks for the stream by itself and asks again when it falls silent. Never raises on what arrives.
+    Requests the stream by itself, and again when no record arrives. Never raises on what arrives.
     """
 
     def __init__(self, config: NetFtConfig) -> None:
@@ -156,8 +156,8 @@ class NetFtClient:
         self._streamed = False
         self._streaming = False
         self._wanted = True
-        self._heard_ns: int | None = None
-        self._asked_ns: int | None = None
+        self._received_ns: int | None = None
+        self._requested_ns: int | None = None
         self._status = 0
         self._restart()
 
@@ -192,22 +192,22 @@ class NetFtClient:
         return request(NetFtCommand.SET_BIAS)
 
     def outgoing(self, now_ns: int) -> bytes:
-        """A request to send now, or nothing. Also where silence is noticed."""
-        if self._streaming and now_ns - (self._heard_ns or 0) > self.config.silent_after_s * 1e9:
+        """Return a request to send now, or nothing. Also detects that no record arrives."""
+        if self._streaming and now_ns - (self._received_ns or 0) > self.config.silent_after_s * 1e9:
             self._counters.silences += 1
             self.lost(now_ns, f"no record for {self.config.silent_after_s} s")
         if self._streaming or not self._wanted:
             return b""
-        if self._asked_ns is not None and now_ns - self._asked_ns < self.config.retry_s * 1e9:
+        if self._requested_ns is not None and now_ns - self._requested_ns < self.config.retry_s * 1e9:
             return b""
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         return self.start()
 
     def lost(self, now_ns: int, why: str) -> None:
         """The stream has ended, or its socket has gone."""
         if self._streaming:
             self._event(DeviceEventKind.LOST, why, now_ns)
-        self._streaming, self._asked_ns = False, None
+        self._streaming, self._requested_ns = False, None
         self._restart()
 
     def feed(self, datagram: bytes, now_ns: int) -> ForceSample | None:
@@ -220,11 +220,11 @@ class NetFtClient:
         lost = self._follow(sequence)
         if lost is None:
             return None
-        self._heard_ns = now_ns
+        self._received_ns = now_ns
         stamp_ns = self._stamp(ft_sequence, now_ns)
         if status != self._status:
             self._status = status
-            self._event(DeviceEventKind.WARNING, f"status {status:08X}: {status_words(status)}", now_ns)
+            self._event(DeviceEventKind.WARNING, f"status {status:08X}: {describe_status(status)}", now_ns)
         if is_fault(status):
             self._counters.status_errors += 1
             return None
@@ -270,7 +270,7 @@ class NetFtClient:
             self._counters.old += 1
         else:
             self._counters.strays += 1
-        # A stream that was started anew counts from 1: believed once it has counted on for a few records.
+        # A stream that was started again counts from 1. It is accepted after a few records in sequence.
         self._stray_run = self._stray_run + 1 if self._stray is not None and sequence == self._stray + 1 else 1
         self._stray = sequence
         if self._stray_run < self.config.resync_after:

@@ -70,7 +70,7 @@ def flags_of(tool: ndi.ToolReply) -> PoseFlag:
     return flags
 
 
-def flag_words(flags: PoseFlag) -> str:
-    """The flags in words, e.g. "missing, out of volume"; "in view" when none is set."""
+def describe_flags(flags: PoseFlag) -> str:
+    """Describe the flags, e.g. "missing, out of volume"; "in view" when none is set."""
     names = [flag.name or "" for flag in PoseFlag if flag in flags]
     return ", ".join(name.lower().replace("_", " ") for name in names) or "in view"

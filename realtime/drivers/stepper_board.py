@@ -41,8 +41,8 @@ class LinkPhase(enum.Enum):
     HELLO = "hello"  # waits for IDENTITY
     CONFIGURE = "configure"  # waits for the limits to be accepted
     READY = "ready"  # may be armed
-    MISMATCH = "mismatch"  # another protocol or firmware: nothing is sent any more
-    RESET = "reset"  # the processor started anew: restart() once the operator knows
+    MISMATCH = "mismatch"  # another protocol or firmware: nothing more is sent
+    RESET = "reset"  # the processor was reset: call restart() when the operator has acknowledged it
 
 
 class BoardEventKind(enum.Enum):
@@ -54,7 +54,7 @@ class BoardEventKind(enum.Enum):
     ACK = "ack"  # a command was accepted
     REFUSED = "refused"  # a command was refused
     FAULT = "fault"  # the board latched a fault
-    RESET = "reset"  # the processor started anew; positions are lost
+    RESET = "reset"  # the processor was reset; positions are lost
     MISMATCH = "mismatch"  # another protocol or firmware version
 
 
@@ -127,7 +127,7 @@ class StepperBoardLink:
 
     axes: limits in the order of protocol.serial_frames.AXES. Call feed() with whatever arrives, send what
     advance() and the commands return. The bring-up is: advance() until phase is READY, then arm().
-    Set-points have their own sequence count, so a compiled loop may send them beside the commands from here.
+    Set-points have their own sequence count, so a compiled loop may send them independently of the commands from here.
     """
 
     def __init__(self, axes: Sequence[AxisLimits]) -> None:
@@ -165,7 +165,7 @@ class StepperBoardLink:
         return b"".join(self.configure(axis) for axis in range(len(AXES)) if axis not in self._configured)
 
     def restart(self) -> None:
-        """Starts the bring-up anew, after RESET or MISMATCH or when another board was plugged in."""
+        """Start the bring-up again, after RESET or MISMATCH or when another board was plugged in."""
         self.phase = LinkPhase.HELLO
         self.identity = None
         self.status = None
@@ -176,7 +176,7 @@ class StepperBoardLink:
         self.clock.restart()
 
     def unplugged(self) -> None:
-        """The cable is out: the bring-up starts anew. The board and its starts are remembered, so that a reset is seen."""
+        """Start the bring-up again after the cable was unplugged; the boot count is kept, so that a reset is detected."""
         if self.phase not in (LinkPhase.RESET, LinkPhase.MISMATCH):
             self.phase = LinkPhase.HELLO
         self.status = None
@@ -291,7 +291,7 @@ class StepperBoardLink:
         status = BoardStatus(arrival_ns=now_ns, **message.fields)
         events = self._check_boot(status.boot_count, now_ns)
         if self.status is None and self.phase is LinkPhase.HELLO:
-            self._sent_ns = None  # the board has only now started to speak: a HELLO before was lost
+            self._sent_ns = None  # the board has just started to send: an earlier HELLO was lost
         self.clock.update(status.mcu_time_us, now_ns - _STATUS_LINE_NS)
         self.status = status
         fault = Fault(status.fault)

@@ -1,4 +1,4 @@
-"""How late the loop wakes and how long it works, measured beside cyclictest on the same CPU in alternating slices."""
+"""Lateness and working time of the loop, measured alternately with cyclictest on the same CPU."""
 
 from __future__ import annotations
 
@@ -255,11 +255,11 @@ def _cyclictest_slice(
 
 def as_contract(result: LatencyResult) -> dict[str, object]:
     """The figures of `result` under the names of the command's contract, all times in us."""
-    beside = result.cyclictest
+    cyclictest = result.cyclictest
     return {
         "hz": result.hz,
         "lateness_us": percentiles_us(result.lateness, LATENESS_BIN_NS),
-        "cyclictest_us": None if beside is None else percentiles_us(beside, LATENESS_BIN_NS),
+        "cyclictest_us": None if cyclictest is None else percentiles_us(cyclictest, LATENESS_BIN_NS),
         "tick_us": percentiles_us(result.work, WORK_BIN_NS),
         "missed": result.missed,
         "realtime_priority": result.granted.priority,
@@ -267,6 +267,6 @@ def as_contract(result: LatencyResult) -> dict[str, object]:
         "histogram": {
             "edges_us": list(EDGES_US),
             "loop": coarse(result.lateness),
-            "cyclictest": None if beside is None else coarse(beside),
+            "cyclictest": None if cyclictest is None else coarse(cyclictest),
         },
     }

@@ -1,4 +1,4 @@
-"""The compiled loop's Python face: makes its memory, starts and stops its thread, hands frames over to it."""
+"""Python interface of the compiled loop: makes its memory, starts and stops its thread, hands frames over to it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class NativeLoop:
     Raises: ValueError for records, fields or mailboxes that do not fit.
 
     While it runs: `latest` (a Mailbox) and `telemetry` (a Ring, one reader) hold records of `published`, the fields
-    `loop` (LOOP) and `outputs`; `heartbeat`, `alive`, `error` and `granted` tell how it is; `send` takes commands.
+    `loop` (LOOP) and `outputs`; `heartbeat`, `alive`, `error` and `granted` are its condition; `send` takes commands.
     `lateness` and `work` are histograms (see `realtime.loop.latency`); whole once the loop has stopped.
     """
 
@@ -153,7 +153,7 @@ class NativeLoop:
                 self.reason = self._run(
                     self._memory, self._params, self._state, first_ns, self.period_ns, max_ticks, self.fd
                 )
-        except Exception as error:  # what the tick raised: kept for whoever looks after the loop
+        except Exception as error:  # what the tick raised: kept for the process that watches the loop
             self.error = error
         finally:
             self._ready.set()

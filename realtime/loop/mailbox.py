@@ -1,7 +1,7 @@
 """Lock-free passing of records between one writer and its reader: the latest value (`Mailbox`) or all of them (`Ring`).
 
 Neither side ever waits. A mailbox keeps four slots, each with its own sequence number (a seqlock per slot), and the
-number of the newest complete one: a writer that is stopped in the middle of a write holds nobody up, and a reader
+number of the newest complete one: a writer that is stopped in the middle of a write blocks no reader, and a reader
 fails only if it is overtaken by three whole writes while it copies. Payload words are copied with atomic loads and
 stores, so nothing about this relies on how the compiler orders plain accesses (Boehm, MSPC 2012, "Can seqlocks get
 along with programming language memory models?"). A ring that is full refuses the new record and counts it.

@@ -22,7 +22,7 @@ from realtime.loop.clock import sleep_until
 from realtime.loop.libc import monotonic_ns, write_bytes
 from realtime.loop.mailbox import mailbox_read, mailbox_write, ring_pop, ring_push
 
-# One pass of the loop, as published beside the tick's outputs. Times are CLOCK_MONOTONIC but for deadline_ns, which is
+# One pass of the loop, published together with the tick's outputs. Times are CLOCK_MONOTONIC but for deadline_ns, which is
 # the loop's clock. A gap is the time between the starts of two ticks; its place is one of GAP_PLACES.
 LOOP = np.dtype(
     [
@@ -90,7 +90,7 @@ class LoopMemory(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def bin_of(bin_ns: int, value_ns: int) -> int:
-    """The bin of a histogram that counts `value_ns`, with its first BINS of `bin_ns` each."""
+    """Return the bin of a histogram that counts `value_ns`, with its first BINS of `bin_ns` each."""
     index = max(value_ns // bin_ns, 0)
     if index < BINS:
         return index
@@ -106,7 +106,7 @@ def count_in(histogram: np.ndarray, bin_ns: int, value_ns: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gather(memory: LoopMemory) -> None:
-    """Newest value of every input mailbox into the input record; where nothing is new the old value stays."""
+    """Copy the newest value of every input mailbox into the input record."""
     for i in range(len(memory.mailboxes)):
         mailbox_read(memory.mailboxes[i], memory.scratch, memory.input_words[memory.offsets[i] :])
 
@@ -124,7 +124,7 @@ def _queue_bytes(memory: LoopMemory, source: np.ndarray, count: int) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _flush(memory: LoopMemory, fd: int) -> None:
-    """Give the line what it takes now; the rest waits. An error number is kept, and what waited is dropped."""
+    """Write to the line what it takes now and keep the remaining bytes. An error keeps its number and drops them."""
     count = memory.pending_count[0]
     if count == 0 or fd < 0:
         memory.pending_count[0] = 0
@@ -142,7 +142,7 @@ def _flush(memory: LoopMemory, fd: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _exchange(memory: LoopMemory, fd: int) -> None:
-    """The set-point first, then commands that wait, to the line; then loop and outputs to whoever looks on."""
+    """Write the set-point to the line, then pending commands."""
     loop, outputs = memory.loop[0], memory.outputs[0]
     if memory.pending_count[0] > 0:
         _flush(memory, fd)

@@ -13,7 +13,7 @@ _PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ER
 
 
 class ServiceNotifier:
-    """Tells the manager at NOTIFY_SOCKET (sd_notify(3)); without one, does nothing. Never raises, never blocks.
+    """Notifies the manager at NOTIFY_SOCKET (sd_notify(3)); without one, does nothing. Never raises, never blocks.
 
     environment: of the process, not inherited by its children's; now_s: monotonic clock.
     """

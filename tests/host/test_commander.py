@@ -52,7 +52,7 @@ def console(gate: Gate, tmp_path: Path) -> Iterator[Session]:
 
 def test_every_command_comes_back_with_what_became_of_it(gate: Gate, console: Session) -> None:
     with Commander(console, "console") as commander:
-        assert not commander.arm().accepted and "found none that stands" in commander.arm().reason
+        assert not commander.arm().accepted and "found no valid one" in commander.arm().reason
         assert commander.take().accepted and 2.0 < commander.lease_left_s <= 3.0
         refused = commander.arm()
         assert (refused.accepted, refused.reason) == (False, "refused: arm: found no board, wanted one")

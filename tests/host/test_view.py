@@ -84,8 +84,8 @@ def test_a_picture_of_nothing_and_of_old_poses_shows_neither_tip_nor_force() -> 
 
 def test_several_causes_are_told_apart_though_their_sentences_hold_semicolons() -> None:
     flags = safety.BOARD_SILENT | safety.OVER_FORCE | safety.POSE_STALE
-    assert causes_of("; ".join(safety.in_words(flags))) == safety.in_words(flags)
-    cut = "; ".join(safety.in_words(flags))[:-10]
+    assert causes_of("; ".join(safety.messages(flags))) == safety.messages(flags)
+    cut = "; ".join(safety.messages(flags))[:-10]
     assert causes_of(cut) == [cut] and causes_of("") == []
 
 

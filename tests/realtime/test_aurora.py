@@ -151,14 +151,14 @@ def test_a_reply_that_does_not_add_up_gives_no_pose(vector: dict) -> None:
 
 @pytest.mark.parametrize("code", [0x01, 0x0C, 0x10, 0xF6])
 def test_an_error_to_a_poll_is_told_in_words_and_starts_anew(code: int) -> None:
-    from realtime.drivers.ndi_protocol import ERROR_WORDS, crc16
+    from realtime.drivers.ndi_protocol import ERROR_TEXTS, crc16
 
     client, now_ns = replay(AuroraConfig())
     client.take_events()
     text = b"ERROR%02X" % code
     assert answer_poll(client, text + b"%04X\r" % crc16(text), now_ns + 25 * MS) == []
     (event,) = client.take_events()
-    assert event.kind is DeviceEventKind.LOST and ERROR_WORDS[code] in event.text
+    assert event.kind is DeviceEventKind.LOST and ERROR_TEXTS[code] in event.text
     client.outgoing(now_ns + 2000 * MS)
     assert client.phase == "resetting"
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from protocol.commander import CommandSender
 from protocol.topics import MAX_PAYLOAD_BYTES, Command, Reply, encode
-from realtime.core.command_gate import AHEAD_NS, BURST, LEASE_NS, LONGEST_LIFE_NS, REMEMBERED, CommandGate, for_the_record
+from realtime.core.command_gate import AHEAD_NS, BURST, LEASE_NS, LONGEST_LIFE_NS, REMEMBERED, CommandGate, without_secrets
 
 S = 1_000_000_000
 
@@ -70,7 +70,7 @@ def test_without_a_lease_nothing_but_the_safe_direction(action: str) -> None:
     rig = Rig()
     assert rig.said(rig.command(action=action)) == (
         "refused",
-        "lease: found none that stands, wanted one taken before and renewed",
+        "lease: found no valid one, wanted one taken before and renewed",
     )
     rig.leased("other")
     assert rig.said(rig.command(action=action)) == ("refused", "lease: held by other, for another 3.0 s")
@@ -245,36 +245,36 @@ def test_only_the_holder_gets_past_the_gate(steps: list[tuple[str, str, int]]) -
             rig.now_ns += wait * S
             continue
         before, holder = len(rig.done), rig.gate.state().holder
-        told = commanders[name].take() if action == "take" else commanders[name].give(action)
+        answer = commanders[name].take() if action == "take" else commanders[name].give(action)
         if action in ("arm", "disarm") and len(rig.done) > before:
             assert rig.gate.state().holder == name
         if holder not in ("", name) and action != "hold":
-            assert not told.accepted and "held by" in told.reason and len(rig.done) == before
+            assert not answer.accepted and "held by" in answer.reason and len(rig.done) == before
 
 
 def test_the_record_shows_no_secret_and_no_renewal() -> None:
     rig = Rig()
     command, reply = rig.gate.answer("console", encode(rig.command(action="take")))
     assert reply is not None and reply.lease
-    told = for_the_record(command, reply)
-    assert told is not None and told[0].lease == told[1].lease == ""
+    public = without_secrets(command, reply)
+    assert public is not None and public[0].lease == public[1].lease == ""
     again = rig.gate.answer("console", encode(rig.command(action="take", lease=reply.lease)))
-    assert for_the_record(*again) is None
-    assert for_the_record(*rig.gate.answer("console", encode(rig.command(action="clock")))) is None
-    assert for_the_record(*rig.gate.answer("console", b"")) is None
+    assert without_secrets(*again) is None
+    assert without_secrets(*rig.gate.answer("console", encode(rig.command(action="clock")))) is None
+    assert without_secrets(*rig.gate.answer("console", b"")) is None
 
 
-def test_refusals_are_told_at_once_and_then_counted_for_half_a_second() -> None:
+def test_refusals_are_logged_at_once_and_then_counted_for_half_a_second() -> None:
     rig = Rig(now_ns=0)
 
-    def told() -> str:
-        return rig.gate.in_words("console", *rig.gate.answer("console", b"junk"))
+    def log_line() -> str:
+        return rig.gate.log_line("console", *rig.gate.answer("console", b"junk"))
 
-    assert told().startswith("console: request: malformed: payload") and [told() for _ in range(7)] == [""] * 7
+    assert log_line().startswith("console: request: malformed: payload") and [log_line() for _ in range(7)] == [""] * 7
     rig.now_ns += S
-    assert told().endswith("(and 7 more not told)")
+    assert log_line().endswith("(and 7 more not logged)")
     assert (
-        rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="take"))))
+        rig.gate.log_line("console", *rig.gate.answer("console", encode(rig.command(action="take"))))
         == "console: take: accepted"
     )
-    assert rig.gate.in_words("console", *rig.gate.answer("console", encode(rig.command(action="clock")))) == ""
+    assert rig.gate.log_line("console", *rig.gate.answer("console", encode(rig.command(action="clock")))) == ""

@@ -136,9 +136,9 @@ def test_the_handle_starts_across_before_the_body_has_to_turn(rig: Rig) -> None:
     turned_s = None
     for k in range(500):
         t = 1e-3 * k
-        wanted, soon, later = (0.001 * np.sin(4 * np.pi * (t + ahead)) for ahead in (0.0, 0.065, 0.125))
+        wanted, at_crossing, after_crossing = (0.001 * np.sin(4 * np.pi * (t + ahead)) for ahead in (0.0, 0.065, 0.125))
         state.body_m = max(state.body_m, wanted)
-        handle = backlash.apply_ahead(config, state, wanted, soon, later, 0.0001)
+        handle = backlash.apply_ahead(config, state, wanted, at_crossing, after_crossing, 0.0001)
         if turned_s is None and state.direction < 0:
             turned_s = t
             assert handle - wanted == pytest.approx(-config.width_m / 2)
@@ -149,13 +149,15 @@ def test_small_ripple_is_not_worth_a_crossing(rig: Rig) -> None:
     config, state = tick_parameters(changed(rig, play_caution_m=0.0))[0].backlash, new(BACKLASH_STATE)[0]
     backlash.start(config, state, 0.0)
     for k in range(2000):
-        wanted, soon, later = (0.00004 * np.sin(4 * np.pi * (1e-3 * k + ahead)) for ahead in (0.0, 0.065, 0.125))
+        wanted, at_crossing, after_crossing = (
+            0.00004 * np.sin(4 * np.pi * (1e-3 * k + ahead)) for ahead in (0.0, 0.065, 0.125)
+        )
         state.body_m = max(state.body_m, wanted)
-        backlash.apply_ahead(config, state, wanted, soon, later, 0.0001)
+        backlash.apply_ahead(config, state, wanted, at_crossing, after_crossing, 0.0001)
     assert state.direction == 1.0
 
 
-def test_believed_body_is_the_play_operator_and_a_narrower_play_is_bounded(rig: Rig) -> None:
+def test_estimated_body_is_the_play_operator_and_the_change_of_width_is_bounded(rig: Rig) -> None:
     config, state = tick_parameters(changed(rig, play_caution_m=0.0))[0].backlash, new(BACKLASH_STATE)[0]
     backlash.start(config, state, 0.0)
     body = [backlash.follow(config, state, h) for h in (0.00155, 0.00355, 0.00155, -0.00155, -0.00255)]

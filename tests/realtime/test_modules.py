@@ -120,7 +120,7 @@ def test_each_cause_leads_to_its_action(cause: tuple) -> None:
     name, action, latches, words = cause
     bit = safety.CAUSE_BIT[name]
     decided, latched = safety.decide(bit, 0, False)
-    assert decided == action and words in safety.in_words(bit)
+    assert decided == action and words in safety.messages(bit)
     after, _ = safety.decide(0, latched, False)
     assert after == (action if latches else SafetyAction.NONE)
 

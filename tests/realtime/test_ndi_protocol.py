@@ -65,13 +65,13 @@ def test_replies_that_do_not_add_up_are_refused_though_their_crc_is_right(vector
 
 @pytest.mark.parametrize("vector", VECTORS["words"], ids=lambda vector: vector["words"])
 def test_codes_are_told_in_words(vector: dict) -> None:
-    assert ndi.words(read_one(vector_bytes(vector)).text or "") == vector["words"]
+    assert ndi.describe_reply(read_one(vector_bytes(vector)).text or "") == vector["words"]
 
 
 def test_every_system_status_bit_has_words() -> None:
-    for bit, text in ndi.SYSTEM_STATUS_WORDS.items():
-        assert ndi.system_words(bit) == text
-    assert ndi.system_words(0) == ""
+    for bit, text in ndi.SYSTEM_STATUS_TEXTS.items():
+        assert ndi.describe_system_status(bit) == text
+    assert ndi.describe_system_status(0) == ""
 
 
 @given(st.lists(st.sampled_from(VECTORS["replies"]), min_size=1, max_size=5), st.data())

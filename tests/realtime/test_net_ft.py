@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from realtime.drivers.device_events import DeviceEventKind
 from realtime.drivers.net_ft import (
-    STATUS_WORDS,
+    STATUS_TEXTS,
     ForceSample,
     NetFtClient,
     NetFtCommand,
     NetFtConfig,
+    describe_status,
     is_fault,
     request,
-    status_words,
 )
 from realtime.drivers.net_ft_calibration import NetFtCalibration, parse_calibration
 from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig, exchange
@@ -157,10 +157,10 @@ def test_one_record_with_a_strange_sequence_is_not_believed() -> None:
 
 
 def test_every_status_bit_has_words_and_only_a_latched_monitor_is_no_fault() -> None:
-    for bit, text in STATUS_WORDS.items():
-        assert text in status_words(0x80000000 | bit)
+    for bit, text in STATUS_TEXTS.items():
+        assert text in describe_status(0x80000000 | bit)
         assert is_fault(0x80000000 | bit) == is_fault(bit) == (bit != 0x00010000)
-    assert status_words(0) == "good" and not is_fault(0) and is_fault(0x80000000)
+    assert describe_status(0) == "good" and not is_fault(0) and is_fault(0x80000000)
 
 
 @pytest.mark.parametrize(("kind", "words"), [("saturated", "saturated"), ("broken", "excitation")])

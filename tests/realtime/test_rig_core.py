@@ -14,7 +14,7 @@ from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Re
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, new
 from realtime.core.rig_core import CAUSE_QUIET_NS, Arrived, CommandRequest, Leaving, RigCore, Tick
-from realtime.core.supervision import STEPS_APART, STEPS_APART_NS
+from realtime.core.supervision import STEPS_DIFFERENCE, STEPS_DIFFERENCE_NS
 from realtime.core.telemetry import loop_message
 from realtime.drivers.aurora import PoseSample
 from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
@@ -189,11 +189,11 @@ def test_lost_steps_are_judged_by_the_phase_of_the_newest_tick(core: Bench) -> N
     ticks = [core.tick()]
     core.ask("clear_fault")
     core.step(Arrived(ticks=ticks, board=core.status()))
-    core.counts = core.counts + np.array([0, round(2 * STEPS_APART * core.rig.stage(1).encoder_counts_per_step), 0])
+    core.counts = core.counts + np.array([0, round(2 * STEPS_DIFFERENCE * core.rig.stage(1).encoder_counts_per_step), 0])
     count = int(core.inputs[0].command.count)
-    core.run(STEPS_APART_NS // MS + 10)
+    core.run(STEPS_DIFFERENCE_NS // MS + 10)
     lines = core.logged("supervision")
-    assert len(lines) == 1 and lines[0].startswith("roll: encoder and steps are 300 steps apart")
+    assert len(lines) == 1 and lines[0].startswith("roll: encoder and steps differ by 300 steps")
     assert core.inputs[0].command.watch == safety.STEPS_LOST
     assert core.inputs[0].command.count == count, "a finding is no new command"
 
@@ -201,7 +201,7 @@ def test_lost_steps_are_judged_by_the_phase_of_the_newest_tick(core: Bench) -> N
 def test_a_refused_arm_does_not_forget_what_the_supervision_found(core: Bench) -> None:
     core.armed()
     core.counts = np.array([10_000, 0, 0])
-    core.run(STEPS_APART_NS // MS + 10)
+    core.run(STEPS_DIFFERENCE_NS // MS + 10)
     assert core.inputs[0].command.watch == safety.STEPS_LOST
     assert core.ask("arm").result == "refused" and core.inputs[0].command.watch == safety.STEPS_LOST
     assert core.ask("clear_fault").result == "accepted" and core.inputs[0].command.watch == 0

@@ -4,7 +4,7 @@ import numpy as np
 
 from protocol.enums import SafetyAction
 from realtime.control import safety
-from realtime.core.supervision import FORCE_APART_N, HOST_SILENT_NS, STEPS_APART, Supervision
+from realtime.core.supervision import FORCE_DIFFERENCE_N, HOST_SILENT_NS, STEPS_DIFFERENCE, Supervision
 
 MS = 1_000_000
 ZERO = np.zeros(3, int)
@@ -30,10 +30,10 @@ def test_an_offset_at_arming_and_the_lag_of_a_move_are_no_loss() -> None:
 
 def test_steps_that_stay_lost_are_told_once_and_stand_until_the_restart() -> None:
     supervision = made()
-    lost = np.array([0, STEPS_APART + 1, 0])
+    lost = np.array([0, STEPS_DIFFERENCE + 1, 0])
     told = [supervision.status(ZERO, -lost * (tick > 3), tick * 5 * MS) for tick in range(40)]
     words = [finding.text for finding in told if finding]
-    assert len(words) == 1 and words[0].startswith("roll: encoder and steps are 151 steps apart")
+    assert len(words) == 1 and words[0].startswith("roll: encoder and steps differ by 151 steps")
     assert supervision.causes == safety.STEPS_LOST and safety.action_of(supervision.causes) == SafetyAction.RETRACT
     supervision.restart()
     assert supervision.causes == 0
@@ -59,7 +59,7 @@ def test_a_noisy_model_agrees_and_a_drifting_sensor_does_not() -> None:
             pair(np.array([0.0, 0.0, 0.2 - 0.1 * sample * 0.025]), np.array([0.0, 0.0, 0.2])), (4000 + sample) * 25 * MS
         )
     )
-    assert FORCE_APART_N < 0.1 * found * 0.025 < FORCE_APART_N + 0.15
+    assert FORCE_DIFFERENCE_N < 0.1 * found * 0.025 < FORCE_DIFFERENCE_N + 0.15
     assert safety.action_of(supervision.causes) == SafetyAction.RETRACT
 
 

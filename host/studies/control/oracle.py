@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 STEP_S = 0.001
 # A slow integral keeps the mean force (m/s per N); before the first touch the wall is looked for at this speed.
 TRIM_m_per_N_s, SEARCH_m_per_s = 0.02, 0.004
-SLOPE_S, LATER_S = 0.005, 0.060
+SLOPE_S, AFTER_CROSSING_S = 0.005, 0.060
 GAINS = (1.0, 1.1, 1.2, 1.3)
 SETTLE_S = 6.0
 
@@ -41,16 +41,16 @@ def _follow(rig: Rig, seed: int, beat: HeartConfig, seconds: float, force_N: flo
     play, stage = new(BACKLASH_STATE)[0], new(STAGE_STATE)[0]
     home_m = float(plant.truth()["insertion_m"])
     backlash.start(p.backlash, play, -0.5 * p.backlash.width_m)
-    soon_s = p.predictive.reversal_share * p.predictive.crossing_s
+    crossing_s = p.predictive.reversal_share * p.predictive.crossing_s
     play.width_m = p.backlash.width_m
-    ahead = np.round(np.array([0.0, SLOPE_S, soon_s, soon_s + LATER_S]) / STEP_S).astype(int)
+    ahead = np.round(np.array([0.0, SLOPE_S, crossing_s, crossing_s + AFTER_CROSSING_S]) / STEP_S).astype(int)
     joints, base_m, errors = np.zeros((4, 3)), 0.018, []
     for k in range(round((seconds + SETTLE_S) / STEP_S)):
         error_N = force_N - float(plant.contact_force_N[2])
         touching = error_N < force_N
         base_m += (TRIM_m_per_N_s * error_N if touching else SEARCH_m_per_s) * STEP_S
-        for row, later in zip(joints, ahead, strict=True):
-            tip = np.array([TARGET_M[0], TARGET_M[1], base_m + gain * wall[k + later]])
+        for row, steps in zip(joints, ahead, strict=True):
+            tip = np.array([TARGET_M[0], TARGET_M[1], base_m + gain * wall[k + steps]])
             row[:] = inverse_kinematics.apply(p.kinematics, tip, 0.0)
         speed = (joints[1] - joints[0]) / SLOPE_S
         handle = backlash.apply_ahead(

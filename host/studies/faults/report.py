@@ -7,7 +7,7 @@ from collections import Counter
 from host.studies.faults.campaign import DELAYS_S, HOLD_AFTER_S, RunResult, summary_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control.stage_limiter import crossing_time_s
-from realtime.core.supervision import FORCE_APART_N
+from realtime.core.supervision import FORCE_DIFFERENCE_N
 from sim.fault_table import BY_NAME, FAULTS, LINK_REST_S, PEAK_N, STEPS_TO_FIND, FaultKind
 
 MOST_EXAMPLES = 12
@@ -74,7 +74,7 @@ def page_section(results: list[RunResult], seed: int, board: str) -> str:
         rest_ms=1e3 * LINK_REST_S,
         longest_ms=_longest_rest_ms(results),
         violations="\n".join(_violations(bad)),
-        apart_N=FORCE_APART_N,
+        apart_N=FORCE_DIFFERENCE_N,
         steps_to_find=STEPS_TO_FIND,
         lost_s=BY_NAME["missed_steps"].within_s,
         crossing_ms=_crossing_ms(),
