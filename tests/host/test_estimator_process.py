@@ -15,13 +15,13 @@ import pytest
 from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
 from host.estimation.service import EstimationService, load_estimator
 from host.recordings.recording import Recording
-from protocol.rig_file import Rig, load_rig
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import ForceSensor, Pose, Stage
 from protocol.zenoh_session import Session
 from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
-RIG = ROOT / "host" / "rigs" / "simulated.toml"
+RIG = SIMULATED_RIG
 
 
 class Spring:

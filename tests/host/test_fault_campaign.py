@@ -104,9 +104,10 @@ def test_a_fault_is_large_once_it_was_so_without_a_break(large_ms: Sequence[int]
     loop = SimpleNamespace(
         outputs=[SimpleNamespace(cause=0)],
         missed_ticks=0,
-        link=SimpleNamespace(status=None, decoder=StreamDecoder()),
-        tracker=SimpleNamespace(counters=SimpleNamespace()),
-        force_sensor=SimpleNamespace(counters=SimpleNamespace()),
+        core=SimpleNamespace(link=SimpleNamespace(status=None, decoder=StreamDecoder())),
+        sensors=SimpleNamespace(
+            tracker=SimpleNamespace(counters=SimpleNamespace()), force_sensor=SimpleNamespace(counters=SimpleNamespace())
+        ),
     )
     watcher = Watcher(SimpleNamespace(world=world, loop=loop), lambda run: now_ms[0] in large_ms, 0.1)  # type: ignore[arg-type]
     for now_ms[0] in range(300):

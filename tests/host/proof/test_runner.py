@@ -263,7 +263,8 @@ def test_without_a_terminal_progress_is_a_line_at_begin_and_end_and_now_and_then
     for done in range(101):
         bar("diagnose", done / 100, f"{done}/100")
     lines = stream.getvalue().splitlines()
-    assert "0/100" in lines[0] and "100/100" in lines[-1] and len(lines) == 2 + 5
+    # Fifty seconds: the first line, one every ten seconds, and the last, which is due when the work ends.
+    assert "0/100" in lines[0] and "100/100" in lines[-1] and len(lines) == 2 + 4
 
 
 def test_a_case_as_a_picture(built: Built, tmp_path: Path) -> None:
