@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from host.cli.diagnose import diagnose
+from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model.nominal import nominal_path, read_nominal
 from host.diagnosis.model.rig_recording import knob_gain, rig_of, rig_rows, staleness
-from host.diagnosis.models import build
 from host.run.demo import DemoSettings, run_lockstep
 from protocol.errors import InputError
 
@@ -93,7 +93,7 @@ def test_age_of_the_encoders_is_read_off_the_commands() -> None:
 def test_force_is_no_output_of_a_wall_that_moves(plain: Path) -> None:
     spec = read_nominal(nominal_path("rig"))
     spec._files = [plain]
-    model = build(spec)
+    model = RecordedRig(spec)
     assert not any(output.channel.startswith("force") for output in model.outputs)
     assert "contact" not in {port.name for port in model.ports} and "force_sensor" in {port.name for port in model.ports}
 
