@@ -49,12 +49,13 @@ def latency_check(
         return
     from realtime.control.configure import tick_parameters
     from realtime.control.tick import tick
+    from realtime.core.control_loop import run
     from realtime.loop.latency import as_contract, check_latency
     from realtime.loop.scheduling import RealtimeSettings
 
     params = tick_parameters(load_rig(SIMULATED_RIG))
     params[0].period_s = 1.0 / hz
-    result = check_latency(tick, params, hz, seconds, RealtimeSettings())
+    result = check_latency(tick, params, hz, seconds, RealtimeSettings(), run=run)
     if result.granted.warning:
         print(f"seldinger: {result.granted.warning}", file=sys.stderr)
     if result.cyclictest_failed:

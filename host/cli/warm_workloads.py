@@ -123,9 +123,10 @@ def control_loop(folder: Path) -> None:
     from protocol.rig_file import SIMULATED_RIG, load_rig
     from realtime.control.configure import tick_parameters
     from realtime.control.tick import tick
+    from realtime.core.control_loop import run
     from realtime.loop.latency import check_latency
 
-    check_latency(tick, tick_parameters(load_rig(SIMULATED_RIG)), 1000, 0.2, None, beside_cyclictest=False)
+    check_latency(tick, tick_parameters(load_rig(SIMULATED_RIG)), 1000, 0.2, None, beside_cyclictest=False, run=run)
 
 
 def rig_processes(folder: Path) -> None:

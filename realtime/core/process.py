@@ -14,7 +14,7 @@ from protocol.topics import CommandCounts, Log, LoopTiming, Reply
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
-from realtime.core import telemetry
+from realtime.core import control_loop, telemetry
 from realtime.core.lines import force_config, tracker_config
 from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
 from realtime.drivers.board_port import RETRY_S, BoardPort
@@ -69,6 +69,7 @@ class RealtimeProcess:
             period_ns=round(1e9 / rig.control.loop_hz),
             fd=self._port.fileno(),
             realtime=RealtimeSettings(),
+            run=control_loop.run,
         )
         self._tracker = AuroraThread(
             lambda: open_serial(tracker_port or rig.tracker.port, 9600),

@@ -189,10 +189,11 @@ def check_latency(
     seconds: float,
     realtime: RealtimeSettings | None,
     beside_cyclictest: bool = True,
+    run: Callable[..., int] | None = None,
 ) -> LatencyResult:
     """Run the native loop with `tick` for `seconds`; where cyclictest is installed, it takes every other slice.
 
-    Args: params: the tick's PARAMS for this hz; realtime: what to ask of the kernel for both.
+    Args: params: the tick's PARAMS for this hz; realtime: what to ask of the kernel for both; run: as for `NativeLoop`.
     Both run with the same priority, CPU and background load, so the half that each gets is comparable.
     """
     installed = beside_cyclictest and shutil.which("cyclictest") is not None
@@ -214,6 +215,7 @@ def check_latency(
         period_ns=round(1e9 / hz),
         fd=line,
         realtime=realtime,
+        run=run,
     )
     loop.prepare()
     feeder = _Feeder(boxes, loop, board)

@@ -21,6 +21,7 @@ from realtime.loop.native_loop import (
     PENDING_BYTES,
     STOP,
     LoopMemory,
+    Schedule,
     make_loop,
 )
 from realtime.loop.scheduling import RealtimeReport, RealtimeSettings, realtime_thread
@@ -48,6 +49,7 @@ class NativeLoop:
         fd: non-blocking descriptor of the board's line, or -1.
         telemetry_capacity: records that the ring holds until they are drained.
         realtime: what to ask of the kernel, None for nothing.
+        run: the loop around `tick` where it is compiled already (`realtime.core.control_loop.run`), else it is made.
     Raises: ValueError for records, fields or mailboxes that do not fit.
 
     While it runs: `latest` (a Mailbox) and `telemetry` (a Ring, one reader) hold records of `published`, the fields
@@ -69,6 +71,7 @@ class NativeLoop:
         fd: int = -1,
         telemetry_capacity: int = 8192,
         realtime: RealtimeSettings | None = None,
+        run: Callable[..., int] | None = None,
     ) -> None:
         if period_ns <= 0:
             raise ValueError(f"period_ns: found {period_ns}, wanted more than 0")
@@ -82,7 +85,7 @@ class NativeLoop:
         self._commands, self._sending = Ring(FRAME, _COMMANDS_WAITING), threading.Lock()
         self._inputs_dtype, self._mailboxes = np.dtype(inputs_dtype), dict(mailboxes)
         self._memory = self._allocate(clock, self.latest, self.telemetry, self._commands)
-        self._run = make_loop(tick)
+        self._run = make_loop(tick) if run is None else run
         self._prepared = False
         self._thread: threading.Thread | None = None
         self._ready = threading.Event()
@@ -127,7 +130,7 @@ class NativeLoop:
             return
         clock = Clock.virtual(self.clock.now_ns())
         memory = self._allocate(clock, Mailbox(self.published), Ring(self.published, 1), Ring(FRAME, 1))
-        self._run(memory, self._params.copy(), self._state.copy(), clock.now_ns(), self.period_ns, 1, -1)
+        self._run(memory, self._params.copy(), self._state.copy(), Schedule(clock.now_ns(), self.period_ns, 1, -1))
         self._prepared = True
 
     def start(self, max_ticks: int = 0, first_ns: int | None = None) -> None:
@@ -150,9 +153,8 @@ class NativeLoop:
             with realtime_thread(self._realtime) as self.granted:
                 first_ns = self.clock.now_ns() + self.period_ns if first_ns is None else first_ns
                 self._ready.set()
-                self.reason = self._run(
-                    self._memory, self._params, self._state, first_ns, self.period_ns, max_ticks, self.fd
-                )
+                schedule = Schedule(first_ns, self.period_ns, max_ticks, self.fd)
+                self.reason = self._run(self._memory, self._params, self._state, schedule)
         except Exception as error:  # what the tick raised: kept for the process that watches the loop
             self.error = error
         finally:

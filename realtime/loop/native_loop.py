@@ -63,6 +63,15 @@ BINS_PER_OCTAVE = 64
 HISTOGRAM_WORDS = BINS + 20 * BINS_PER_OCTAVE + 1
 
 
+class Schedule(NamedTuple):
+    """When the loop ticks and where it writes: as in `make_loop`."""
+
+    first_ns: int
+    period_ns: int
+    max_ticks: int
+    fd: int
+
+
 class LoopMemory(NamedTuple):
     """All that the compiled loop touches, made beforehand (`realtime.loop.loop_thread`)."""
 
@@ -181,52 +190,66 @@ def _note_gap(loop: Any, woke_ns: int, lateness_ns: int) -> None:
         loop.longest_gap_place = 2 if loop.tick_ns >= loop.exchange_ns else 3
 
 
+@njit(inline="always", error_model="numpy")
+def run_loop(
+    tick: Callable[..., None],
+    memory: LoopMemory,
+    params: np.ndarray,
+    state: np.ndarray,
+    schedule: Schedule,
+) -> int:
+    """Tick until told to stop; see `make_loop`. Inlined, so that `tick` is a constant of the function that calls it.
+
+    A loop for one known tick (`realtime.core.control_loop`) is then cached like any kernel; a closure cannot be.
+    """
+    first_ns, period_ns, max_ticks, fd = schedule
+    loop, inputs = memory.loop[0], memory.inputs[0]
+    deadline_ns, passes = first_ns, 0
+    loop.woke_ns = 0
+    while max_ticks <= 0 or passes < max_ticks:
+        now = sleep_until(memory.clock, deadline_ns, memory.control)
+        if load_acquire(memory.control, STOP) != 0:
+            return STOPPED
+        woke_ns, lateness_ns = monotonic_ns(), now - deadline_ns
+        late_by = lateness_ns // period_ns
+        if max_ticks > 0:
+            late_by = min(late_by, max_ticks - passes - 1)
+        loop.missed += late_by
+        passes += late_by + 1
+        deadline_ns += late_by * period_ns
+        _note_gap(loop, woke_ns, lateness_ns)
+        loop.tick += 1
+        loop.deadline_ns, loop.woke_ns, loop.lateness_ns = deadline_ns, woke_ns, lateness_ns
+        inputs.now_ns = deadline_ns
+        _gather(memory)
+        before_ns = monotonic_ns()
+        tick(params, state, memory.inputs, memory.outputs)
+        after_ns = monotonic_ns()
+        _exchange(memory, fd)
+        done_ns = monotonic_ns()
+        loop.tick_ns = after_ns - before_ns
+        loop.exchange_ns = done_ns - woke_ns - loop.tick_ns
+        _publish(memory)
+        count_in(memory.lateness, LATENESS_BIN_NS, lateness_ns)
+        count_in(memory.work, WORK_BIN_NS, monotonic_ns() - woke_ns)
+        store_release(memory.control, HEARTBEAT, passes)
+        deadline_ns += period_ns
+    return TICKS_DONE
+
+
 @functools.cache
 def make_loop(tick: Callable[..., None]) -> Callable[..., int]:
     """The loop around `tick(params, state, inputs, outputs)`, each a record array of length 1; tick returns None.
 
-    Returns: `run(memory, params, state, first_ns, period_ns, max_ticks, fd) -> reason`, compiled without the
-    interpreter's lock. It ticks at first_ns, first_ns + period_ns, ... on the clock in `memory` until memory.control
+    Returns: `run(memory, params, state, schedule) -> reason`, compiled without the interpreter's lock. It ticks at
+    first_ns, first_ns + period_ns, ... on the clock in `memory` until memory.control
     [STOP] is not zero (STOPPED, within one period) or, where max_ticks > 0, until that many periods have gone by,
     missed ones counted (TICKS_DONE). `fd` is a non-blocking file descriptor, or -1 to send nothing.
     inputs.now_ns is the deadline of the tick, so that set-points are spaced by whole periods however late it woke.
     """
 
     @njit(nogil=True, error_model="numpy")
-    def run(
-        memory: LoopMemory, params: np.ndarray, state: np.ndarray, first_ns: int, period_ns: int, max_ticks: int, fd: int
-    ) -> int:
-        loop, inputs = memory.loop[0], memory.inputs[0]
-        deadline_ns, passes = first_ns, 0
-        loop.woke_ns = 0
-        while max_ticks <= 0 or passes < max_ticks:
-            now = sleep_until(memory.clock, deadline_ns, memory.control)
-            if load_acquire(memory.control, STOP) != 0:
-                return STOPPED
-            woke_ns, lateness_ns = monotonic_ns(), now - deadline_ns
-            late_by = lateness_ns // period_ns
-            if max_ticks > 0:
-                late_by = min(late_by, max_ticks - passes - 1)
-            loop.missed += late_by
-            passes += late_by + 1
-            deadline_ns += late_by * period_ns
-            _note_gap(loop, woke_ns, lateness_ns)
-            loop.tick += 1
-            loop.deadline_ns, loop.woke_ns, loop.lateness_ns = deadline_ns, woke_ns, lateness_ns
-            inputs.now_ns = deadline_ns
-            _gather(memory)
-            before_ns = monotonic_ns()
-            tick(params, state, memory.inputs, memory.outputs)
-            after_ns = monotonic_ns()
-            _exchange(memory, fd)
-            done_ns = monotonic_ns()
-            loop.tick_ns = after_ns - before_ns
-            loop.exchange_ns = done_ns - woke_ns - loop.tick_ns
-            _publish(memory)
-            count_in(memory.lateness, LATENESS_BIN_NS, lateness_ns)
-            count_in(memory.work, WORK_BIN_NS, monotonic_ns() - woke_ns)
-            store_release(memory.control, HEARTBEAT, passes)
-            deadline_ns += period_ns
-        return TICKS_DONE
+    def run(memory: LoopMemory, params: np.ndarray, state: np.ndarray, schedule: Schedule) -> int:
+        return run_loop(tick, memory, params, state, schedule)
 
     return run
