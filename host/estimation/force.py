@@ -154,7 +154,8 @@ def _search_again(
     n = len(found.force_N)
     insertion, curvature = np.broadcast_to(insertion_m, n), np.broadcast_to(curvature_per_m, n)
     for i in np.flatnonzero(found.converged & quieter_than_noise(found.chi_square, int(ROWS_OF_CASE[case]) - 3)):
-        sensors = list(zip(poses.offsets_m, poses.positions_m[i], poses.quaternions_wxyz[i], strict=True))
+        places = zip(poses.offsets_m, poses.positions_m[i], poses.quaternions_wxyz[i], strict=True)
+        sensors = [PoseSensor(offset, position, quaternion) for offset, position, quaternion in places]
         one = estimate_cosserat(catheter, float(insertion[i]), float(curvature[i]), case, sensors)
         found.force_N[i], found.covariance_N2[i] = one.force_N, one.covariance_N2
         found.converged[i], found.residual[i], found.chi_square[i] = one.converged, one.residual, one.chi_square

@@ -126,7 +126,7 @@ class SpatialEstimate:
         return values, directions
 
 
-def quieter_than_noise(chi_square: ArrayLike, freedom: int) -> Array:
+def quieter_than_noise(chi_square: ArrayLike, freedom: int) -> NDArray[np.bool_]:
     """Whether residuals are not zero and yet far below what noise leaves: another force may explain the poses exactly.
 
     chi_square: (n,) or one number; freedom: number of residuals above the three of the force. Chance 0.001 by noise.

@@ -6,6 +6,7 @@ from typing import Any
 
 from realtime.control import records
 from realtime.control.tick import tick
+from realtime.core import control_loop
 from realtime.loop.clock import Clock
 from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 
@@ -31,6 +32,7 @@ def main() -> None:
         input_mailboxes(records.INPUTS),
         clock=Clock.virtual(),
         period_ns=1_000_000,
+        run=control_loop.run,
     )
     loop.prepare()
     found = called_by(loop._run)
