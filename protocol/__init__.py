@@ -1,4 +1,4 @@
-"""Ground floor: the words that every part speaks - serial frames and zenoh topics. Imports no other room."""
+"""Definitions that all parts share: serial frames, zenoh topics, rig file, enums. Imports no other package."""
 
 from protocol import kernel_cache
 

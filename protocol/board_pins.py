@@ -10,14 +10,14 @@ from protocol.serial_frames import AXES
 
 SWITCHES = (*(f"{axis}_{end}" for axis in AXES for end in ("min", "max")), "estop")  # in the order of InputBit
 ENABLE_BIT = 6  # of the outputs: BOARD_ENABLE_BIT in firmware/src/board.h
-ENABLE_PIN_BESIDE = 4  # of the switches' port, where the outputs' port has no pin left
+ENABLE_PIN_WITH_SWITCHES = 4  # of the switches' port, where the outputs' port has no pin left
 
 
 class Processor(NamedTuple):
     """What a processor has and needs: pins of its ports that are free on the board (bit masks), and usual choices.
 
     Of the outputs' port the firmware uses `outputs` moved up by the shift, of the other two the lowest pins.
-    `shared_limits`: both limit switches of an axis share one input, and the enable line is beside the switches.
+    `shared_limits`: both limit switches of an axis share one input, and the enable line is on the port of the switches.
     """
 
     board: str
@@ -87,8 +87,8 @@ def signals(mcu: str, outputs: str, output_shift: int, encoders: str, switches: 
 
     found = [at(f"step {axis}", outputs, output_shift + i) for i, axis in enumerate(AXES)]
     found += [at(f"direction {axis}", outputs, output_shift + 3 + i) for i, axis in enumerate(AXES)]
-    beside = (switches, ENABLE_PIN_BESIDE) if chip.shared_limits else (outputs, output_shift + ENABLE_BIT)
-    found.append(at("enable", *beside))
+    enable_place = (switches, ENABLE_PIN_WITH_SWITCHES) if chip.shared_limits else (outputs, output_shift + ENABLE_BIT)
+    found.append(at("enable", *enable_place))
     found += [
         at(f"encoder {line} {axis}", encoders, 2 * i + j) for i, axis in enumerate(AXES) for j, line in enumerate("AB")
     ]
@@ -151,7 +151,7 @@ def definitions(
     keep_enabled: bool = False,
 ) -> list[str]:
     """Options of the compiler that put these pins and polarities in the place of those in firmware/src/board.h."""
-    words: dict[str, str | int] = {
+    definitions: dict[str, str | int] = {
         f"{mcu.upper()}_OUTPUTS": outputs,
         f"{mcu.upper()}_OUTPUT_SHIFT": output_shift,
         f"{mcu.upper()}_ENCODERS": encoders,
@@ -160,7 +160,7 @@ def definitions(
         "BOARD_NORMALLY_OPEN": sum(1 << SWITCHES.index(name) for name in set(normally_open)),
         "BOARD_KEEP_ENABLED": int(keep_enabled),
     }
-    return [f"-D{word}={value}" for word, value in words.items()]
+    return [f"-D{word}={value}" for word, value in definitions.items()]
 
 
 class Build(NamedTuple):

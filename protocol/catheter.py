@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from protocol.errors import InputError, Words, reason
+from protocol.errors import Description, InputError, reason
 from protocol.requests import Request, validate
 
 CATHETER_FOLDER = Path(__file__).resolve().parent / "catheters"
@@ -128,7 +128,7 @@ def load_catheter(name_or_path: str | Path) -> Catheter:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise InputError("catheter", Words(f"{text}: {reason(error)}"), "a readable catheter TOML file") from None
+        raise InputError("catheter", Description(f"{text}: {reason(error)}"), "a readable catheter TOML file") from None
     return catheter_from_table(data)
 
 

@@ -20,7 +20,7 @@ _PROMPT_NS = 100_000_000
 
 @dataclass(frozen=True)
 class Acknowledgement:
-    """What became of a command. `reason`: why not, in words; empty when it was accepted.
+    """Result of a command. `reason`: why it was refused; empty when it was accepted.
 
     result: as in Reply, or `unanswered`: it may or may not have been carried out.
     """

@@ -31,17 +31,17 @@ class InputError(ValueError):
         return InputError.from_sentence, (str(self),)
 
 
-class Words(str):
-    """What was found, in our own words: printed without the quotes of a value."""
+class Description(str):
+    """A description of what was found: printed without the quotes of a value."""
 
 
-def reason(error: Exception) -> Words:
+def reason(error: Exception) -> Description:
     """Say why a file could not be read, without the number and the path that the system's message adds."""
-    return Words(getattr(error, "strerror", None) or str(error) or type(error).__name__)
+    return Description(getattr(error, "strerror", None) or str(error) or type(error).__name__)
 
 
 def _short(value: object, limit: int = 80) -> str:
-    if isinstance(value, Words):
+    if isinstance(value, Description):
         return str(value)
     text = json.dumps(value) if isinstance(value, (dict, list, str, int, float, bool, type(None))) else str(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 # An explanation came at most so long before what it explains: a rig that was late a minute ago is not late now.
 EXPLAINS_FOR_NS = 5_000_000_000
-# ... or was noticed so much later: lateness and the board's counters are reported twice a second.
+# ... or was noticed after at most this time: lateness and the board's counters are reported twice a second.
 NOTICED_WITHIN_NS = 600_000_000
 
 
@@ -89,7 +89,7 @@ RULES: dict[str, Rule] = {
         ("loop_late", "force_rejected", "force_stale"),
     ),
     "force_handover": Rule(
-        "The force sensor is silent, frozen or off: the estimate closes the loop.",
+        "The force sensor sends nothing, is frozen or disagrees: the estimate closes the loop.",
         "Check the force sensor.",
         ("force_rejected", "force_stale", "force_lost"),
     ),
@@ -109,15 +109,15 @@ _RANK = {cause: rank for rank, cause in enumerate(RULES)}
 
 
 class Observation(NamedTuple):
-    """A cause when it was first noticed; `words` are its own where the rule has none, or add a detail."""
+    """A cause when it was first noticed; `text` describes it where the rule does not, or adds a detail."""
 
     cause: str
     at_ns: int
-    words: str = ""
+    text: str = ""
 
 
 class FirstCause(NamedTuple):
-    """The headline: what came first and its remedy; then what followed from it, and what came beside it, in time."""
+    """The first cause and its remedy; then all other observed causes in the order of time."""
 
     cause: str
     at_ns: int
@@ -146,9 +146,9 @@ def first_cause(observed: Iterable[Observation]) -> FirstCause | None:
     roots = [item for item in ordered if not any(_explains(earliest[by], item) for by in _explanations(item, earliest))]
     first = (roots or ordered)[0]
     rule = RULES.get(first.cause, _UNKNOWN)
-    says = rule.says or first.words
-    if rule.says and first.words and first.words != rule.says:
-        says = f"{rule.says.removesuffix('.')} ({first.words})."
+    says = rule.says or first.text
+    if rule.says and first.text and first.text != rule.says:
+        says = f"{rule.says.removesuffix('.')} ({first.text})."
     return FirstCause(first.cause, first.at_ns, says, rule.remedy, tuple(item for item in ordered if item != first))
 
 
@@ -160,6 +160,6 @@ def _explains(by: Observation, item: Observation) -> bool:
     return -NOTICED_WITHIN_NS <= item.at_ns - by.at_ns <= EXPLAINS_FOR_NS
 
 
-def in_words(item: Observation) -> str:
+def describe(item: Observation) -> str:
     """Return an observed cause as one sentence."""
-    return RULES.get(item.cause, _UNKNOWN).says or item.words
+    return RULES.get(item.cause, _UNKNOWN).says or item.text

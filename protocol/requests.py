@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from protocol.errors import InputError, Words, reason
+from protocol.errors import Description, InputError, reason
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -31,7 +31,7 @@ def read_json(source: str) -> Any:
     try:
         return json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(source, Words(error), "one JSON object") from None
+        raise InputError(source, Description(error), "one JSON object") from None
 
 
 # Type of a pydantic error -> what is wanted, with the names of its context.
@@ -74,7 +74,7 @@ def validate(model: type[Model], data: Any) -> Model:
         key = ".".join(str(part) for part in first["loc"]) or "request"
         if first["type"] == "extra_forbidden":
             raise InputError(key, first["input"], "no such key; known keys: " + ", ".join(model.model_fields)) from None
-        found = Words("nothing") if first["type"] == "missing" else first["input"]
+        found = Description("nothing") if first["type"] == "missing" else first["input"]
         raise InputError(key, found, wanted_of(first)) from None
 
 

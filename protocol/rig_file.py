@@ -360,7 +360,7 @@ def _known_keys(path: tuple[Any, ...]) -> list[str]:
     return list(section.model_fields) if hasattr(section, "model_fields") else []
 
 
-def _in_words(error: Any) -> str:
+def _describe(error: Any) -> str:
     """One of pydantic's errors as key, what was found, what is wanted."""
     key = ".".join(str(part) for part in error["loc"]) or "rig"
     if error["type"] == "extra_forbidden":
@@ -381,7 +381,7 @@ def problems_of(data: dict[str, Any]) -> list[str]:
     try:
         Rig.model_validate(data)
     except ValidationError as problem:
-        return [_in_words(error) for error in problem.errors()]
+        return [_describe(error) for error in problem.errors()]
     return []
 
 
@@ -390,7 +390,7 @@ def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
     try:
         return Rig.model_validate(data)
     except ValidationError as problem:
-        raise InputError.from_sentence(f"{name}: {_in_words(problem.errors()[0])}") from None
+        raise InputError.from_sentence(f"{name}: {_describe(problem.errors()[0])}") from None
 
 
 def read_rig_data(path: str | Path) -> dict[str, Any]:

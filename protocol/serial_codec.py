@@ -126,7 +126,7 @@ class StreamCounters:
 class StreamDecoder:
     """Bytes in any portions to messages; damaged frames are counted and dropped.
 
-    What comes before the first whole frame is not counted as damage: a port opened in mid-frame is no error.
+    What comes before the first whole frame is not counted as damage, because a port may be opened in mid-frame.
     A repeated frame is dropped too.
     """
 

@@ -1,4 +1,4 @@
-"""The rig that stands in for steel. Its physics is written apart from the models in `host` that are judged on it."""
+"""The simulated rig. Its physics is written separately from the models in `host` that are tested on it."""
 
 from protocol import kernel_cache
 

@@ -57,9 +57,9 @@ class BoardSlice(NamedTuple):
     enable_changes: int  # of that line since the child started
 
     def timed_frames(self) -> Iterator[tuple[bytes, int]]:
-        """uart_out in pieces that each end with a frame's delimiter (or the slice), and when they had left, in us.
+        """uart_out in segments that each end with a frame's delimiter (or the slice), and when they had left, in us.
 
-        For whoever wants to stamp the arrival of a frame more finely than by the slice.
+        A caller can stamp the arrival of a frame more finely than by the slice.
         """
         start = 0
         for part in self.uart_out.split(b"\0"):

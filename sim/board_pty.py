@@ -29,7 +29,7 @@ class PacingReport(NamedTuple):
     slices: int
     longest_gap_ns: int  # between two slices; the board stood still meanwhile
     longest_gap_at_us: int  # board time at which it was
-    dropped_bytes: int  # sent by the board while nobody read the pty
+    dropped_bytes: int  # sent by the board while no process read the pty
 
 
 class BoardPty:

@@ -48,7 +48,7 @@ _BAD_FORCE = ("malformed", "duplicates", "old", "strays", "lost", "status_errors
 
 
 class FaultyScenario(Scenario):
-    """A `Scenario` that can be spoilt while it runs: `noise` on the cables, and the attributes below.
+    """A `Scenario` with faults that are injected while it runs: `noise` on the cables, and the attributes below.
 
     pause_ns: the computer stands still for so long before its next period, the world does not; clock_shift_ns: added
     to the computer's clock; host: "well", "dead" (never answers again) or "hung" (answers nothing); host_late_ns: more
@@ -61,16 +61,18 @@ class FaultyScenario(Scenario):
         self.host = "well"
         self.watchers: list[Watcher] = []
         self.out = publish
-        super().__init__(rig, world, self._told, estimator=None if estimator is None else self._asked)
+        super().__init__(
+            rig, world, self._publish_to_watchers, estimator=None if estimator is None else self._estimate_unless_failed
+        )
         self.clock_shift_ns = CLOCK_START_NS
         self._model = estimator
 
-    def _told(self, topic: str, message: Message) -> None:
+    def _publish_to_watchers(self, topic: str, message: Message) -> None:
         self.out(topic, message)
         for watcher in self.watchers:
-            watcher.hear(topic, message)
+            watcher.receive(topic, message)
 
-    def _asked(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
+    def _estimate_unless_failed(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
         if self.host != "well" or self._model is None:
             return None
         return self._model(tip, shaft, stage)
@@ -150,8 +152,8 @@ class Watcher:
         if self.outcome.detected_s is None:
             self.outcome.detected_s, self.outcome.detected_by = self.now_s, by
 
-    def hear(self, topic: str, message: Message) -> None:
-        """What the loop publishes."""
+    def receive(self, topic: str, message: Message) -> None:
+        """Take in a message that the loop published."""
         if topic == "pose/tip":
             self._poses += 1
         elif isinstance(message, Log) and message.level in ("warning", "error"):

@@ -57,7 +57,7 @@ class Outcome:
 class Scenario:
     """Runs `LockstepLoop` against `World`. `estimator` answers each tip pose after `estimator_delay_s`, if given.
 
-    pace: 1.0 is real time, 0 is as fast as it goes.
+    pace: 1.0 is real time, 0 is unlimited.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Scenario:
         self.world, self.pace = world, pace
         self._estimator, self._delay_ns = estimator, round(estimator_delay_s * 1e9)
         self._publish = publish
-        self.loop = LockstepLoop(rig, force_source, self._heard)
+        self.loop = LockstepLoop(rig, force_source, self._on_message)
         self._leaving = self.loop.step(0, FromRig())
         self._latest: dict[str, Message] = {}
         self._commands = 0
@@ -91,7 +91,7 @@ class Scenario:
         """Ends the run after the present period; for signal handlers."""
         self._stop = True
 
-    def _heard(self, topic: str, message: Message) -> None:
+    def _on_message(self, topic: str, message: Message) -> None:
         """All that the loop publishes goes out, and the estimator receives the poses."""
         self._publish(topic, message)
         self._latest[topic] = message

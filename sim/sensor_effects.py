@@ -145,7 +145,7 @@ def _turn_pose(v0: float, v1: float, v2: float, position: Array, quaternion: Arr
 
 @njit(cache=True)
 def _distort(e, position: Array, quaternion: Array) -> None:  # type: ignore[no-untyped-def]
-    """The field of a piece of metal: shift away from it that falls with the cube of distance beyond its reach."""
+    """The field of a metal object: shift away from it that falls with the cube of distance beyond its reach."""
     x, y, z = position[0] - e.p[1], position[1] - e.p[2], position[2] - e.p[3]
     distance = math.sqrt(x * x + y * y + z * z)
     size = e.p[0] / (1.0 + (distance / e.p[4]) ** 3)

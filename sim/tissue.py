@@ -28,7 +28,7 @@ class TissueConfig:
     exponential_depth_m: float = 0.0  # above 0: stiffness * depth0 * (exp(depth/depth0) - 1)
     hunt_crossley_s_per_m: float = 0.0  # force * (1 + this * depth rate)
     viscosity_N_s_per_m: float = 0.0
-    relaxing_N_per_m: float = 0.0  # a Maxwell branch beside the spring
+    relaxing_N_per_m: float = 0.0  # a Maxwell branch parallel to the spring
     relaxation_s: float = 0.1
     friction: float = 0.0
     bristle_N_per_m: float = 2000.0  # tangential stiffness while it sticks

@@ -22,7 +22,7 @@ def control_study(
     json: Json = False,
 ) -> None:
     """Run the study in virtual time; with the defaults it takes some twenty minutes of one core."""
-    from host.studies.control.study import SECTIONS, StudySettings, in_words, study
+    from host.studies.control.study import SECTIONS, StudySettings, study, table_lines
 
     names = tuple(part.strip() for part in only.split(",") if part.strip()) or SECTIONS
     for name in names:
@@ -31,7 +31,7 @@ def control_study(
     within("--goals", goals, 1, 1000)
     settings = StudySettings(_seeds(seeds), seconds, goals, rig, names)
     result = study(settings, lambda text: print(f"seldinger: {text}", file=sys.stderr, flush=True))
-    print("\n".join(in_words(result)), file=sys.stderr)
+    print("\n".join(table_lines(result)), file=sys.stderr)
     if json:
         write_json(result)
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from protocol.commander import Acknowledgement
-from protocol.errors import InputError, Words, reason
+from protocol.errors import Description, InputError, reason
 from protocol.requests import Request, validate
 from protocol.rig_file import AXES, Rig
 from realtime.control import inverse_kinematics
@@ -65,7 +65,7 @@ def read_script(path: Path) -> Script:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError("script", Words(f"{path}: {reason(error)}"), "a readable TOML file") from None
+        raise InputError("script", Description(f"{path}: {reason(error)}"), "a readable TOML file") from None
     rows = content.get("rows")
     if isinstance(rows, list):
         content["rows"] = [_floats(row) if isinstance(row, list) else row for row in rows]

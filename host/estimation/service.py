@@ -1,4 +1,4 @@
-"""The estimator among messages: pairs poses with the actuation of their time, asks, checks the answer."""
+"""Estimation service: pairs each pose with the actuation at its time, estimates the force, and checks the estimate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAIRED_WITHIN_NS = 5_000_000
 
 
 def load_estimator(name: str, rig: Rig) -> Estimator:
-    """The estimator that `module:function` makes for `rig`. Raises ValueError where there is no such function."""
+    """Return the estimator that `module:function` makes for `rig`. Raises ValueError if there is no such function."""
     module, _, function = name.partition(":")
     try:
         make = getattr(importlib.import_module(module), function)
@@ -43,7 +43,7 @@ def _actuation(stage: Stage) -> Actuation | None:
 class EstimationService:
     """Answers poses with force messages; no clock and no transport of its own.
 
-    estimator: asked once per tip pose. timer_ns: measures how long it took; never anything else.
+    estimator: called once per tip pose. timer_ns: measures only the computing time.
     """
 
     def __init__(self, estimator: Estimator, timer_ns: Callable[[], int] = time.perf_counter_ns) -> None:
@@ -55,7 +55,7 @@ class EstimationService:
         self.unanswered = 0
         self.last_failure = ""
 
-    def hear(self, topic: str, message: Message) -> None:
+    def receive(self, topic: str, message: Message) -> None:
         """Take in a message; topics of no concern are ignored. A newer tip pose takes the place of one not answered."""
         if isinstance(message, Stage):
             self._stages.append(message)
@@ -67,7 +67,7 @@ class EstimationService:
             self._waiting = message
 
     def answer(self, now_ns: int) -> ForceEstimate | None:
-        """The estimate for the newest tip pose, None where there is none that was not answered before.
+        """Return the estimate for the newest tip pose; None if no pose has arrived since the last call.
 
         now_ns: the rig's clock, for `published_ns`.
         """
@@ -82,10 +82,10 @@ class EstimationService:
         return self._ask(tip, self._shaft_of(tip), actuation, now_ns)
 
     def __call__(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
-        """One pose answered at once, for lock step; `published_ns` is then the caller's to set."""
+        """Return the estimate for one pose at once, for lock step; the caller sets `published_ns`."""
         for topic, message in (("stage", stage), ("pose/shaft", shaft), ("pose/tip", tip)):
             if message is not None:
-                self.hear(topic, message)
+                self.receive(topic, message)
         return self.answer(tip.stamp_ns)
 
     def _actuation_at(self, stamp_ns: int) -> Actuation | None:
@@ -108,7 +108,7 @@ class EstimationService:
             self.last_failure = f"{type(error).__name__}: {error}"
             answer = None
         compute_us = (self._timer_ns() - begin_ns) * 1e-3
-        good = answer is not None and answer.converged and _believable(answer.force_N, answer.covariance_N2)
+        good = answer is not None and answer.converged and _plausible(answer.force_N, answer.covariance_N2)
         self.answered += good
         self.unanswered += not good
         if answer is None or not good:
@@ -132,8 +132,8 @@ class EstimationService:
         )
 
 
-def _believable(force_N: np.ndarray, covariance_N2: np.ndarray) -> bool:
-    """Right shapes, finite, and a covariance that is one: symmetric, no negative variance along any direction."""
+def _plausible(force_N: np.ndarray, covariance_N2: np.ndarray) -> bool:
+    """Whether shapes are right, values finite, and the covariance symmetric and positive semidefinite."""
     force_N, covariance_N2 = np.asarray(force_N), np.asarray(covariance_N2)
     if force_N.shape != (3,) or covariance_N2.shape != (3, 3):
         return False

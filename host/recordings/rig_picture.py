@@ -11,7 +11,7 @@ import numpy as np
 
 from host.recordings.cause_watch import CauseWatch
 from protocol.enums import BoardState
-from protocol.first_cause import in_words
+from protocol.first_cause import describe
 
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
@@ -161,7 +161,7 @@ class Picture:
         first = self._causes.first()
         if first is None or state.get("safety_action", "none") in ("none", "warn"):
             return None
-        followed = [in_words(item) for item in first.followed]
+        followed = [describe(item) for item in first.followed]
         return {"says": first.says, "remedy": first.remedy, "followed": followed}
 
     def _drawn(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from host.recordings.recording import Recording
 from host.report.run_figures import RunFigures
 from host.report.run_summary import SETTLE_S, RunSummary, summarize
-from protocol.first_cause import in_words
+from protocol.first_cause import describe
 
 # Keeps a number and its unit on one line.
 NBSP = "\u00a0"
@@ -117,7 +117,7 @@ def _with_first_cause(verdict: RunVerdict, summary: RunSummary) -> RunVerdict:
     if verdict.level != "bad" or first is None or first.cause == "operator_stop":
         return verdict
     followed = tuple(
-        f"{(item.at_ns - first.at_ns) * 1e-6:+.0f} ms: {in_words(item)}".replace("-", "\u2212") for item in first.followed
+        f"{(item.at_ns - first.at_ns) * 1e-6:+.0f} ms: {describe(item)}".replace("-", "\u2212") for item in first.followed
     )
     return verdict._replace(sentence=f"{verdict.sentence} {first.says}", remedy=first.remedy, followed=followed)
 

@@ -199,7 +199,7 @@ def connect(
 
     Raises:
         InputError: the rig file is not good, or `endpoint` and `keys` do not go together.
-        OSError: nobody answers at `endpoint`, or the certificate is refused.
+        OSError: no rig answers at `endpoint`, or the certificate is refused.
 
     Source:
         Topics and roles: docs/topics.md and docs/security.md.

@@ -24,7 +24,7 @@ Progress = Callable[[str, float, float], None]
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """force_N wanted; hold_s after contact; pace: 1 is real time, 0 as fast as it goes; board: avr, native or auto.
+    """force_N: requested; hold_s: after contact; pace: 1 is real time, 0 unlimited; board: avr, native or auto.
 
     effects: planted in the simulated rig, as `sim.effects.parse` reads them.
     """

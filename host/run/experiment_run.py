@@ -26,8 +26,8 @@ ARM_WITHIN_S = 10.0
 REST_BEFORE_S = 4.0  # stillness, from which a diagnosis takes the noise
 
 
-class VirtualDesk:
-    """A `sim.scenario.Scenario` as a desk."""
+class SimulatedCommands:
+    """Command interface of a simulated rig (`sim.scenario.Scenario`)."""
 
     def __init__(self, scenario: Any) -> None:
         self._scenario = scenario
@@ -76,15 +76,15 @@ def run_simulated(script: Script, rig: Rig, directory: Path, board: str, seed: i
         scenario.run(REST_BEFORE_S)
         if not scenario.arm():
             raise RuntimeError("devices not ready")
-        desk = VirtualDesk(scenario)
-        perform(script, desk, progress)
-        desk.give("disarm")
+        commands = SimulatedCommands(scenario)
+        perform(script, commands, progress)
+        commands.give("disarm")
         scenario.run(0.1)
     return target
 
 
-class LiveDesk:
-    """A running rig over zenoh as a desk."""
+class LiveCommands:
+    """Command interface of a running rig over zenoh."""
 
     def __init__(self, session: Any, commander: Any) -> None:
         self._states, self._commander = session.latest("state"), commander
@@ -131,17 +131,17 @@ class LiveDesk:
 def run_live(script: Script, rig: Rig, progress: Callable[[float], None]) -> None:
     """Perform `script` on the running rig of the rig file; its own services record. Raises RuntimeError."""
     with Session(rig.name, [], rig.zenoh.connect) as session, Commander(session, "experiment") as commander:
-        desk = LiveDesk(session, commander)
+        commands = LiveCommands(session, commander)
         taken = commander.take()
         if not taken.accepted:
             raise RuntimeError(f"lease: {taken.reason}")
-        if not desk.wait(2.0, lambda: desk.mode() != ""):
+        if not commands.wait(2.0, lambda: commands.mode() != ""):
             raise RuntimeError("no message of the topic state from the rig within 2 s; check that it runs")
-        if desk.mode() == "disarmed":
+        if commands.mode() == "disarmed":
             armed = commander.arm()
-            if not armed.accepted or not desk.wait(ARM_WITHIN_S, lambda: desk.mode() == "hold"):
+            if not armed.accepted or not commands.wait(ARM_WITHIN_S, lambda: commands.mode() == "hold"):
                 raise RuntimeError(f"not armed: {armed.reason or 'the loop does not hold'}")
         try:
-            perform(script, desk, progress)
+            perform(script, commands, progress)
         finally:
             commander.disarm()

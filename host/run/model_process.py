@@ -41,8 +41,8 @@ class EstimatorProcess:
         self._everything = session.everything()
         self._forces = session.publisher("force/estimate")
         self._logs = session.publisher("log")
-        self._heard_s = self._told_s = time.monotonic()
-        self._told = ""
+        self._received_s = self._logged_s = time.monotonic()
+        self._logged = ""
         self._steps = 0
 
     def step(self) -> bool:
@@ -52,33 +52,33 @@ class EstimatorProcess:
         self._newest_ns = max([self._newest_ns, *(message.stamp_ns for _, message, _ in taken)])
         now_ns = self._now_ns()
         for topic, message, payload in taken:
-            self.service.hear(topic, message)
+            self.service.receive(topic, message)
             if self._recording is not None:
                 self._recording.write_encoded(topic, payload, message.stamp_ns, message.sequence, now_ns)
         estimate = self.service.answer(self._now_ns())
         if estimate is not None:
             self._forces.put(estimate)
-        self._tell(self._everything.complaint or self.service.last_failure)
+        self._log_once(self._everything.complaint or self.service.last_failure)
         self._flush_when_quiet(bool(taken))
         return bool(taken)
 
-    def _flush_when_quiet(self, heard: bool) -> None:
+    def _flush_when_quiet(self, received: bool) -> None:
         now_s = time.monotonic()
-        if not heard and self._recording is not None and now_s - self._heard_s > QUIET_S:
+        if not received and self._recording is not None and now_s - self._received_s > QUIET_S:
             self._recording.flush()
-        if heard or now_s - self._heard_s > QUIET_S:
-            self._heard_s = now_s
+        if received or now_s - self._received_s > QUIET_S:
+            self._received_s = now_s
 
     def log(self, level: str, text: str) -> None:
-        """Say `text` on the log topic and on standard error."""
+        """Write `text` to the log topic and to standard error."""
         print(f"seldinger estimator: {text}", file=sys.stderr, flush=True)
         self._logs.put(Log(stamp_ns=max(self._now_ns(), 0), level=level, source="estimator", text=text))
 
-    def _tell(self, text: str) -> None:
-        """Log `text` when it is new, at most once in QUIET_S: a flood of bad messages must not become one of logs."""
+    def _log_once(self, text: str) -> None:
+        """Log `text` when it is new, at most once in QUIET_S, so that many bad messages do not become many log lines."""
         now_s = time.monotonic()
-        if text and text != self._told and now_s - self._told_s > QUIET_S:
-            self._told, self._told_s = text, now_s
+        if text and text != self._logged and now_s - self._logged_s > QUIET_S:
+            self._logged, self._logged_s = text, now_s
             self.log("warning", text)
 
     def run(self, stop: threading.Event) -> None:

@@ -1,4 +1,4 @@
-"""The main job on the wall clock: simulated rig, realtime and model process each on its own, and an operator here."""
+"""The demo on the wall clock: simulated rig, realtime and model process as processes, and an operator in this one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sim.scenario import TARGET_M, ContactJob, Outcome
 
 _BEFORE_S = 6.0  # to come before the tissue
 _TOUCH_TIMEOUT_S = 60.0  # for all attempts to touch it
-_START_TIMEOUT_S = 120.0  # a first start compiles the loop, beside whatever else this machine does
+_START_TIMEOUT_S = 120.0  # a first start compiles the loop, on a machine that may be busy
 _STOP_TIMEOUT_S = 20.0  # for all to end of themselves; a recorder that is killed leaves a truncated recording
 
 
@@ -114,10 +114,10 @@ class Fleet:
         line = process.stdout.readline() if answers else ""
         if answers and not line:
             process.wait()
-            raise OSError(f"{name}: found that it ended at its start, wanted it to run: {self.last_words(name)}")
+            raise OSError(f"{name}: found that it ended at its start, wanted it to run: {self.last_log_line(name)}")
         return line
 
-    def wait_until_heard(self, seconds: float = _START_TIMEOUT_S) -> None:
+    def wait_for_state(self, seconds: float = _START_TIMEOUT_S) -> None:
         """Wait for the loop's first state. Raises OSError where a process ends, or none comes in time."""
         rig, until = load_rig(self.rig_file), time.monotonic() + seconds
         with Session(rig.name, [], rig.zenoh.connect) as session:
@@ -126,13 +126,15 @@ class Fleet:
                 if self.dead():
                     raise OSError(
                         f"{self.dead()[0]}: found that it ended at its start, wanted it to run: "
-                        f"{self.last_words(self.dead()[0])}"
+                        f"{self.last_log_line(self.dead()[0])}"
                     )
                 if time.monotonic() > until:
-                    raise OSError(f"realtime: found no state after {seconds:g} s, wanted one: {self.last_words('realtime')}")
+                    raise OSError(
+                        f"realtime: found no state after {seconds:g} s, wanted one: {self.last_log_line('realtime')}"
+                    )
                 time.sleep(0.02)
 
-    def last_words(self, name: str) -> str:
+    def last_log_line(self, name: str) -> str:
         """The last line that process `name` wrote to its log."""
         lines = (Path(self._folder.name) / f"{name}.log").read_text(encoding="utf-8").strip().splitlines()
         return lines[-1] if lines else "no message"
@@ -255,7 +257,7 @@ def run_wall_clock(settings: DemoSettings, progress: Progress) -> DemoRun:
             run.interrupted = "SIGINT"
         operator.look()
         timing = operator.timing
-        run.outcome.notes += [f"{name} ended: {fleet.last_words(name)}" for name in fleet.dead()] + operator.causes
+        run.outcome.notes += [f"{name} ended: {fleet.last_log_line(name)}" for name in fleet.dead()] + operator.causes
         operator.commander.close()
         operator.session.close()
     run.counts = {
@@ -280,7 +282,7 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     if outcome.contact:
         operator.wait(job.hold_s, lambda: operator.mode() == "stopped", lambda share: progress("hold", share, force()))
     else:
-        outcome.notes.append(f"no contact; the rig is {operator.mode() or 'silent'}")
+        outcome.notes.append(f"no contact; the phase of the rig is {operator.mode() or 'unknown'}")
     outcome.stopped = operator.mode() == "stopped"
     operator.commander.retract()
     operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))

@@ -22,7 +22,7 @@ import numpy as np
 
 from host.commissioning.experiment_script import Script, perform
 from host.diagnosis.live.watch import Watch
-from host.run.experiment_run import VirtualDesk
+from host.run.experiment_run import SimulatedCommands
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Alarm, Message
 from sim.board import SimulatedBoard
@@ -137,19 +137,19 @@ def run(task: Task, board: str = "native") -> LiveRow:
     with SimulatedBoard(board) as made:
         world = World(rig, simulated_plant(rig, task.seed, effects=effect_of(task)), made, task.seed)
 
-        def heard(topic: str, message: Message) -> None:
+        def received(topic: str, message: Message) -> None:
             watch.hear(topic, message)
             if topic == "pose/shaft":
                 alarm = watch.look()
                 alarms.extend([alarm] if alarm else [])
                 scores.append(watch.score)
 
-        scenario = Scenario(rig, world, heard)
+        scenario = Scenario(rig, world, received)
         if task.job == PRESS:
             scenario.press(ContactJob(target_m=TARGET_M, force_N=0.2, hold_s=task.seconds))
         else:
             scenario.arm()
-            desk: Any = VirtualDesk(scenario)
+            desk: Any = SimulatedCommands(scenario)
             perform(round_trip(rig, task.seconds), desk)
         return LiveRow(task, world.now_ns * 1e-9, tuple(map(_alarm, alarms)), max(scores), _ratio(watch))
 

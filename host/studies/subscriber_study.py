@@ -1,4 +1,4 @@
-"""Does it matter to the loop who listens? Its timing on the wall clock beside subscribers of all kinds, in turn with none.
+"""Effect of subscribers on the loop: its timing on the wall clock with each kind of subscriber, in turn with none.
 
 `seldinger latency-check --with ...` runs the simulated rig, the model process and, here, the realtime process.
 """
@@ -24,8 +24,8 @@ from realtime.core.process import RealtimeProcess
 from realtime.loop.latency import percentiles_us, run_cyclictest
 from realtime.loop.native_loop import LATENESS_BIN_NS, WORK_BIN_NS
 
-NOBODY, IDLE = "nobody", "cyclictest"
-SAYS = {NOBODY: "only the recorder"} | KINDS
+RECORDER_ONLY, IDLE = "nobody", "cyclictest"
+SAYS = {RECORDER_ONLY: "only the recorder"} | KINDS
 ROUNDS = 3
 _SETTLED_S, _OVER_S = 2.0, 1.0
 
@@ -96,7 +96,7 @@ def study(kinds: Sequence[str], seconds: float, board: str = "native") -> Study:
             time.sleep(_SETTLED_S)
             try:
                 for _ in range(ROUNDS):
-                    for kind in (NOBODY, *kinds):
+                    for kind in (RECORDER_ONLY, *kinds):
                         _slice(process, kind, slice_s, found.measured)
                     _reference(process, slice_s, found)
             finally:

@@ -54,7 +54,7 @@ def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[P
     recording = new_recording_path(directory, "view")
     try:
         with Fleet(DemoSettings(rig_file=rig_file), recording) as fleet:
-            fleet.wait_until_heard()
+            fleet.wait_for_state()
             yield fleet.rig_file
     finally:
         report(f"recording: {recording}")

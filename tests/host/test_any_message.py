@@ -107,7 +107,7 @@ def take_in(
     recorder.write_encoded(topic, payload, message.stamp_ns, message.sequence, recorded_ns)
     picture.take(topic, msgspec.msgpack.decode(payload))
     picture.frame()
-    service.hear(topic, message)
+    service.receive(topic, message)
     answer = service.answer(recorded_ns)
     if answer is not None:
         encode(answer)

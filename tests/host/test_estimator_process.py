@@ -80,9 +80,9 @@ def test_a_pose_is_answered_once_with_the_actuation_of_its_time() -> None:
     spring = Spring()
     service = EstimationService(spring)
     for tick in range(100):
-        service.hear("stage", stage(tick * 1_000_000, insertion_m=tick * 1e-3))
-    service.hear("pose/shaft", pose(75_000_000, height_m=0.01))
-    service.hear("pose/tip", pose(75_000_000))
+        service.receive("stage", stage(tick * 1_000_000, insertion_m=tick * 1e-3))
+    service.receive("pose/shaft", pose(75_000_000, height_m=0.01))
+    service.receive("pose/tip", pose(75_000_000))
     answer = service.answer(now_ns=100_000_000)
     assert answer is not None and answer.converged and answer.stamp_ns == 75_000_000
     assert answer.published_ns == 100_000_000 and answer.force_N is not None
@@ -95,9 +95,9 @@ def test_a_pose_is_answered_once_with_the_actuation_of_its_time() -> None:
 
 def test_a_newer_pose_takes_the_place_of_an_older_one() -> None:
     service = EstimationService(Spring())
-    service.hear("stage", stage(0))
-    service.hear("pose/tip", pose(0))
-    service.hear("pose/tip", pose(25_000_000))
+    service.receive("stage", stage(0))
+    service.receive("pose/tip", pose(0))
+    service.receive("pose/tip", pose(25_000_000))
     answer = service.answer(30_000_000)
     assert answer is not None and answer.stamp_ns == 25_000_000 and service.answered == 1
 
@@ -105,9 +105,9 @@ def test_a_newer_pose_takes_the_place_of_an_older_one() -> None:
 def test_a_shaft_pose_of_another_time_is_not_paired() -> None:
     spring = Spring()
     service = EstimationService(spring)
-    service.hear("stage", stage(0))
-    service.hear("pose/shaft", pose(0))
-    service.hear("pose/tip", pose(25_000_000))
+    service.receive("stage", stage(0))
+    service.receive("pose/shaft", pose(0))
+    service.receive("pose/tip", pose(25_000_000))
     service.answer(25_000_000)
     assert spring.asked[0][1] is None
 
@@ -125,7 +125,7 @@ def test_a_shaft_pose_of_another_time_is_not_paired() -> None:
 def test_without_a_pose_and_its_actuation_nothing_is_said(messages: list[tuple[str, Stage | Pose]]) -> None:
     service = EstimationService(Spring())
     for topic, message in messages:
-        service.hear(topic, message)
+        service.receive(topic, message)
     assert service.answer(0) is None
 
 

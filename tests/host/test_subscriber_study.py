@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from host.studies.bad_subscriber import KINDS
-from host.studies.subscriber_study import NOBODY, SAYS, MeasuredLoop, Study, page_section
+from host.studies.subscriber_study import RECORDER_ONLY, SAYS, MeasuredLoop, Study, page_section
 from realtime.loop.native_loop import BINS
 
 
@@ -21,7 +21,7 @@ def measured(late_us: int, missed: int = 0) -> MeasuredLoop:
 
 
 def test_the_page_has_a_row_for_each_kind_and_one_for_comparison() -> None:
-    found = Study({NOBODY: measured(4), "view": measured(9, missed=2)}, measured(3).lateness)
+    found = Study({RECORDER_ONLY: measured(4), "view": measured(9, missed=2)}, measured(3).lateness)
     rows = {line.split(" | ")[0]: line for line in page_section(found, ["view"], 60.0).splitlines() if line.startswith("| ")}
     assert len(rows) == 4 and f"| {SAYS['view']}" in rows
     assert [float(cell) for cell in rows[f"| {SAYS['view']}"].strip("| ").split(" | ")[1:]][:3] == [1000, 2, 9.5]

@@ -205,7 +205,7 @@ def asked(open_page: OpenPage, button: str, name: str) -> str:
 def test_a_running_rig_is_armed_held_and_stopped_from_the_page(browser: Any, tmp_path: Path) -> None:
     settings = DemoSettings(board="native", directory=tmp_path, estimator="tests.host.no_estimator:make")
     with Fleet(settings, tmp_path / "view.mcap") as fleet:
-        fleet.wait_until_heard()
+        fleet.wait_for_state()
         rig = load_rig(fleet.rig_file)
         with (
             Session(rig.name, [], rig.zenoh.connect) as session,

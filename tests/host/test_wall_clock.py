@@ -27,7 +27,7 @@ def test_killing_a_process_in_contact(victim: str, tmp_path: Path) -> None:
     recording = tmp_path / "kill.mcap"
     with Fleet(settings, recording) as fleet:
         operator = Operator(fleet)
-        assert operator.touch(JOB, PATIENCE_S), [operator.mode(), *(fleet.last_words(name) for name in fleet.processes)]
+        assert operator.touch(JOB, PATIENCE_S), [operator.mode(), *(fleet.last_log_line(name) for name in fleet.processes)]
         os.kill(fleet.processes[victim].pid, signal.SIGKILL)
         fleet.processes[victim].wait()
         time.sleep(1.0)

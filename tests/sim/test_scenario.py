@@ -56,8 +56,8 @@ def test_the_tip_comes_to_the_wall_and_holds(board: SimulatedBoard) -> None:
 PROGRAM = """
 import sys
 from tests.sim.test_scenario import scenario, TARGET
-from sim.board import Board
-with Board(sys.argv[1]) as board:
+from sim.board import SimulatedBoard
+with SimulatedBoard(sys.argv[1]) as board:
     run = scenario(board, int(sys.argv[2]))
     run.press(TARGET)
     print(run.world.digest)

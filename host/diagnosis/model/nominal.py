@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from protocol.errors import InputError, Words, reason
+from protocol.errors import Description, InputError, reason
 from protocol.requests import Request, validate
 
 
@@ -204,10 +204,10 @@ def read_nominal(path: Path | str) -> NominalSpec:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            "nominal", Words(f"{path}: {reason(error)}"), "a readable TOML file, or the name of one that ships"
+            "nominal", Description(f"{path}: {reason(error)}"), "a readable TOML file, or the name of one that ships"
         ) from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError("nominal", Words(f"{path}: {error}"), "valid TOML") from None
+        raise InputError("nominal", Description(f"{path}: {error}"), "valid TOML") from None
     return nominal_of(content, path.parent)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocol.errors import InputError, Words, reason
+from protocol.errors import Description, InputError, reason
 
 Array = npt.NDArray[np.float64]
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
@@ -87,7 +87,7 @@ def read_table(path: Path) -> dict[str, Array]:
         else:
             raise InputError("recording", path.name, "a table ending in " + ", ".join(SUFFIXES))
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError("recording", Words(f"{path.name}: {reason(error)}"), "a readable table") from None
+        raise InputError("recording", Description(f"{path.name}: {reason(error)}"), "a readable table") from None
     if not columns:
         raise InputError("recording", path.name, "at least one numeric column")
     return columns

@@ -1,4 +1,4 @@
-"""Benchmark of a diagnosis: backlash in a cable, found and fitted; the peer is told the effect and only fits it."""
+"""Benchmark of a diagnosis: backlash in a cable, found and fitted; the peer is given the effect and only fits it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def diagnose(seed: int, report: Report) -> list[Row]:
         row_of(
             "diagnose",
             f"backlash, {RECORDINGS} recordings of {SECONDS_s:.0f} s",
-            "scipy least_squares that is told the effect",
+            "scipy least_squares with the effect given",
             timed,
             seed,
             right=int(np.isfinite(errors).sum()),

@@ -50,7 +50,7 @@ CONTRACT = {
     "diagnose",
 }
 SECONDS_PER_BLOCK = 100e-6  # a call shorter than this is repeated inside one reading of the clock
-BLOCKS = 3  # readings of each side, of which the least counts: the rest is what else ran on the machine
+BLOCKS = 3  # readings of each side, of which the least counts: other programs on the machine only add to it
 PEER_BLOCKS_LONGER_THAN_s = 0.02  # ... and one reading is enough
 
 

@@ -220,7 +220,7 @@ class PredictedTarget(NamedTuple):
     no_heart_m: float
 
 
-def foretell(
+def predict_target(
     rig: Rig, seed: int, beat: HeartConfig, by_pose: bool, seconds: float = 60.0, after_s: float = 10.0
 ) -> PredictedTarget:
     """The predictor on the simulated heart, by forces, or by poses (rate and noise of the rig, 2 ms jitter, 5 % lost)."""
@@ -233,13 +233,13 @@ def foretell(
     if by_pose:
         times = (times + rng.integers(0, 3, len(times)))[rng.random(len(times)) > 0.05]
     samples = wall[times] + noise_m * rng.standard_normal(len(times))
-    state, foretold = new(TARGET_STATE)[0], np.zeros((len(times), 2))
+    state, predicted = new(TARGET_STATE)[0], np.zeros((len(times), 2))
     for k, time_ms in enumerate(times):
         target_predictor.apply(config, state, 10**9 + 10**6 * int(time_ms), samples[k], 0.0, 0.0, noise_m**2)
-        foretold[k] = target_predictor.ahead(state, AHEAD_S), position(state.x[LOCAL], AHEAD_S)
+        predicted[k] = target_predictor.ahead(state, AHEAD_S), position(state.x[LOCAL], AHEAD_S)
     truth, kept = wall[times + round(AHEAD_S * 1000)], times > after_s * 1000
     linear = np.append(samples[0], samples[1:] + AHEAD_S * np.diff(samples) / (np.diff(times) * 1e-3))
-    guesses = (foretold[:, 0], samples, linear, foretold[:, 1])
+    guesses = (predicted[:, 0], samples, linear, predicted[:, 1])
     return PredictedTarget(*(float(np.sqrt(np.mean((guess[kept] - truth[kept]) ** 2))) for guess in guesses))
 
 

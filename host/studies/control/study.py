@@ -134,7 +134,7 @@ def _prediction(runs: _Runs) -> dict[str, Any]:
     table: dict[str, Any] = {"ahead_s": control_runs.AHEAD_S}
     for source, by_pose in (("force", False), ("pose", True)):
         for beat, heart, wanted in (("regular", REGULAR, 0.25), ("irregular", IRREGULAR, 0.5)):
-            each = [control_runs.foretell(runs.rig, seed, heart, by_pose) for seed in runs.settings.seeds]
+            each = [control_runs.predict_target(runs.rig, seed, heart, by_pose) for seed in runs.settings.seeds]
             errors = {name: float(np.mean([getattr(one, name) for one in each])) for name in each[0]._fields}
             share = errors["predictor_m"] / errors["holding_m"]
             table[f"by_{source}_{beat}"] = {**errors, "of_holding": share, "reached": share <= wanted}
@@ -188,7 +188,7 @@ def _limits(runs: _Runs) -> dict[str, Any]:
         for source in ("sensor", "estimate"):
             runs.progress(f"configured backlash off by {off_m * 1e3:+.1f} mm {name}, {source}")
             run = control_runs.hold(rig, seed, REGULAR, min(runs.settings.hold_s, 20.0), source, WANTED_N)
-            table[f"play_believed_{name}_{source}_rms_N"] = run.rms_N(WANTED_N)
+            table[f"backlash_configured_{name}_{source}_rms_N"] = run.rms_N(WANTED_N)
     return table
 
 
@@ -204,7 +204,7 @@ _SECTION: dict[str, Callable[[_Runs], dict[str, Any]]] = {
 }
 
 
-def in_words(result: dict[str, Any]) -> list[str]:
+def table_lines(result: dict[str, Any]) -> list[str]:
     """The table for people, a line a figure."""
     lines: list[str] = []
     for name in SECTIONS:

@@ -55,7 +55,7 @@ class RunPlan:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run. `violations`: what the rig must not do and did, in words."""
+    """Result of a run. `violations`: what the rig must not do and did, one line each."""
 
     plan: RunPlan
     outcome: dict[str, Any]
@@ -175,8 +175,8 @@ def _forked(run: FaultyScenario, board: ForkableBoard, plan: RunPlan) -> RunResu
     _, status = os.waitpid(child, 0)
     if status != 0 or not said:
         said = json.dumps({"outcome": {}, "readable": False, "lost_s": 0.0, "unhandled": f"run ended with status {status}"})
-    told = json.loads(said)
-    result = RunResult(plan, told["outcome"], told["readable"], told["lost_s"], told["unhandled"], ())
+    answered = json.loads(said)
+    result = RunResult(plan, answered["outcome"], answered["readable"], answered["lost_s"], answered["unhandled"], ())
     return replace(result, violations=tuple(violations(result)))
 
 
@@ -230,7 +230,7 @@ def found_due_s(result: RunResult) -> float | None:
 
 
 def violations(result: RunResult) -> Iterator[str]:
-    """What must not be, in words, of one run."""
+    """Yield the violations of one run, one line each."""
     fault, outcome = BY_NAME[result.plan.fault], result.outcome
     if result.unhandled:
         yield f"unhandled: {result.unhandled}"
@@ -269,17 +269,17 @@ def by_fault(results: list[RunResult]) -> list[dict[str, Any]]:
 
 def summary_of(results: list[RunResult]) -> dict[str, Any]:
     """Figures over some runs."""
-    told = [result.outcome for result in results if result.outcome]
+    outcomes = [result.outcome for result in results if result.outcome]
     times_ms = [
         1e3 * max(result.outcome["detected_s"] - (found_due_s(result) or 0.0), 0.0)
         for result in results
         if result.outcome.get("detected_s") is not None
     ]
     actions: dict[str, int] = {}
-    for outcome in told:
+    for outcome in outcomes:
         actions[outcome["action"]] = actions.get(outcome["action"], 0) + 1
     wanted = [result for result in results if found_due_s(result) is not None]
-    stopping = [outcome["moved_after_m"] for outcome in told if outcome["action"] in ("hold", "retract", "stop")]
+    stopping = [outcome["moved_after_m"] for outcome in outcomes if outcome["action"] in ("hold", "retract", "stop")]
     return {
         "runs": len(results),
         "detected": len(times_ms),
@@ -287,11 +287,11 @@ def summary_of(results: list[RunResult]) -> dict[str, Any]:
         "missed": sum(result.outcome.get("detected_s") is None for result in wanted),
         "detection_ms_p50": float(np.median(times_ms)) if times_ms else None,
         "detection_ms_p99": float(np.percentile(times_ms, 99)) if times_ms else None,
-        "peak_force_N": max((outcome["peak_force_N"] for outcome in told), default=0.0),
+        "peak_force_N": max((outcome["peak_force_N"] for outcome in outcomes), default=0.0),
         "moved_after_m": max(stopping, default=0.0),
-        "rest_ms_max": max((1e3 * outcome["rest_s"] for outcome in told), default=0.0),
+        "rest_ms_max": max((1e3 * outcome["rest_s"] for outcome in outcomes), default=0.0),
         "actions": actions,
-        "poses_lost": sum(outcome["poses_lost"] for outcome in told),
+        "poses_lost": sum(outcome["poses_lost"] for outcome in outcomes),
         "recording_lost_s": max((result.recording_lost_s for result in results), default=0.0),
         "recordings_unreadable": sum(not result.recording_readable for result in results),
         "unhandled": sum(bool(result.unhandled) for result in results),

@@ -52,7 +52,7 @@ def _workspace() -> Section:
     )
     says = (
         f"det J is zero at bends of {', '.join(f'{b:+.2f}' for b in crossing)} rad: extremes of y, across "
-        f"{FOLD_REACH * LENGTH_M * 1e3:.1f} mm; straight is no singular point of (7.3)."
+        f"{FOLD_REACH * LENGTH_M * 1e3:.1f} mm; straight is not a singular point of (7.3)."
     )
     return Section(
         "fig_7.5",
@@ -67,9 +67,9 @@ def _workspace() -> Section:
 
 def _polynomials() -> list[Section]:
     """Three connected 9th-order polynomials for curvature over y, and the tip that they lead to."""
-    pieces = [(-GREATEST_BEND, -FOLD_BEND), (-FOLD_BEND, FOLD_BEND), (FOLD_BEND, GREATEST_BEND)]
+    ranges = [(-GREATEST_BEND, -FOLD_BEND), (-FOLD_BEND, FOLD_BEND), (FOLD_BEND, GREATEST_BEND)]
     fits, errors, places = [], [], []
-    for low, high in pieces:
+    for low, high in ranges:
         bend = low + (high - low) * 0.5 * (1 - np.cos(np.linspace(0, math.pi, 800)))
         across = _along_across(bend)[1]
         polynomial = np.polynomial.Polynomial.fit(across, bend / LENGTH_M, 9)

@@ -104,21 +104,21 @@ def experiment(
     point = np.array(where.point_m) - shift_m * np.array(where.into)
     tissue = TissueConfig(point_m=tuple(point), normal=tuple(-np.array(where.into)), friction=FRICTION)
     plant = simulated_plant(rig, seed, tissue=tissue, heart=HeartConfig(beat_m=0.0, respiration_m=0.0))
-    heard: dict[str, list[Message]] = {"force/sensor": [], "state": [], "stage": []}
+    received: dict[str, list[Message]] = {"force/sensor": [], "state": [], "stage": []}
 
     def publish(topic: str, message: Message) -> None:
-        if topic in heard:
-            heard[topic].append(message)
+        if topic in received:
+            received[topic].append(message)
 
     with SimulatedBoard(board) as made:
         scenario = Scenario(rig, World(rig, plant, made, seed), publish)
         job = ContactJob(tuple(point), where.into, force_N=wanted_N, hold_s=hold_s, approach_s=8.0)
         outcome = scenario.press(job)
-    return _cut(heard, where, label, wanted_N, point, outcome.contact, hold_s)
+    return _cut(received, where, label, wanted_N, point, outcome.contact, hold_s)
 
 
 def _cut(
-    heard: dict[str, list[Message]],
+    received: dict[str, list[Message]],
     where: Configuration,
     label: str,
     wanted_N: float,
@@ -126,7 +126,7 @@ def _cut(
     contact: bool,
     hold_s: float,
 ) -> RigRun:
-    states = [m for m in heard["state"] if m.mode == "contact"]  # type: ignore[attr-defined]
+    states = [m for m in received["state"] if m.mode == "contact"]  # type: ignore[attr-defined]
     if not contact or not states:
         empty = np.zeros(0)
         return RigRun(label, False, empty, empty, empty, empty, np.zeros((0, 3)), wanted_N)
@@ -135,7 +135,11 @@ def _cut(
     def window(messages: Sequence[Message], before_s: float) -> list[Message]:
         return [m for m in messages if -before_s <= m.stamp_ns * 1e-9 - start_s <= hold_s]
 
-    forces, tips, stages = window(heard["force/sensor"], 0.5), window(heard["state"], 0.0), window(heard["stage"], 3.0)
+    forces, tips, stages = (
+        window(received["force/sensor"], 0.5),
+        window(received["state"], 0.0),
+        window(received["stage"], 3.0),
+    )
     time_s = np.array([m.stamp_ns for m in forces]) * 1e-9 - start_s
     into = np.array(where.into)
     force = np.array([m.force_N for m in forces]) @ into  # type: ignore[attr-defined]
@@ -170,7 +174,7 @@ def _smooth(force_N: Array) -> Array:
 
 
 def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
-    """Whether all came to their force, and how well, in words."""
+    """Return whether all runs reached their force, and a sentence about how well."""
     said, good = [], True
     for run in runs:
         if not run.contact or run.late().size == 0:

@@ -137,7 +137,7 @@ def identified() -> Catheter:
     return with_parameters(least_squares(residuals, start, loss="soft_l1", diff_step=1e-4, max_nfev=40).x)
 
 
-def _in_words(catheter: Catheter) -> str:
+def _describe(catheter: Catheter) -> str:
     pcar = catheter.pcar
     assert pcar is not None
     stiffness = ", ".join(f"{value * 1e6:.0f}" for value in pcar.EI_N_m2)
@@ -187,12 +187,12 @@ def figure_2_5() -> Section:
         worst_tip <= 0.00185,
         "largest tip error 1.85 mm, largest of any marker 2.74 mm",
         f"largest tip error {worst_tip * 1e3:.2f} mm, largest of any marker {worst * 1e3:.2f} mm",
-        f"three arcs stay within {worst_tip * 1e3:.2f} mm at the tip of a catheter that is no set of arcs; the number of "
+        f"three arcs stay within {worst_tip * 1e3:.2f} mm at the tip of a catheter that is not made of arcs; the number of "
         f"arcs is why: the same model in arcs of 5 mm stays within {finest * 1e3:.2f} mm",
         "The thesis' recordings are not published. In their place: a planar elastica with the stiffness of Table 2.1 "
         "integrated at 1e-9, its tip 30 % stiffer over 8 mm (electrodes), its shaft not quite circular when unloaded "
         "(1.5 %), markers read to 0.1 mm. The three arcs were identified on 15 other shapes of it, as in 2.3.1: "
-        f"{_in_words(catheter)}",
+        f"{_describe(catheter)}",
         draw,
         "Model (lines) and markers (dots), mm",
         tuple(rows),

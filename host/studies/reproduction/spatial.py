@@ -237,8 +237,8 @@ def figure_3_7(quick: bool) -> Section:
     m = np.einsum("sji,sj->si", R, np.cross(found.tip_position_m - found.station_positions_m, found.force_base_N))
     at = total - offsets
     n[offsets <= rod[6], 2] -= tension
-    beside = internal_loads(rod, force, tension, offsets[::-1])[::-1]
-    off_n, off_m = (float(np.abs(a - b).max()) for a, b in ((n, beside[:, :3]), (m, beside[:, 3:])))
+    reference = internal_loads(rod, force, tension, offsets[::-1])[::-1]
+    off_n, off_m = (float(np.abs(a - b).max()) for a, b in ((n, reference[:, :3]), (m, reference[:, 3:])))
     in_body = offsets > rod[6]
     u = m * np.where(in_body[:, None], rod[3:6], rod[:3])
     u[~in_body, 0] += k0
@@ -301,11 +301,11 @@ def table_3_1(quick: bool) -> Section:
             for k0 in ((0.0, 45.0) if quick else (0.0, 15.0, 30.0, 45.0))
             for direction in _directions()
         ]
-        told = [_three_ways(k0, force, quick) for k0, force in cases]
-        a, b, c, w = (1e3 * np.median([row[i] for row in told]) for i in range(4))
-        slowest = max(slowest, *(row[2] for row in told))
-        ok = [sum(bool(row[i]) for row in told) for i in range(4, 8)]
-        right, asked, found_ours = right + ok[1], asked + len(told), found_ours + ok[3]
+        results = [_three_ways(k0, force, quick) for k0, force in cases]
+        a, b, c, w = (1e3 * np.median([row[i] for row in results]) for i in range(4))
+        slowest = max(slowest, *(row[2] for row in results))
+        ok = [sum(bool(row[i]) for row in results) for i in range(4, 8)]
+        right, asked, found_ours = right + ok[1], asked + len(results), found_ours + ok[3]
         ratio.append(b / c)
         rows.append(
             (
@@ -313,12 +313,12 @@ def table_3_1(quick: bool) -> Section:
                 own,
                 bvp,
                 f"{a:.2f}",
-                f"{ok[0]}, {ok[1]} of {len(told)}",
+                f"{ok[0]}, {ok[1]} of {len(results)}",
                 f"{b:.0f}",
-                f"{ok[2]} of {len(told)}",
+                f"{ok[2]} of {len(results)}",
                 f"{c * 1e3:.0f}",
                 f"{w * 1e3:.0f}",
-                f"{ok[3]} of {len(told)}",
+                f"{ok[3]} of {len(results)}",
             )
         )
     return section(
