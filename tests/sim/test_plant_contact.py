@@ -204,8 +204,8 @@ def test_same_inputs_same_numbers() -> None:
 def test_the_kernels_give_the_same_numbers_without_the_compiler() -> None:
     program = (
         "from sim.plant import Plant, PlantConfig\n"
-        "from sim.effects import CATALOGUE, Effect\n"
-        "some = [Effect(i, p) for p in CATALOGUE for i in CATALOGUE[p] if i not in ('saturation', 'missed_steps')]\n"
+        "from sim.effects import CATALOGUE, PlantedEffect\n"
+        "some = [PlantedEffect(i, p) for p in CATALOGUE for i in CATALOGUE[p] if i not in ('saturation', 'missed_steps')]\n"
         "plant = Plant(PlantConfig(effects=tuple(some)), 4)\n"
         "for n in range(12):\n"
         "    plant.step(1e-3, (0.0006 * n, 0.1, 0.4))\n"
