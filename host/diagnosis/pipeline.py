@@ -22,7 +22,7 @@ from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
 from host.diagnosis.model.findings import Finding, Inspected, inspect
-from host.diagnosis.model.model import Model, Piece
+from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
@@ -34,7 +34,7 @@ from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Figures:
 
     before: Array
     after: Array
-    floor: Array
+    noise_sd: Array
     white_before: Array
     white_after: Array
     primary: int
@@ -129,26 +129,26 @@ def thinning(model: Model, recordings: list[Recording]) -> int:
 
 
 def _problem(model: Model, recordings: list[Recording], columns: dict[str, str]) -> Problem:
-    pieces = [model.prepare(r) for r in recordings]
+    segments = [model.prepare(r) for r in recordings]
     still = [
         noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed)
-        for p in pieces
+        for p in segments
     ]
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
-        found = noise_module.estimate([p.y[row] for p in pieces], still)
-        if "noise" in pieces[0].extra:  # of a difference that the model itself makes
-            found = sorted((p.extra["noise"] for p in pieces), key=lambda noise: noise.sigma)[len(pieces) // 2]
+        found = noise_module.estimate([p.y[row] for p in segments], still)
+        if "noise" in segments[0].extra:  # of a difference that the model itself makes
+            found = sorted((p.extra["noise"] for p in segments), key=lambda noise: noise.sigma)[len(segments) // 2]
         noises.append(found)
-        for piece in pieces:
-            piece.y[row, noise_module.wild(piece.y[row], found.sigma)] = np.nan
-    return Problem(model, pieces, noises, np.ones(len(model.outputs)), columns)
+        for segment in segments:
+            segment.y[row, noise_module.wild(segment.y[row], found.sigma)] = np.nan
+    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns)
 
 
 def diagnose(
     spec: NominalSpec,
     sources: Sequence[Path | Table],
-    tell: Tell,
+    progress: Progress,
     left_out: frozenset[str] = frozenset(),
     rules: SelectionRules = RULES,
     time_budget_s: float | None = None,
@@ -159,28 +159,28 @@ def diagnose(
         InputError: the recordings do not fit the nominal model's file.
         NothingToCompare: a channel that the comparison needs says nothing.
     """
-    tell("reading recordings", 0.0)
+    progress("reading recordings", 0.0)
     budget = Budget(time_budget_s)
     data = inspected(spec, sources)
     if not data.recordings:
         raise NothingToCompare(data.findings)
     model, problem, full = problems(spec, data.recordings, rules)
     problem.budget = budget
-    pool = candidates(model.ports, problem.pieces[0].recording.timed, model.taken | left_out)
-    pool = [c for c in pool if c.effect.id not in left_out]
-    found = search(problem, pool, tell)
-    floor = np.array([n.sigma for n in problem.noise])
-    tell("examining the residual", 0.0)
-    rest = explain_rest(problem, found, floor, tell)
-    tell("weighing what stands in their place", 0.0)
-    standing = beside_unlisted(standings(problem, found, floor), rest)
-    tell("intervals", 0.0)
+    candidate_effects = candidates(model.ports, problem.segments[0].recording.timed, model.taken | left_out)
+    candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
+    found = search(problem, candidate_effects, progress)
+    noise_sd = np.array([n.sigma for n in problem.noise])
+    progress("examining the residual", 0.0)
+    rest = explain_rest(problem, found, noise_sd, progress)
+    progress("weighing what stands in their place", 0.0)
+    standing = beside_unlisted(standings(problem, found, noise_sd), rest)
+    progress("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
     result.findings = [*data.findings, *uncertain(problem, found.best, spans)]
-    result.designs = [] if budget.spent() else design(problem, found, standing, tell)
+    result.designs = [] if budget.spent() else design(problem, found, standing, progress)
     result.stopped_early = budget.spent()
     piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects
     named = bool(found.best.terms) and not piled
@@ -199,10 +199,10 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     top = max(rows, key=lambda row: _weight(full, residuals, row))
     spans = [
         windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma)
-        for p, r in zip(full.pieces, residuals, strict=True)
+        for p, r in zip(full.segments, residuals, strict=True)
     ]
     told = _told(full, spans)
-    where = condition(full, residuals, top, max(1, sum(p.n for p in full.pieces) // 20000))
+    where = condition(full, residuals, top, max(1, sum(p.n for p in full.segments) // 20000))
     return Location(
         subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top)
     )
@@ -210,15 +210,15 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
 
 def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
     """`fit` simulated on the samples of `full`."""
-    for piece, coarse in zip(full.pieces, like.pieces, strict=True):
-        piece.start = coarse.start
+    for segment, coarse in zip(full.segments, like.segments, strict=True):
+        segment.start = coarse.start
         settle = getattr(full.model, "settle", None)
         if settle is not None and not fit.terms:
-            settle(piece, fit.values)
+            settle(segment, fit.values)
         if "begin" in coarse.extra:
-            piece.extra["begin"] = coarse.extra["begin"]
+            segment.extra["begin"] = coarse.extra["begin"]
     again = replace(fit)
-    again.residuals = [piece.y - full.simulate(piece, fit.terms, fit.values) for piece in full.pieces]
+    again.residuals = [segment.y - full.simulate(segment, fit.terms, fit.values) for segment in full.segments]
     return again
 
 
@@ -228,9 +228,9 @@ def _figures(full: Problem, found: Found) -> Figures:
     nominal, best = found.nominal_full, found.best_full
     for row in rows:
         for store, fit in ((before, nominal), (after, best)):
-            store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.pieces, strict=True)])
+            store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.segments, strict=True)])
         for store, fit in ((white_b, nominal), (white_a, best)):
-            masks = [p.heldout for p in full.pieces]
+            masks = [p.heldout for p in full.segments]
             store[row] = whiteness([full.noise[row].whiten(r[row]) for r in fit.residuals], masks)
     ratio = np.where(after > 0, before / np.maximum(after, 1e-300), 1.0)
     used = np.isfinite(before) & (before > 0)
@@ -248,7 +248,7 @@ def rms(parts: list[Array]) -> float:
 def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
     found.nominal_full = at_full_rate(full, found.nominal, coarse)
     for form in found.forms:
-        lay_out(full.pieces, form)
+        lay_out(full.segments, form)
     found.best_full = at_full_rate(full, found.best, coarse)
     out: list[Location] = []
     for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):
@@ -259,11 +259,11 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
         top = max(rows, key=lambda row: _weight(full, alone, row))
         strong = [row for row in rows if _weight(full, alone, row) >= 0.5 * _weight(full, alone, top)]
         spans = [
-            joined([span for row in strong for span in _windows(piece, m[row])])
-            for piece, m in zip(full.pieces, alone, strict=True)
+            joined([span for row in strong for span in _windows(segment, m[row])])
+            for segment, m in zip(full.segments, alone, strict=True)
         ]
         share = _share(full, found, spans, top)
-        where = condition(full, alone, top, max(1, sum(p.n for p in full.pieces) // 20000))
+        where = condition(full, alone, top, max(1, sum(p.n for p in full.segments) // 20000))
         out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans), where, share))
     return out
 
@@ -283,8 +283,8 @@ def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
             terms.append(term)
             values += list(part)
     out = []
-    for piece, r in zip(full.pieces, found.best_full.residuals, strict=True):
-        change = (piece.y - r) - full.simulate(piece, tuple(terms), np.array(values))
+    for segment, r in zip(full.segments, found.best_full.residuals, strict=True):
+        change = (segment.y - r) - full.simulate(segment, tuple(terms), np.array(values))
         out.append(change - np.nanmean(change, axis=1, keepdims=True))
     return out
 
@@ -305,23 +305,23 @@ def _weight(full: Problem, change: list[Array], row: int) -> float:
 
 def _told(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
     """Windows of every recording by its name, in the time of its file."""
-    begins = [piece.recording.begin_s for piece in full.pieces]
+    begins = [segment.recording.begin_s for segment in full.segments]
     return {
-        piece.recording.name: [(a + begin, b + begin) for a, b in each]
-        for piece, each, begin in zip(full.pieces, spans, begins, strict=True)
+        segment.recording.name: [(a + begin, b + begin) for a, b in each]
+        for segment, each, begin in zip(full.segments, spans, begins, strict=True)
     }
 
 
-def _windows(piece: Piece, change: Array) -> list[tuple[float, float]]:
-    return windows(change, piece.recording.time_s, piece.recording.dt_s)
+def _windows(segment: Segment, change: Array) -> list[tuple[float, float]]:
+    return windows(change, segment.recording.time_s, segment.recording.dt_s)
 
 
 def _share(full: Problem, found: Found, spans: list[list[tuple[float, float]]], row: int) -> float:
     """Part of the nominal model's residual energy above noise that falls into the windows."""
     held = total = 0.0
-    for piece, r, span in zip(full.pieces, found.nominal_full.residuals, spans, strict=True):
+    for segment, r, span in zip(full.segments, found.nominal_full.residuals, spans, strict=True):
         good = np.isfinite(r[row])
         above = np.where(good, r[row] ** 2 - full.noise[row].sigma ** 2, 0.0)
         total += float(above.sum())
-        held += float(above[inside(span, piece.recording.time_s)].sum())
+        held += float(above[inside(span, segment.recording.time_s)].sum())
     return float(np.clip(held / total, 0.0, 1.0)) if total > 0.0 else 0.0

@@ -53,14 +53,14 @@ class Design:
         )
 
 
-def design(problem: Problem, found: Found, standing: list[Standing], tell: Callable[[str, float], None]) -> list[Design]:
+def design(problem: Problem, found: Found, standing: list[Standing], progress: Callable[[str, float], None]) -> list[Design]:
     """For each pair that the recordings cannot tell apart, the motion that would; none where an equation of recorded
     signals is in play, since motions that nobody recorded have no such signals.
     """
     out = []
     for stands in standing if all(term.candidate.effect.id != "unlisted" for term in found.best.terms) else ():
         for other in (other for other in stands.alike if other.effect.id != "unlisted"):
-            tell(f"how to tell {stands.candidate.key} from {other.key}", 0.0)
+            progress(f"how to tell {stands.candidate.key} from {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)
             out += [] if made is None else [made]
@@ -95,8 +95,8 @@ def against(problem: Problem, best: Fit, rival: Fit, candidate: Candidate, other
             top = (reached, excitation, trial)
     if top is None:
         return None
-    piece = top[2].pieces[0]
-    inputs = {name: piece.recording.channels[name] for name in asked(problem)}
+    segment = top[2].segments[0]
+    inputs = {name: segment.recording.channels[name] for name in asked(problem)}
     return Design(candidate, other, top[1], top[0], had, inputs)
 
 
@@ -104,15 +104,15 @@ def weighed(problem: Problem, best: Fit) -> Problem:
     """`problem` with residuals in units of what `best` leaves, correlated samples counted once."""
     together = [max(correlation_time(r[row]) for r in best.residuals) for row in range(len(problem.noise))]
     scale = problem.scale * np.sqrt(np.maximum(together, 1.0))
-    return Problem(problem.model, problem.pieces, problem.noise, scale, problem.columns)
+    return Problem(problem.model, problem.segments, problem.noise, scale, problem.columns)
 
 
 def difference(problem: Problem, one: Fit, two: Fit) -> Array:
     """What two models say of the present recordings, apart, weighted."""
     rows = []
-    for piece in problem.pieces:
-        apart = problem.simulate(piece, one.terms, one.values) - problem.simulate(piece, two.terms, two.values)
-        rows.append(np.where(np.isfinite(piece.y) & np.isfinite(apart), apart, 0.0) / problem.scale[:, None])
+    for segment in problem.segments:
+        apart = problem.simulate(segment, one.terms, one.values) - problem.simulate(segment, two.terms, two.values)
+        rows.append(np.where(np.isfinite(segment.y) & np.isfinite(apart), apart, 0.0) / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
 
 
@@ -152,13 +152,13 @@ def trials(problem: Problem, best: Fit) -> list[tuple[Excitation, Problem]]:
 
 def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | None:
     """A problem of one recording whose outputs are what `best` says; None where it says nothing finite."""
-    piece = problem.model.prepare(recording)
+    segment = problem.model.prepare(recording)
     settle = getattr(problem.model, "settle", None)
     if settle is not None and not hasattr(plain(problem), "excitations"):
-        settle(piece, best.values[: len(problem.model.parameters)])
-    trial = Problem(problem.model, [piece], problem.noise, problem.scale, problem.columns)
-    piece.y = problem.simulate(piece, best.terms, best.values)
-    return trial if np.isfinite(piece.y).all() and np.max(np.abs(piece.y)) < 1e100 else None
+        settle(segment, best.values[: len(problem.model.parameters)])
+    trial = Problem(problem.model, [segment], problem.noise, problem.scale, problem.columns)
+    segment.y = problem.simulate(segment, best.terms, best.values)
+    return trial if np.isfinite(segment.y).all() and np.max(np.abs(segment.y)) < 1e100 else None
 
 
 def asked(problem: Problem) -> tuple[str, ...]:
@@ -176,10 +176,10 @@ def plain(problem: Problem) -> Any:
 
 def at_rest(problem: Problem) -> tuple[Recording, dict[str, float]]:
     """A recording to copy from, and where each of its channels usually is."""
-    first = problem.pieces[0].recording
+    first = problem.segments[0].recording
     usual = {}
     for name in first.channels:
-        together = np.concatenate([p.recording.channels[name] for p in problem.pieces if name in p.recording.channels])
+        together = np.concatenate([p.recording.channels[name] for p in problem.segments if name in p.recording.channels])
         usual[name] = float(np.nanmedian(together)) if np.isfinite(together).any() else np.nan
     return first, usual
 
@@ -222,12 +222,12 @@ def held_levels(name: str, names: tuple[str, ...], spans: dict[str, Span]) -> li
 
 def recorded_span(problem: Problem, name: str) -> Span:
     """Where input `name` has been, and how fast."""
-    values = np.concatenate([p.recording.channels[name] for p in problem.pieces])
+    values = np.concatenate([p.recording.channels[name] for p in problem.segments])
     values = values[np.isfinite(values)]
     low, high = (float(q) for q in np.quantile(values, INSIDE))
-    steps = np.concatenate([np.abs(np.diff(p.recording.channels[name])) / p.recording.dt_s for p in problem.pieces])
+    steps = np.concatenate([np.abs(np.diff(p.recording.channels[name])) / p.recording.dt_s for p in problem.segments])
     speed = float(np.nanquantile(steps, 0.999))
-    unit = problem.pieces[0].recording.units.get(name, "")
+    unit = problem.segments[0].recording.units.get(name, "")
     return Span(unit, 0.5 * (low + high), 0.5 * (high - low), speed)
 
 

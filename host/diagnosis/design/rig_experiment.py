@@ -39,7 +39,7 @@ class Places:
 def places(model: Any, problem: Problem, best: Fit) -> Places:
     """A working point in free space, clear of the wall, and one on the wall where it was touched."""
     handle, tip, force = (
-        np.hstack([np.vstack([p.recording.channels[name] for name in names]) for p in problem.pieces])
+        np.hstack([np.vstack([p.recording.channels[name] for name in names]) for p in problem.segments])
         for names in (tuple(HANDLES), ("tip_x_m", "tip_y_m", "tip_z_m"), FORCE)
     )
     pressing = np.isfinite(tip).all(axis=0) & (model.normal @ np.nan_to_num(force) > TOUCH_N)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -59,25 +59,25 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
     return float(np.clip(total, 1.0, n / 4.0))
 
 
-def compare(pieces: list[Piece], which: str, before: list[Array], after: list[Array], floor: Array) -> Gain:
-    """Gain of `after` over `before` (residuals per piece, (outputs, n)) on the samples `which` (`fit`, `heldout` or `both`).
+def compare(segments: list[Segment], which: str, before: list[Array], after: list[Array], noise_sd: Array) -> Gain:
+    """Gain of `after` over `before` (residuals per segment, (outputs, n)) on samples `which` (`fit`, `heldout` or `both`).
 
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
     is divided by
-    the correlation time of what the better model leaves. `floor` (outputs,): standard deviations below which nothing is
+    the correlation time of what the better model leaves. `noise_sd` (outputs,): standard deviations below which nothing is
     gained.
     """
-    independent, log_ratio, excess, excess_after = (np.zeros(floor.size) for _ in range(4))
+    independent, log_ratio, excess, excess_after = (np.zeros(noise_sd.size) for _ in range(4))
     by_output: list[list[float]] = []
-    for row in range(floor.size):
-        b2, a2, n_eff, times = _pooled(pieces, which, before, after, row)
+    for row in range(noise_sd.size):
+        b2, a2, n_eff, times = _pooled(segments, which, before, after, row)
         if n_eff < 3.0:
             continue
-        level_b, level_a = b2 + 1e-6 * floor[row] ** 2, a2 + 1e-6 * floor[row] ** 2
+        level_b, level_a = b2 + 1e-6 * noise_sd[row] ** 2, a2 + 1e-6 * noise_sd[row] ** 2
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
-        excess[row] = max(0.0, 1.0 - floor[row] ** 2 / level_b)
-        excess_after[row] = max(0.0, 1.0 - 1.5 * floor[row] ** 2 / level_a)
-        by_output.append(_blocks(pieces, which, before, after, row, times, level_a))
+        excess[row] = max(0.0, 1.0 - noise_sd[row] ** 2 / level_b)
+        excess_after[row] = max(0.0, 1.0 - 1.5 * noise_sd[row] ** 2 / level_a)
+        by_output.append(_blocks(segments, which, before, after, row, times, level_a))
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
     share = float(1.0 - np.exp(-log_ratio[top]))
@@ -93,17 +93,17 @@ def _p_value(by_output: list[list[float]]) -> float:
     return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
-def _asked(piece: Piece, which: str) -> Mask:
-    return np.asarray(piece.fit | piece.heldout) if which == "both" else np.asarray(getattr(piece, which))
+def _asked(segment: Segment, which: str) -> Mask:
+    return np.asarray(segment.fit | segment.heldout) if which == "both" else np.asarray(getattr(segment, which))
 
 
 def _pooled(
-    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int
+    segments: list[Segment], which: str, before: list[Array], after: list[Array], row: int
 ) -> tuple[float, float, float, list[float]]:
     sum_b = sum_a = count = n_eff = 0.0
     times = []
-    for piece, b, a in zip(pieces, before, after, strict=True):
-        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+    for segment, b, a in zip(segments, before, after, strict=True):
+        mask = _asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         n = int(mask.sum())
         if n < 20:
             times.append(1.0)
@@ -118,11 +118,11 @@ def _pooled(
 
 
 def _blocks(
-    pieces: list[Piece], which: str, before: list[Array], after: list[Array], row: int, times: list[float], level: float
+    segments: list[Segment], which: str, before: list[Array], after: list[Array], row: int, times: list[float], level: float
 ) -> list[float]:
     found = []
-    for piece, b, a, tau in zip(pieces, before, after, times, strict=True):
-        mask = _asked(piece, which) & np.isfinite(b[row]) & np.isfinite(a[row])
+    for segment, b, a, tau in zip(segments, before, after, times, strict=True):
+        mask = _asked(segment, which) & np.isfinite(b[row]) & np.isfinite(a[row])
         gained = (b[row][mask] ** 2 - a[row][mask] ** 2) / level
         length = int(max(4.0 * tau, gained.size / 24.0, 8.0))
         parts = max(1, gained.size // length)

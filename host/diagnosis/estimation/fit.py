@@ -11,7 +11,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter
-from host.diagnosis.model.model import Act, Model, Piece
+from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
@@ -32,7 +32,7 @@ class Fit:
 
     terms: tuple[Term, ...]
     values: Array
-    residuals: list[Array] = field(default_factory=list)  # per piece (outputs, n): measured - simulated
+    residuals: list[Array] = field(default_factory=list)  # per segment (outputs, n): measured - simulated
     jacobian: Array | None = None
     cost: float = np.inf
 
@@ -47,7 +47,7 @@ class Problem:
     """A model, its prepared recordings and the noise of each output. `scale` (outputs,) weighs residuals."""
 
     model: Model
-    pieces: list[Piece]
+    segments: list[Segment]
     noise: list[Noise]
     scale: Array
     columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
@@ -58,37 +58,37 @@ class Problem:
         """All parameters of a structure, nominal first."""
         return [*self.model.parameters, *(p for term in terms for p in term.parameters)]
 
-    def simulate(self, piece: Piece, terms: tuple[Term, ...], values: Array) -> Array:
+    def simulate(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> Array:
         """Outputs (outputs, n) of one recording."""
-        out = self.model.simulate(piece, *self.parted(terms, values))
+        out = self.model.simulate(segment, *self.parted(terms, values))
         return np.where(np.abs(out) < 1e150, out, 1e150)
 
-    def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[Act]]:
+    def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[ActiveEffect]]:
         """Nominal parameters, and every effect with its own."""
         at = len(self.model.parameters)
-        nominal, acts = values[:at], []
+        nominal, active = values[:at], []
         for term in terms:
-            acts.append((term.candidate, values[at : at + len(term.parameters)]))
+            active.append((term.candidate, values[at : at + len(term.parameters)]))
             at += len(term.parameters)
-        return nominal, acts
+        return nominal, active
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
         """Measured minus simulated, NaN outside the part asked for (`fit`, `heldout` or `all`)."""
         out = []
-        for piece in self.pieces:
-            mask = np.ones(piece.n, dtype=bool) if which == "all" else getattr(piece, which)
+        for segment in self.segments:
+            mask = np.ones(segment.n, dtype=bool) if which == "all" else getattr(segment, which)
             if not mask.any():
-                out.append(np.full_like(piece.y, np.nan))
+                out.append(np.full_like(segment.y, np.nan))
                 continue
-            out.append(np.where(mask, piece.y - self.simulate(piece, terms, values), np.nan))
+            out.append(np.where(mask, segment.y - self.simulate(segment, terms, values), np.nan))
         return out
 
     def stacked(self, terms: tuple[Term, ...], values: Array) -> Array:
         """Weighted residuals of the samples to fit, one vector; missing samples are zero."""
         rows = []
-        for piece in self.pieces:
-            if piece.fit.any():
-                r = (piece.y - self.simulate(piece, terms, values))[:, piece.fit] / self.scale[:, None]
+        for segment in self.segments:
+            if segment.fit.any():
+                r = (segment.y - self.simulate(segment, terms, values))[:, segment.fit] / self.scale[:, None]
                 rows.append(np.clip(np.nan_to_num(r, nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
         return np.concatenate(rows)
 
@@ -187,22 +187,22 @@ def _solve(A: Array, g: Array, diagonal: Array, damping: float) -> Array:
 def reweigh(problem: Problem, fit: Fit) -> None:
     """Scale of each output: what this fit leaves, robustly, but no less than the noise."""
     left: list[list[Array]] = [[] for _ in problem.model.outputs]
-    for piece in problem.pieces:
-        if piece.fit.any():
-            r = piece.y - problem.simulate(piece, fit.terms, fit.values)
-            for row, rest in zip(r[:, piece.fit], left, strict=True):
+    for segment in problem.segments:
+        if segment.fit.any():
+            r = segment.y - problem.simulate(segment, fit.terms, fit.values)
+            for row, rest in zip(r[:, segment.fit], left, strict=True):
                 rest.append(row[np.isfinite(row)])
     for index, rest in enumerate(left):
         together = np.concatenate(rest) if rest else np.zeros(0)
         rms = float(np.sqrt(np.mean(together**2))) if together.size else 1.0
         problem.scale[index] = max(rms, problem.noise[index].sigma, 1e-12)
-    for piece in problem.pieces:
-        piece.extra["weight"] = problem.scale
+    for segment in problem.segments:
+        segment.extra["weight"] = problem.scale
 
 
 def finish(problem: Problem, fit: Fit) -> Fit:
     """`fit` with its residuals on every sample."""
-    fit.residuals = [piece.y - problem.simulate(piece, fit.terms, fit.values) for piece in problem.pieces]
+    fit.residuals = [segment.y - problem.simulate(segment, fit.terms, fit.values) for segment in problem.segments]
     return fit
 
 
@@ -210,10 +210,10 @@ def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
     """Displacement that each port still needs at the start of each recording, after `fit` (with residuals)."""
     n = len(problem.model.parameters)
     out = []
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        first = slice(0, max(5, round(0.3 / piece.recording.dt_s)) if piece.recording.timed else 5)
+    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
+        first = slice(0, max(5, round(0.3 / segment.recording.dt_s)) if segment.recording.timed else 5)
         needs = {
-            port.name: problem.model.needs(piece, port, fit.values[:n], residual)[first] for port in problem.model.ports
+            port.name: problem.model.needs(segment, port, fit.values[:n], residual)[first] for port in problem.model.ports
         }
         out.append({name: float(np.nanmedian(need)) if np.isfinite(need).any() else 0.0 for name, need in needs.items()})
     return out
@@ -221,14 +221,14 @@ def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
 
 def get_starts(problem: Problem) -> list[dict[str, float]]:
     """Starts of memory of every recording."""
-    return [dict(piece.start) for piece in problem.pieces]
+    return [dict(segment.start) for segment in problem.segments]
 
 
 def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
     """Puts starts of memory back."""
-    for piece, start in zip(problem.pieces, given, strict=True):
-        piece.start.clear()
-        piece.start.update(start)
+    for segment, start in zip(problem.segments, given, strict=True):
+        segment.start.clear()
+        segment.start.update(start)
 
 
 def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, float]) -> Array:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from host.diagnosis.effects import candidates
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Parameter, Port
-from host.diagnosis.model.model import Act, Model, Piece, scale_of
+from host.diagnosis.model.model import ActiveEffect, Model, Segment, scale_of
 from host.diagnosis.model.nominal import EffectSpec
 from protocol.errors import InputError
 
@@ -39,67 +39,67 @@ class Known:
             "taken",
         ):
             setattr(self, name, getattr(inner, name))
-        pieces = [inner.prepare(recording) for recording in recordings]
-        self.acts: list[tuple[Candidate, tuple[Parameter, ...]]] = []
+        segments = [inner.prepare(recording) for recording in recordings]
+        self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []
         for spec in effects:
             candidate = chosen(inner, spec, recordings[0].timed)
-            scale = scale_of(inner, pieces, candidate.port, candidate, 1e-3)
-            self.acts.append((candidate, placed(candidate, candidate.effect.parameters(scale, candidate.form), spec)))
+            scale = scale_of(inner, segments, candidate.port, candidate, 1e-3)
+            self.active.append((candidate, placed(candidate, candidate.effect.parameters(scale, candidate.form), spec)))
         self.own = len(inner.parameters)
-        self.parameters = (*inner.parameters, *(p for _, parameters in self.acts for p in parameters))
-        self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.acts}
+        self.parameters = (*inner.parameters, *(p for _, parameters in self.active for p in parameters))
+        self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.active}
         if hasattr(inner, "settle"):
-            self.settle = lambda piece, theta: inner.settle(piece, theta[: self.own])
+            self.settle = lambda segment, theta: inner.settle(segment, theta[: self.own])
         if hasattr(inner, "begin_anew"):
-            self.begin_anew = lambda piece, theta, acts: inner.begin_anew(
-                piece, theta[: self.own], self.with_known(theta, acts)
+            self.begin_anew = lambda segment, theta, active: inner.begin_anew(
+                segment, theta[: self.own], self.with_known(theta, active)
             )
         if hasattr(inner, "sensitivity"):
             self.sensitivity = self._sensitivity
-            self.change = lambda piece, theta, *rest: inner.change(piece, theta[: self.own], *rest)  # type: ignore[attr-defined]
+            self.change = lambda segment, theta, *rest: inner.change(segment, theta[: self.own], *rest)  # type: ignore[attr-defined]
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """As the model without effects."""
         return self.inner.prepare(recording)
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Start values of the model, then the values given for the effects."""
-        return np.concatenate([self.inner.guess(pieces), [p.grid[0] for _, parameters in self.acts for p in parameters]])
+        return np.concatenate([self.inner.guess(segments), [p.grid[0] for _, parameters in self.active for p in parameters]])
 
-    def with_known(self, theta: Array, acts: list[Act]) -> list[Act]:
-        """`acts` and the known ones, with their share of `theta`."""
+    def with_known(self, theta: Array, active: list[ActiveEffect]) -> list[ActiveEffect]:
+        """`active` and the known ones, with their share of `theta`."""
         known, at = [], self.own
-        for candidate, parameters in self.acts:
+        for candidate, parameters in self.active:
             known.append((candidate, theta[at : at + len(parameters)]))
             at += len(parameters)
-        return [*known, *acts]
+        return [*known, *active]
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (outputs, n) with the known effects at work."""
-        return self.inner.simulate(piece, theta[: self.own], self.with_known(theta, acts))
+        return self.inner.simulate(segment, theta[: self.own], self.with_known(theta, active))
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """As the model without effects."""
-        return self.inner.motion(piece, port)
+        return self.inner.motion(segment, port)
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """As the model without effects."""
-        return self.inner.needs(piece, port, theta[: self.own], residual)
+        return self.inner.needs(segment, port, theta[: self.own], residual)
 
-    def _sensitivity(self, piece: Piece, theta: Array, axis: str, acts: list[Act]) -> Any:
+    def _sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Any:
         inner: Any = self.inner
-        return inner.sensitivity(piece, theta[: self.own], axis, self.with_known(theta, acts))
+        return inner.sensitivity(segment, theta[: self.own], axis, self.with_known(theta, active))
 
 
 def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
     """The candidate that `spec` names. Raises InputError with those there are."""
-    pool = candidates(model.ports, timed)
-    at = [c for c in pool if c.effect.id == spec.id and spec.at in (c.port.name, c.port.subsystem)]
+    candidate_effects = candidates(model.ports, timed)
+    at = [c for c in candidate_effects if c.effect.id == spec.id and spec.at in (c.port.name, c.port.subsystem)]
     if not at:
         raise InputError(
             "effect",
             f"{spec.id}@{spec.at}",
-            "one of " + ", ".join(dict.fromkeys(f"{c.effect.id}@{c.port.name}" for c in pool)),
+            "one of " + ", ".join(dict.fromkeys(f"{c.effect.id}@{c.port.name}" for c in candidate_effects)),
         )
     exact = [c for c in at if c.form == spec.form and c.source == (spec.source or c.source) and fits(c, spec)]
     if not exact:

@@ -79,25 +79,25 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
         for values, mask in zip(outputs, still, strict=True)
         for part in runs(mask & np.isfinite(values), SHORTEST)
     ]
-    pieces = []
-    for piece in _settled(stretches):
-        line = np.polynomial.polynomial.polyfit(np.arange(piece.size), piece, 1)
-        pieces.append(piece - np.polynomial.polynomial.polyval(np.arange(piece.size), line))
+    segments = []
+    for segment in _settled(stretches):
+        line = np.polynomial.polynomial.polyfit(np.arange(segment.size), segment, 1)
+        segments.append(segment - np.polynomial.polynomial.polyval(np.arange(segment.size), line))
     step = max((quantum(values) for values in outputs), default=0.0)
-    floor = step / np.sqrt(12.0)
-    if sum(piece.size for piece in pieces) < 100:
+    noise_sd = step / np.sqrt(12.0)
+    if sum(segment.size for segment in segments) < 100:
         return Noise(
-            max(_high_frequency(outputs), floor, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
+            max(_high_frequency(outputs), noise_sd, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
         )
     table = []
-    for piece in pieces:
-        spread = 1.4826 * np.median(np.abs(piece - np.median(piece))) + 1e-300
-        tame = np.clip(piece, -5 * spread, 5 * spread) if spread > 1e-200 else piece
+    for segment in segments:
+        spread = 1.4826 * np.median(np.abs(segment - np.median(segment))) + 1e-300
+        tame = np.clip(segment, -5 * spread, 5 * spread) if spread > 1e-200 else segment
         table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
-    lags = _typical(np.array(table), np.array([piece.size for piece in pieces]))
+    lags = _typical(np.array(table), np.array([segment.size for segment in segments]))
     sigma = float(np.sqrt(max(lags[0], 0.0)))
-    if sigma <= floor:
-        return Noise(max(floor, 1e-300), np.zeros(0), "resolution")
+    if sigma <= noise_sd:
+        return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")
     return Noise(sigma, autoregression(lags), "quiescent parts")
 
 
@@ -106,7 +106,7 @@ def _settled(stretches: list[Array]) -> list[Array]:
     but the output is still on its way; too few to judge by are left as they are.
     """
     while len(stretches) >= 4:
-        halves = [(piece[: piece.size // 2], piece[piece.size // 2 :]) for piece in stretches]
+        halves = [(segment[: segment.size // 2], segment[segment.size // 2 :]) for segment in stretches]
         if np.median([np.var(first) / (np.var(second) + 1e-300) for first, second in halves]) < SETTLING:
             break
         stretches = [second for _, second in halves if second.size >= SHORTEST]
@@ -114,7 +114,7 @@ def _settled(stretches: list[Array]) -> list[Array]:
 
 
 def _typical(table: Array, sizes: Array) -> Array:
-    """Mean of the autocovariances (pieces, lags), by size, over the pieces of middling level: one that holds a jump
+    """Mean of the autocovariances (segments, lags), by size, over the segments of middling level: one that holds a jump
     does not count.
     """
     order = np.argsort(table[:, 0])

@@ -94,20 +94,20 @@ def _inverse(A: Array) -> Array:
 
 def _across_recordings(problem: Problem, fit: Fit, sizes: list[float], inverse: Array) -> tuple[Array, int]:
     """Variances from the scatter of scores between halves of recordings, fitted and held-out ones alike; their number."""
-    both = replace(problem, pieces=[replace(piece, fit=piece.fit | piece.heldout) for piece in problem.pieces])
+    both = replace(problem, segments=[replace(segment, fit=segment.fit | segment.heldout) for segment in problem.segments])
     base = both.stacked(fit.terms, fit.values)
     J = jacobian(both, fit.terms, fit.values, base, sizes)
     J = np.column_stack([J, np.zeros((base.size, inverse.shape[0] - J.shape[1]))])
     scores, at, rows = [], 0, len(problem.model.outputs)
-    for piece, given in zip(both.pieces, problem.pieces, strict=True):
-        n = int(piece.fit.sum())
+    for segment, given in zip(both.segments, problem.segments, strict=True):
+        n = int(segment.fit.sum())
         part = slice(at, at + rows * n)
         products = (J[part] * base[part, None]).reshape(rows, n, -1).sum(axis=0)
         at += rows * n
-        for mask in (given.fit[piece.fit], given.heldout[piece.fit]):
+        for mask in (given.fit[segment.fit], given.heldout[segment.fit]):
             scores += [half.sum(axis=0) for half in np.array_split(products[mask], 2) if half.size]
     S, count = np.array(scores), len(scores)
-    share = sum(p.fit.sum() for p in problem.pieces) / max(sum(p.fit.sum() for p in both.pieces), 1)
+    share = sum(p.fit.sum() for p in problem.segments) / max(sum(p.fit.sum() for p in both.segments), 1)
     covariance = inverse @ (S.T @ S * (share * count / max(count - 1, 1))) @ inverse
     return np.diag(covariance), max(count, 2)
 
@@ -117,13 +117,13 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
     is estimated too.
     """
     columns = []
-    for piece in problem.pieces:
-        if piece.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in piece.extra:
-            begin, spread = piece.extra["begin"], piece.extra["measured"][1]
+    for segment in problem.segments:
+        if segment.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in segment.extra:
+            begin, spread = segment.extra["begin"], segment.extra["measured"][1]
             for k in range(2):
-                piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+                segment.extra["begin"] = begin + np.eye(2)[k] * spread[k]
                 columns.append(base - problem.stacked(fit.terms, fit.values))
-            piece.extra["begin"] = begin
+            segment.extra["begin"] = begin
     used = [column for column in columns if np.any(column)]
     return np.array(used).T if used else np.zeros((base.size, 0))
 
@@ -131,8 +131,8 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
 def _parts(problem: Problem, J: Array, base: Array) -> Iterator[tuple[Array, Array]]:
     """Weighted residuals (outputs, n) and their rates (outputs, n, parameters) of each recording that is fitted."""
     at, rows = 0, len(problem.model.outputs)
-    for piece in problem.pieces:
-        n = int(piece.fit.sum())
+    for segment in problem.segments:
+        n = int(segment.fit.sum())
         if n:
             yield base[at : at + rows * n].reshape(rows, n), J[at : at + rows * n].reshape(rows, n, -1)
             at += rows * n

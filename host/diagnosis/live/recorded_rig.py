@@ -14,7 +14,7 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.live.twin import Twin
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Port
-from host.diagnosis.model.model import Act, Piece
+from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.rig_recording import knob_gain, rig_of
 from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS
@@ -56,26 +56,26 @@ class RecordedRig(Twin):
         self.outputs = self.outputs[:POSE_ROWS]
         self.ports = tuple(port for port in self.ports if port.name != "contact")
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """As the twin does, the force as it was averaged about each frame; it is no output."""
-        piece = super().prepare(recording)
-        piece.y = piece.y[:POSE_ROWS]
-        return piece
+        segment = super().prepare(recording)
+        segment.y = segment.y[:POSE_ROWS]
+        return segment
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Poses (12, n) of tip and shaft."""
-        return super().simulate(piece, theta, acts)[:POSE_ROWS]
+        return super().simulate(segment, theta, active)[:POSE_ROWS]
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """As the chain has it; for the force sensor, the force along the wall's normal that the poses would need."""
         if port.name != "force_sensor":
-            return super().needs(piece, port, theta, residual)
-        given = piece.extra["force"]
-        base = self.simulate(piece, theta, [])
-        piece.extra["force"] = given + NUDGE_N * self.normal[:, None]
-        slope = (self.simulate(piece, theta, []) - base) / NUDGE_N
-        piece.extra["force"] = given
-        weight = piece.extra.get("weight", np.ones(POSE_ROWS))[:, None]
+            return super().needs(segment, port, theta, residual)
+        given = segment.extra["force"]
+        base = self.simulate(segment, theta, [])
+        segment.extra["force"] = given + NUDGE_N * self.normal[:, None]
+        slope = (self.simulate(segment, theta, []) - base) / NUDGE_N
+        segment.extra["force"] = given
+        weight = segment.extra.get("weight", np.ones(POSE_ROWS))[:, None]
         slope = np.where(np.isfinite(residual), slope, 0.0) / weight
         return np.asarray(np.sum(slope * np.nan_to_num(residual) / weight, axis=0) / (np.sum(slope**2, axis=0) + 1e-12))
 
@@ -83,12 +83,12 @@ class RecordedRig(Twin):
         """Motions that this rig can make in an experiment."""
         return rig_excitations(self, problem, best)
 
-    def settle(self, piece: Piece, theta: Array) -> None:
+    def settle(self, segment: Segment, theta: Array) -> None:
         """Lets the rod model correct the chain at these nominal parameters."""
         self.softness = self.rigidity / float(theta[EI])
-        self.correct(piece, theta)
+        self.correct(segment, theta)
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """The calibrated values."""
         return np.array([p.grid[0] for p in self.parameters])
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.model import Act, Piece
+from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
 from host.diagnosis.models.rig import FORCE, SHAFT, TIP
@@ -93,9 +93,9 @@ class Twin(RigChain):
             moved = theta.copy()
             moved[list(OFFSETS)] += z[:3]
             rest()
-            piece = self.prepare(thinned(delayed(recording, float(z[4])), EVERY))
-            self.correct(piece, moved)
-            r = (piece.y - self.simulate(piece, moved, []))[:12] / scale
+            segment = self.prepare(thinned(delayed(recording, float(z[4])), EVERY))
+            self.correct(segment, moved)
+            r = (segment.y - self.simulate(segment, moved, []))[:12] / scale
             return np.clip(np.nan_to_num(r), -8.0, 8.0).ravel()
 
         z, steps = np.zeros(5), np.array([1e-4, 2e-3, 0.1, 0.02, 2e-3])
@@ -108,40 +108,40 @@ class Twin(RigChain):
         theta[list(OFFSETS)] += z[:3]
         return Calibration(theta, float(z[4]), float(np.sqrt(np.mean(r**2))))
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """As the chain does, but with the force as it was recorded: it is an average over a frame already."""
-        piece = super().prepare(recording)
-        piece.extra["force"] = np.vstack([np.nan_to_num(fill(recording.channels[name])) for name in FORCE])
-        piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
-        return piece
+        segment = super().prepare(recording)
+        segment.extra["force"] = np.vstack([np.nan_to_num(fill(recording.channels[name])) for name in FORCE])
+        segment.inputs["axial_force"] = self.normal @ segment.extra["force"]
+        return segment
 
-    def correct(self, piece: Piece, theta: Array) -> None:
-        """Makes `simulate` of `piece` exact at `theta` (nominal parameters) without effects."""
-        piece.extra.pop("exact", None)
-        piece.extra["exact"] = self._exact(piece, theta) - super().simulate(piece, theta, [])
-        piece.extra["exact"][12:] = 0.0
+    def correct(self, segment: Segment, theta: Array) -> None:
+        """Makes `simulate` of `segment` exact at `theta` (nominal parameters) without effects."""
+        segment.extra.pop("exact", None)
+        segment.extra["exact"] = self._exact(segment, theta) - super().simulate(segment, theta, [])
+        segment.extra["exact"][12:] = 0.0
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n) of the chain, plus what the rod model adds where `correct` was called."""
-        return np.asarray(super().simulate(piece, theta, acts) + piece.extra.get("exact", 0.0))
+        return np.asarray(super().simulate(segment, theta, active) + segment.extra.get("exact", 0.0))
 
-    def _exact(self, piece: Piece, theta: Array) -> Array:
+    def _exact(self, segment: Segment, theta: Array) -> Array:
         """Outputs (15, n) by the rod model, NaN where it has no equilibrium."""
-        insertion, roll, kappa = self.links(piece, theta, [])
-        push, start = piece.extra["force"] * self.softness, None
-        tip, shaft = np.full((2, 7, piece.n), np.nan)
-        for i in range(piece.n):
+        insertion, roll, kappa = self.links(segment, theta, [])
+        push, start = segment.extra["force"] * self.softness, None
+        tip, shaft = np.full((2, 7, segment.n), np.nan)
+        for i in range(segment.n):
             found = self._solve(insertion[i], roll[i], kappa[i], -push[:, i], start)
             start = found if found.converged else None
             if found.converged:
                 tip[:, i] = [*found.tip_position_m, *found.tip_quaternion_wxyz]
                 shaft[:, i] = [*found.station_positions_m[0], *found.station_quaternions_wxyz[0]]
         rows = []
-        for pose, reference in zip((tip, shaft), piece.extra["reference"], strict=True):
+        for pose, reference in zip((tip, shaft), segment.extra["reference"], strict=True):
             good = np.isfinite(pose[0])
             turn = rotation_logs(reference, matrices(np.where(good, pose[3:], np.array([1.0, 0.0, 0.0, 0.0])[:, None])))
             rows += [pose[:3], np.where(good, turn, np.nan)]
-        return np.vstack([*rows, piece.extra["force"]])
+        return np.vstack([*rows, segment.extra["force"]])
 
     def _solve(
         self, insertion: float, roll: float, kappa: float, force: Array, start: CosseratSolution | None

@@ -15,7 +15,7 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.live.twin import Calibration, Listener, Twin
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.screening import screen
 from protocol.rig_file import Rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
@@ -76,7 +76,7 @@ class Watch:
         self.settings, self._rest = settings or LiveSettings(), rest
         self.twin = Twin(rig)
         self.listener = Listener(rig, max(self.settings.learn_s, 30.0))
-        self.pool = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
+        self.candidate_effects = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
         self.calibration: Calibration | None = None
         self.baseline: Baseline | None = None
         self._armed_at_ns: int | None = None
@@ -120,22 +120,22 @@ class Watch:
         """Calibrates the twin on what was heard since arming, and notes how well it then agrees, second by second."""
         recording = self.listener.recording(-self._rows(self.settings.learn_s))
         self.calibration = self.twin.calibrate(recording, self._rest)
-        piece, residual = self._residual(-self._rows(self.settings.learn_s))
-        residual = residual[:, piece.n // 4 :]  # the approach is not what the rest will be like
+        segment, residual = self._residual(-self._rows(self.settings.learn_s))
+        residual = residual[:, segment.n // 4 :]  # the approach is not what the rest will be like
         mean, rms = np.nanmean(residual, axis=1), np.sqrt(np.nanmean(residual**2, axis=1))
         blocks = np.array_split(residual, max(3, round(0.75 * self.settings.learn_s)), axis=1)
         spread = np.std([np.nanmean(block, axis=1) for block in blocks], axis=0) / np.sqrt(self.settings.window_s)
         least = rms / np.sqrt(self._rows(self.settings.window_s))
         self.baseline = Baseline(mean, np.maximum(rms, 1e-9), np.maximum(spread, least))
 
-    def _residual(self, first: int) -> tuple[Piece, Array]:
-        """Rows from `first` on as a piece of the twin, and measured minus expected (12, n)."""
+    def _residual(self, first: int) -> tuple[Segment, Array]:
+        """Rows from `first` on as a segment of the twin, and measured minus expected (12, n)."""
         assert self.calibration is not None
-        piece = self.twin.prepare(self.calibration.applied(self.listener.recording(first)))
-        self.twin.correct(piece, self.calibration.theta)
-        piece.y[POSE_ROWS:] = np.nan
-        expected = self.twin.simulate(piece, self.calibration.theta, [])
-        return piece, (piece.y - expected)[:POSE_ROWS]
+        segment = self.twin.prepare(self.calibration.applied(self.listener.recording(first)))
+        self.twin.correct(segment, self.calibration.theta)
+        segment.y[POSE_ROWS:] = np.nan
+        expected = self.twin.simulate(segment, self.calibration.theta, [])
+        return segment, (segment.y - expected)[:POSE_ROWS]
 
     def _compare(self) -> Alarm | None:
         """The last window against the baseline."""
@@ -189,16 +189,16 @@ class Watch:
             words=words,
         )
 
-    def _suspects(self, piece: Piece) -> list[Suspect]:
+    def _suspects(self, segment: Segment) -> list[Suspect]:
         """Causes that explain the window about as well as any does, the one with the fewest parameters first."""
         b, calibration = self.baseline, self.calibration
         assert b is not None and calibration is not None
-        piece.y[:POSE_ROWS] -= b.mean[:, None]
+        segment.y[:POSE_ROWS] -= b.mean[:, None]
         scale = np.concatenate([b.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
-        piece.extra["weight"] = scale
-        problem = Problem(self.twin, [piece], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
+        segment.extra["weight"] = scale
+        problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
-        ranked = screen(problem, fit, self.pool, lambda what, part: self._rest())[: self.settings.suspects]
+        ranked = screen(problem, fit, self.candidate_effects, lambda what, part: self._rest())[: self.settings.suspects]
         before = float(np.sum(problem.stacked((), calibration.theta) ** 2))
         found: dict[str, Suspect] = {}
         for item in ranked:
@@ -265,7 +265,7 @@ class Bus(Protocol):
 
 
 def watch(
-    rig: Rig, bus: Bus, publish: Callable[[Alarm], None], tell: Callable[[str], None], stop: Callable[[], bool]
+    rig: Rig, bus: Bus, publish: Callable[[Alarm], None], progress: Callable[[str], None], stop: Callable[[], bool]
 ) -> int:
     """Watches until `stop`; publishes alarms, and tells what it does when that changes. How many alarms there were."""
     watcher, said, count = Watch(rig, rest=lambda: time.sleep(REST_S)), "", 0
@@ -279,7 +279,7 @@ def watch(
             publish(alarm)
         if watcher.phase != said:
             said = watcher.phase
-            tell(said)
+            progress(said)
         if not heard:
             time.sleep(IDLE_S)
     return count

@@ -91,27 +91,27 @@ def _separated(table: Table, by: str | None) -> list[Table]:
 
 def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
     """Recordings of `tables`; `needed`: the channels of the model; those in `optional` may be absent. Raises InputError."""
-    pieces: list[Recording] = []
+    segments: list[Recording] = []
     wholes = [_one(spec, table.name, table.columns, needed, optional) for table in tables]
     shared = one_clock(wholes)
     first = min(whole.time_s[0] for whole in wholes)
     for whole in wholes:
         begin = float(first if shared else whole.time_s[0])
         whole = replace(whole, time_s=whole.time_s - begin, begin_s=begin)
-        cuts = [piece for piece in spec.data.pieces if fnmatch(whole.name, piece.file)]
-        pieces += [_cut(whole, piece.name, piece.rows[0], piece.rows[1], lead=spec.data.lead_rows) for piece in cuts] or [
-            whole
-        ]
-    return _split(_named_apart(pieces), spec.data.heldout)
+        cuts = [segment for segment in spec.data.segments if fnmatch(whole.name, segment.file)]
+        segments += [
+            _cut(whole, segment.name, segment.rows[0], segment.rows[1], lead=spec.data.lead_rows) for segment in cuts
+        ] or [whole]
+    return _split(_named_apart(segments), spec.data.heldout)
 
 
-def _named_apart(pieces: list[Recording]) -> list[Recording]:
+def _named_apart(segments: list[Recording]) -> list[Recording]:
     """Recordings of one name get a number: two stay two."""
     count: dict[str, int] = {}
     out = []
-    for piece in pieces:
-        count[piece.name] = count.get(piece.name, 0) + 1
-        out.append(piece if count[piece.name] == 1 else replace(piece, name=f"{piece.name} ({count[piece.name]})"))
+    for segment in segments:
+        count[segment.name] = count.get(segment.name, 0) + 1
+        out.append(segment if count[segment.name] == 1 else replace(segment, name=f"{segment.name} ({count[segment.name]})"))
     return out
 
 
@@ -181,7 +181,7 @@ def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array
 
 def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recording:
     if not 0 <= first < last <= whole.n:
-        raise InputError("data.pieces.rows", [first, last], f"0 <= first < last <= {whole.n}")
+        raise InputError("data.segments.rows", [first, last], f"0 <= first < last <= {whole.n}")
     start = max(0, first - lead)
     part = slice(start, last)
     use = np.arange(start, last) >= first
@@ -197,25 +197,25 @@ def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recor
     )
 
 
-def _split(pieces: list[Recording], patterns: list[str] | None) -> list[Recording]:
-    used = [p.fit if p.fit.any() else np.ones(p.n, dtype=bool) for p in pieces]
+def _split(segments: list[Recording], patterns: list[str] | None) -> list[Recording]:
+    used = [p.fit if p.fit.any() else np.ones(p.n, dtype=bool) for p in segments]
     if patterns is not None:
-        out = [any(fnmatch(p.name, pattern) for pattern in patterns) for p in pieces]
-        if len(pieces) > 1 and (all(out) or not any(out)):
+        out = [any(fnmatch(p.name, pattern) for pattern in patterns) for p in segments]
+        if len(segments) > 1 and (all(out) or not any(out)):
             raise InputError(
                 "data.heldout",
                 patterns,
-                "patterns that match some recordings, not all: " + ", ".join(p.name for p in pieces),
+                "patterns that match some recordings, not all: " + ", ".join(p.name for p in segments),
             )
-        if len(pieces) == 1:
+        if len(segments) == 1:
             patterns = None
-    if patterns is None and len(pieces) >= 3:
-        out = [index % 3 == 1 for index in range(len(pieces))]
+    if patterns is None and len(segments) >= 3:
+        out = [index % 3 == 1 for index in range(len(segments))]
     elif patterns is None:
-        return [replace(p, fit=u & ~b, heldout=u & b) for p, u in zip(pieces, used, strict=True) for b in [_blocks(p.n)]]
-    nothing = [np.zeros(p.n, dtype=bool) for p in pieces]
+        return [replace(p, fit=u & ~b, heldout=u & b) for p, u in zip(segments, used, strict=True) for b in [_blocks(p.n)]]
+    nothing = [np.zeros(p.n, dtype=bool) for p in segments]
     return [
-        replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(pieces, used, nothing, out, strict=True)
+        replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(segments, used, nothing, out, strict=True)
     ]
 
 

@@ -14,7 +14,7 @@ from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-Act = tuple[Candidate, Array]
+ActiveEffect = tuple[Candidate, Array]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Output:
 
 
 @dataclass
-class Piece:
+class Segment:
     """One recording made ready for a model. `y` (outputs, n) is what was measured, NaN where missing or wild."""
 
     recording: Recording
@@ -45,7 +45,7 @@ class Piece:
 
 
 class Model(Protocol):
-    """A nominal model. `simulate` runs freely from the inputs; acts change it at their ports."""
+    """A nominal model. `simulate` runs freely from the inputs; active effects change it at their ports."""
 
     kind: str
     outputs: tuple[Output, ...]
@@ -56,30 +56,30 @@ class Model(Protocol):
     scan_points: int  # simulations that screening one candidate may take
     fit_samples: int  # and so many to fit; beyond, samples are averaged
     coarsest_s: float  # period beyond which they must not be averaged
-    travel: tuple[tuple[str, str, str], ...]  # signals a condition may speak of: words, key of Piece.inputs, unit
+    travel: tuple[tuple[str, str, str], ...]  # signals a condition may speak of: words, key of Segment.inputs, unit
     moves: dict[str, str]  # channel of the motion at each port of `unlisted_at`
     unlisted_at: tuple[
         tuple[str, str], ...
     ]  # ports of an equation found by search: whose motion it is made of, where it is added
     taken: frozenset[str]  # effects (id, or id:form) that the nominal model has already
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Inputs filled and derived, outputs stacked."""
         ...
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Start values of the nominal parameters."""
         ...
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (outputs, n) for nominal parameters `theta` and active effects."""
         ...
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """Nominal signal (n,) at `port`, whose sizes set start values."""
         ...
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """The displacement or force (n,) that `port` would need to explain `residual` (outputs, n)."""
         ...
 
@@ -91,39 +91,47 @@ def tolerance_of(values: Array, span: float) -> float:
     return max(3.0 * quantum(values), 1e-3 * span, 1e-12)
 
 
-def apply_acts(signal: Array, acts: list[Act], port: str, piece: Piece, side: str | None, kind: str | None = None) -> Array:
-    """`signal` after all acts at `port` (on `side` of the nominal gain), in their order."""
-    here = [act for act in acts if act[0].port.name == port and (side is None or act[0].effect.side == side)]
+def apply_effects(
+    signal: Array, active: list[ActiveEffect], port: str, segment: Segment, side: str | None, kind: str | None = None
+) -> Array:
+    """`signal` after all active effects at `port` (on `side` of the nominal gain), in their order."""
+    here = [effect for effect in active if effect[0].port.name == port and (side is None or effect[0].effect.side == side)]
     if not here:
         return signal
     motion = signal
     span = float(np.ptp(motion)) or 1.0
-    tolerance = piece.extra.get(f"tolerance:{port}", 1e-3 * span)
-    for candidate, values in sorted(here, key=lambda act: act[0].effect.order):
+    tolerance = segment.extra.get(f"tolerance:{port}", 1e-3 * span)
+    for candidate, values in sorted(here, key=lambda effect: effect[0].effect.order):
         if kind is not None and candidate.effect.port != kind:
             continue
         if candidate.effect.apply is None:
             continue
-        source = piece.inputs[candidate.source] if candidate.source else None
-        base = piece.inputs.get(f"motion:{port}", motion) if candidate.effect.side == "output" else signal
+        source = segment.inputs[candidate.source] if candidate.source else None
+        base = segment.inputs.get(f"motion:{port}", motion) if candidate.effect.side == "output" else signal
         context = Context(
-            piece.recording.time_s, piece.recording.dt_s, base, tolerance, piece.start.get(port, 0.0), source, piece.extra
+            segment.recording.time_s,
+            segment.recording.dt_s,
+            base,
+            tolerance,
+            segment.start.get(port, 0.0),
+            source,
+            segment.extra,
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal
 
 
-def scale_of(model: Model, pieces: list[Piece], port: Port, candidate: Candidate, need_rms: float) -> Scale:
+def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candidate, need_rms: float) -> Scale:
     """Sizes at `port` over the samples to fit."""
-    motions = [model.motion(piece, port)[piece.fit] for piece in pieces if piece.fit.any()]
+    motions = [model.motion(segment, port)[segment.fit] for segment in segments if segment.fit.any()]
     together = np.concatenate(motions)
     low, high = float(np.min(together)), float(np.max(together))
-    used = [piece for piece in pieces if piece.fit.any()]
+    used = [segment for segment in segments if segment.fit.any()]
     dt = used[0].recording.dt_s
-    rates = [np.gradient(model.motion(piece, port), piece.recording.dt_s) for piece in used]
+    rates = [np.gradient(model.motion(segment, port), segment.recording.dt_s) for segment in used]
     speed = float(np.sqrt(np.mean(np.concatenate(rates) ** 2))) or 1e-12
-    duration = max(float(piece.recording.time_s[-1]) for piece in used)
-    source = np.concatenate([piece.inputs[candidate.source] for piece in used]) if candidate.source else np.ones(1)
+    duration = max(float(segment.recording.time_s[-1]) for segment in used)
+    source = np.concatenate([segment.inputs[candidate.source] for segment in used]) if candidate.source else np.ones(1)
     units = used[0].recording.units
     unit = used[0].extra["units"][port.name]
     if candidate.effect.side == "output":

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import AliasChoices, Field, PrivateAttr, model_validator
 
 from protocol.errors import Description, InputError, reason
 from protocol.requests import Request, validate
@@ -22,7 +22,7 @@ class ChannelSpec(Request):
     offset: float = 0.0
 
 
-class PieceSpec(Request):
+class SegmentSpec(Request):
     """One recording inside a file: `rows` first (inclusive) and last (exclusive)."""
 
     name: str
@@ -37,7 +37,7 @@ class DataSpec(Request):
     time: str | None = None
     rate_Hz: float | None = Field(default=None, gt=0)
     heldout: list[str] | None = None
-    pieces: list[PieceSpec] = []
+    segments: list[SegmentSpec] = Field(default=[], validation_alias=AliasChoices("segments", "pieces"))
     lead_rows: int = Field(default=0, ge=0)
     by: str | None = None  # column of a file in which several recordings follow each other: a new value begins a new one
 

@@ -11,7 +11,7 @@ from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.force_kernel import run_axis, slot_array
-from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives
 from host.diagnosis.models import balance
@@ -72,14 +72,14 @@ class Axis:
         self.moves = {name: self.spec.output}
         self.quiet_inputs = (self.spec.input,)
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Input up-sampled to half sub-steps; start taken from the measured motion."""
         spec = self.spec
         names = [spec.input]
         if spec.controller is not None:
             names += [name for name in (spec.controller.reference, spec.controller.added) if name in recording.channels]
         y = stack(recording, [o.channel for o in self.outputs])
-        piece = Piece(recording, y, recording.fit, recording.heldout, filled(recording, names))
+        segment = Segment(recording, y, recording.fit, recording.heldout, filled(recording, names))
         motion = fill(recording.channels[spec.output])
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
         x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
@@ -89,17 +89,17 @@ class Axis:
             "velocity": (np.cumsum(x) * recording.dt_s, x),
             "acceleration": (np.zeros_like(x), np.zeros_like(x)),
         }
-        piece.inputs[f"motion:{name}"] = reads[spec.reads][0]
+        segment.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
-        piece.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
-        piece.extra.update(
+        segment.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
+        segment.extra.update(
             begin=np.array(begin),
             x=x,
             v=v,
-            substeps=self._substeps(piece),
+            substeps=self._substeps(segment),
             tolerance=tolerance_of(motion, float(np.ptp(motion))),
         )
-        piece.extra["units"] = {
+        segment.extra["units"] = {
             **self.units,
             name: self.units[spec.input],
             f"motion:{name}": self.units[spec.output],
@@ -107,27 +107,27 @@ class Axis:
             f"{name}_reading": self.units[spec.output],
         }
         if self.free_run:
-            piece.extra["stages"] = stages(piece.inputs[spec.input], piece.extra["substeps"], self.hold)
+            segment.extra["stages"] = stages(segment.inputs[spec.input], segment.extra["substeps"], self.hold)
         else:
-            piece.y = np.zeros_like(y)
-            piece.extra["force"] = spec.input
+            segment.y = np.zeros_like(y)
+            segment.extra["force"] = spec.input
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
-            balance.prepare(piece, motion, seen, SMOOTHING_S, spec.hold)
-        return piece
+            balance.prepare(segment, motion, seen, SMOOTHING_S, spec.hold)
+        return segment
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Equation-error estimate in the frequency domain where the TOML gives no value: U = (-w^2 m + i w c + k) X."""
         given = np.array([p.grid[0] for p in self.parameters])
         if len(self.given) == len(self.spec.terms):
             return given
         rows, sides = [], []
-        for piece in pieces:
-            if not piece.fit.any():
+        for segment in segments:
+            if not segment.fit.any():
                 continue
-            u, y = piece.inputs[self.spec.input], fill(piece.recording.channels[self.spec.output])
+            u, y = segment.inputs[self.spec.input], fill(segment.recording.channels[self.spec.output])
             window = np.hanning(u.size)
             U, Y = np.fft.rfft(window * (u - u.mean())), np.fft.rfft(window * (y - y.mean()))
-            s = 2j * np.pi * np.fft.rfftfreq(u.size, piece.recording.dt_s)
+            s = 2j * np.pi * np.fft.rfftfreq(u.size, segment.recording.dt_s)
             keep = (np.abs(s) > 0) & (np.abs(U) > 0.02 * np.max(np.abs(U)))
             X = Y[keep] / s[keep] ** ("position", "velocity", "acceleration").index(self.spec.reads)
             columns = {"mass": s[keep] ** 2 * X, "damping": s[keep] * X, "stiffness": X, "offset": np.zeros_like(X)}
@@ -143,21 +143,23 @@ class Axis:
         ]
         return np.array(pick)
 
-    def restarts(self, pieces: list[Piece]) -> list[Array]:
+    def restarts(self, segments: list[Segment]) -> list[Array]:
         """Nominal parameters over a range of time constants and dampings, each with the gain that gives the measured RMS.
 
         Parameters that the TOML holds keep their values.
         """
-        used = [piece for piece in pieces if piece.fit.any()] if self.free_run and self.spec.controller is None else []
+        used = (
+            [segment for segment in segments if segment.fit.any()] if self.free_run and self.spec.controller is None else []
+        )
         if not used:
             return []
-        slowest_s = max(float(piece.recording.time_s[-1]) for piece in used) / 8.0
+        slowest_s = max(float(segment.recording.time_s[-1]) for segment in used) / 8.0
         times_s = np.geomspace(3.0 * used[0].recording.dt_s, slowest_s, 9)
-        measured = np.sqrt(np.nanmean(np.concatenate([piece.y[0][piece.fit] for piece in used]) ** 2))
+        measured = np.sqrt(np.nanmean(np.concatenate([segment.y[0][segment.fit] for segment in used]) ** 2))
         found = []
         for law in [law for time_s in times_s for law in self._laws(float(time_s))]:
             theta = np.array([law[term] for term in self.spec.terms])
-            run = np.concatenate([self.simulate(piece, theta, [])[0][piece.fit] for piece in used])
+            run = np.concatenate([self.simulate(segment, theta, [])[0][segment.fit] for segment in used])
             rms = float(np.sqrt(np.mean(run**2)))
             if np.isfinite(rms) and rms > 0.0:
                 theta = theta * rms / measured
@@ -173,54 +175,54 @@ class Axis:
             slowed = [{"mass": time_s, "damping": 1.0, "stiffness": spring / time_s} for spring in (1e-9, 1.0)]
         return [{**law, "offset": 0.0} for law in slowed]
 
-    def _substeps(self, piece: Piece) -> int:
+    def _substeps(self, segment: Segment) -> int:
         return 2 if self.spec.controller is not None or "stiffness" not in self.spec.terms else 3
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs in free run. Shape (outputs, n)."""
-        spec, extra = self.spec, piece.extra
+        spec, extra = self.spec, segment.extra
         linear = np.zeros(4)
         for term, value in zip(spec.terms, theta, strict=True):
             linear[("mass", "damping", "stiffness", "offset").index(term)] = value
         if "mass" not in spec.terms:
             linear[0] = 1.0
-        force = piece.inputs[spec.input]
-        drive = [act for act in acts if act[0].port.name == f"{spec.subsystem}_drive"]
+        force = segment.inputs[spec.input]
+        drive = [effect for effect in active if effect[0].port.name == f"{spec.subsystem}_drive"]
         if drive:
-            force = apply_acts(force, drive, f"{spec.subsystem}_drive", piece, None)
+            force = apply_effects(force, drive, f"{spec.subsystem}_drive", segment, None)
         slots = [
             candidate.effect.slots(values, candidate.form)
-            for candidate, values in acts
+            for candidate, values in active
             if candidate.effect.slots is not None
         ]
         p = slot_array([*slots, {"stiffness": float(linear[2])}])
-        load = np.zeros(piece.n)
+        load = np.zeros(segment.n)
         if spec.controller is not None:
             c = spec.controller
             control = np.array([c.position_gain_per_s, c.velocity_gain, c.force_gain, c.force_limit])
-            reference = np.vstack([piece.inputs[c.reference], piece.inputs.get(c.added, load)])
+            reference = np.vstack([segment.inputs[c.reference], segment.inputs.get(c.added, load)])
         else:
             control, reference = np.zeros(0), load[None, :]
         if not self.free_run:
-            return balance.error(piece, linear, force, p, piece.start.get(spec.subsystem, 0.0))
+            return balance.error(segment, linear, force, p, segment.start.get(spec.subsystem, 0.0))
         run = run_axis(
             stages(force, extra["substeps"], self.hold) if drive else extra["stages"],
             extra["substeps"],
-            piece.recording.dt_s,
+            segment.recording.dt_s,
             linear,
             p,
             extra["begin"],
             load,
             control,
             reference,
-            piece.start.get(spec.subsystem, 0.0),
-            float(piece.recording.time_s[0]),
+            segment.start.get(spec.subsystem, 0.0),
+            float(segment.recording.time_s[0]),
         )
         motion = run[("position", "velocity", "acceleration").index(spec.reads)]
-        motion = apply_acts(motion, acts, f"{spec.subsystem}_reading", piece, None)
+        motion = apply_effects(motion, active, f"{spec.subsystem}_reading", segment, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
 
-    def begin_anew(self, piece: Piece, theta: Array, acts: list[Act]) -> None:
+    def begin_anew(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> None:
         """Position and speed at the first sample, as measured there and as the free run wants them, each by its own
         variance.
 
@@ -228,26 +230,26 @@ class Axis:
         """
         if not self.free_run or self.spec.controller is not None or self.spec.reads != "position":
             return
-        begin, spread, _ = piece.extra["measured"]
-        piece.extra["begin"] = begin
-        r = piece.y[0] - self.simulate(piece, theta, acts)[0]
+        begin, spread, _ = segment.extra["measured"]
+        segment.extra["begin"] = begin
+        r = segment.y[0] - self.simulate(segment, theta, active)[0]
         columns = []
         for k in range(2):
-            piece.extra["begin"] = begin + np.eye(2)[k] * spread[k]
-            columns.append((piece.y[0] - self.simulate(piece, theta, acts)[0] - r) * -1.0)
+            segment.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+            columns.append((segment.y[0] - self.simulate(segment, theta, active)[0] - r) * -1.0)
         used = np.isfinite(r)
         A, b = np.array(columns).T[used], r[used]
         sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
         by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
-        piece.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
+        segment.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """Motion at the force port, force at the drive, reading at the sensor."""
         if port.name == f"{self.spec.subsystem}_drive":
-            return piece.inputs[self.spec.input]
-        return piece.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else piece.extra["x"]
+            return segment.inputs[self.spec.input]
+        return segment.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else segment.extra["x"]
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of
         size).
         """

@@ -15,7 +15,7 @@ from scipy.signal import fftconvolve
 
 from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
 from host.diagnosis.model.force_kernel import along
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import signal_band, white_level
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ HOLDS = ("linear", "zero", "band_limited")
 FINE = 32  # points a sample, to integrate a held force
 
 
-def prepare(piece: Piece, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None) -> None:
+def prepare(segment: Segment, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None) -> None:
     """Test function, and the motion's (acceleration, speed, place) (3, n) under it.
 
     Its length follows the band in which the motion stands out of its noise; being the same for all terms it bends none of
@@ -35,7 +35,7 @@ def prepare(piece: Piece, motion: Array, seen: npt.NDArray[np.bool_], least_s: f
     motion: (n,), gaps bridged; seen: where motion and force were measured; hold: how the force runs between samples, None
     for what fits best.
     """
-    dt_s, recording = piece.recording.dt_s, piece.recording
+    dt_s, recording = segment.recording.dt_s, segment.recording
     sigma = estimate([motion], [quiescent([motion], dt_s, recording.timed)]).sigma
     length = max(HALF_GAIN / signal_band(motion, dt_s, sigma), least_s, FEWEST * dt_s)
     length = min(length, max(FEWEST * dt_s, motion.size * dt_s / 16.0))
@@ -49,21 +49,21 @@ def prepare(piece: Piece, motion: Array, seen: npt.NDArray[np.bool_], least_s: f
     kernels = np.array([bend, slope, bump])
     rows = np.array([_along_record(motion, kernel) for kernel in kernels])
     gap = np.concatenate((np.zeros(1), np.cumsum(~seen)))
-    first, last = np.maximum(np.arange(piece.n) - half, 0), np.minimum(np.arange(piece.n) + half + 1, piece.n)
-    whole = (np.arange(piece.n) >= half) & (np.arange(piece.n) < piece.n - half) & (gap[last] == gap[first])
-    piece.y[:, ~whole] = np.nan
-    kept = slice(half, piece.n - half)
-    columns = np.vstack([rows, np.ones(piece.n)])[:, kept].T
+    first, last = np.maximum(np.arange(segment.n) - half, 0), np.minimum(np.arange(segment.n) + half + 1, segment.n)
+    whole = (np.arange(segment.n) >= half) & (np.arange(segment.n) < segment.n - half) & (gap[last] == gap[first])
+    segment.y[:, ~whole] = np.nan
+    kept = slice(half, segment.n - half)
+    columns = np.vstack([rows, np.ones(segment.n)])[:, kept].T
     fits = []
     for each in (hold,) if hold else HOLDS:
         held = _held(s, length, dt_s, each)
-        force = _along_record(piece.inputs[piece.extra["force"]], held)[kept]
+        force = _along_record(segment.inputs[segment.extra["force"]], held)[kept]
         found = np.linalg.lstsq(columns, force, rcond=1e-12)[0]
         fits.append((float(np.sum((force - columns @ found) ** 2)), held, found[:3]))
     _, held, coefficients = min(fits, key=lambda item: item[0])
-    piece.extra.update(bump=bump, held_bump=held, balance=rows)
-    levels = white_level(motion), white_level(piece.inputs[piece.extra["force"]])
-    piece.extra["noise"] = _noise(coefficients, *levels, kernels, held)
+    segment.extra.update(bump=bump, held_bump=held, balance=rows)
+    levels = white_level(motion), white_level(segment.inputs[segment.extra["force"]])
+    segment.extra["noise"] = _noise(coefficients, *levels, kernels, held)
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
@@ -109,32 +109,32 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     )
 
 
-def applied(piece: Piece, force: Array) -> Array:
+def applied(segment: Segment, force: Array) -> Array:
     """Input (n,) under the test function, integrated as it is held between samples."""
-    return _along_record(force, piece.extra["held_bump"])
+    return _along_record(force, segment.extra["held_bump"])
 
 
-def error(piece: Piece, linear: Array, force: Array, p: Array, start: float) -> Array:
+def error(segment: Segment, linear: Array, force: Array, p: Array, start: float) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
     An effect of the drive changes the input `force` (n,), which is what is compared here: where it shrinks the
     input the error counts in the size of the recorded one, so that nothing is gained by shrinking.
     """
-    extra = piece.extra
+    extra = segment.extra
     a, v, x = extra["balance"]
     need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
     if np.any(p):
         dry = along(
             extra["x"],
             extra["v"],
-            np.gradient(extra["v"], piece.recording.dt_s),
-            np.zeros(piece.n),
-            piece.recording.time_s,
-            piece.recording.dt_s,
+            np.gradient(extra["v"], segment.recording.dt_s),
+            np.zeros(segment.n),
+            segment.recording.time_s,
+            segment.recording.dt_s,
             extra["tolerance"],
             start,
             p,
         )
         need = need + _along_record(dry, extra["bump"])
-    size = float(np.std(force)) / max(float(np.std(piece.inputs[extra["force"]])), 1e-300)
-    return np.asarray(need - applied(piece, force))[None, :] / min(max(size, 1e-6), 1.0)
+    size = float(np.std(force)) / max(float(np.std(segment.inputs[extra["force"]])), 1e-300)
+    return np.asarray(need - applied(segment, force))[None, :] / min(max(size, 1e-6), 1.0)

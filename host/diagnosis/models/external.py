@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from protocol.errors import InputError
 
@@ -69,10 +69,10 @@ class External:
         self.moves = {channel: channel for channel in inputs}
         self.quiet_inputs = tuple(dict.fromkeys((*inputs, *loads)))
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Inputs bridged, outputs stacked."""
         spec = self.spec
-        piece = Piece(
+        segment = Segment(
             recording,
             stack(recording, spec.outputs),
             recording.fit,
@@ -81,58 +81,58 @@ class External:
         )
         units = dict(self.units)
         for channel in spec.inputs:
-            values = piece.inputs[channel]
-            piece.extra[f"tolerance:{channel}"] = tolerance_of(values, float(np.ptp(values)))
+            values = segment.inputs[channel]
+            segment.extra[f"tolerance:{channel}"] = tolerance_of(values, float(np.ptp(values)))
             units[f"output:{channel}"] = self.units[channel]
-        piece.extra["units"] = {**units, **{f"{channel}_reading": self.units[channel] for channel in spec.outputs}}
-        return piece
+        segment.extra["units"] = {**units, **{f"{channel}_reading": self.units[channel] for channel in spec.outputs}}
+        return segment
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Start values of the TOML."""
         return np.array([p.grid[0] for p in self.parameters])
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Every output (outputs, n). Raises InputError where the function does not give what it should."""
-        given = {name: apply_acts(piece.inputs[name], acts, name, piece, None) for name in self.spec.inputs}
+        given = {name: apply_effects(segment.inputs[name], active, name, segment, None) for name in self.spec.inputs}
         values = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
-        found = self.function(given, values, piece.recording.time_s)
+        found = self.function(given, values, segment.recording.time_s)
         rows = []
         for name in self.spec.outputs:
             row = np.asarray(found[name] if isinstance(found, dict) and name in found else np.nan, dtype=np.float64)
-            if row.shape != (piece.n,):
+            if row.shape != (segment.n,):
                 raise InputError(
                     "callable.function",
                     f"{self.spec.function} gave {name} of shape {row.shape}",
-                    f"a dictionary with {name} of shape ({piece.n},)",
+                    f"a dictionary with {name} of shape ({segment.n},)",
                 )
-            rows.append(apply_acts(row, acts, f"{name}_reading", piece, None))
+            rows.append(apply_effects(row, active, f"{name}_reading", segment, None))
         return np.vstack(rows)
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """The input at its port, or the measured output."""
-        if port.name in piece.inputs:
-            return piece.inputs[port.name]
-        row = piece.y[self.spec.outputs.index(port.channels[0])]
+        if port.name in segment.inputs:
+            return segment.inputs[port.name]
+        row = segment.y[self.spec.outputs.index(port.channels[0])]
         return np.where(np.isfinite(row), row, np.nanmedian(row))
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their
         noise.
         """
-        if port.name not in piece.inputs:
+        if port.name not in segment.inputs:
             return np.asarray(residual[self.spec.outputs.index(port.channels[0])])
-        step = 1e-4 * (float(np.ptp(piece.inputs[port.name])) or 1.0)
-        moved = Piece(
-            piece.recording,
-            piece.y,
-            piece.fit,
-            piece.heldout,
-            {**piece.inputs, port.name: piece.inputs[port.name] + step},
-            piece.start,
-            piece.extra,
+        step = 1e-4 * (float(np.ptp(segment.inputs[port.name])) or 1.0)
+        moved = Segment(
+            segment.recording,
+            segment.y,
+            segment.fit,
+            segment.heldout,
+            {**segment.inputs, port.name: segment.inputs[port.name] + step},
+            segment.start,
+            segment.extra,
         )
-        slope = (self.simulate(moved, theta, []) - self.simulate(piece, theta, [])) / step
-        weight = np.asarray(piece.extra.get("weight", np.ones(len(self.outputs))))[:, None]
+        slope = (self.simulate(moved, theta, []) - self.simulate(segment, theta, [])) / step
+        weight = np.asarray(segment.extra.get("weight", np.ones(len(self.outputs))))[:, None]
         s = np.where(np.isfinite(residual), slope, 0.0) / weight
         return np.asarray(
             np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)

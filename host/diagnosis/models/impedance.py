@@ -9,7 +9,7 @@ from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.force_kernel import along, slot_array
-from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
 
@@ -66,69 +66,69 @@ class Impedance:
         self.moves = {name: self.spec.input}
         self.quiet_inputs = (self.spec.input, *loads)
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Motion smoothed to velocity and acceleration without phase."""
-        piece = Piece(
+        segment = Segment(
             recording,
             stack(recording, [self.spec.output]),
             recording.fit,
             recording.heldout,
             filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]),
         )
-        motion = piece.inputs[self.spec.input]
+        motion = segment.inputs[self.spec.input]
         noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
         window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
         x, v, a = smooth_derivatives(motion, recording.dt_s, window)
-        piece.inputs[f"motion:{self.spec.subsystem}"] = motion
+        segment.inputs[f"motion:{self.spec.subsystem}"] = motion
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
         if noise < CLEAN * tolerance:
             x = motion  # smoothing would round its reversals, and friction with them
-        piece.extra.update(v=v, a=a, x=x, tolerance=tolerance)
+        segment.extra.update(v=v, a=a, x=x, tolerance=tolerance)
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
-        piece.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
-        return piece
+        segment.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
+        return segment
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Start values of the TOML; linear parameters find their place from anywhere."""
         return np.array([p.grid[0] for p in self.parameters])
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Force along the measured motion. Shape (1, n)."""
-        extra = piece.extra
-        force = np.zeros(piece.n)
+        extra = segment.extra
+        force = np.zeros(segment.n)
         given = {"mass": extra["a"], "damping": extra["v"], "stiffness": extra["x"], "offset": 1.0}
         stiffness = 0.0
         for (term, source), value in zip(self.terms, theta, strict=True):
-            force = force + value * (piece.inputs[source] if term == "load" else given[term])
+            force = force + value * (segment.inputs[source] if term == "load" else given[term])
             stiffness = value if term == "stiffness" else stiffness
-        here = [(candidate, values) for candidate, values in acts if candidate.effect.slots is not None]
+        here = [(candidate, values) for candidate, values in active if candidate.effect.slots is not None]
         for source in dict.fromkeys(candidate.source for candidate, _ in here):
             filled_slots = [
                 candidate.effect.slots(values, candidate.form)
                 for candidate, values in here
                 if candidate.source == source and candidate.effect.slots is not None
             ]
-            load = piece.inputs[source] if source else np.zeros(piece.n)
+            load = segment.inputs[source] if source else np.zeros(segment.n)
             p = slot_array([*filled_slots, {"stiffness": float(stiffness)}])
             force = force + along(
                 extra["x"],
                 extra["v"],
                 extra["a"],
                 load,
-                piece.recording.time_s,
-                piece.recording.dt_s,
+                segment.recording.time_s,
+                segment.recording.dt_s,
                 extra["tolerance"],
-                piece.start.get(self.spec.subsystem, 0.0),
+                segment.start.get(self.spec.subsystem, 0.0),
                 p,
             )
-        return np.asarray(apply_acts(force, acts, f"{self.spec.subsystem}_reading", piece, None))[None, :]
+        return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """The measured motion, or the measured force for the reading port."""
         if port.name == self.spec.subsystem:
-            return piece.inputs[self.spec.input]
-        return np.where(np.isfinite(piece.y[0]), piece.y[0], np.nanmedian(piece.y[0]))
+            return segment.inputs[self.spec.input]
+        return np.where(np.isfinite(segment.y[0]), segment.y[0], np.nanmedian(segment.y[0]))
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """The residual is a force already."""
         return np.asarray(residual[0])

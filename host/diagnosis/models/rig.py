@@ -10,7 +10,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.noise import by_steps, estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Context, Parameter, Port
-from host.diagnosis.model.model import Act, Output, Piece, apply_acts, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, tolerance_of
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.model.operators import calm, fill
 from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, drag_along, matrices, rotation_logs, shapes
@@ -136,7 +136,7 @@ class Rig:
         self.moves = {axis: f"handle_{axis}" for axis in AXES}
         self.quiet_inputs = tuple(HANDLES)
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Poses as positions and rotation matrices; forces bridged; loads derived."""
         n = recording.n
         channels = recording.channels
@@ -176,11 +176,11 @@ class Rig:
         inputs["axial_force"] = self.normal @ extra["force"]
         theta = np.array([p.grid[0] for p in self.parameters])
         inputs["curvature"] = theta[4] * inputs["handle_knob"] + theta[5]
-        piece = Piece(
+        segment = Segment(
             recording, np.full((len(self.outputs), n), np.nan), recording.fit, recording.heldout, inputs, extra=extra
         )
         given, extra["force"] = extra["force"], np.zeros((3, n))
-        run = self._run(piece, theta, [])
+        run = self._run(segment, theta, [])
         extra["force"] = given
         extra["reference"] = (run["tip_R"], run["shaft_R"])
         rows = []
@@ -189,47 +189,49 @@ class Rig:
             good = np.isfinite(pose).all(axis=0) & (np.abs(norm - 1.0) < 0.05)
             turn = rotation_logs(reference, matrices(np.where(good, pose[3:], np.array([1.0, 0.0, 0.0, 0.0])[:, None])))
             rows += [np.where(good, pose[:3], np.nan), np.where(good, turn, np.nan)]
-        piece.y = np.vstack([*rows, force])
-        return piece
+        segment.y = np.vstack([*rows, force])
+        return segment
 
     def _force_noise(self, recording: Recording, inputs: dict[str, Array], force: Array) -> list[tuple[float, float]]:
         still = [quiescent([inputs[name] for name in HANDLES], recording.dt_s, recording.timed)]
         found = [estimate([row], still) for row in force]
         return [(noise.sigma, noise.correlation_samples) for noise in found]
 
-    def settle(self, piece: Piece, theta: Array) -> None:
+    def settle(self, segment: Segment, theta: Array) -> None:
         """Recorded force as the shape's input: simulated contact force plus what of the difference is surely not noise.
 
         Sensor noise would bend the simulated shaft and be seen in its pose; a smooth force alone would miss the instant
         of contact. Where the sensor says next to nothing (noise above FAINT of the force), the simulated force goes on
         following the parameters in the fit, so that force and stiffness cannot drift off together.
         """
-        recorded = piece.y[12:15]
+        recorded = segment.y[12:15]
         if not np.isfinite(recorded).any():
-            piece.extra["force"] = self._run(piece, theta, [])["force"]
+            segment.extra["force"] = self._run(segment, theta, [])["force"]
             return
-        simulated = self.simulate(piece, theta, [])[12:15]
+        simulated = self.simulate(segment, theta, [])[12:15]
         sigmas = [
             by_steps(row, *s)
-            for row, s in zip(recorded - simulated, self._force_noise(piece.recording, piece.inputs, recorded), strict=True)
+            for row, s in zip(
+                recorded - simulated, self._force_noise(segment.recording, segment.inputs, recorded), strict=True
+            )
         ]
         beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
-        piece.extra["force"] = simulated + beyond
-        noise = max(self._force_noise(piece.recording, piece.inputs, recorded))[0]
-        if noise > FAINT * float(np.sqrt(np.mean(np.sum(piece.extra["force"] ** 2, axis=0)))):
-            piece.extra["beyond"] = beyond
+        segment.extra["force"] = simulated + beyond
+        noise = max(self._force_noise(segment.recording, segment.inputs, recorded))[0]
+        if noise > FAINT * float(np.sqrt(np.mean(np.sum(segment.extra["force"] ** 2, axis=0)))):
+            segment.extra["beyond"] = beyond
         else:
-            piece.extra.pop("beyond", None)
-        piece.inputs["axial_force"] = self.normal @ piece.extra["force"]
+            segment.extra.pop("beyond", None)
+        segment.inputs["axial_force"] = self.normal @ segment.extra["force"]
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """The calibrated values of the TOML."""
         return np.array([p.grid[0] for p in self.parameters])
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n), free run from the handle and the recorded force."""
-        run = self._run(piece, theta, acts)
-        reference = piece.extra["reference"]
+        run = self._run(segment, theta, active)
+        reference = segment.extra["reference"]
         return np.vstack(
             [
                 run["tip"],
@@ -240,18 +242,18 @@ class Rig:
             ]
         )
 
-    def links(self, piece: Piece, theta: Array, acts: list[Act]) -> tuple[Array, Array, Array]:
+    def links(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> tuple[Array, Array, Array]:
         """Insertion, roll and curvature (n,) behind the three axes."""
         out = []
         for index, axis in enumerate(AXES):
-            signal = apply_acts(piece.inputs[f"handle_{axis}"], acts, axis, piece, "input")
+            signal = apply_effects(segment.inputs[f"handle_{axis}"], active, axis, segment, "input")
             signal = theta[2 * index] * signal + theta[2 * index + 1]
-            out.append(apply_acts(signal, acts, axis, piece, "output"))
+            out.append(apply_effects(signal, active, axis, segment, "output"))
         return out[0], out[1], out[2]
 
-    def _run(self, piece: Piece, theta: Array, acts: list[Act]) -> dict[str, Any]:
-        insertion, roll, kappa = self.links(piece, theta, acts)
-        n = piece.n
+    def _run(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
+        insertion, roll, kappa = self.links(segment, theta, active)
+        n = segment.n
         state: dict[str, Any] = {
             "insertion": insertion,
             "roll": roll,
@@ -261,17 +263,17 @@ class Rig:
             "load": np.zeros((3, n)),
             "point": np.zeros((3, n)),
             "point_at": np.zeros(n),
-            "push": piece.extra["force"],
+            "push": segment.extra["force"],
             "shift": np.zeros((3, n)),
             "normal": self.normal,
             "distal": self.spec.distal_length_m,
         }
-        state["push"] = 2.0 * state["push"] - _vector(state["push"], acts, "force_sensor", piece)
+        state["push"] = 2.0 * state["push"] - _vector(state["push"], active, "force_sensor", segment)
         prompt = state["push"]
-        state = _changed(state, acts, "shape", piece)
+        state = _changed(state, active, "shape", segment)
         slow = state["push"] - prompt
-        state = _changed(state, acts, "base", piece)
-        shape = self._shapes(piece, state)
+        state = _changed(state, active, "base", segment)
+        shape = self._shapes(segment, state)
         free, soft = shape[4:]
         placed = (np.einsum("abn,bn->an", state["turn"], free) if "turn" in state else free) + state["shift"]
         law: dict[str, Any] = {
@@ -286,27 +288,27 @@ class Rig:
             "friction": 0.0,
             "friction_distance": 1e-3,
         }
-        law = _changed(law, acts, "contact", piece)
-        normal_force = _pressed(law, self.normal @ soft, piece.recording.dt_s)
+        law = _changed(law, active, "contact", segment)
+        normal_force = _pressed(law, self.normal @ soft, segment.recording.dt_s)
         force = self.normal[:, None] * normal_force
-        if "beyond" in piece.extra:
-            shape = self._shapes(piece, {**state, "push": force + piece.extra["beyond"]})
+        if "beyond" in segment.extra:
+            shape = self._shapes(segment, {**state, "push": force + segment.extra["beyond"]})
         run = _posed(shape, state)
         if law["friction"]:
             along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
             drag = law["friction"] * drag_along(along, law["friction_distance"])
-            normal_force = _pressed(law, self.normal @ soft + np.sum(soft * drag, axis=0), piece.recording.dt_s)
+            normal_force = _pressed(law, self.normal @ soft + np.sum(soft * drag, axis=0), segment.recording.dt_s)
             force = (self.normal[:, None] + drag) * normal_force
-        run["force"] = _vector(force, acts, "force_sensor", piece)
-        return _changed(run, acts, "pose_sensor", piece)
+        run["force"] = _vector(force, active, "force_sensor", segment)
+        return _changed(run, active, "pose_sensor", segment)
 
-    def _shapes(self, piece: Piece, state: dict[str, Any]) -> tuple[Array, ...]:
+    def _shapes(self, segment: Segment, state: dict[str, Any]) -> tuple[Array, ...]:
         """Kernel call; the last two results are kept, since contact and sensors change without the shape."""
         key = tuple(
             hash(np.ascontiguousarray(state[name]).tobytes())
             for name in ("insertion", "roll", "kappa", "push", "extra", "load", "point", "point_at", "flex")
         )
-        kept: dict[Any, tuple[Array, ...]] = piece.extra.setdefault("kept", {})
+        kept: dict[Any, tuple[Array, ...]] = segment.extra.setdefault("kept", {})
         if key not in kept:
             while len(kept) > 1:
                 kept.pop(next(iter(kept)))
@@ -329,39 +331,43 @@ class Rig:
             )
         return kept[key]
 
-    def change(self, piece: Piece, theta: Array, S: dict[str, Array], candidate: Candidate, values: Array) -> Array:
+    def change(self, segment: Segment, theta: Array, S: dict[str, Array], candidate: Candidate, values: Array) -> Array:
         """Linearized change of outputs (15, n) by a candidate at an axis, for screening. `S`: sensitivity of each axis."""
         axis = candidate.port.name
         index = AXES.index(axis)
-        q = piece.inputs[f"handle_{axis}"]
+        q = segment.inputs[f"handle_{axis}"]
         gain = theta[2 * index]
         side = candidate.effect.side
         signal = q if side == "input" else gain * q + theta[2 * index + 1]
-        moved = apply_acts(signal, [(candidate, values)], axis, piece, side) - signal
+        moved = apply_effects(signal, [(candidate, values)], axis, segment, side) - signal
         return np.asarray(S[axis] * (moved if side == "input" else moved / gain))
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """Handle motion at the axes; else a signal of the port's unit that shows its size."""
         if port.name in AXES:
-            return piece.inputs[f"handle_{port.name}"]
+            return segment.inputs[f"handle_{port.name}"]
         if port.name in ("contact", "force_sensor"):
-            return piece.inputs["axial_force"]
-        return piece.inputs["curvature"] if port.name == "shape" else np.nan_to_num(piece.y[0]) - np.nan_to_num(piece.y[2])
+            return segment.inputs["axial_force"]
+        return (
+            segment.inputs["curvature"]
+            if port.name == "shape"
+            else np.nan_to_num(segment.y[0]) - np.nan_to_num(segment.y[2])
+        )
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """What the port would have to add: least squares over the pose rows by the port's sensitivity; residual
         itself at the sensors.
         """
         if port.name in AXES:
-            S = self.sensitivity(piece, theta, port.name)
-            weight = piece.extra.get("weight", np.ones(len(self.outputs)))[:12, None]
+            S = self.sensitivity(segment, theta, port.name)
+            weight = segment.extra.get("weight", np.ones(len(self.outputs)))[:12, None]
             r = np.nan_to_num(residual[:12]) / weight
             s = np.where(np.isfinite(residual[:12]), S[:12], 0.0) / weight
             return np.asarray(np.sum(s * r, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300))
         row = 14 if port.name in ("contact", "force_sensor") else 0
         return np.asarray(residual[row])
 
-    def sensitivity(self, piece: Piece, theta: Array, axis: str, acts: list[Act] | None = None) -> Array:
+    def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect] | None = None) -> Array:
         """Change of outputs (15, n) per change of the signal that enters `axis`, by a central difference."""
         index = AXES.index(axis)
         step = 1e-5 if axis == "insertion" else 1e-4
@@ -369,7 +375,7 @@ class Rig:
         for sign in (1.0, -1.0):
             moved = theta.copy()
             moved[2 * index + 1] += sign * step * theta[2 * index]
-            out.append(self.simulate(piece, moved, acts or []))
+            out.append(self.simulate(segment, moved, active or []))
         return np.asarray((out[0] - out[1]) / (2.0 * step))
 
 
@@ -402,33 +408,35 @@ def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:
     return run
 
 
-def _changed(state: dict[str, Any], acts: list[Act], port: str, piece: Piece) -> dict[str, Any]:
-    """`state` after the acts at a port of the rig's own kinds; they change it by key."""
-    here = sorted((act for act in acts if act[0].port.name == port), key=lambda act: act[0].effect.order)
+def _changed(state: dict[str, Any], active: list[ActiveEffect], port: str, segment: Segment) -> dict[str, Any]:
+    """`state` after the active effects at a port of the rig's own kinds; they change it by key."""
+    here = sorted((effect for effect in active if effect[0].port.name == port), key=lambda effect: effect[0].effect.order)
     if not here:
         return state
     state = dict(state)
     for candidate, values in here:
         if candidate.effect.apply is not None:
-            state = candidate.effect.apply(state, _context(piece, candidate.source), values, candidate.form)  # type: ignore[arg-type,assignment]
+            state = candidate.effect.apply(state, _context(segment, candidate.source), values, candidate.form)  # type: ignore[arg-type,assignment]
     return state
 
 
-def _vector(force: Array, acts: list[Act], port: str, piece: Piece) -> Array:
+def _vector(force: Array, active: list[ActiveEffect], port: str, segment: Segment) -> Array:
     """A force (3, n) as its sensor would read it."""
-    for candidate, values in sorted((act for act in acts if act[0].port.name == port), key=lambda act: act[0].effect.order):
+    for candidate, values in sorted(
+        (effect for effect in active if effect[0].port.name == port), key=lambda effect: effect[0].effect.order
+    ):
         if candidate.effect.apply is not None:
-            force = candidate.effect.apply(force, _context(piece, candidate.source), values, candidate.form)
+            force = candidate.effect.apply(force, _context(segment, candidate.source), values, candidate.form)
     return force
 
 
-def _context(piece: Piece, source: str) -> Context:
+def _context(segment: Segment, source: str) -> Context:
     return Context(
-        piece.recording.time_s,
-        piece.recording.dt_s,
-        piece.inputs["motion:insertion"],
+        segment.recording.time_s,
+        segment.recording.dt_s,
+        segment.inputs["motion:insertion"],
         0.0,
         0.0,
-        piece.inputs[source] if source else None,
-        piece.extra,
+        segment.inputs[source] if source else None,
+        segment.extra,
     )

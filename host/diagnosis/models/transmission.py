@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import Act, Output, Piece, apply_acts, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import LinkSpec, NominalSpec
 from host.diagnosis.model.operators import lag
 
@@ -63,10 +63,10 @@ class Transmission:
             dict.fromkeys([link.input for link in self.links] + [name for link in self.links for name in link.load])
         )
 
-    def prepare(self, recording: Recording) -> Piece:
+    def prepare(self, recording: Recording) -> Segment:
         """Inputs bridged, outputs stacked."""
         names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *link.others)))
-        piece = Piece(
+        segment = Segment(
             recording,
             stack(recording, [link.output for link in self.links]),
             recording.fit,
@@ -75,41 +75,41 @@ class Transmission:
         )
         units: dict[str, str] = dict(self.units)
         for name, link in zip(self.names, self.links, strict=True):
-            motion = piece.inputs[link.input]
-            piece.extra[f"tolerance:{name}"] = tolerance_of(motion, float(np.ptp(motion)))
+            motion = segment.inputs[link.input]
+            segment.extra[f"tolerance:{name}"] = tolerance_of(motion, float(np.ptp(motion)))
             units[name], units[f"output:{name}"] = self.units[link.input], self.units[link.output]
             units[f"{name}_reading"] = self.units[link.output]
-        piece.extra["units"] = units
-        return piece
+        segment.extra["units"] = units
+        return segment
 
-    def guess(self, pieces: list[Piece]) -> Array:
+    def guess(self, segments: list[Segment]) -> Array:
         """Start values of the TOML; linear parameters find their place from anywhere."""
         return np.array([p.grid[0] for p in self.parameters])
 
-    def simulate(self, piece: Piece, theta: Array, acts: list[Act]) -> Array:
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Every link's output, free run. Shape (outputs, n)."""
-        out = np.empty_like(piece.y)
+        out = np.empty_like(segment.y)
         at = 0
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
-            signal = apply_acts(piece.inputs[link.input], acts, name, piece, "input")
+            signal = apply_effects(segment.inputs[link.input], active, name, segment, "input")
             signal = theta[at] * signal + theta[at + 1]
             for constant in theta[at + 2 : at + 2 + link.lag_order]:
-                signal = lag(signal, piece.recording.dt_s, float(constant))
+                signal = lag(signal, segment.recording.dt_s, float(constant))
             at += 2 + link.lag_order
-            signal = apply_acts(signal, acts, name, piece, "output")
-            out[row] = apply_acts(signal, acts, f"{name}_reading", piece, None)
+            signal = apply_effects(signal, active, name, segment, "output")
+            out[row] = apply_effects(signal, active, f"{name}_reading", segment, None)
         return out
 
-    def motion(self, piece: Piece, port: Port) -> Array:
+    def motion(self, segment: Segment, port: Port) -> Array:
         """Nominal input of the link, or its measured output for the reading port."""
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
             if port.name == name:
-                return piece.inputs[link.input]
+                return segment.inputs[link.input]
             if port.name == f"{name}_reading":
-                return np.where(np.isfinite(piece.y[row]), piece.y[row], np.nanmedian(piece.y[row]))
+                return np.where(np.isfinite(segment.y[row]), segment.y[row], np.nanmedian(segment.y[row]))
         raise KeyError(port.name)
 
-    def needs(self, piece: Piece, port: Port, theta: Array, residual: Array) -> Array:
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Residual divided by the gain."""
         at = 0
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):

@@ -41,27 +41,27 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    piece, _, row = shown(result)
-    samples = sum(p.n for p in result.full.pieces)
+    segment, _, row = shown(result)
+    samples = sum(p.n for p in result.full.segments)
     text = environment.get_template("diagnosis.html.j2").render(
         title=headline(result, verdict),
         eyebrow=f"Diagnosis of {result.spec.name}",
         lead=lead(result, verdict),
-        footer=f"{len(result.full.pieces)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
+        footer=f"{len(result.full.segments)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
         lines=lines(result, verdict),
         pictures=pictures(result),
         effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
         nominal=_nominal(result),
         candidates=candidates(result),
-        located=[{**place, "times": times(place, timed=piece.recording.timed)} for place in verdict["located"]],
+        located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
         scripts=[Path(path).name for path in verdict.get("scripts", ())],
         on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
         partly=result.rest.left,
         noises=_noises(result),
         output=result.model.outputs[row].channel.replace("_", " "),
-        recording=piece.recording.name,
+        recording=segment.recording.name,
         switches=switches(result),
-        heldout=[p.recording.name for p in result.full.pieces if p.heldout.any()],
+        heldout=[p.recording.name for p in result.full.segments if p.heldout.any()],
         verdict=verdict["verdict"],
         findings=verdict["data_findings"],
         worse=verdict["worse"],

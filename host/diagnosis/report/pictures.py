@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from host.diagnosis.model.effect import Port
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.quantities import scaled
 from host.diagnosis.selection.locate import joined
@@ -35,20 +35,20 @@ ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9}
 SIDE_BY_SIDE = ("pose_sensor", "force_sensor")
 
 
-def shown(result: Diagnosis) -> tuple[Piece, int, int]:
-    """The held-out recording (piece, its index) and output that show the mismatch best."""
+def shown(result: Diagnosis) -> tuple[Segment, int, int]:
+    """The held-out recording (segment, its index) and output that show the mismatch best."""
     row = result.figures.primary
 
     def gain(index: int) -> float:
-        piece = result.full.pieces[index]
-        mask = piece.heldout
+        segment = result.full.segments[index]
+        mask = segment.heldout
         if not mask.any():
             return -1.0
         change = result.found.nominal_full.residuals[index][row][mask] - result.found.best_full.residuals[index][row][mask]
         return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
 
-    index = max(range(len(result.full.pieces)), key=gain)
-    return result.full.pieces[index], index, row
+    index = max(range(len(result.full.segments)), key=gain)
+    return result.full.segments[index], index, row
 
 
 def chain(result: Diagnosis) -> ReportFigure:
@@ -96,15 +96,15 @@ def chain(result: Diagnosis) -> ReportFigure:
 
 def over_time(result: Diagnosis) -> ReportFigure:
     """Recording and both models, and below what each leaves; windows of the mismatch shaded."""
-    piece, index, row = shown(result)
+    segment, index, row = shown(result)
     output = result.model.outputs[row]
-    t = piece.recording.time_s + piece.recording.begin_s
-    size, unit = scaled(output.unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
-    y = piece.y[row] / size
+    t = segment.recording.time_s + segment.recording.begin_s
+    size, unit = scaled(output.unit, float(np.nanmax(np.abs(segment.y[row]), initial=0.0)))
+    y = segment.y[row] / size
     nominal = y - result.found.nominal_full.residuals[index][row] / size
     best = y - result.found.best_full.residuals[index][row] / size
-    spans = joined([span for place in result.located for span in place.windows_s[piece.recording.name]])
-    floor = result.figures.floor[row] / size
+    spans = joined([span for place in result.located for span in place.windows_s[segment.recording.name]])
+    noise_sd = result.figures.noise_sd[row] / size
 
     def draw(figure: Figure, narrow: bool) -> None:
         top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.0))
@@ -119,17 +119,17 @@ def over_time(result: Diagnosis) -> ReportFigure:
         ):
             if label != "extended" or result.found.best.terms:
                 top.plot(*thinned(t, values, bins), color=colour, lw=width, label=label)
-        bottom.axhspan(-floor, floor, color="#e6edf3", lw=0)
+        bottom.axhspan(-noise_sd, noise_sd, color="#e6edf3", lw=0)
         bottom.plot(*thinned(t, y - nominal, bins), color=FAULT, lw=0.9)
         if result.found.best.terms:
             bottom.plot(*thinned(t, y - best, bins), color=INK, lw=0.9)
         top.set_ylabel(f"{output.channel.replace('_', ' ')} ({unit})")
         bottom.set_ylabel(f"residual ({unit})")
-        bottom.set_xlabel("time (s)" if piece.recording.timed else "sample")
+        bottom.set_xlabel("time (s)" if segment.recording.timed else "sample")
         legend_above(top, 2 if narrow else 3)
 
-    unused = "" if piece.fit.any() else ", not used to fit"
-    caption = f"Recording {piece.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
+    unused = "" if segment.fit.any() else ", not used to fit"
+    caption = f"Recording {segment.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
     return report_figure(
         draw,
         4.3,
@@ -154,10 +154,10 @@ def loop(result: Diagnosis) -> ReportFigure | None:
     if name is None:
         return None
     port: Port = ports[name]
-    piece, index, _ = shown(result)
+    segment, index, _ = shown(result)
     row = most_moved(result, index, port.subsystem)
-    size, unit = scaled(result.model.outputs[row].unit, float(np.nanmax(np.abs(piece.y[row]), initial=0.0)))
-    x = result.model.motion(piece, port)
+    size, unit = scaled(result.model.outputs[row].unit, float(np.nanmax(np.abs(segment.y[row]), initial=0.0)))
+    x = result.model.motion(segment, port)
     left = result.found.nominal_full.residuals[index][row] / size
     extra = left - result.found.best_full.residuals[index][row] / size
     travel = next(
@@ -193,7 +193,7 @@ def most_moved(result: Diagnosis, index: int, subsystem: str) -> int:
         full = result.found
         change = full.nominal_full.residuals[index][row] - full.best_full.residuals[index][row]
         good = change[np.isfinite(change)]
-        return float(np.std(good)) / max(result.figures.floor[row], 1e-300) if good.size else 0.0
+        return float(np.std(good)) / max(result.figures.noise_sd[row], 1e-300) if good.size else 0.0
 
     return max(rows, key=weight) if rows else result.figures.primary
 
@@ -207,7 +207,7 @@ def before_after(result: Diagnosis) -> ReportFigure:
     def draw(figure: Figure, narrow: bool) -> None:
         axes = figure.add_subplot()
         place = np.arange(len(rows))[::-1]
-        before, after = figures.before[rows] / figures.floor[rows], figures.after[rows] / figures.floor[rows]
+        before, after = figures.before[rows] / figures.noise_sd[rows], figures.after[rows] / figures.noise_sd[rows]
         axes.hlines(place, after, before, color=FAINT, lw=4)
         axes.plot(before, place, "o", color=FAULT, ms=5, label="nominal, refitted")
         axes.plot(after, place, "o", color=INK, ms=5, label="extended")

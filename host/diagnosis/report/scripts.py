@@ -28,9 +28,9 @@ def write_scripts(result: Diagnosis, folder: Path) -> list[Path]:
 
 def write_table(result: Diagnosis, design: Design, path: Path) -> Path:
     """Inputs over time (s) in SI units, as columns of the channels' names."""
-    units = result.problem.pieces[0].recording.units
+    units = result.problem.segments[0].recording.units
     names = [f"{name} ({units[name]})" if units.get(name) else name for name in design.inputs]
     table = np.column_stack((design.excitation.time_s, *design.inputs.values()))
-    head = ",".join(["time (s)" if result.problem.pieces[0].recording.timed else "sample", *names])
+    head = ",".join(["time (s)" if result.problem.segments[0].recording.timed else "sample", *names])
     np.savetxt(path, table, fmt="%.7g", delimiter=",", header=f"{design.says}\n{head}", comments="# ")
     return path

@@ -29,7 +29,7 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         output.channel: {
             "rmse_before": figures.before[row],
             "rmse_after": figures.after[row],
-            "noise_floor": figures.floor[row],
+            "noise_floor": figures.noise_sd[row],
             "unit": output.unit,
             "whiteness_p_before": figures.white_before[row],
             "whiteness_p_after": figures.white_after[row],
@@ -48,7 +48,7 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
             "heldout": True,
             "rmse_before": figures.before[primary],
             "rmse_after": figures.after[primary],
-            "noise_floor": figures.floor[primary],
+            "noise_floor": figures.noise_sd[primary],
             "unit": result.model.outputs[primary].unit,
             "per_channel": per_channel,
             "per_recording": per_recording(result),
@@ -144,7 +144,7 @@ def finding_json(finding: Finding) -> dict[str, str]:
 
 def _located(location: Location, result: Diagnosis) -> dict[str, Any]:
     return {
-        "windows_unit": "s" if result.full.pieces[0].recording.timed else "samples",
+        "windows_unit": "s" if result.full.segments[0].recording.timed else "samples",
         "subsystem": location.subsystem,
         "channels": location.channels,
         "windows_s": every_window(location),
@@ -165,14 +165,14 @@ def nominal_parameters(result: Diagnosis) -> dict[str, dict[str, Any]]:
 def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
     """RMS error before and after of every channel in every recording that was held out, by their names."""
     found: dict[str, dict[str, dict[str, float]]] = {}
-    for piece, before, after in zip(
-        result.full.pieces, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True
+    for segment, before, after in zip(
+        result.full.segments, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True
     ):
-        if piece.heldout.any():
-            found[piece.recording.name] = {
-                output.channel: {"rmse_before": rms([b[piece.heldout]]), "rmse_after": rms([a[piece.heldout]])}
+        if segment.heldout.any():
+            found[segment.recording.name] = {
+                output.channel: {"rmse_before": rms([b[segment.heldout]]), "rmse_after": rms([a[segment.heldout]])}
                 for output, b, a in zip(result.model.outputs, before, after, strict=True)
-                if np.isfinite(b[piece.heldout]).any()
+                if np.isfinite(b[segment.heldout]).any()
             }
     return found
 

@@ -33,16 +33,16 @@ class Standing:
     parameters: int = 1
 
 
-def standings(problem: Problem, found: Found, floor: Array) -> list[Standing]:
+def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
     """For every effect of the best structure: its gain over the structure without it, and its equals."""
     out = []
     for term in found.best.terms:
         terms, values = without(found.best, problem, (term.candidate.key,))
         less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
-        gain = compare(problem.pieces, "heldout", less.residuals, found.best.residuals, floor)
-        both = compare(problem.pieces, "both", less.residuals, found.best.residuals, floor)
-        alike, rivals = _equals(problem, found, term.candidate, less, both, floor)
-        said = _better_said(problem, found, term.candidate, less, floor)
+        gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
+        both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
+        alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
+        said = _better_said(problem, found, term.candidate, less, noise_sd)
         alike += tuple(candidate for candidate, _ in said)
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
@@ -64,13 +64,13 @@ def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
 
 
 def _better_said(
-    problem: Problem, found: Found, candidate: Candidate, less: Fit, floor: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, noise_sd: Array
 ) -> tuple[tuple[Candidate, float], ...]:
     """An equation of no listed effect that does plainly better in the place of `candidate`: this may be a stand-in."""
     if candidate.effect.id == "unlisted":
         return ()
-    for trial in equations_for(problem, less, candidate.port, floor):
-        behind = compare(problem.pieces, "both", found.best.residuals, trial.fit.residuals, floor)
+    for trial in equations_for(problem, less, candidate.port, noise_sd):
+        behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
             more = len(found.best.values) - len(trial.fit.values)
             return ((trial.candidate, -coarse(behind, -more, problem.rules)),)
@@ -78,7 +78,7 @@ def _better_said(
 
 
 def _equals(
-    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, floor: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, noise_sd: Array
 ) -> tuple[tuple[Candidate, ...], list[tuple[Candidate, float]]]:
     """Rivals in the place of `candidate`: those that neither held-out samples nor all together tell from it, and all that
     were refitted with their coarsened differences.
@@ -94,9 +94,9 @@ def _equals(
         other = finish(
             problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
         )
-        ahead = compare(problem.pieces, "both", other.residuals, best.residuals, floor)
-        held = compare(problem.pieces, "heldout", other.residuals, best.residuals, floor)
-        rival = compare(problem.pieces, "both", less.residuals, other.residuals, floor)
+        ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
+        held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
+        rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
         refitted.append((trial.candidate, coarse(ahead, len(best.values) - len(other.values), problem.rules)))
         if len(kept) < problem.rules.most_equals and _not_told(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.fit import Fit, Problem
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill, since_reversal
 
 Array = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ def moving_rms(values: Array, dt_s: float) -> Array:
 
 def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
     """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed,
-    short pieces dropped.
+    short segments dropped.
     """
     rms = moving_rms(fill(mismatch), dt_s)
     high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
@@ -67,27 +67,27 @@ def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
 
 
 def mismatch_of(problem: Problem, nominal: Fit, best: Fit) -> list[Array]:
-    """What the effects add to the refitted nominal model, per piece (outputs, n); without effects, the nominal residual."""
+    """What the effects add to the refitted nominal model, per segment (outputs, n); else the nominal residual."""
     if not best.terms:
         return nominal.residuals
     return [n - b for n, b in zip(nominal.residuals, best.residuals, strict=True)]
 
 
-def features(problem: Problem, piece: Piece) -> dict[str, Array]:
+def features(problem: Problem, segment: Segment) -> dict[str, Array]:
     """Signals a condition may speak of, by words; every one (n,)."""
     found: dict[str, Array] = {}
-    dt = piece.recording.dt_s
+    dt = segment.recording.dt_s
     for name, key, _ in problem.model.travel:
-        values = fill(piece.inputs[key])
+        values = fill(segment.inputs[key])
         span = float(np.ptp(values)) or 1.0
         found[f"distance from reversals of {name}"] = since_reversal(values, 0.01 * span)
         found[f"size of {name}"] = np.abs(values)
         found[f"place of {name}"] = values
-        if piece.recording.timed:
+        if segment.recording.timed:
             width = max(3, round(0.05 / dt) | 1)
             found[f"speed of {name}"] = np.abs(np.gradient(np.convolve(values, np.ones(width) / width, mode="same"), dt))
-    if piece.recording.timed:
-        found["time"] = piece.recording.time_s
+    if segment.recording.timed:
+        found["time"] = segment.recording.time_s
     return found
 
 
@@ -98,9 +98,9 @@ def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1
     `stride`: every so many samples are looked at.
     """
     energy, tables = [], []
-    for piece, m in zip(problem.pieces, mismatch, strict=True):
+    for segment, m in zip(problem.segments, mismatch, strict=True):
         energy.append(np.where(np.isfinite(m[row]), m[row], 0.0)[::stride] ** 2)
-        tables.append({name: values[::stride] for name, values in features(problem, piece).items()})
+        tables.append({name: values[::stride] for name, values in features(problem, segment).items()})
     together = np.concatenate(energy)
     total = float(together.sum())
     if total <= 0.0:

@@ -13,7 +13,7 @@ from host.diagnosis.selection.screening import Screened, enough, term_of
 KEPT = 3
 
 
-def hidden(problem: Problem, nominal: Fit, pool: list[Candidate]) -> list[Screened]:
+def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -> list[Screened]:
     """Candidates that the refitted nominal model cannot vouch for, each with nominal parameters of its own to start from.
 
     A model that offers `restarts` says which parameters are worth a try; those that leave the least with the effect are
@@ -22,12 +22,12 @@ def hidden(problem: Problem, nominal: Fit, pool: list[Candidate]) -> list[Screen
     own = getattr(problem.model, "restarts", None)
     few = enough(problem)
     found = []
-    for candidate in pool if own is not None else ():
+    for candidate in candidate_effects if own is not None else ():
         if not candidate.effect.hides:
             continue
         term = term_of(problem, candidate, nominal)
         begin = starts(term, {}, {})
-        tried = [np.concatenate((theta, begin)) for theta in own(few.pieces)]  # type: ignore[misc]
+        tried = [np.concatenate((theta, begin)) for theta in own(few.segments)]  # type: ignore[misc]
         tried.sort(key=lambda values: robust(few.stacked((term,), values))[0])
         item = Screened(candidate, term, (), 0.0, [begin] * KEPT)
         found.append(replace(item, nominal=[values[: -begin.size] for values in tried[:KEPT]]))

@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import scale_of
 
 Array = npt.NDArray[np.float64]
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 STEPPED_SAMPLES = 150  # of each output and recording, to look for steps in
@@ -25,13 +25,13 @@ def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
     """`candidate` with bounds and start values for these recordings."""
     n = len(problem.model.parameters)
     needs = [
-        problem.model.needs(piece, candidate.port, fit.values[:n], residual)[piece.fit]
-        for piece, residual in zip(problem.pieces, fit.residuals, strict=True)
-        if piece.fit.any()
+        problem.model.needs(segment, candidate.port, fit.values[:n], residual)[segment.fit]
+        for segment, residual in zip(problem.segments, fit.residuals, strict=True)
+        if segment.fit.any()
     ]
     together = np.concatenate(needs)
     rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
-    scale = scale_of(problem.model, problem.pieces, candidate.port, candidate, rms)
+    scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
     parameters = candidate.effect.parameters(scale, candidate.form)
     if problem.model.kind == "impedance":
         parameters = tuple(replace(p, low=-np.inf) if p.linear and p.low == 0.0 else p for p in parameters)
@@ -97,7 +97,7 @@ class Point:
 
 
 def screen(
-    problem: Problem, fit: Fit, pool: list[Candidate], tell: Tell, known_Hz: tuple[float, ...] = ()
+    problem: Problem, fit: Fit, candidate_effects: list[Candidate], progress: Progress, known_Hz: tuple[float, ...] = ()
 ) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
     search). `known_Hz`: frequencies to try besides those that stand out.
@@ -109,12 +109,14 @@ def screen(
     few = _independent(problem, r)
     slopes = _slopes(problem, fit)
     used = [
-        np.where(piece.fit, r, np.nan) for piece, r in zip(problem.pieces, fit.residuals, strict=True) if piece.fit.any()
+        np.where(segment.fit, r, np.nan)
+        for segment, r in zip(problem.segments, fit.residuals, strict=True)
+        if segment.fit.any()
     ]
-    lines = np.concatenate((known_Hz, lines_of(used, problem.pieces[0].recording.dt_s)))
+    lines = np.concatenate((known_Hz, lines_of(used, problem.segments[0].recording.dt_s)))
     resting = _resting(problem)
-    for count, candidate in enumerate(pool):
-        tell("screening", count / len(pool))
+    for count, candidate in enumerate(candidate_effects):
+        progress("screening", count / len(candidate_effects))
         drop = replaced_by(fit, candidate)
         if drop is None or (candidate.port.name in resting and not candidate.effect.at_rest and not candidate.source):
             continue
@@ -149,8 +151,10 @@ def _resting(problem: Problem) -> set[str]:
     found = set()
     for port in problem.model.ports:
         if port.kind.startswith("motion"):
-            spans = [np.ptp(problem.model.motion(piece, port)[piece.fit]) for piece in problem.pieces if piece.fit.any()]
-            sizes = [np.max(np.abs(problem.model.motion(piece, port))) for piece in problem.pieces]
+            spans = [
+                np.ptp(problem.model.motion(segment, port)[segment.fit]) for segment in problem.segments if segment.fit.any()
+            ]
+            sizes = [np.max(np.abs(problem.model.motion(segment, port))) for segment in problem.segments]
             if max(spans) <= 1e-9 * max(sizes):
                 found.add(port.name)
     return found
@@ -160,21 +164,21 @@ Slopes = list[dict[str, Array]]
 
 
 def _slopes(problem: Problem, fit: Fit) -> Slopes | None:
-    """Sensitivity of the outputs to each axis, per piece, where the model offers it."""
+    """Sensitivity of the outputs to each axis, per segment, where the model offers it."""
     sensitivity = getattr(problem.model, "sensitivity", None)
     if sensitivity is None:
         return None
     n = len(problem.model.parameters)
-    acts, at = [], n
+    active, at = [], n
     for term in fit.terms:
-        acts.append((term.candidate, fit.values[at : at + len(term.parameters)]))
+        active.append((term.candidate, fit.values[at : at + len(term.parameters)]))
         at += len(term.parameters)
     axes = [port.name for port in problem.model.ports if port.kind.startswith("motion")]
     return [
-        {axis: sensitivity(piece, fit.values[:n], axis, acts) for axis in axes}
-        if piece.fit.any()
-        else {axis: piece.y for axis in axes}
-        for piece in problem.pieces
+        {axis: sensitivity(segment, fit.values[:n], axis, active) for axis in axes}
+        if segment.fit.any()
+        else {axis: segment.y for axis in axes}
+        for segment in problem.segments
     ]
 
 
@@ -183,40 +187,40 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
     term = terms[-1]
     n = len(problem.model.parameters)
     rows = []
-    for piece, S in zip(problem.pieces, slopes, strict=True):
-        if piece.fit.any():
-            change = problem.model.change(piece, trial[:n], S, term.candidate, trial[-len(term.parameters) :])  # type: ignore[attr-defined]
-            rows.append(np.where(np.isfinite(piece.y), change, 0.0)[:, piece.fit] / problem.scale[:, None])
+    for segment, S in zip(problem.segments, slopes, strict=True):
+        if segment.fit.any():
+            change = problem.model.change(segment, trial[:n], S, term.candidate, trial[-len(term.parameters) :])  # type: ignore[attr-defined]
+            rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
 
 
 def enough(problem: Problem) -> Problem:
     """The problem with enough recordings to fit, spread over all; the rest neither fitted nor simulated."""
-    used = [index for index, piece in enumerate(problem.pieces) if piece.fit.any()]
+    used = [index for index, segment in enumerate(problem.segments) if segment.fit.any()]
     count = max(
-        1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.pieces[index].n for index in used))))
+        1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.segments[index].n for index in used))))
     )
     chosen = {used[round(k)] for k in np.linspace(0, len(used) - 1, count)}
-    pieces = [
-        piece if index in chosen else replace(piece, fit=np.zeros(piece.n, dtype=bool))
-        for index, piece in enumerate(problem.pieces)
+    segments = [
+        segment if index in chosen else replace(segment, fit=np.zeros(segment.n, dtype=bool))
+        for index, segment in enumerate(problem.segments)
     ]
-    return replace(problem, pieces=pieces)
+    return replace(problem, segments=segments)
 
 
 def _smaller(problem: Problem) -> Problem:
     """Few recordings, every so many samples of them: enough to screen by."""
     few = enough(problem)
-    stride = max(1, int(sum(piece.fit.sum() for piece in few.pieces) * len(problem.noise) / SCREEN_ROWS))
-    pieces = [replace(piece, fit=piece.fit & (np.arange(piece.n) % stride == 0)) for piece in few.pieces]
-    return replace(problem, pieces=pieces)
+    stride = max(1, int(sum(segment.fit.sum() for segment in few.segments) * len(problem.noise) / SCREEN_ROWS))
+    segments = [replace(segment, fit=segment.fit & (np.arange(segment.n) % stride == 0)) for segment in few.segments]
+    return replace(problem, segments=segments)
 
 
 def _independent(problem: Problem, left: Array) -> float:
     """Independent samples to fit in what would be `left`, weighted and stacked."""
     total, at, rows = 0.0, 0, len(problem.noise)
-    for piece in problem.pieces:
-        n = int(piece.fit.sum())
+    for segment in problem.segments:
+        n = int(segment.fit.sum())
         for row in left[at : at + rows * n].reshape(rows, n) if n else ():
             used = int(np.count_nonzero(row))
             total += used / correlation_time(np.where(row != 0.0, row, np.nan)) if used else 0.0
@@ -233,11 +237,11 @@ def _stepped(problem: Problem, fit: Fit, term: Term) -> Term:
     if not rows:
         return term
     x, r = [], []
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
+    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
         for row in rows:
-            good = piece.fit & np.isfinite(residual[row])
+            good = segment.fit & np.isfinite(residual[row])
             every = max(1, int(good.sum()) // STEPPED_SAMPLES)
-            x.append((piece.y[row] - residual[row])[good][::every])
+            x.append((segment.y[row] - residual[row])[good][::every])
             r.append(residual[row][good][::every] / problem.scale[row])
     place, rest = np.concatenate(x), np.concatenate(r)
     low, high = 1.2 * min(problem.scale[row] for row in rows), 12.0 * max(problem.scale[row] for row in rows)

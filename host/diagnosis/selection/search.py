@@ -22,14 +22,14 @@ from host.diagnosis.estimation.fit import (
 )
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, enough, screen, without
 from host.diagnosis.selection.trial import Trial, at_bound, good_enough, rank, related, weighty
 from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 
 
 @dataclass
@@ -57,16 +57,16 @@ class Found:
 def settle(problem: Problem, values: Array) -> None:
     """Lets a model that needs it prepare its recordings for these nominal parameters."""
     own = getattr(problem.model, "settle", None)
-    for piece in problem.pieces if own is not None else ():
-        own(piece, values)  # type: ignore[misc]
+    for segment in problem.segments if own is not None else ():
+        own(segment, values)  # type: ignore[misc]
     begin_anew(problem, Fit((), values))
 
 
 def begin_anew(problem: Problem, fit: Fit) -> None:
     """Lets a model that runs freely from a measured state find that state anew."""
     own = getattr(problem.model, "begin_anew", None)
-    for piece in problem.pieces if own is not None else ():
-        own(piece, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
+    for segment in problem.segments if own is not None else ():
+        own(segment, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
 
 
 def refined(problem: Problem, fit: Fit) -> Fit:
@@ -84,7 +84,7 @@ def fit_nominal(problem: Problem) -> Fit:
     simulates itself:
     errors in a variable that the fit takes for exact would bend its parameters.
     """
-    fit = Fit((), problem.model.guess(problem.pieces))
+    fit = Fit((), problem.model.guess(problem.segments))
     for _ in range(3):
         settle(problem, fit.values)
         reweigh(problem, fit)
@@ -96,7 +96,7 @@ def fit_nominal(problem: Problem) -> Fit:
     return fit
 
 
-def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
+def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Trial:
     """Full joint refit of one candidate from its best starts."""
     terms, values = without(base, problem, item.drop)
     few = enough(problem)
@@ -108,16 +108,16 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
     ]
     fit = min(fits, key=lambda f: f.cost)
     fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
-    if any(a is not b for a, b in zip(few.pieces, problem.pieces, strict=True)):
+    if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
     fit = finish(problem, fit)
     begun = get_starts(problem)
     fit = _restart(problem, fit, item.candidate)
     after = get_starts(problem)
     set_starts(problem, begun)
-    heldout = compare(problem.pieces, "heldout", base.residuals, fit.residuals, floor)
-    trained = compare(problem.pieces, "fit", base.residuals, fit.residuals, floor)
-    both = compare(problem.pieces, "both", base.residuals, fit.residuals, floor)
+    heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
+    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
+    both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)
     return Trial(
         item.candidate,
         fit,
@@ -127,9 +127,9 @@ def try_fit(problem: Problem, base: Fit, item: Screened, floor: Array) -> Trial:
         both.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(base.values)),
         after,
         bool(item.drop),
-        problem.pieces[0].recording.dt_s,
+        problem.segments[0].recording.dt_s,
         problem.rules,
-        any(piece.heldout.any() and not piece.fit.any() for piece in problem.pieces),
+        any(segment.heldout.any() and not segment.fit.any() for segment in problem.segments),
     )
 
 
@@ -141,8 +141,8 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
     for _ in range(2):
         before = get_starts(problem)
         reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
-        for piece in problem.pieces:
-            _best_start(problem, fit, piece, port, reach)
+        for segment in problem.segments:
+            _best_start(problem, fit, segment, port, reach)
         trial = minimize(problem, fit.terms, fit.values, rounds=6, tolerance=1e-4)
         if not trial.cost < fit.cost:
             set_starts(problem, before)
@@ -157,23 +157,23 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
 def _need_rms(problem: Problem, fit: Fit, candidate: Candidate) -> float:
     n = len(problem.model.parameters)
     needs = [
-        problem.model.needs(piece, candidate.port, fit.values[:n], r)
-        for piece, r in zip(problem.pieces, fit.residuals, strict=True)
+        problem.model.needs(segment, candidate.port, fit.values[:n], r)
+        for segment, r in zip(problem.segments, fit.residuals, strict=True)
     ]
     return float(np.sqrt(np.nanmean(np.concatenate(needs) ** 2)))
 
 
-def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: float) -> None:
-    """Start of memory at `port` that leaves the least error in `piece`: a scan over [-reach, reach], then its best
+def _best_start(problem: Problem, fit: Fit, segment: Segment, port: str, reach: float) -> None:
+    """Start of memory at `port` that leaves the least error in `segment`: a scan over [-reach, reach], then its best
     cell halved.
     """
 
     def error(start: float) -> float:
-        piece.start[port] = start
-        r = (piece.y - problem.simulate(piece, fit.terms, fit.values)) / problem.scale[:, None]
+        segment.start[port] = start
+        r = (segment.y - problem.simulate(segment, fit.terms, fit.values)) / problem.scale[:, None]
         return float(np.nansum(np.minimum(r * r, 16.0)))
 
-    old = piece.start.get(port, 0.0)
+    old = segment.start.get(port, 0.0)
     tried = {float(s): error(float(s)) for s in (*np.linspace(-reach, reach, 9), old)}
     step = 0.125 * reach
     for _ in range(4):
@@ -182,40 +182,42 @@ def _best_start(problem: Problem, fit: Fit, piece: Piece, port: str, reach: floa
             tried[s] = error(s)
         step *= 0.5
     best = min(tried, key=lambda s: tried[s])
-    piece.start[port] = best if tried[best] < 0.9999 * tried[old] else old
+    segment.start[port] = best if tried[best] < 0.9999 * tried[old] else old
 
 
-def search(problem: Problem, pool: list[Candidate], tell: Tell) -> Found:
+def search(problem: Problem, candidate_effects: list[Candidate], progress: Progress) -> Found:
     """Nominal refit, then moves until none is earned; then detours by other first effects, where two may do better."""
-    tell("refitting the nominal model", 0.0)
+    progress("refitting the nominal model", 0.0)
     nominal = fit_nominal(problem)
-    floor = np.array([noise.sigma for noise in problem.noise])
+    noise_sd = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
-    _grow(problem, found, pool, floor, 0.0, tell)
-    found = _detour(problem, found, pool, floor, tell)
-    _exchange(problem, found, pool, floor, tell)
+    _grow(problem, found, candidate_effects, noise_sd, 0.0, progress)
+    found = _detour(problem, found, candidate_effects, noise_sd, progress)
+    _exchange(problem, found, candidate_effects, noise_sd, progress)
     if found.best.terms:
         found.best = refined(problem, found.best)
     return found
 
 
-def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, earned: float, tell: Tell) -> None:
+def _grow(
+    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, earned: float, progress: Progress
+) -> None:
     """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
     rules = problem.rules
     while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
-        ranked = screen(problem, best, pool, tell)
+        ranked = screen(problem, best, candidate_effects, progress)
         trials: list[Trial] = []
         promising = _varied(
             [item for item in ranked if item.promise > problem.rules.screening_log_likelihood], problem.rules
         )
         if not best.terms:
-            promising += hidden(problem, best, pool)
+            promising += hidden(problem, best, candidate_effects)
         for count, item in enumerate(promising):
             if trials and problem.budget.spent():
                 break
-            tell(f"fitting {item.candidate.key}", count / len(promising))
-            trials.append(try_fit(problem, best, item, floor))
+            progress(f"fitting {item.candidate.key}", count / len(promising))
+            trials.append(try_fit(problem, best, item, noise_sd))
         rank(trials, best)
         winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
         if winner is None:
@@ -226,8 +228,8 @@ def _grow(problem: Problem, found: Found, pool: list[Candidate], floor: Array, e
         earned += winner.both.log_likelihood
         best = _taken(problem, winner)
         if len(best.terms) > 1:
-            best = _swap(problem, best, floor, steps)
-        best = _prune(problem, best, floor, steps)
+            best = _swap(problem, best, noise_sd, steps)
+        best = _prune(problem, best, noise_sd, steps)
     found.best = best
 
 
@@ -239,7 +241,9 @@ def _taken(problem: Problem, trial: Trial) -> Fit:
     return best
 
 
-def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> Found:
+def _detour(
+    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
+) -> Found:
     """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
     screening promises beside them would outdo all that was found.
     """
@@ -252,16 +256,17 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
         if trial.score < problem.rules.alternative_start_score * top or not good_enough(trial, found.nominal):
             continue
         base = _taken(problem, trial)
-        ranked = screen(problem, base, pool, tell)
+        ranked = screen(problem, base, candidate_effects, progress)
         if (
             not ranked
-            or _total(problem, found.nominal, base, floor) + ranked[0].promise
-            < _total(problem, found.nominal, best.best, floor) + len(best.best.terms) * problem.rules.heldout_log_likelihood
+            or _total(problem, found.nominal, base, noise_sd) + ranked[0].promise
+            < _total(problem, found.nominal, best.best, noise_sd)
+            + len(best.best.terms) * problem.rules.heldout_log_likelihood
         ):
             continue
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
-        _grow(problem, other, pool, floor, trial.both.log_likelihood, tell)
-        ahead = compare(problem.pieces, "both", best.best.residuals, other.best.residuals, floor)
+        _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
+        ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd)
         more = max(len(other.best.values) - len(best.best.values), 0)
         if (
             ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
@@ -270,19 +275,19 @@ def _detour(problem: Problem, found: Found, pool: list[Candidate], floor: Array,
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
     set_starts(problem, begun)
     problem.scale[:] = scale
-    for piece in problem.pieces:
-        piece.extra["weight"] = problem.scale
+    for segment in problem.segments:
+        segment.extra["weight"] = problem.scale
     begin_anew(problem, best.best)
     return best
 
 
-def _total(problem: Problem, nominal: Fit, fit: Fit, floor: Array) -> float:
+def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:
     """Likelihood on all samples that a structure has earned, less the price of its parameters."""
-    gain = compare(problem.pieces, "both", nominal.residuals, fit.residuals, floor)
+    gain = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
     return gain.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(nominal.values))
 
 
-def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
     """Each effect's rivals refitted beside the others: one that only stood in for several has to leave now."""
     for term in best.terms:
         step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
@@ -293,7 +298,7 @@ def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
             other = finish(
                 problem, minimize(problem, (*rest, new), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             )
-            ahead = compare(problem.pieces, "both", best.residuals, other.residuals, floor)
+            ahead = compare(problem.segments, "both", best.residuals, other.residuals, noise_sd)
             more = len(other.values) - len(best.values)
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
@@ -303,7 +308,9 @@ def _swap(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
     return best
 
 
-def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+def _exchange(
+    problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
+) -> None:
     """Each of several effects taken out, and all candidates screened anew for its place: what was the best beside nothing
     may not be the best beside the others.
     """
@@ -311,8 +318,8 @@ def _exchange(problem: Problem, found: Found, pool: list[Candidate], floor: Arra
         before = found.best.names
         for term in found.best.terms:
             if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
-                _in_place_of(problem, found, term, pool, floor, tell)
-        found.best = _prune(problem, found.best, floor, found.steps)
+                _in_place_of(problem, found, term, candidate_effects, noise_sd, progress)
+        found.best = _prune(problem, found.best, noise_sd, found.steps)
         if found.best.names == before or len(found.best.terms) < 2:
             return
 
@@ -324,20 +331,22 @@ def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
     return tuple(float(value) for p, value in pairs if p.name == "frequency" and p.unit == "Hz")
 
 
-def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidate], floor: Array, tell: Tell) -> None:
+def _in_place_of(
+    problem: Problem, found: Found, term: Term, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
+) -> None:
     known = _frequencies(found.best, term)
     terms, values = without(found.best, problem, (term.candidate.key,))
     less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
     ranked = [
         item
-        for item in screen(problem, less, pool, tell, known)
+        for item in screen(problem, less, candidate_effects, progress, known)
         if item.promise > problem.rules.screening_log_likelihood and not item.drop
     ]
     own = [item for item in ranked if item.candidate.key == term.candidate.key]
     top = max((item.promise for item in ranked), default=0.0)
     others = [item for item in ranked if item not in own and item.promise > problem.rules.exchange_promise * top]
     trials = [
-        try_fit(problem, less, item, floor)
+        try_fit(problem, less, item, noise_sd)
         for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
     ]
     rank(trials, less)
@@ -345,7 +354,7 @@ def _in_place_of(problem: Problem, found: Found, term: Term, pool: list[Candidat
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
-    ahead = compare(problem.pieces, "both", found.best.residuals, winner.fit.residuals, floor)
+    ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd)
     more = len(winner.fit.values) - len(found.best.values)
     if (
         ahead.log_likelihood
@@ -380,7 +389,7 @@ def _varied(items: list[Screened], rules: SelectionRules) -> list[Screened]:
     return kept
 
 
-def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
+def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
     """Backward: drop what no longer earns its place."""
     dropped = True
     while dropped and len(best.terms) > 1:
@@ -388,8 +397,8 @@ def _prune(problem: Problem, best: Fit, floor: Array, steps: list[Step]) -> Fit:
         for term in best.terms:
             terms, values = without(best, problem, (term.candidate.key,))
             less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
-            gain = compare(problem.pieces, "both", less.residuals, best.residuals, floor)
-            held = compare(problem.pieces, "heldout", less.residuals, best.residuals, floor)
+            gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd)
+            held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd)
             least = 0.5 * max(problem.rules.least_error_reduction, problem.rules.least_excess_reduction * gain.excess)
             few = gain.log_likelihood < problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * len(
                 term.parameters

@@ -15,11 +15,11 @@ from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
 from host.diagnosis.selection.trial import Trial, rank
-from host.diagnosis.symbolic.dictionary import Foretold, Form, equation_at, fallen, foretell, lay_out
+from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
 
 Array = npt.NDArray[np.float64]
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 # several effects that pile up and still do not fit stand for something that is in no list
 
 
@@ -29,7 +29,7 @@ class Rest:
     there.
     """
 
-    foretold: Foretold | None
+    foretold: PredictedPart | None
     left: float
     doubtful: bool = False  # known effects are named, but they are probably stand-ins
     loud: bool = False  # more is left than noise can be, foretold or not
@@ -40,91 +40,94 @@ class Rest:
         return self.loud or (self.foretold is not None and self.foretold.sure)
 
 
-def left_over(problem: Problem, found: Found, floor: Array) -> float:
+def left_over(problem: Problem, found: Found, noise_sd: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
     mattered most; noise may be larger than its estimate by `noise_uncertainty`.
     """
     shares, weights = [], []
-    for row in range(floor.size):
-        before = _power(problem, found.nominal.residuals, row) - floor[row] ** 2
-        after = _power(problem, found.best.residuals, row) - (problem.rules.noise_uncertainty * floor[row]) ** 2
+    for row in range(noise_sd.size):
+        before = _power(problem, found.nominal.residuals, row) - noise_sd[row] ** 2
+        after = _power(problem, found.best.residuals, row) - (problem.rules.noise_uncertainty * noise_sd[row]) ** 2
         if before > 0.0:
             shares.append(float(np.clip(after / before, 0.0, 1.0)))
-            weights.append(before / floor[row] ** 2)
+            weights.append(before / noise_sd[row] ** 2)
     return shares[int(np.argmax(weights))] if shares else 0.0
 
 
-def _above_noise(problem: Problem, found: Found, floor: Array) -> bool:
+def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     """Whether the best model leaves more than the noise of some output can be: noise known from quiescent parts, or
     guessed.
     """
     measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
     return any(
         _power(problem, found.best.residuals, row)
-        > ((measured if noise.source == "quiescent parts" else problem.rules.residual_over_guessed_noise) * floor[row]) ** 2
+        > ((measured if noise.source == "quiescent parts" else problem.rules.residual_over_guessed_noise) * noise_sd[row])
+        ** 2
         for row, noise in enumerate(problem.noise)
     )
 
 
 def _power(problem: Problem, residuals: list[Array], row: int) -> float:
-    parts = [r[row][piece.heldout] for piece, r in zip(problem.pieces, residuals, strict=True)]
+    parts = [r[row][segment.heldout] for segment, r in zip(problem.segments, residuals, strict=True)]
     together = np.concatenate(parts)
     together = together[np.isfinite(together)]
     return float(np.mean(together**2)) if together.size else 0.0
 
 
-def explain_rest(problem: Problem, found: Found, floor: Array, tell: Tell) -> Rest:
+def explain_rest(problem: Problem, found: Found, noise_sd: Array, progress: Progress) -> Rest:
     """Looks at the rest, and adds an equation to `found.best` where one earns its place."""
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
-    tell("testing whether the residual is predictable", 0.0)
-    places = foretell(problem, found.best, floor)
-    rest = _rest(problem, found, floor, places)
+    progress("testing whether the residual is predictable", 0.0)
+    places = predict_residual(problem, found.best, noise_sd)
+    rest = _rest(problem, found, noise_sd, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
     if not rest.sure or rest.foretold is None or (crowd and rest.left < problem.rules.partial_share / crowd[0][1]):
         return rest
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
-        if not problem.budget.spent() and _equation_instead(problem, found, floor, *pairs[place], tell, evolve=number == 0):
-            return _rest(problem, found, floor, foretell(problem, found.best, floor))
+        if not problem.budget.spent() and _equation_instead(
+            problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
+        ):
+            return _rest(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
     return replace(rest, doubtful=bool(crowd))
 
 
-def _rest(problem: Problem, found: Found, floor: Array, places: list[Foretold]) -> Rest:
+def _rest(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Rest:
     best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
-    explained = fallen(problem, found.nominal.residuals, found.best.residuals, floor)
+    explained = fallen(problem, found.nominal.residuals, found.best.residuals, noise_sd)
     told = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
-    left = max(left_over(problem, found, floor), told)
-    return Rest(best, left, loud=_above_noise(problem, found, floor))
+    left = max(left_over(problem, found, noise_sd), told)
+    return Rest(best, left, loud=_above_noise(problem, found, noise_sd))
 
 
 def _equation_instead(
-    problem: Problem, found: Found, floor: Array, port: Port, target: Port, tell: Tell, evolve: bool
+    problem: Problem, found: Found, noise_sd: Array, port: Port, target: Port, progress: Progress, evolve: bool
 ) -> bool:
     """Puts an equation in the place of all effects at its port, if it earns its place and does better than they.
 
     `evolve`: search by genetic programming too, where no form of the library says it all.
     """
-    tell("searching an equation", 0.0)
+    progress("searching an equation", 0.0)
     there = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.name in (port.name, target.name))
     terms, values = without(found.best, problem, there)
     base = finish(problem, minimize(problem, terms, values, rounds=8)) if there else found.best
-    sized = [form for place in foretell(problem, base, floor) if place.port is port for form in place.forms]
-    trials = [_tried(problem, base, floor, target, form, size) for form, size in sized]
+    sized = [form for place in predict_residual(problem, base, noise_sd) if place.port is port for form in place.forms]
+    trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
     rank(trials, base)
     winner = next((trial for trial in trials if _earned(trial)), None)
-    if evolve and (winner is None or _left(problem, found, winner.fit, floor) > problem.rules.partial_share):
+    if evolve and (winner is None or _left(problem, found, winner.fit, noise_sd) > problem.rules.partial_share):
         evolved = search_equation(problem, base, port)
-        trials += [_tried(problem, base, floor, target, form, 1.0) for form in evolved]
+        trials += [_tried(problem, base, noise_sd, target, form, 1.0) for form in evolved]
         forms += evolved
         rank(trials, base)
         winner = next((trial for trial in trials if _earned(trial)), None)
-    if winner is None or not _better_than_known(problem, found, floor, winner, bool(there)):
+    if winner is None or not _better_than_known(problem, found, noise_sd, winner, bool(there)):
         return False
-    if _left(problem, found, winner.fit, floor) > problem.rules.equation_residual_share:
+    if _left(problem, found, winner.fit, noise_sd) > problem.rules.equation_residual_share:
         return False
-    if there and _still_earned(problem, found.best, winner, there, floor):
+    if there and _still_earned(problem, found.best, winner, there, noise_sd):
         return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
     found.steps.append(Step("equation", winner.candidate.key, winner.heldout, trials))
@@ -133,25 +136,27 @@ def _equation_instead(
     return True
 
 
-def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], floor: Array) -> bool:
+def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], noise_sd: Array) -> bool:
     """Whether the effects that an equation would replace gain as much beside it as they must to enter: then they stay."""
     term = winner.fit.terms[-1]
     begin = np.concatenate((best.values, winner.fit.values[-len(term.parameters) :]))
     both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
-    gain = compare(problem.pieces, "heldout", winner.fit.residuals, both.residuals, floor)
+    gain = compare(problem.segments, "heldout", winner.fit.residuals, both.residuals, noise_sd)
     more = len(both.values) - len(winner.fit.values)
     return gain.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
 
 
-def equations_for(problem: Problem, less: Fit, port: Port, floor: Array) -> list[Trial]:
+def equations_for(problem: Problem, less: Fit, port: Port, noise_sd: Array) -> list[Trial]:
     """The best forms of the library at `port`, or at the one whose reading it is, each refitted beside `less`."""
     target = next((b for a, b in problem.model.unlisted_at if port.name in (a, b)), None)
     if target is None:
         return []
     ports = {p.name: p for p in problem.model.ports}
     name = next(a for a, b in problem.model.unlisted_at if b == target)
-    sized = [form for place in foretell(problem, less, floor, name) for form in place.forms]
-    return [_tried(problem, less, floor, ports[target], form, size) for form, size in sized[: problem.rules.equation_fits]]
+    sized = [form for place in predict_residual(problem, less, noise_sd, name) for form in place.forms]
+    return [
+        _tried(problem, less, noise_sd, ports[target], form, size) for form, size in sized[: problem.rules.equation_fits]
+    ]
 
 
 def _earned(trial: Trial) -> bool:
@@ -169,20 +174,22 @@ def _earned(trial: Trial) -> bool:
     )
 
 
-def _tried(problem: Problem, base: Fit, floor: Array, target: Port, form: Form, size: float) -> Trial:
-    lay_out(problem.pieces, form)
+def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: Form, size: float) -> Trial:
+    lay_out(problem.segments, form)
     candidate = equation_at(target, form, size)
-    return try_fit(problem, base, Screened(candidate, term_of(problem, candidate, base), (), 1.0, [np.array([size])]), floor)
+    return try_fit(
+        problem, base, Screened(candidate, term_of(problem, candidate, base), (), 1.0, [np.array([size])]), noise_sd
+    )
 
 
-def _left(problem: Problem, found: Found, fit: Fit, floor: Array) -> float:
-    return left_over(problem, replace(found, best=fit), floor)
+def _left(problem: Problem, found: Found, fit: Fit, noise_sd: Array) -> float:
+    return left_over(problem, replace(found, best=fit), noise_sd)
 
 
-def _better_than_known(problem: Problem, found: Found, floor: Array, winner: Trial, instead: bool) -> bool:
+def _better_than_known(problem: Problem, found: Found, noise_sd: Array, winner: Trial, instead: bool) -> bool:
     """Whether an equation beats the known effects it takes the place of, or else all those that were tried and refused."""
     if instead:
-        gain = compare(problem.pieces, "heldout", found.best.residuals, winner.fit.residuals, floor)
+        gain = compare(problem.segments, "heldout", found.best.residuals, winner.fit.residuals, noise_sd)
         return gain.log_likelihood > problem.rules.heldout_log_likelihood
     last = found.steps[-1].trials if found.steps else []
     return all(

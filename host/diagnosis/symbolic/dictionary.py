@@ -17,7 +17,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, Term, free, size_of
 from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import lag, play
 
 Array = npt.NDArray[np.float64]
@@ -25,7 +25,7 @@ PLAYS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # widths, parts of the span
 LAGS_S = (0.05, 0.2, 0.6, 2.0, 6.0)
 WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
-MOST_FORMS = 2  # joined to foretell
+MOST_FORMS = 2  # joined to predict_residual
 BEST = 6  # forms that are worth a refit
 NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
@@ -35,12 +35,12 @@ class Form:
     """`text` in names of columns; `evaluate` gives (n,) of a recording; `length`: symbols in it."""
 
     text: str
-    evaluate: Callable[[Piece], Array]
+    evaluate: Callable[[Segment], Array]
     length: int
 
 
 @dataclass(frozen=True)
-class Foretold:
+class PredictedPart:
     """What the best forms at one place take from the rest. `forms`: the singles worth a refit with their sizes, best first;
     `port`: None for a reading.
     """
@@ -59,7 +59,7 @@ class Foretold:
 def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     """The library at one port: its motion, the signals beside it, their rates, magnitudes, waves, memory and products."""
     signals = [s for s in _signals(problem, fit, port) if s.span > 1e-9 * s.largest][:MOST_SIGNALS]
-    timed = problem.pieces[0].recording.timed
+    timed = problem.segments[0].recording.timed
     factors = [_factors(s, timed) for s in signals]
     out = [form for group in factors for form in group]
     out += [form for s in signals for form in _memories(s, timed)]
@@ -78,28 +78,28 @@ class _Signal:
 
     name: str
     unit: str
-    values: Callable[[Piece], Array]
+    values: Callable[[Segment], Array]
     span: float
     largest: float
 
 
 def _signals(problem: Problem, fit: Fit, port: Port) -> Iterator[_Signal]:
-    first = problem.pieces[0]
+    first = problem.segments[0]
     units = first.recording.units | first.extra.get("units", {})
     own = problem.model.moves[port.name]
-    sources: dict[str, Callable[[Piece], Array]] = {own: _own(problem, fit, port)}
+    sources: dict[str, Callable[[Segment], Array]] = {own: _own(problem, fit, port)}
     for key in (*port.others, *port.loads):
         if key != own and key in first.inputs:
             sources.setdefault(key, lambda p, key=key: p.inputs[key])  # type: ignore[misc]
     for key, values in sources.items():
-        together = np.concatenate([values(p) for p in problem.pieces])
+        together = np.concatenate([values(p) for p in problem.segments])
         unit = units.get(key) or units.get(port.name, "") if key == own else units.get(key, "")
         yield _Signal(
             problem.columns.get(key, key), unit, values, float(np.ptp(together)), float(np.max(np.abs(together))) or 1.0
         )
 
 
-def _own(problem: Problem, fit: Fit, port: Port) -> Callable[[Piece], Array]:
+def _own(problem: Problem, fit: Fit, port: Port) -> Callable[[Segment], Array]:
     """The motion at a port: recorded, or simulated where it is itself an output, since what was read of that holds the
     residual.
     """
@@ -108,10 +108,10 @@ def _own(problem: Problem, fit: Fit, port: Port) -> Callable[[Piece], Array]:
         return lambda p: problem.model.motion(p, port)
     row, known = channels.index(problem.model.moves[port.name]), {}  # type: ignore[var-annotated]
 
-    def simulated(piece: Piece) -> Array:
-        if id(piece) not in known:
-            known[id(piece)] = problem.simulate(piece, fit.terms, fit.values)[row]
-        return np.asarray(known[id(piece)])
+    def simulated(segment: Segment) -> Array:
+        if id(segment) not in known:
+            known[id(segment)] = problem.simulate(segment, fit.terms, fit.values)[row]
+        return np.asarray(known[id(segment)])
 
     return simulated
 
@@ -130,8 +130,8 @@ def _factors(signal: _Signal, timed: bool) -> list[Form]:
     return out
 
 
-def _rate(values: Array, piece: Piece) -> Array:
-    return np.asarray(np.gradient(values, piece.recording.dt_s))
+def _rate(values: Array, segment: Segment) -> Array:
+    return np.asarray(np.gradient(values, segment.recording.dt_s))
 
 
 def _memories(signal: _Signal, timed: bool) -> Iterator[Form]:
@@ -155,7 +155,7 @@ def _product(a: Form, b: Form) -> Form:
 
 def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
     """The form as an effect at `port`: its size is to be refitted with everything else. Its values are laid out in
-    `Piece.extra` first (`lay_out`).
+    `Segment.extra` first (`lay_out`).
     """
 
     def parameters(s: Scale, which: str) -> tuple[Parameter, ...]:
@@ -177,19 +177,19 @@ def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
     return Candidate(effect, port, "", "search")
 
 
-def lay_out(pieces: list[Piece], form: Form) -> None:
+def lay_out(segments: list[Segment], form: Form) -> None:
     """Values of a form for every recording, where its effect finds them."""
-    for piece in pieces:
-        piece.extra.setdefault("equations", {})[form.text] = form.evaluate(piece)
+    for segment in segments:
+        segment.extra.setdefault("equations", {})[form.text] = form.evaluate(segment)
 
 
-def foretell(problem: Problem, fit: Fit, floor: Array, only: str = "") -> list[Foretold]:
+def predict_residual(problem: Problem, fit: Fit, noise_sd: Array, only: str = "") -> list[PredictedPart]:
     """The best forms at each port where an equation may stand, and, if the model has many outputs, in each of them alone;
     or at the port `only`.
     """
     ports = {port.name: port for port in problem.model.ports}
     used = _measured(fit)
-    rates = [_slopes(problem, fit, piece) for piece in problem.pieces]
+    rates = [_slopes(problem, fit, segment) for segment in problem.segments]
     found = []
     for name, target in problem.model.unlisted_at:
         if only not in ("", name):
@@ -197,11 +197,11 @@ def foretell(problem: Problem, fit: Fit, floor: Array, only: str = "") -> list[F
         forms = forms_at(problem, fit, ports[name])
         if forms:
             responses = _responses(problem, fit, ports[target], forms)
-            found.append(_best(problem, fit, floor, rates, forms, responses, ports[name].subsystem, ports[name]))
+            found.append(_best(problem, fit, noise_sd, rates, forms, responses, ports[name].subsystem, ports[name]))
             if hasattr(problem.model, "sensitivity") and not only:
                 table = [r.table for r in responses]
                 found += [
-                    _best(problem, fit, floor, rates, forms, _alone(problem, row, table), output.subsystem, None)
+                    _best(problem, fit, noise_sd, rates, forms, _alone(problem, row, table), output.subsystem, None)
                     for row, output in enumerate(problem.model.outputs)
                     if used[row] and name == problem.model.unlisted_at[0][0]
                 ]
@@ -232,21 +232,21 @@ class Response:
 
 def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> list[Response]:
     sensitivity = getattr(problem.model, "sensitivity", None)
-    nominal, acts = problem.parted(fit.terms, fit.values)
+    nominal, active = problem.parted(fit.terms, fit.values)
     out = []
-    for piece in problem.pieces:
-        table = np.array([np.nan_to_num(form.evaluate(piece)) for form in forms])
+    for segment in problem.segments:
+        table = np.array([np.nan_to_num(form.evaluate(segment)) for form in forms])
         if sensitivity is not None:
-            out.append(Response(table, np.nan_to_num(sensitivity(piece, nominal, target.name, acts))))
+            out.append(Response(table, np.nan_to_num(sensitivity(segment, nominal, target.name, active))))
             continue
-        base = problem.simulate(piece, fit.terms, fit.values)
-        need = float(np.nanstd(problem.model.needs(piece, target, nominal, piece.y - base))) or 1e-6
+        base = problem.simulate(segment, fit.terms, fit.values)
+        need = float(np.nanstd(problem.model.needs(segment, target, nominal, segment.y - base))) or 1e-6
         whole = np.zeros((len(forms), *base.shape))
         for index, (form, values) in enumerate(zip(forms, table, strict=True)):
             size = 0.1 * need / (float(np.std(values)) or 1.0)
             term = Term(equation_at(target, form), ())
-            piece.extra.setdefault("equations", {})[form.text] = values
-            moved = problem.model.simulate(piece, nominal, [*acts, (term.candidate, np.array([size]))])
+            segment.extra.setdefault("equations", {})[form.text] = values
+            moved = problem.model.simulate(segment, nominal, [*active, (term.candidate, np.array([size]))])
             whole[index] = np.nan_to_num((moved - base) / size)
         out.append(Response(table, whole=whole))
     return out
@@ -256,35 +256,35 @@ def _alone(problem: Problem, row: int, tables: list[Array]) -> list[Response]:
     """Forms added to one output's reading."""
     unit = np.zeros((len(problem.model.outputs), 1))
     unit[row] = 1.0
-    return [Response(table, np.broadcast_to(unit, p.y.shape)) for table, p in zip(tables, problem.pieces, strict=True)]
+    return [Response(table, np.broadcast_to(unit, p.y.shape)) for table, p in zip(tables, problem.segments, strict=True)]
 
 
-def _slopes(problem: Problem, fit: Fit, piece: Piece) -> Array:
+def _slopes(problem: Problem, fit: Fit, segment: Segment) -> Array:
     """Change of the outputs by each free parameter in its own size, (parameters, outputs, n)."""
-    base = problem.simulate(piece, fit.terms, fit.values)
+    base = problem.simulate(segment, fit.terms, fit.values)
     parameters, out = problem.parameters(fit.terms), []
     for index in free(parameters):
         p, value = parameters[index], float(fit.values[index])
         step = 1e-3 * (abs(value) if p.log else size_of(p, value))
         moved = fit.values.copy()
         moved[index] = value + step if value + step <= p.high else value - step
-        out.append(np.nan_to_num((problem.simulate(piece, fit.terms, moved) - base) / 1e-3))
+        out.append(np.nan_to_num((problem.simulate(segment, fit.terms, moved) - base) / 1e-3))
     return np.array(out) if out else np.zeros((0, *base.shape))
 
 
 def _best(
     problem: Problem,
     fit: Fit,
-    floor: Array,
+    noise_sd: Array,
     slopes: list[Array],
     forms: list[Form],
     responses: list[Response],
     subsystem: str,
     port: Port | None,
-) -> Foretold:
+) -> PredictedPart:
     """Greedy choice among `forms`, one more as long as held-out samples are foretold better."""
-    sums = _Sums(problem, fit, floor, slopes, responses)
-    best = Foretold(subsystem, port, 0.0, 1.0, 0.0, 0.0)
+    sums = _Sums(problem, fit, noise_sd, slopes, responses)
+    best = PredictedPart(subsystem, port, 0.0, 1.0, 0.0, 0.0)
     chosen: list[int] = []
     worth: tuple[tuple[Form, float], ...] = ()
     for _ in range(MOST_FORMS):
@@ -299,12 +299,12 @@ def _best(
             r - response.to(chosen, sizes) + np.tensordot(sums.absorbed(chosen, sizes), slope, 1)
             for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
         ]
-        held = compare(problem.pieces, "heldout", fit.residuals, after, floor)
-        trained = compare(problem.pieces, "fit", fit.residuals, after, floor)
+        held = compare(problem.segments, "heldout", fit.residuals, after, noise_sd)
+        trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd)
         likelihood = held.log_likelihood - len(chosen)
         if likelihood > best.log_likelihood:
-            power = fallen(problem, fit.residuals, after, floor)
-            best = Foretold(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
+            power = fallen(problem, fit.residuals, after, noise_sd)
+            best = PredictedPart(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
     rules = problem.rules
     sure = (
         min(best.log_likelihood, best.trained) > rules.predictable_log_likelihood
@@ -314,14 +314,14 @@ def _best(
     return replace(best, forms=worth, sure=sure)
 
 
-def fallen(problem: Problem, before: list[Array], after: list[Array], floor: Array) -> float:
+def fallen(problem: Problem, before: list[Array], after: list[Array], noise_sd: Array) -> float:
     """Fall of the mean squared error on held-out samples, over each output's noise, summed over those where it fell."""
     total = 0.0
-    for row in range(floor.size):
-        pairs = [(b[row][p.heldout], a[row][p.heldout]) for p, b, a in zip(problem.pieces, before, after, strict=True)]
+    for row in range(noise_sd.size):
+        pairs = [(b[row][p.heldout], a[row][p.heldout]) for p, b, a in zip(problem.segments, before, after, strict=True)]
         change = np.concatenate([b**2 - a**2 for b, a in pairs])
         change = change[np.isfinite(change)]
-        total += max(float(np.mean(change)), 0.0) / floor[row] ** 2 if change.size else 0.0
+        total += max(float(np.mean(change)), 0.0) / noise_sd[row] ** 2 if change.size else 0.0
     return total
 
 
@@ -334,13 +334,13 @@ def _by_gain(gain: Array, forms: list[Form], penalty: float) -> list[int]:
 class _Sums:
     """Inner products, over the samples to fit and in units of noise, of forms, parameters and residual."""
 
-    def __init__(self, problem: Problem, fit: Fit, floor: Array, slopes: list[Array], responses: list[Response]) -> None:
-        unit = np.maximum(floor, 1e-300)[:, None]
+    def __init__(self, problem: Problem, fit: Fit, noise_sd: Array, slopes: list[Array], responses: list[Response]) -> None:
+        unit = np.maximum(noise_sd, 1e-300)[:, None]
         count, rates = len(responses[0].table), len(slopes[0])
         gram, cross, pull = np.zeros((count, count)), np.zeros((count, rates)), np.zeros(count)
         own, start = np.zeros((rates, rates)), np.zeros(rates)
-        for piece, residual, slope, response in zip(problem.pieces, fit.residuals, slopes, responses, strict=True):
-            mask = piece.fit
+        for segment, residual, slope, response in zip(problem.segments, fit.residuals, slopes, responses, strict=True):
+            mask = segment.fit
             if not mask.any():
                 continue
             seen = np.isfinite(residual[:, mask])

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Port
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import lag, play
 from host.diagnosis.symbolic.dictionary import Form
 
@@ -21,65 +21,65 @@ SEEDS = (1, 2)
 TELLING = 0.1  # precision of a sample, over the mean, from which it is searched
 
 
-def features(problem: Problem, piece: Piece, port: Port) -> Array:
+def features(problem: Problem, segment: Segment, port: Port) -> Array:
     """Feature table (n, features) of one recording; the same scales in every recording."""
-    return np.array([values for values, _ in described(problem, piece, port)]).T
+    return np.array([values for values, _ in described(problem, segment, port)]).T
 
 
-def described(problem: Problem, piece: Piece, port: Port) -> list[tuple[Array, str]]:
+def described(problem: Problem, segment: Segment, port: Port) -> list[tuple[Array, str]]:
     """Features and their text in the names of columns: the motion, its memory, its rate, the other inputs and their
     rates.
     """
-    x, span, dt = problem.model.motion(piece, port), _span(problem, port), piece.recording.dt_s
+    x, span, dt = problem.model.motion(segment, port), _span(problem, port), segment.recording.dt_s
     name = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
     out = [(x / span, f"({name} / {span:.6g})")]
     for part in (0.1, 0.4):
         out.append(
             ((x - play(x, 0.5 * part * span, 0.0)) / span, f"(({name} - play({name}, {part * span:.6g})) / {span:.6g})")
         )
-    if piece.recording.timed:
-        duration = max(float(p.recording.time_s[-1] - p.recording.time_s[0]) for p in problem.pieces)
-        out.append(_rated(problem, piece, name, lambda p: problem.model.motion(p, port)))
+    if segment.recording.timed:
+        duration = max(float(p.recording.time_s[-1] - p.recording.time_s[0]) for p in problem.segments)
+        out.append(_rated(problem, segment, name, lambda p: problem.model.motion(p, port)))
         for time_constant in (max(5 * dt, 0.005 * duration), 0.1 * duration):
             out.append(
                 ((x - lag(x, dt, time_constant)) / span, f"(({name} - lag({name}, {time_constant:.6g})) / {span:.6g})")
             )
     for other in dict.fromkeys((*port.loads, *port.others)):
-        if other in piece.inputs:
-            size = float(np.sqrt(np.mean(np.concatenate([p.inputs[other] for p in problem.pieces]) ** 2))) or 1.0
+        if other in segment.inputs:
+            size = float(np.sqrt(np.mean(np.concatenate([p.inputs[other] for p in problem.segments]) ** 2))) or 1.0
             text = problem.columns.get(other, other)
-            out.append((piece.inputs[other] / size, f"({text} / {size:.6g})"))
-            if piece.recording.timed and other in port.others:
-                out.append(_rated(problem, piece, text, lambda p, other=other: p.inputs[other]))  # type: ignore[misc]
+            out.append((segment.inputs[other] / size, f"({text} / {size:.6g})"))
+            if segment.recording.timed and other in port.others:
+                out.append(_rated(problem, segment, text, lambda p, other=other: p.inputs[other]))  # type: ignore[misc]
     return out
 
 
-def _rated(problem: Problem, piece: Piece, name: str, signal: Callable[[Piece], Array]) -> tuple[Array, str]:
+def _rated(problem: Problem, segment: Segment, name: str, signal: Callable[[Segment], Array]) -> tuple[Array, str]:
     """Rate of a signal over the RMS rate of all recordings, and its text."""
 
-    def rate(p: Piece) -> Array:
+    def rate(p: Segment) -> Array:
         return np.gradient(signal(p), p.recording.dt_s)
 
-    size = float(np.sqrt(np.mean(np.concatenate([rate(p) for p in problem.pieces]) ** 2))) or 1.0
-    return rate(piece) / size, f"(rate({name}) / {size:.6g})"
+    size = float(np.sqrt(np.mean(np.concatenate([rate(p) for p in problem.segments]) ** 2))) or 1.0
+    return rate(segment) / size, f"(rate({name}) / {size:.6g})"
 
 
 def _span(problem: Problem, port: Port) -> float:
-    return float(np.ptp(np.concatenate([problem.model.motion(piece, port) for piece in problem.pieces]))) or 1.0
+    return float(np.ptp(np.concatenate([problem.model.motion(segment, port) for segment in problem.segments]))) or 1.0
 
 
-def latent(problem: Problem, fit: Fit, piece: Piece, residual: Array, port: Port) -> tuple[Array, Array]:
+def latent(problem: Problem, fit: Fit, segment: Segment, residual: Array, port: Port) -> tuple[Array, Array]:
     """What the port would have to add to explain the residual, (n,), NaN where nothing was measured; and its precision (n,),
     relative.
     """
-    nominal, acts = problem.parted(fit.terms, fit.values)
+    nominal, active = problem.parted(fit.terms, fit.values)
     seen = np.isfinite(residual)
     slope = getattr(problem.model, "sensitivity", None)
     if slope is None:
-        need = problem.model.needs(piece, port, nominal, residual)
-        return np.where(seen.any(axis=0), need, np.nan), np.ones(piece.n)
+        need = problem.model.needs(segment, port, nominal, residual)
+        return np.where(seen.any(axis=0), need, np.nan), np.ones(segment.n)
     unit = np.array([noise.sigma for noise in problem.noise])[:, None]
-    s, r = np.where(seen, slope(piece, nominal, port.name, acts), 0.0) / unit, np.where(seen, residual, 0.0) / unit
+    s, r = np.where(seen, slope(segment, nominal, port.name, active), 0.0) / unit, np.where(seen, residual, 0.0) / unit
     precision = np.sum(s * s, axis=0)
     return np.where(precision > 0.0, np.sum(s * r, axis=0) / np.maximum(precision, 1e-300), np.nan), precision
 
@@ -89,9 +89,9 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     from pyoperon.sklearn import SymbolicRegressor
 
     tables, targets, precisions = [], [], []
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        F, (z, precision) = features(problem, piece, port), latent(problem, fit, piece, residual, port)
-        mask = piece.fit & np.isfinite(z)
+    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
+        F, (z, precision) = features(problem, segment, port), latent(problem, fit, segment, residual, port)
+        mask = segment.fit & np.isfinite(z)
         tables.append(F[mask])
         targets.append(z[mask])
         precisions.append(precision[mask])
@@ -103,7 +103,7 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     cut = len(X) // step * step
     X = X[:cut].reshape(-1, step, X.shape[1]).mean(axis=1)
     z = np.clip(z[:cut].reshape(-1, step).mean(axis=1) / size, -8.0, 8.0)
-    names, found = [text for _, text in described(problem, problem.pieces[0], port)], []
+    names, found = [text for _, text in described(problem, problem.segments[0], port)], []
     for seed in SEEDS:
         regressor = SymbolicRegressor(
             allowed_symbols="add,sub,mul,div,sin,exp,abs,square,tanh,constant,variable",
@@ -128,7 +128,7 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
 
 
 def _form(
-    regressor: object, item: dict, names: list[str], size: float, table: Callable[[Piece], Array]
+    regressor: object, item: dict, names: list[str], size: float, table: Callable[[Segment], Array]
 ) -> tuple[Form, Callable[[Array], Array]]:
     """A tree of the search as a form, and as a function of the feature table (n, features)."""
     tree = item["tree"]

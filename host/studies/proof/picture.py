@@ -46,11 +46,11 @@ def draw_case(case: Path, label: dict[str, Any], out: Path) -> dict[str, Any]:
 
 def _recording(result: Diagnosis, axes: Axes) -> None:
     """Inputs of the held-out recording, each as a share of its own range."""
-    piece, _, _ = shown(result)
-    names = [name for name in result.model.quiet_inputs if name in piece.inputs]
+    segment, _, _ = shown(result)
+    names = [name for name in result.model.quiet_inputs if name in segment.inputs]
     for name, colour in zip(names, INPUT_COLOURS, strict=False):
-        share = piece.inputs[name] / (np.max(np.abs(piece.inputs[name])) or 1.0)
-        axes.plot(*thinned(piece.recording.time_s, share), color=colour, label=name.replace("_", " "))
+        share = segment.inputs[name] / (np.max(np.abs(segment.inputs[name])) or 1.0)
+        axes.plot(*thinned(segment.recording.time_s, share), color=colour, label=name.replace("_", " "))
     axes.set(ylabel="of its range", title="")
     axes.tick_params(labelbottom=False)
     legend_above(axes, 4)
@@ -58,7 +58,7 @@ def _recording(result: Diagnosis, axes: Axes) -> None:
 
 def _left(result: Diagnosis, verdict: dict[str, Any], before: Axes, after: Axes) -> None:
     """What the refitted nominal model and the extended one leave of the output that shows the mismatch best."""
-    piece, index, row = shown(result)
+    segment, index, row = shown(result)
     unit, sigma = result.model.outputs[row].unit, result.full.noise[row].sigma
     scale, unit = (1e3, f"m{unit}") if unit in ("m", "rad", "N") else (1.0, unit)
     pairs = (
@@ -68,7 +68,7 @@ def _left(result: Diagnosis, verdict: dict[str, Any], before: Axes, after: Axes)
     limit = 1.05 * scale * float(np.nanmax(np.abs(result.found.nominal_full.residuals[index][row])))
     for axes, fit, colour, name in pairs:
         axes.plot(
-            *thinned(piece.recording.time_s, scale * fit.residuals[index][row]),
+            *thinned(segment.recording.time_s, scale * fit.residuals[index][row]),
             color=colour,
             lw=0.8,
             label=f"{result.model.outputs[row].channel.replace('_', ' ')}, recorded less {name}",
@@ -76,7 +76,7 @@ def _left(result: Diagnosis, verdict: dict[str, Any], before: Axes, after: Axes)
         axes.axhspan(-scale * sigma, scale * sigma, color="#e9edf1", zorder=0, label="noise (1 sigma)")
         axes.set(ylim=(-limit, limit), ylabel=unit)
     legend_above(after, 2)
-    first, last = float(piece.recording.time_s[0]), float(piece.recording.time_s[-1])
+    first, last = float(segment.recording.time_s[0]), float(segment.recording.time_s[-1])
     spans = [(a, b) for location in verdict["located"] for a, b in location["windows_s"] if b > first and a < last]
     for k, (a, b) in enumerate(spans):
         before.axvspan(max(a, first), min(b, last), color=SHADE, zorder=-1, label="" if k else "windows named")
@@ -103,7 +103,7 @@ def _words(verdict: dict[str, Any], label: dict[str, Any], axes: Axes) -> None:
     error = f"Held-out error {fit['rmse_before']:.3g} -> {fit['rmse_after']:.3g} {fit['unit']}"
     lines = [
         f"Verdict: {verdict['verdict'].replace('_', ' ')}. {'; '.join(said) or 'No effect named'}",
-        f"{error}, noise floor {fit['noise_floor']:.3g} {fit['unit']}",
+        f"{error}, noise {fit['noise_floor']:.3g} {fit['unit']}",
         f"Under the seal: {'; '.join(planted) or 'nothing'} (rho {label['rho']:.2f}, {loop} loop)",
     ]
     axes.text(0.0, 0.95, "\n".join(lines), va="top", linespacing=1.7, fontsize=9, wrap=True)

@@ -181,9 +181,9 @@ def window_f1(label: Label, verdict: dict[str, Any]) -> float | None:
     return 2.0 * shared / both if both > 0.0 else None
 
 
-def _joined(pieces: list[list[float]]) -> list[list[float]]:
+def _joined(segments: list[list[float]]) -> list[list[float]]:
     out: list[list[float]] = []
-    for begin, end in sorted([float(p[0]), float(p[1])] for p in pieces):
+    for begin, end in sorted([float(p[0]), float(p[1])] for p in segments):
         if out and begin <= out[-1][1]:
             out[-1][1] = max(out[-1][1], end)
         else:

@@ -1,4 +1,4 @@
-"""Small recordings of the rig's chain by other means than the finder's: forty rigid pieces and springs between them."""
+"""Small recordings of the rig's chain by other means than the finder's: forty rigid segments and springs between them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def shape(d: float, roll: float, kappa: float) -> tuple[Array, Array]:
 
 
 def bent(points: Array, frames: Array, force: Array, upto: float) -> tuple[Array, Array]:
-    """Pose at arc share `upto` after a tip force, every piece's turn summed (small)."""
+    """Pose at arc share `upto` after a tip force, every segment's turn summed (small)."""
     h = np.linalg.norm(points[1] - points[0])
     place = upto * PIECES
     low = min(int(place), PIECES - 1)

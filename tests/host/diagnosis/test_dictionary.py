@@ -1,4 +1,4 @@
-"""Simple forms foretell what no listed effect explains, where the outputs can show it; noise is foretold by none."""
+"""Simple forms predict_residual what no listed effect explains, where the outputs can show it; noise is foretold by none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.search import fit_nominal
-from host.diagnosis.symbolic.dictionary import Foretold, foretell, forms_at
+from host.diagnosis.symbolic.dictionary import PredictedPart, forms_at, predict_residual
 from tests.host.diagnosis import planted, rig_cases
 
 MICROMETRES = 25e-6  # of insertion: a quarter of the poses' noise
@@ -22,8 +22,8 @@ def fitted(case: tuple[Path, list[Path]]) -> tuple[Problem, Fit]:
     return problem, fit_nominal(problem)
 
 
-def places(problem: Problem, fit: Fit) -> list[Foretold]:
-    return foretell(problem, fit, np.array([noise.sigma for noise in problem.noise]))
+def places(problem: Problem, fit: Fit) -> list[PredictedPart]:
+    return predict_residual(problem, fit, np.array([noise.sigma for noise in problem.noise]))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
@@ -41,11 +41,11 @@ def test_a_product_of_channels_is_read_off(tmp_path: Path) -> None:
 def test_micrometres_that_only_the_force_shows_are_seen(tmp_path: Path) -> None:
     problem, fit = fitted(rig_cases.write(tmp_path, rig_cases.Truth(), 0, duration_s=12.0))
     assert not any(place.sure for place in places(problem, fit))
-    for piece, residual in zip(problem.pieces, fit.residuals, strict=True):
-        roll, knob = piece.inputs["handle_roll"], piece.inputs["handle_knob"]
+    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
+        roll, knob = segment.inputs["handle_roll"], segment.inputs["handle_knob"]
         shape = np.sin(roll) * knob
         moved = MICROMETRES * shape / np.std(shape)
-        residual += problem.model.sensitivity(piece, fit.values, "insertion") * moved  # type: ignore[attr-defined]
+        residual += problem.model.sensitivity(segment, fit.values, "insertion") * moved  # type: ignore[attr-defined]
     best = max(places(problem, fit), key=lambda place: place.log_likelihood)
     assert best.sure and best.subsystem == "insertion"
     assert "handle_roll" in best.forms[0][0].text and "handle_knob" in best.forms[0][0].text
@@ -53,9 +53,9 @@ def test_micrometres_that_only_the_force_shows_are_seen(tmp_path: Path) -> None:
 
 def test_forms_are_told_as_they_are_computed(tmp_path: Path) -> None:
     problem, fit = fitted(planted.transmission(tmp_path, "", 1))
-    piece, port = problem.pieces[0], problem.model.ports[0]
-    motor, load = piece.inputs["motor"], piece.inputs["load"]
-    forms = {form.text: form.evaluate(piece) for form in forms_at(problem, fit, port)}
+    segment, port = problem.segments[0], problem.model.ports[0]
+    motor, load = segment.inputs["motor"], segment.inputs["load"]
+    forms = {form.text: form.evaluate(segment) for form in forms_at(problem, fit, port)}
     assert np.array_equal(forms["motor*load"], motor * load)
     assert np.array_equal(forms["sin(2*motor)*abs(load)"], np.sin(2.0 * motor) * np.abs(load))
     assert all(np.isfinite(values).all() and values.shape == motor.shape for values in forms.values())

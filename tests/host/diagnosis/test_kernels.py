@@ -161,7 +161,7 @@ def test_an_even_load_on_a_bent_shaft_is_the_sum_of_point_loads() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_bent_and_rolled_shaft_matches_rigid_pieces(seed: int) -> None:
+def test_bent_and_rolled_shaft_matches_rigid_segments(seed: int) -> None:
     rng = np.random.default_rng(seed)
     d, roll, kappa, force = rng.uniform(-0.075, -0.06), rng.uniform(-2, 2), rng.uniform(5, 25), rng.uniform(-0.15, 0.15, 3)
     tip, tip_R, shaft, shaft_R, free, _ = shape(d, roll, kappa, force)

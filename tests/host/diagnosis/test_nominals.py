@@ -151,6 +151,6 @@ def test_a_force_that_drowns_in_noise_names_nothing(tmp_path: Path) -> None:
     drawn = noisy_force.rig(4711, 3)
     files = noisy_force.write(drawn, 0.1, tmp_path)
     result = noisy_force.judged(tmp_path, files)
-    assert all("beyond" in piece.extra for piece in result.problem.pieces)
+    assert all("beyond" in segment.extra for segment in result.problem.segments)
     assert result.verdict == "nothing_missing"
     assert result.found.nominal.values[6] == pytest.approx(drawn.system.case.nominal[6], rel=0.3)

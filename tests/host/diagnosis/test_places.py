@@ -54,9 +54,9 @@ def fitted(case: tuple[Path, list[Path]]) -> tuple[Problem, Fit]:
 
 def found_by(problem: Problem, nominal: Fit, *ids: str) -> Found:
     """What a search that knows only these effects finds."""
-    pool = [c for c in candidates(problem.model.ports, True) if c.effect.id in ids]
+    candidate_effects = [c for c in candidates(problem.model.ports, True) if c.effect.id in ids]
     found = Found(nominal, nominal, [])
-    _grow(problem, found, pool, floor_of(problem), 0.0, silent)
+    _grow(problem, found, candidate_effects, floor_of(problem), 0.0, silent)
     return found
 
 

@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate, Parameter, Port
 from host.diagnosis.selection.equivalence import Standing, beside_unlisted
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
 from host.diagnosis.selection.unlisted import Rest
-from host.diagnosis.symbolic.dictionary import Foretold, Form
+from host.diagnosis.symbolic.dictionary import Form, PredictedPart
 
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
 NOTHING = Gain(0.0, 1.0, 0.0)
@@ -41,8 +41,8 @@ def test_evidence_is_likelihood_or_agreement_of_blocks(held: Gain, both: Gain, t
 
 
 def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
-    form = Form("angle^2", lambda piece: piece.y[0] ** 2, 2)
-    rest = Rest(Foretold("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
+    form = Form("angle^2", lambda segment: segment.y[0] ** 2, 2)
+    rest = Rest(PredictedPart("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
     weak, strong = (Standing(BACKLASH, Gain(gain, 1e-9, 0.2), Gain(gain, 1e-9, 0.2), ()) for gain in (10.0, 80.0))
     assert [[c.name for c in s.alike] for s in beside_unlisted([weak, strong], rest)] == [[], ["unlisted@cable"]]
     assert beside_unlisted([weak, strong], replace(rest, doubtful=False)) == [weak, strong]

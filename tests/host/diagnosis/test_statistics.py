@@ -11,7 +11,7 @@ from host.diagnosis.estimation import noise
 from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
 from host.diagnosis.estimation.uncertainty import _jackknife
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.model import Piece
+from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.locate import inside, joined, windows
 
 
@@ -23,11 +23,11 @@ def ar1(rng: np.random.Generator, n: int, phi: float, sigma: float = 1.0) -> np.
     return sigma * out
 
 
-def piece(n: int) -> Piece:
+def segment(n: int) -> Segment:
     """A recording that is all held out."""
     every = np.ones(n, dtype=bool)
     t = np.arange(n) * 0.01
-    return Piece(Recording("r", t, 0.01, True, {}, ~every, every), np.zeros((1, n)), ~every, every, {})
+    return Segment(Recording("r", t, 0.01, True, {}, ~every, every), np.zeros((1, n)), ~every, every, {})
 
 
 def test_noise_comes_from_the_quiescent_parts() -> None:
@@ -75,7 +75,7 @@ def test_nothing_gained_is_not_taken_for_something() -> None:
         rng = np.random.default_rng(seed)
         r = ar1(rng, 3000, 0.9)
         other = r - 0.03 * ar1(rng, 3000, 0.9)
-        small += compare([piece(3000)], "heldout", [r[None]], [other[None]], np.array([1.0])).p_value < 0.01
+        small += compare([segment(3000)], "heldout", [r[None]], [other[None]], np.array([1.0])).p_value < 0.01
     assert small <= 3
 
 
@@ -83,7 +83,7 @@ def test_a_gain_is_counted_by_independent_samples() -> None:
     rng = np.random.default_rng(0)
     r = ar1(rng, 8000, 0.9)
     s = np.sin(np.arange(8000) / 50.0)
-    gain = compare([piece(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]))
+    gain = compare([segment(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]))
     assert gain.p_value < 1e-6 and gain.share == pytest.approx(1 / 3, abs=0.05)
     assert gain.log_likelihood == pytest.approx(0.5 * 8000 / 19 * np.log(1.5), rel=0.4)
 
