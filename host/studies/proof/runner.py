@@ -244,8 +244,8 @@ def _baselines(settings: Settings, labels: list[Label], folders: dict[str, Path]
     done = len(labels) - len(todo)
     progress("baselines", done, len(labels))
     jobs = max(1, settings.jobs)
-    with ProcessPoolExecutor(max_workers=jobs) as candidate_effects:
-        made: Iterable[None] = (candidate_effects.map if jobs > 1 else map)(partial(_compare, kept, folders), todo)
+    with ProcessPoolExecutor(max_workers=jobs) as executor:
+        made: Iterable[None] = (executor.map if jobs > 1 else map)(partial(_compare, kept, folders), todo)
         for _ in made:
             done += 1
             progress("baselines", done, len(labels))

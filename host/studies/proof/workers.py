@@ -92,8 +92,8 @@ def locally(folders: dict[str, Path], finder: Sequence[str], limit_s: float, job
                 error = lost
         return {"verdict": "failed", "error": f"{error}, {TRIES} times"}
 
-    with ThreadPoolExecutor(max_workers=jobs) as candidate_effects:
-        waiting = {candidate_effects.submit(attempt, folder): name for name, folder in folders.items()}
+    with ThreadPoolExecutor(max_workers=jobs) as executor:
+        waiting = {executor.submit(attempt, folder): name for name, folder in folders.items()}
         for done in as_completed(waiting):
             yield waiting[done], done.result()
 
