@@ -32,6 +32,8 @@ BENCHMARKS: dict[str, str] = {
     "estimate_case_5": "host.studies.benchmarks.estimation:case_5",
     "estimate_case_6": "host.studies.benchmarks.estimation:case_6",
     "estimate_batch": "host.studies.benchmarks.estimation:batch",
+    "public_solve": "host.studies.benchmarks.public_face:public_solve",
+    "public_estimate": "host.studies.benchmarks.public_face:public_estimate",
     "import_and_solve": "host.studies.benchmarks.start_up:import_and_solve",
     "control_tick": "host.studies.benchmarks.control:control_tick",
     "kalman_predict": "host.studies.benchmarks.control:kalman_predict",

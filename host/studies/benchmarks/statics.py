@@ -141,7 +141,7 @@ def tip_frame(seed: int, _report: Report) -> list[Row]:
 def base_frame(seed: int, report: Report) -> list[Row]:
     """Force in the base frame: cold and warm compared with solve_bvp, cold with Algorithm 3.1, and the hard cases."""
     cases = random_cases(CASES, seed)
-    cold = [_cold_side(case) for case in cases]
+    cold = [cold_side(case) for case in cases]
     rows = [compared("cosserat_global", "cold", "scipy solve_bvp, tol 1e-6", cold, [_bvp_cold(c) for c in cases], seed)]
     report("cosserat_global warm ...")
     rng = np.random.default_rng(seed + 1)
@@ -157,7 +157,7 @@ def base_frame(seed: int, report: Report) -> list[Row]:
             "cosserat_global",
             "cold, thesis",
             "thesis' Algorithm 3.1, Euler 500, compiled",
-            [_cold_side(case) for case in cases],
+            [cold_side(case) for case in cases],
             [_fixed_point(case) for case in cases],
             seed,
         )
@@ -169,7 +169,7 @@ def base_frame(seed: int, report: Report) -> list[Row]:
             "cosserat_global",
             f"load numbers to {LARGEST_NUMBER:g}",
             "scipy solve_bvp, tol 1e-6",
-            [_cold_side(case) for case in hard],
+            [cold_side(case) for case in hard],
             [_bvp_cold(case) for case in hard],
             seed,
         )
@@ -189,7 +189,7 @@ def helical(seed: int, _report: Report) -> list[Row]:
             lambda n, c=c, f=c_.force_base_N, h=h, u=u: _helical(c, f, h, u, n)  # type: ignore[misc]
             for c, c_, h, u in zip(chains, cases, firsts, shapes, strict=True)
         ]
-        rods = [_cold_side(case) for case in cases]
+        rods = [cold_side(case) for case in cases]
         ours[0](1), rods[0](1)
         timed = alternate(ours, [lambda r=rod: r(1) for rod in rods])  # type: ignore[misc]
         errors = np.array(
@@ -213,7 +213,8 @@ def helical(seed: int, _report: Report) -> list[Row]:
     return rows
 
 
-def _cold_side(case: SpatialCase) -> SolveCalls:
+def cold_side(case: SpatialCase) -> SolveCalls:
+    """Our solver from the unloaded shape, ready to be called."""
     return SolveCalls(case, lambda x, out, work, n: _cold(case.rod, case.force_base_N, x, out, work, n))
 
 
