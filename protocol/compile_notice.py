@@ -24,7 +24,7 @@ def listen() -> None:
         return
     from numba.core import event
 
-    class Listener(event.Listener):  # type: ignore[misc]
+    class CompileListener(event.Listener):  # type: ignore[misc]
         """Calls back at the first event."""
 
         def on_start(self, event: Any) -> None:
@@ -37,4 +37,4 @@ def listen() -> None:
         def on_end(self, event: Any) -> None:
             """Nothing to do."""
 
-    event.register("numba:compile", Listener())
+    event.register("numba:compile", CompileListener())

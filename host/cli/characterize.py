@@ -36,7 +36,7 @@ def characterize(
     from host.commissioning.calibration_files import write_calibration
     from host.commissioning.characterization import characterize as identify
     from host.commissioning.rig_sweeps import PortNames
-    from host.recordings.recording import Recording
+    from host.recordings.recording import RecordingFile
     from sim.board import BoardUnavailable
 
     one_of("--board", board, BOARDS)
@@ -52,7 +52,7 @@ def characterize(
             source = _record_on_rig(loaded, repeats, PortNames(board_port, tracker_port, force_port), yes, directory)
         else:
             source = recording or _record_simulated(loaded, repeats, seed, board, directory)
-        found = identify(Recording(source), loaded)
+        found = identify(RecordingFile(source), loaded)
     except (BoardUnavailable, RuntimeError, OSError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

@@ -36,7 +36,7 @@ def demo(
     ] = None,
 ) -> None:
     """Bring the tip from rest to a beating wall and hold a force on it."""
-    from host.recordings.recording import Recording
+    from host.recordings.recording import RecordingFile
     from host.report.demo_summary import demo_result, print_summary
     from host.report.run_report import write_report
     from host.run.demo import DemoSettings, exit_status
@@ -77,7 +77,7 @@ def demo(
         if isinstance(error, InputError):
             raise
         raise InputError.from_sentence(str(error)) from None
-    recording = Recording(run.recording)
+    recording = RecordingFile(run.recording)
     try:
         report = write_report(recording, run.recording.with_suffix(".html"))
     except OSError as error:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from host.recordings.recording import Recording
+    from host.recordings.recording import RecordingFile
 
 
 UnpackLimit = Annotated[
@@ -18,11 +18,11 @@ UnpackLimit = Annotated[
 ]
 
 
-def open_recording(path: Path, unpack_limit_MiB: int | None = None) -> Recording:
+def open_recording(path: Path, unpack_limit_MiB: int | None = None) -> RecordingFile:
     """Open the recording at `path`; say on standard error where it is incomplete. Raises InputError."""
-    from host.recordings.recording import Recording
+    from host.recordings.recording import RecordingFile
 
-    recording = Recording(path, None if unpack_limit_MiB is None else unpack_limit_MiB * 2**20)
+    recording = RecordingFile(path, None if unpack_limit_MiB is None else unpack_limit_MiB * 2**20)
     if recording.truncated or recording.damaged_chunks:
         print(
             f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "

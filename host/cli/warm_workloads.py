@@ -139,10 +139,10 @@ def rig_processes(folder: Path) -> None:
 
 def shape_on_the_page(folder: Path) -> None:
     """Draw the recorded catheter as the page does."""
-    from host.recordings.recording import Recording
+    from host.recordings.recording import RecordingFile
     from host.view.replay import Replay
 
-    player = Replay(Recording(Path((folder / RECORDING).read_text(encoding="utf-8"))), 50.0)
+    player = Replay(RecordingFile(Path((folder / RECORDING).read_text(encoding="utf-8"))), 50.0)
     player.hello()
     for at_s in (1.0, 4.0):
         player.act(f'{{"seek_s": {player.hello()["begin"] + at_s}}}')

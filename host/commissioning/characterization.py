@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from host.commissioning.sweep_fits import Estimate, KnobFit, PlayFit, Run, fit_knob, fit_play
 from host.recordings.header import header_of
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.rig_file import Rig, load_rig, parse_rig
@@ -140,7 +140,7 @@ def record_simulated(
     return path
 
 
-def characterize(recording: Recording, rig: Rig) -> Characterization:
+def characterize(recording: RecordingFile, rig: Rig) -> Characterization:
     """Identify the transmission from a recording of sweeps of `rig`. Raises ValueError where a sweep is missing or of
     another catheter."""
     name = recording.catheter.get("name")
@@ -188,7 +188,7 @@ class _Poses(NamedTuple):
 class _Cuts:
     """The recording's tables, cut at the sweeps' begins and ends."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: RecordingFile) -> None:
         self._stage, self._pose = recording.table("stage"), recording.table("pose/tip")
         self._spans: list[_Span] = []
         begun: dict[str, Any] | None = None

@@ -9,12 +9,12 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 
 FORMATS = ("parquet", "csv")
 
 
-def arrow_table(recording: Recording, topic: str) -> pa.Table:
+def arrow_table(recording: RecordingFile, topic: str) -> pa.Table:
     """The table of `topic`; every field's metadata has its unit, the table's has run, configuration and catheter."""
     units = recording.units(topic)
     columns = recording.table(topic)
@@ -37,7 +37,7 @@ def arrow_table(recording: Recording, topic: str) -> pa.Table:
     return pa.table([pa.array(values) for values in columns.values()], schema=schema)
 
 
-def export(recording: Recording, form: str, folder: Path) -> list[Path]:
+def export(recording: RecordingFile, form: str, folder: Path) -> list[Path]:
     """One file a topic, named after it (`pose/tip` gives pose_tip.parquet), into `folder`, which is made if need be.
 
     form: one of FORMATS. A CSV cannot carry units: units.json next to it does, topic -> column -> unit; NaN is an empty

@@ -86,7 +86,7 @@ class RecordedTable(dict[str, np.ndarray]):
         raise InputError(self._source, f"no column {column}", "a recording that has it: " + ", ".join(self)[:200])
 
 
-class Recording:
+class RecordingFile:
     """A recording. A file that was cut off, or has damaged chunks, gives every message that is intact.
 
     Args:
@@ -370,7 +370,7 @@ class Recording:
 
 def is_whole(path: Path) -> bool:
     """Return whether the file has its end and every chunk of it is intact. Raises InputError as `Recording`."""
-    recording = Recording(path)
+    recording = RecordingFile(path)
     return not recording.truncated and recording.damaged_chunks == 0
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ class RecordingTables:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the MCAP file `path`. Raises InputError where it cannot be read or is no recording."""
-        self._recording = Recording(os.fspath(path))
+        self._recording = RecordingFile(os.fspath(path))
 
     @property
     def topics(self) -> dict[str, int]:

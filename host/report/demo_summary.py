@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.report.run_report import duration, lateness_of, quantity, verdict_of
 from host.report.run_summary import RunSummary, summarize
 
@@ -36,7 +36,7 @@ class FinishedRun(Protocol):
         """Name of the signal that ended the run, empty if none did."""
 
 
-def demo_result(recording: Recording, run: FinishedRun, report: Path) -> dict[str, Any]:
+def demo_result(recording: RecordingFile, run: FinishedRun, report: Path) -> dict[str, Any]:
     """The object of `seldinger demo --json`.
 
     Forces, tip and timing come from the recording. `run.counts` adds what happened between two recorded board messages
@@ -80,7 +80,7 @@ def _whole(value: float) -> float | int:
 def print_summary(result: dict[str, Any], run: FinishedRun, console: Console | None = None) -> None:
     """Verdict, a short table, and where recording and report are, on standard error."""
     console = console or Console(stderr=True, highlight=False)
-    summary = summarize(Recording(run.recording))
+    summary = summarize(RecordingFile(run.recording))
     verdict = verdict_of(summary)
     colour = {"good": "green", "fair": "yellow", "bad": "red"}[verdict.level]
     console.print(f"\n[bold {colour}]{verdict.sentence}[/]", markup=True)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.report.run_summary import RunSummary, estimate_along, stack, table_or_none
 from host.report.style import (
     ACTION_COLOURS,
@@ -36,7 +36,7 @@ DETAIL_S = 6.0
 class RunFigures:
     """Draws the figures of one recording. Times are in seconds from its start."""
 
-    def __init__(self, recording: Recording, summary: RunSummary) -> None:
+    def __init__(self, recording: RecordingFile, summary: RunSummary) -> None:
         self.recording, self.summary = recording, summary
         self.start_ns = recording.span_ns[0]
         self.end_s = max(summary.duration_s, 1e-3)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.report.run_figures import RunFigures
 from host.report.run_summary import SETTLE_S, RunSummary, summarize
 from protocol.first_cause import describe
@@ -39,14 +39,14 @@ class TableRow(NamedTuple):
     beside: str = ""
 
 
-def write_report(recording: Recording, target: str | Path) -> Path:
+def write_report(recording: RecordingFile, target: str | Path) -> Path:
     """Write the report of `recording` to `target` (HTML) and return its path. Raises OSError where it cannot write."""
     target = Path(target)
     target.write_text(render(recording), encoding="utf-8")
     return target
 
 
-def render(recording: Recording) -> str:
+def render(recording: RecordingFile) -> str:
     """The report of `recording` as one self-contained HTML text."""
     summary = summarize(recording)
     environment = Environment(
@@ -216,12 +216,12 @@ def firmware_of(summary: RunSummary) -> list[TableRow]:
     return lines
 
 
-def _safety_rows(recording: Recording, summary: RunSummary) -> list[TableRow]:
+def _safety_rows(recording: RecordingFile, summary: RunSummary) -> list[TableRow]:
     start_ns = recording.span_ns[0]
     return [TableRow(f"{(span.start_ns - start_ns) * 1e-9:.2f} s", span.name, span.note) for span in summary.safety[:200]]
 
 
-def _event_rows(recording: Recording, most: int = 200) -> list[TableRow]:
+def _event_rows(recording: RecordingFile, most: int = 200) -> list[TableRow]:
     """Commands with their replies, and log lines, in order of time."""
     start_ns = recording.span_ns[0]
     replies = {reply["id"]: reply for reply in recording.messages("reply")}
@@ -237,7 +237,7 @@ def _event_rows(recording: Recording, most: int = 200) -> list[TableRow]:
     return [TableRow(f"{(stamp_ns - start_ns) * 1e-9:.2f} s", source, text) for stamp_ns, source, text in rows[:most]]
 
 
-def _topic_rows(recording: Recording, summary: RunSummary) -> list[TableRow]:
+def _topic_rows(recording: RecordingFile, summary: RunSummary) -> list[TableRow]:
     duration_s = max(summary.duration_s, 1e-9)
     rows = []
     for topic, count in sorted(recording.topics.items()):
@@ -246,7 +246,7 @@ def _topic_rows(recording: Recording, summary: RunSummary) -> list[TableRow]:
     return rows
 
 
-def _appendix(recording: Recording) -> list[tuple[str, list[TableRow]]]:
+def _appendix(recording: RecordingFile) -> list[tuple[str, list[TableRow]]]:
     """Run, catheter and effective configuration as flat tables."""
     run = [TableRow(name, value) for name, value in recording.run.items() if value]
     sections: list[tuple[str, list[TableRow]]] = [("run", run)]

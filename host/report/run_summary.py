@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from host.recordings.cause_watch import CauseWatch
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.enums import SafetyAction
 from protocol.first_cause import FirstCause
 from protocol.topics import HISTOGRAM_BUCKETS
@@ -118,7 +118,7 @@ def stack(table: dict[str, Array], *names: str) -> Array:
     return np.stack([table[name] for name in names], axis=1)
 
 
-def table_or_none(recording: Recording, topic: str) -> dict[str, Array] | None:
+def table_or_none(recording: RecordingFile, topic: str) -> dict[str, Array] | None:
     """The table of `topic`, None where the recording has no message of it."""
     return recording.table(topic) if recording.topics.get(topic) else None
 
@@ -137,7 +137,7 @@ def spans(stamp_ns: Array, names: Array, notes: Array | None = None) -> list[Tim
     ]
 
 
-def summarize(recording: Recording) -> RunSummary:
+def summarize(recording: RecordingFile) -> RunSummary:
     """All figures of `recording`; topics that it does not have leave theirs at NaN, zero or empty."""
     first_ns, last_ns = recording.span_ns
     state, force = table_or_none(recording, "state"), table_or_none(recording, "force/sensor")
@@ -175,7 +175,7 @@ def summarize(recording: Recording) -> RunSummary:
     )
 
 
-def _first_cause(recording: Recording) -> FirstCause | None:
+def _first_cause(recording: RecordingFile) -> FirstCause | None:
     """What went wrong first since the rig was last armed, from the messages in the order of their time."""
     watch = CauseWatch()
     bodies = {topic: list(recording.messages(topic)) for topic in ("loop", "board", "state")}
@@ -230,7 +230,9 @@ def _force_figures(
     )
 
 
-def _tip_error_m(recording: Recording, state: dict[str, Array] | None, contact: TimeSpan | None, direction: Array) -> float:
+def _tip_error_m(
+    recording: RecordingFile, state: dict[str, Array] | None, contact: TimeSpan | None, direction: Array
+) -> float:
     """RMS distance of the tracked tip from its target during contact, across the direction that force controls."""
     pose = table_or_none(recording, "pose/tip")
     if pose is None or state is None:
@@ -244,7 +246,7 @@ def _tip_error_m(recording: Recording, state: dict[str, Array] | None, contact: 
     return _rms(np.linalg.norm(across_m[np.isfinite(across_m).all(axis=1)], axis=1))
 
 
-def _ticks(recording: Recording) -> TickTimes:
+def _ticks(recording: RecordingFile) -> TickTimes:
     table = table_or_none(recording, "loop")
     if table is None:
         return TickTimes()
@@ -265,7 +267,7 @@ def _ticks(recording: Recording) -> TickTimes:
     )
 
 
-def _board(recording: Recording) -> BoardHealth:
+def _board(recording: RecordingFile) -> BoardHealth:
     table = table_or_none(recording, "board")
     if table is None:
         return BoardHealth()
@@ -288,14 +290,14 @@ def _board(recording: Recording) -> BoardHealth:
     )
 
 
-def _as_steps(recording: Recording, table: dict[str, Array], axis: str) -> Array:
+def _as_steps(recording: RecordingFile, table: dict[str, Array], axis: str) -> Array:
     stages = recording.configuration.get("stages", {})
     per_step = float(stages.get(axis, {}).get("encoder_counts_per_step", 1.0))
     return np.round(table[f"encoder_{axis}_counts"] / per_step).astype(np.int64)
 
 
 def _estimate(
-    recording: Recording, force: dict[str, Array] | None, contact: TimeSpan | None, direction: Array
+    recording: RecordingFile, force: dict[str, Array] | None, contact: TimeSpan | None, direction: Array
 ) -> EstimateQuality:
     table = table_or_none(recording, "force/estimate")
     if table is None or force is None:
@@ -327,7 +329,7 @@ def estimate_along(table: dict[str, Array], direction: Array) -> tuple[Array, Ar
     return stack(table, "fx_N", "fy_N", "fz_N") @ direction, np.sqrt(np.maximum(variance_N2, 0.0))
 
 
-def _lost(recording: Recording) -> dict[str, int]:
+def _lost(recording: RecordingFile) -> dict[str, int]:
     """Topic -> messages that its numbering says are missing (a publisher that restarts counts from 0 again)."""
     lost = {}
     for topic in recording.topics:

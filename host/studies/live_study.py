@@ -138,7 +138,7 @@ def run(task: Task, board: str = "native") -> LiveRow:
         world = World(rig, simulated_plant(rig, task.seed, effects=effect_of(task)), made, task.seed)
 
         def received(topic: str, message: Message) -> None:
-            watch.hear(topic, message)
+            watch.receive(topic, message)
             if topic == "pose/shaft":
                 alarm = watch.look()
                 alarms.extend([alarm] if alarm else [])

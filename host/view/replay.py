@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import WAITING, Picture
 from host.view.source import refusal
 from protocol.errors import InputError
@@ -68,7 +68,7 @@ def read_findings(source: str) -> Findings:
         raise InputError(source, f"{type(error).__name__}: {error}", "the JSON that `seldinger diagnose` writes") from None
 
 
-def origin_ns(recording: Recording) -> int:
+def origin_ns(recording: RecordingFile) -> int:
     """Where the time of a diagnosis begins: the first stamp of the topic with most messages."""
     base = max(recording.topics, key=lambda topic: recording.topics[topic])
     first = recording.message(base, 0)
@@ -87,7 +87,7 @@ class Replay:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: RecordingFile,
         speed: float = 1.0,
         findings: Findings | None = None,
         clock_s: Callable[[], float] = time.monotonic,

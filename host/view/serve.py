@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import new_recording_path
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet
@@ -38,7 +38,7 @@ def serve_rig(rig_file: Path, port: int, report: Report) -> None:
         serve(source, port, f"rig {rig.name}", report)
 
 
-def serve_recording(recording: Recording, speed: float, diagnosis: str | None, port: int, report: Report) -> None:
+def serve_recording(recording: RecordingFile, speed: float, diagnosis: str | None, port: int, report: Report) -> None:
     """Serve a recording at `speed` times real time, with the windows of the verdict in JSON file `diagnosis` marked.
 
     Raises: InputError.

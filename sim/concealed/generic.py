@@ -15,14 +15,14 @@ from numba import njit
 from scipy.optimize import least_squares
 
 from sim import axis_effects
-from sim.concealed.menu import Dish
-from sim.concealed.rig import Session
+from sim.concealed.rig import NoiselessRecordings
+from sim.concealed.scalable_effects import ScalableEffect
 from sim.concealed.signals import KINDS, signal
 from sim.effects import PlantedEffect, pack
 from sim.friction_effects import bouc_wen
 
 Array = np.ndarray
-Planted = tuple[Dish, dict[str, float]]
+Planted = tuple[ScalableEffect, dict[str, float]]
 DURATION_S, PAUSE_S = 30.0, 4.0
 INSIDE = 10  # integration steps a sample
 CODES = (
@@ -204,14 +204,16 @@ def _drive(drive: Array, planted: Sequence[Planted]) -> Array:
     return np.asarray(limit * np.tanh(out / limit) if limit > 0.0 else out)
 
 
-def simulate(case: GenericCase, planted: Sequence[Planted] = (), replay: Sequence[Array] | None = None) -> Session:
+def simulate(
+    case: GenericCase, planted: Sequence[Planted] = (), replay: Sequence[Array] | None = None
+) -> NoiselessRecordings:
     """Run the session; `replay` gives the recorded inputs instead of the case's own excitation and control."""
     times = [start + case.period_s * np.arange(len(r)) for start, r in zip(case.starts_s, case.reference, strict=True)]
     asked = list(case.reference if replay is None else replay)
     closed = case.closed_loop and replay is None
     run = {"transmission": _transmission, "axis": _axis, "impedance": _impedance}[case.kind]
     pairs = [run(case, planted, time, wanted, closed, i) for i, (time, wanted) in enumerate(zip(times, asked, strict=True))]
-    return Session(tuple(times), tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
+    return NoiselessRecordings(tuple(times), tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
 
 
 def _axis(

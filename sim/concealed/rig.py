@@ -49,7 +49,7 @@ class RigCase:
 
 
 @dataclass(frozen=True)
-class Session:
+class NoiselessRecordings:
     """What happened, without noise: per recording time (n,), inputs (n, k) and outputs (n, m)."""
 
     time_s: tuple[Array, ...]
@@ -169,7 +169,7 @@ def commands(case: RigCase) -> tuple[Array, list[slice]]:
 
 def simulate(
     case: RigCase, effects: Sequence[PlantedEffect] = (), distortion: Distortion | None = None, replay: Array | None = None
-) -> Session:
+) -> NoiselessRecordings:
     """Run the session. `distortion` stands between handle and rig; `replay` (n, 3) gives the handle instead of control."""
     reference, where = commands(case)
     rig = plant(case, effects)
@@ -193,7 +193,9 @@ def simulate(
         if loop:
             loop.seen(outputs[i, :3])
     clock = np.arange(len(reference)) * FRAME_S + FRAME_S
-    return Session(tuple(clock[w] for w in where), tuple(handles[w] for w in where), tuple(outputs[w] for w in where))
+    return NoiselessRecordings(
+        tuple(clock[w] for w in where), tuple(handles[w] for w in where), tuple(outputs[w] for w in where)
+    )
 
 
 class _Loop:

@@ -23,10 +23,10 @@ from sim.concealed import generic as concealed_generic
 from sim.concealed import rig as concealed_rig
 from sim.concealed import system as concealed_system
 from sim.concealed.label import Label
-from sim.concealed.menu import MENU, UNLISTED, Dish, equivalents
-from sim.concealed.rig import Session
+from sim.concealed.rig import NoiselessRecordings
+from sim.concealed.scalable_effects import EFFECTS, UNLISTED, ScalableEffect, equivalents
 from sim.concealed.signals import tidy, windows
-from sim.concealed.system import Planted, System
+from sim.concealed.system import ScaledEffect, System
 
 Array = np.ndarray
 SHARES = {"null": 0.30, "single": 0.30, "pair": 0.15, "outside": 0.15, "unidentifiable": 0.10}
@@ -44,7 +44,7 @@ _TRAIN, _ALL = (0, 1), (0, 1, 2)
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConcealedPlan:
     """What a case is to be; `index` numbers the streams of chance, `attempt` the redraws."""
 
     seed: int
@@ -75,7 +75,7 @@ def counts(cases: int) -> dict[str, int]:
     return out
 
 
-def plans(seed: int, cases: int) -> list[Plan]:
+def plans(seed: int, cases: int) -> list[ConcealedPlan]:
     """The whole suite in the order of its case numbers, which is shuffled. Raises ValueError for less than one case."""
     if cases < 1 or seed < 0:
         raise ValueError(f"cases and seed: found {cases} and {seed}, wanted at least 1 and at least 0")
@@ -88,26 +88,26 @@ def plans(seed: int, cases: int) -> list[Plan]:
     order = np.random.default_rng([seed, 1]).permutation(len(drafts))
     closed = np.random.default_rng([seed, 2]).permutation(len(drafts)) % 2 == 0
     return [
-        Plan(seed, number, drafts[k][0], drafts[k][1], bool(closed[k]), drafts[k][2], drafts[k][3])
+        ConcealedPlan(seed, number, drafts[k][0], drafts[k][1], bool(closed[k]), drafts[k][2], drafts[k][3])
         for number, k in enumerate(order)
     ]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ConcealedCase:
     """A case before noise: system, what is planted, how it came out."""
 
-    plan: Plan
+    plan: ConcealedPlan
     system: System
-    planted: tuple[Planted, ...]
-    session: Session
+    planted: tuple[ScaledEffect, ...]
+    session: NoiselessRecordings
     rho: float
     mismatch: tuple[Array, ...]
     truth_set: tuple[str, ...] = ()
     puzzle: str = ""
 
 
-def _system(plan: Plan, puzzle: str = "") -> System:
+def _system(plan: ConcealedPlan, puzzle: str = "") -> System:
     """The case's rig or mechanism, with the excitation that its puzzle wants."""
     rng = plan.stream(1)
     if plan.kind == "rig":
@@ -119,7 +119,7 @@ def _system(plan: Plan, puzzle: str = "") -> System:
     )
 
 
-def measure(system: System, session: Session) -> tuple[float, list[Array]]:
+def measure(system: System, session: NoiselessRecordings) -> tuple[float, list[Array]]:
     """(rho, mismatch per recording): what the nominal model, refitted to noise-free training data, leaves.
 
     rho is the RMS over the noise of the channel that shows it most, over all recordings.
@@ -130,12 +130,12 @@ def measure(system: System, session: Session) -> tuple[float, list[Array]]:
 
 
 def scaled(
-    system: System, dish: Dish, rho: float, start_s: float, sign: float
-) -> tuple[Planted, Session, float, list[Array]] | None:
-    """`dish` at the size whose mismatch has `rho` within 15 %: secant steps on logarithms; None where there is none."""
+    system: System, effect: ScalableEffect, rho: float, start_s: float, sign: float
+) -> tuple[ScaledEffect, NoiselessRecordings, float, list[Array]] | None:
+    """`effect` at the size whose mismatch has `rho` within 15 %: secant steps on logarithms; None where there is none."""
     size, best, points = 1.0, None, []
     for _ in range(7):
-        planted = Planted(dish, sign * size, start_s)
+        planted = ScaledEffect(effect, sign * size, start_s)
         try:
             session = system.run([planted])
         except ValueError:
@@ -165,25 +165,31 @@ def _fits(rho: float, wanted: float) -> bool:
     return 0.75 < rho / wanted < 1.33
 
 
-def _choose(plan: Plan, menu: Sequence[Dish], rng: np.random.Generator, skip: int = 0) -> tuple[Dish, float, float]:
-    """A dish of the menu, its sign, its start: by turn, so that a suite goes round all ports before it repeats."""
-    ports = sorted({d.port for d in menu})
+def _choose(
+    plan: ConcealedPlan, effects: Sequence[ScalableEffect], rng: np.random.Generator, skip: int = 0
+) -> tuple[ScalableEffect, float, float]:
+    """One of `effects`, its sign, its start: by turn, so that a suite goes round all ports before it repeats."""
+    ports = sorted({d.port for d in effects})
     port = ports[(plan.turn + plan.seed + skip + int(rng.integers(2)) * plan.attempt) % len(ports)]
-    among = [d for d in menu if d.port == port]
-    dish = among[int(rng.integers(len(among)))]
-    sign = -1.0 if dish.signed and rng.random() < 0.5 else 1.0
-    start = float(rng.uniform(8.0, 18.0)) if dish.late and plan.kind == "rig" and rng.random() < 0.6 else 0.0
-    return dish, sign, round(start, 2)
+    among = [d for d in effects if d.port == port]
+    effect = among[int(rng.integers(len(among)))]
+    sign = -1.0 if effect.signed and rng.random() < 0.5 else 1.0
+    start = float(rng.uniform(8.0, 18.0)) if effect.late and plan.kind == "rig" and rng.random() < 0.6 else 0.0
+    return effect, sign, round(start, 2)
 
 
-def _null(plan: Plan) -> Drawn | None:
+def _null(plan: ConcealedPlan) -> ConcealedCase | None:
     """Nothing planted, and the nominal chain good to a small part of the noise, even as calibrated on noisy recordings."""
     system = _system(plan)
     session = system.run([])
     rho, left = measure(system, session)
     calibrated = system.calibrate(system.noisy(session, plan.stream(3)), _TRAIN, system.case.nominal)
     size = np.sqrt(np.mean(np.vstack(system.residuals(calibrated, session)) ** 2, axis=0)) / system.sigma
-    return Drawn(plan, system, (), session, rho, tuple(left), (NOTHING,)) if rho < 0.06 and np.max(size) < 0.13 else None
+    return (
+        ConcealedCase(plan, system, (), session, rho, tuple(left), (NOTHING,))
+        if rho < 0.06 and np.max(size) < 0.13
+        else None
+    )
 
 
 def taught(system: System, left: Sequence[Array]) -> bool:
@@ -195,21 +201,21 @@ def taught(system: System, left: Sequence[Array]) -> bool:
     return bool(training[top] >= 0.5 * everywhere[top])
 
 
-def _single(plan: Plan, menu: Sequence[Dish]) -> Drawn | None:
+def _single(plan: ConcealedPlan, effects: Sequence[ScalableEffect]) -> ConcealedCase | None:
     system = _system(plan)
-    dish, sign, start = _choose(plan, menu, plan.stream(2))
-    found = scaled(system, dish, plan.rho, start, sign)
+    effect, sign, start = _choose(plan, effects, plan.stream(2))
+    found = scaled(system, effect, plan.rho, start, sign)
     if found is None or not _fits(found[2], plan.rho) or not taught(system, found[3]):
         return None
-    return Drawn(plan, system, (found[0],), found[1], found[2], tuple(found[3]))
+    return ConcealedCase(plan, system, (found[0],), found[1], found[2], tuple(found[3]))
 
 
-def _pair(plan: Plan) -> Drawn | None:
+def _pair(plan: ConcealedPlan) -> ConcealedCase | None:
     """Two effects, each of the plan's rho by itself; in every fourth case the second one's sign is that which cancels."""
     system, rng = _system(plan), plan.stream(2)
-    menu = MENU[plan.kind]
-    first = _choose(plan, menu, rng)
-    rest = [d for d in menu if d.id not in first[0].names()]
+    effects = EFFECTS[plan.kind]
+    first = _choose(plan, effects, rng)
+    rest = [d for d in effects if d.id not in first[0].names()]
     cancelling = plan.turn % 4 == 0
     if cancelling:
         near = [d for d in rest if d.signed and (d.port == first[0].port or plan.kind != "rig")]
@@ -219,7 +225,7 @@ def _pair(plan: Plan) -> Drawn | None:
     two = scaled(system, second[0], plan.rho, second[2], second[1])
     if one is None or two is None or not (_fits(one[2], plan.rho) and _fits(two[2], plan.rho)):
         return None
-    options = [two[0], replace(two[0], size=-two[0].size)] if cancelling and two[0].dish.signed else [two[0]]
+    options = [two[0], replace(two[0], size=-two[0].size)] if cancelling and two[0].effect.signed else [two[0]]
     tried = []
     for other in options:
         session = system.run([one[0], other])
@@ -227,26 +233,26 @@ def _pair(plan: Plan) -> Drawn | None:
     rho, left, other, session = min(tried, key=lambda t: t[0])
     if rho < 0.2 or not (taught(system, one[3]) and taught(system, two[3])):
         return None
-    return Drawn(plan, system, (one[0], other), session, rho, tuple(left))
+    return ConcealedCase(plan, system, (one[0], other), session, rho, tuple(left))
 
 
-def _puzzle(plan: Plan) -> Drawn | None:
+def _puzzle(plan: ConcealedPlan) -> ConcealedCase | None:
     """A case that its own data cannot decide; the label says what they leave open."""
     puzzle = PUZZLES[(plan.turn + plan.attempt) % len(PUZZLES)]
     if puzzle == "one_slow_tone":
         plan = replace(plan, kind="transmission", closed_loop=False)
     system, rng, wanted = _system(plan, puzzle), plan.stream(2), 0.02
 
-    def dish(name: str, port: str) -> Dish:
-        return next(d for d in MENU[plan.kind] if (d.id, d.port) == (name, port))
+    def effect_at(name: str, port: str) -> ScalableEffect:
+        return next(d for d in EFFECTS[plan.kind] if (d.id, d.port) == (name, port))
 
     if puzzle in ("below_noise", "not_moved", "force_scale", "never_touched"):
-        ways: dict[str, Callable[[], tuple[Dish, float, float]]] = {
-            "below_noise": partial(_choose, plan, MENU["rig"], rng),
-            "not_moved": lambda: (dish(str(rng.choice(["backlash", "latency", "whip"])), "roll"), 1.0, 0.0),
+        ways: dict[str, Callable[[], tuple[ScalableEffect, float, float]]] = {
+            "below_noise": partial(_choose, plan, EFFECTS["rig"], rng),
+            "not_moved": lambda: (effect_at(str(rng.choice(["backlash", "latency", "whip"])), "roll"), 1.0, 0.0),
             "force_scale": lambda: (_FORCE_SCALE, 1.0, 0.0),
             "never_touched": lambda: (
-                dish(str(rng.choice(["contact_nonlinear", "contact_viscous", "contact_friction"])), "contact"),
+                effect_at(str(rng.choice(["contact_nonlinear", "contact_viscous", "contact_friction"])), "contact"),
                 1.0,
                 0.0,
             ),
@@ -256,7 +262,7 @@ def _puzzle(plan: Plan) -> Drawn | None:
     elif puzzle == "bias_or_base":
         chosen, names, wanted = (_STANDING_BIAS, 1.0, 0.0), ("sensor_bias", "base_motion", "sensor_misalignment"), plan.rho
     else:
-        chosen, wanted = (dish(str(rng.choice(["latency", "rate_lag"])), "roll"), 1.0, 0.0), 0.5
+        chosen, wanted = (effect_at(str(rng.choice(["latency", "rate_lag"])), "roll"), 1.0, 0.0), 0.5
         names = ("latency", "rate_lag", "viscous_friction", "creep_relaxation", "resonance")
     found = (
         _as_is(system, chosen[0])
@@ -265,26 +271,28 @@ def _puzzle(plan: Plan) -> Drawn | None:
     )
     if found is None or (NOTHING in names and found[2] > 0.08) or (NOTHING not in names and not _fits(found[2], wanted)):
         return None
-    return Drawn(plan, system, (found[0],), found[1], found[2], tuple(found[3]), names, puzzle)
+    return ConcealedCase(plan, system, (found[0],), found[1], found[2], tuple(found[3]), names, puzzle)
 
 
-_FORCE_SCALE = Dish("sensor_scale", "force_sensor", lambda s: {"gain": 1.0 + 0.12 * s})
-_STANDING_BIAS = Dish("sensor_bias", "pose_sensor", lambda s: {"x_m": 2e-4 * s, "y_m": 1e-4 * s, "z_m": 0.0}, signed=True)
+_FORCE_SCALE = ScalableEffect("sensor_scale", "force_sensor", lambda s: {"gain": 1.0 + 0.12 * s})
+_STANDING_BIAS = ScalableEffect(
+    "sensor_bias", "pose_sensor", lambda s: {"x_m": 2e-4 * s, "y_m": 1e-4 * s, "z_m": 0.0}, signed=True
+)
 
 
-def _as_is(system: System, dish: Dish) -> tuple[Planted, Session, float, list[Array]]:
-    """`dish` at size 1: whatever it does, the data must not show it."""
-    session = system.run([Planted(dish, 1.0)])
-    return (Planted(dish, 1.0), session, *measure(system, session))
+def _as_is(system: System, effect: ScalableEffect) -> tuple[ScaledEffect, NoiselessRecordings, float, list[Array]]:
+    """`effect` at size 1: whatever it does, the data must not show it."""
+    session = system.run([ScaledEffect(effect, 1.0)])
+    return (ScaledEffect(effect, 1.0), session, *measure(system, session))
 
 
-def draw(plan: Plan) -> Drawn:
+def draw(plan: ConcealedPlan) -> ConcealedCase:
     """The case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError after 40 attempts."""
     for attempt in range(40):
         now = replace(plan, attempt=attempt)
-        ways: dict[str, Callable[[], Drawn | None]] = {
+        ways: dict[str, Callable[[], ConcealedCase | None]] = {
             "null": partial(_null, now),
-            "single": partial(_single, now, MENU[plan.kind]),
+            "single": partial(_single, now, EFFECTS[plan.kind]),
             "pair": partial(_pair, now),
             "outside": partial(_single, now, UNLISTED[plan.kind]),
             "unidentifiable": partial(_puzzle, now),
@@ -295,7 +303,7 @@ def draw(plan: Plan) -> Drawn:
     raise RuntimeError(f"{plan.id}: no {plan.category} case of kind {plan.kind} and rho {plan.rho} after 40 attempts")
 
 
-def label(drawn: Drawn, recorded: Session) -> dict[str, Any]:
+def label(drawn: ConcealedCase, recorded: NoiselessRecordings) -> dict[str, Any]:
     """What the seal keeps: the truth in plain words and numbers, and what a scorer needs to hold a verdict against it."""
     plan, system = drawn.plan, drawn.system
     size = np.sqrt(np.mean(np.vstack(drawn.mismatch) ** 2, axis=0)) / system.sigma
@@ -308,23 +316,23 @@ def label(drawn: Drawn, recorded: Session) -> dict[str, Any]:
         "puzzle": drawn.puzzle,
         "kind": plan.kind,
         "closed_loop": plan.closed_loop,
-        "truth": [f"{p.dish.id}@{_place(plan.kind, p.dish)}" for p in drawn.planted],
-        "names": [list(p.dish.names()) for p in drawn.planted],
+        "truth": [f"{p.effect.id}@{_place(plan.kind, p.effect)}" for p in drawn.planted],
+        "names": [list(p.effect.names()) for p in drawn.planted],
         "set": list(drawn.truth_set),
-        "form": drawn.planted[0].dish.form if plan.category == "outside" else "",
-        "says": [p.dish.says for p in drawn.planted],
+        "form": drawn.planted[0].effect.form if plan.category == "outside" else "",
+        "says": [p.effect.says for p in drawn.planted],
         "rho": drawn.rho,
         "rho_wanted": plan.rho,
         "planted": [
             {
-                "id": p.dish.id,
-                "port": p.dish.port,
+                "id": p.effect.id,
+                "port": p.effect.port,
                 "size": p.size,
                 "start_s": p.start_s,
                 "parameters": p.parameters,
-                "compared": list(p.dish.compared),
-                "equivalent": equivalents(p.dish, p.parameters, _gain(system, p.dish.port), p.start_s),
-                "gain": _gain(system, p.dish.port),
+                "compared": list(p.effect.compared),
+                "equivalent": equivalents(p.effect, p.parameters, _gain(system, p.effect.port), p.start_s),
+                "gain": _gain(system, p.effect.port),
             }
             for p in drawn.planted
         ],
@@ -344,12 +352,12 @@ def _gain(system: System, port: str) -> float:
     return float(system.case.nominal[at[port]]) if port in at else 1.0
 
 
-def _place(kind: str, dish: Dish) -> str:
-    """Subsystem in which a dish acts, as the case's nominal file names it."""
-    return dish.port or {"axis": "knob", "impedance": "contact"}[kind]
+def _place(kind: str, effect: ScalableEffect) -> str:
+    """Subsystem in which an effect acts, as the case's nominal file names it."""
+    return effect.port or {"axis": "knob", "impedance": "contact"}[kind]
 
 
-def make(plan: Plan, folder: Path) -> dict[str, Any]:
+def make(plan: ConcealedPlan, folder: Path) -> dict[str, Any]:
     """Draw the case of `plan`, write its recordings and nominal file into `folder`, return its label."""
     drawn = draw(plan)
     rng = drawn.plan.stream(3)
@@ -373,15 +381,15 @@ def _near(system: System, rng: np.random.Generator) -> Array:
     return p
 
 
-def rebuild(truth: Label) -> tuple[System, list[Planted]]:
+def rebuild(truth: Label) -> tuple[System, list[ScaledEffect]]:
     """System and planted effects of a label, for the oracle."""
-    plan = Plan(**truth["plan"])
-    dishes = [*MENU[plan.kind], *UNLISTED[plan.kind], _FORCE_SCALE, _STANDING_BIAS]
+    plan = ConcealedPlan(**truth["plan"])
+    known = [*EFFECTS[plan.kind], *UNLISTED[plan.kind], _FORCE_SCALE, _STANDING_BIAS]
     planted = []
     for item, says in zip(truth["planted"], truth["says"], strict=True):
-        same = [d for d in dishes if (d.id, d.port, d.says) == (item["id"], item["port"], says)]
+        same = [d for d in known if (d.id, d.port, d.says) == (item["id"], item["port"], says)]
         exact = [d for d in same if d.make(item["size"]) == item["parameters"]]
-        planted.append(Planted(exact[0], item["size"], item["start_s"]))
+        planted.append(ScaledEffect(exact[0], item["size"], item["start_s"]))
     return _system(plan, truth["puzzle"]), planted
 
 
@@ -407,7 +415,7 @@ def suite(seed: int, cases: int, folder: Path, jobs: int = 1, progress: Callable
     return hashlib.sha256(seal.read_bytes()).hexdigest()
 
 
-def _keep(folder: Path, plan: Plan) -> int:
+def _keep(folder: Path, plan: ConcealedPlan) -> int:
     """Make one case and put its label behind the seal."""
     truth = make(plan, folder / "cases" / plan.id)
     part = folder / "sealed" / "parts" / f"{plan.id}.json"

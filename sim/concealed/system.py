@@ -14,8 +14,8 @@ from sim.concealed import generic as concealed_generic
 from sim.concealed import nominal as concealed_nominal
 from sim.concealed import rig as concealed_rig
 from sim.concealed.generic import GenericCase
-from sim.concealed.menu import Dish
-from sim.concealed.rig import RigCase, Session
+from sim.concealed.rig import NoiselessRecordings, RigCase
+from sim.concealed.scalable_effects import ScalableEffect
 from sim.concealed.signals import coloured, lost
 from sim.effects import PlantedEffect
 
@@ -24,17 +24,17 @@ _HANDLE = ("handle_insertion_m", "handle_roll_rad", "handle_knob_rad")
 
 
 @dataclass(frozen=True)
-class Planted:
-    """A dish with its size and the moment (s of the session) from which it acts."""
+class ScaledEffect:
+    """A scalable effect with its size and the moment (s of the session) from which it acts."""
 
-    dish: Dish
+    effect: ScalableEffect
     size: float
     start_s: float = 0.0
 
     @property
     def parameters(self) -> dict[str, float]:
         """Planted parameters by name."""
-        return self.dish.make(self.size)
+        return self.effect.make(self.size)
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ class System:
     sigma: Array
     period_s: float
 
-    def run(self, planted: Sequence[Planted], replay: Sequence[Array] | None = None) -> Session:
+    def run(self, planted: Sequence[ScaledEffect], replay: Sequence[Array] | None = None) -> NoiselessRecordings:
         """The session with `planted` in it, without noise. `replay`: recorded inputs instead of excitation and control."""
         if isinstance(self.case, GenericCase):
-            return concealed_generic.simulate(self.case, [(p.dish, p.parameters) for p in planted], replay)
+            return concealed_generic.simulate(self.case, [(p.effect, p.parameters) for p in planted], replay)
         effects = [
-            PlantedEffect(p.dish.id, p.dish.port, p.parameters, p.start_s) for p in planted if p.dish.id != "unlisted"
+            PlantedEffect(p.effect.id, p.effect.port, p.parameters, p.start_s) for p in planted if p.effect.id != "unlisted"
         ]
-        strange = [p for p in planted if p.dish.id == "unlisted"]
+        strange = [p for p in planted if p.effect.id == "unlisted"]
         return concealed_rig.simulate(
             self.case, effects, Warp(strange) if strange else None, None if replay is None else self._bridged(replay)
         )
@@ -65,7 +65,9 @@ class System:
         case = RigCase(self.case.nominal, self.case.starts_s, tuple(replay), self.sigma, False, 0)
         return concealed_rig.commands(case)[0]
 
-    def calibrate(self, session: Session, which: Sequence[int], start: Array, every: int = 3, robust: bool = False) -> Array:
+    def calibrate(
+        self, session: NoiselessRecordings, which: Sequence[int], start: Array, every: int = 3, robust: bool = False
+    ) -> Array:
         """Nominal parameters fitted to recordings `which`, every so many samples of them."""
         if isinstance(self.case, GenericCase):
             return concealed_generic.fit(
@@ -79,7 +81,7 @@ class System:
         handle, outputs = (np.vstack([x[i][::every] for i in which]) for x in (session.inputs, session.outputs))
         return concealed_nominal.fit(start, handle, outputs, self.sigma, robust=robust)
 
-    def residuals(self, p: Array, session: Session) -> list[Array]:
+    def residuals(self, p: Array, session: NoiselessRecordings) -> list[Array]:
         """Recorded minus nominal per recording, (n, channels), SI."""
         if isinstance(self.case, GenericCase):
             return [
@@ -92,7 +94,7 @@ class System:
         """Outputs minus model, (n, channels), SI."""
         return outputs - model if isinstance(self.case, GenericCase) else concealed_nominal.apart(model, outputs)
 
-    def noisy(self, session: Session, rng: np.random.Generator) -> Session:
+    def noisy(self, session: NoiselessRecordings, rng: np.random.Generator) -> NoiselessRecordings:
         """The session as devices record it: coloured noise on every channel, samples lost in bursts."""
         share, correlation = rng.uniform(0.0, 0.4), rng.uniform(0.04, 0.25)
         drops, burst = rng.uniform(0.002, 0.03), rng.uniform(1.5, 5.0)
@@ -100,7 +102,7 @@ class System:
         for y in session.outputs:
             noise = coloured(rng, (len(y), len(self.channels)), self.sigma, share, correlation, self.period_s)
             outputs.append(self._disturbed(y, noise, [lost(rng, len(y), drops, burst) for _ in range(2)]))
-        return Session(session.time_s, session.inputs, tuple(outputs))
+        return NoiselessRecordings(session.time_s, session.inputs, tuple(outputs))
 
     def _disturbed(self, y: Array, noise: Array, gone: list[Array]) -> Array:
         if isinstance(self.case, GenericCase):
@@ -120,7 +122,7 @@ class System:
 class Warp:
     """An effect outside every library between handle and rig, evaluated step by step."""
 
-    def __init__(self, planted: Sequence[Planted]) -> None:
+    def __init__(self, planted: Sequence[ScaledEffect]) -> None:
         self._planted, self._last, self._rate = planted, np.zeros(0), np.zeros(3)
         self._play = math.nan
 
@@ -132,7 +134,9 @@ class Warp:
         self._last = handle.copy()
         out = handle.copy()
         for p in self._planted:
-            out[("insertion", "roll", "knob").index(p.dish.port)] += p.parameters["size"] * self._value(p.dish.form, handle)
+            out[("insertion", "roll", "knob").index(p.effect.port)] += p.parameters["size"] * self._value(
+                p.effect.form, handle
+            )
         return out
 
     def _value(self, form: str, handle: Array) -> float:
@@ -172,7 +176,7 @@ def generic(case: GenericCase) -> System:
     return System(case.kind, case, concealed_generic.OUTPUTS[case.kind], case.sigma, case.period_s)
 
 
-def columns(system: System, session: Session, i: int) -> dict[str, Array]:
+def columns(system: System, session: NoiselessRecordings, i: int) -> dict[str, Array]:
     """Columns of recording i as they are written."""
     out: dict[str, Array] = {"time_s": np.round(session.time_s[i], 6)}
     if isinstance(system.case, GenericCase):
@@ -186,7 +190,7 @@ def columns(system: System, session: Session, i: int) -> dict[str, Array]:
     return out | {name: values[:, k] for k, name in enumerate(names)}
 
 
-def write(system: System, session: Session, calibrated: Array, folder: Path, parquet: bool) -> None:
+def write(system: System, session: NoiselessRecordings, calibrated: Array, folder: Path, parquet: bool) -> None:
     """Recordings a, b, c (c is held out) and nominal.toml into `folder`."""
     import pyarrow as pa
     from pyarrow import csv

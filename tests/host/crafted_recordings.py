@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, Writer
 from host.recordings.export import arrow_table
 from host.recordings.header import RecordingHeader
 from host.recordings.index import MAGIC
-from host.recordings.recording import Recording, is_whole
+from host.recordings.recording import RecordingFile, is_whole
 from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.topics import ForceSensor, Log, Pose, RigState, Stage
@@ -153,7 +153,7 @@ def read_all(path: Path) -> None:
 
 
 def _tables(path: Path) -> None:
-    recording = Recording(path)
+    recording = RecordingFile(path)
     for topic in recording.topics:
         try:
             arrow_table(recording, topic)
@@ -162,14 +162,14 @@ def _tables(path: Path) -> None:
 
 
 def _replay(path: Path) -> None:
-    recording = Recording(path)
+    recording = RecordingFile(path)
     for topic, count in recording.topics.items():
         recording.times_ns(topic)
         recording.message(topic, count - 1)
 
 
 def _sections(path: Path) -> None:
-    recording = Recording(path)
+    recording = RecordingFile(path)
     for section in ("run", "configuration", "catheter", "span_ns"):
         getattr(recording, section)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.header import header_of
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import Picture
 from host.recordings.writer import RecordingWriter
 from host.report.run_report import render
@@ -138,6 +138,6 @@ def test_a_report_is_written_of_it(tmp_path_factory: pytest.TempPathFactory, dat
         for topic, payload in arrived:
             message = decode(TOPICS[topic].message, payload)
             writer.write_encoded(topic, payload, message.stamp_ns, message.sequence, message.stamp_ns)
-    recording = Recording(path)
+    recording = RecordingFile(path)
     assert sum(recording.topics.values()) == len(arrived)
     assert timed(lambda: render(recording)) < LONGEST_REPORT_s

@@ -18,7 +18,7 @@ from host.commissioning.characterization import (
 from host.commissioning.characterization_report import write_characterization
 from host.commissioning.sine_kinematics import fit_sines
 from host.commissioning.sweep_fits import Run, dead_zone_curvature, fit_knob, fit_play, play
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
 from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
@@ -102,7 +102,7 @@ def sweeps_recorded(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_the_rigs_truth_is_found_through_the_board(rig: Rig, sweeps_recorded: Path, tmp_path: Path) -> None:
-    found = characterize(Recording(sweeps_recorded), rig)
+    found = characterize(RecordingFile(sweeps_recorded), rig)
     assert found.insertion.width.value == pytest.approx(0.0024, abs=1e-4)
     assert found.insertion.slope.value == pytest.approx(1.0, abs=0.01)
     assert found.insertion_at_home_m.value == pytest.approx(-0.089, abs=2e-4)
@@ -120,7 +120,7 @@ def test_sweeps_of_another_catheter_are_refused(rig: Rig, sweeps_recorded: Path)
     data = rig.effective()
     data["catheter"]["name"] = data["transmission"]["catheter"] = "livewire"
     with pytest.raises(ValueError, match="found sweeps of catheter blazer_prime_xp, wanted livewire"):
-        characterize(Recording(sweeps_recorded), parse_rig(data))
+        characterize(RecordingFile(sweeps_recorded), parse_rig(data))
 
 
 def test_a_calibration_of_another_catheter_is_refused(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from host.recordings import open_recording
 from host.recordings.index import MAGIC
-from host.recordings.recording import TABLE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES, Recording
+from host.recordings.recording import TABLE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES, RecordingFile
 from protocol.errors import InputError
 from tests.host.crafted_recordings import HEAD, chunk_body, foreign, mutated, originals, read_all, records, small
 
@@ -38,7 +37,7 @@ def test_the_originals_are_read_whole(files: list[bytes], tmp_path: Path) -> Non
     for number, content in enumerate(files):
         path = tmp_path / f"{number}.mcap"
         path.write_bytes(content)
-        recording = Recording(path)
+        recording = RecordingFile(path)
         assert not recording.truncated and recording.damaged_chunks == 0
         assert len(recording.table("stage")["stamp_ns"]) == recording.topics["stage"] >= 40
 
@@ -72,13 +71,13 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused_and_the_limit_can_be_
     with pytest.raises(
         InputError, match=rf"unpack to more than {UNPACKED_LIMIT_BYTES // 2**20} MiB.*, wanted less; .*unpack limit"
     ):
-        open_recording(str(path))
-    assert open_recording(str(with_chunks(tmp_path / "three.mcap", *[bomb] * 3)), 200 * 2**20).damaged_chunks == 0
+        RecordingFile(str(path))
+    assert RecordingFile(str(with_chunks(tmp_path / "three.mcap", *[bomb] * 3)), 200 * 2**20).damaged_chunks == 0
 
 
 def test_a_chunk_that_declares_less_than_it_unpacks_to_is_damaged(tmp_path: Path) -> None:
     body = chunk_body(bytes(2**24), declared=1000)
-    assert Recording(with_chunks(tmp_path / "a.mcap", body)).damaged_chunks == 1
+    assert RecordingFile(with_chunks(tmp_path / "a.mcap", body)).damaged_chunks == 1
 
 
 def test_a_table_larger_than_its_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +85,7 @@ def test_a_table_larger_than_its_limit_is_refused(tmp_path: Path, monkeypatch: p
     path = with_chunks(tmp_path / "a.mcap", chunk_body(messages(2000, b'{"stamp_ns":1,"x_m":0.5}')))
     assert TABLE_LIMIT_BYTES >= 2**20
     with pytest.raises(InputError, match=r"found .a table of 4000 cells., wanted at most 1000"):
-        Recording(path).table("stage")
+        RecordingFile(path).table("stage")
 
 
 @pytest.mark.parametrize(
@@ -106,7 +105,7 @@ def test_a_table_larger_than_its_limit_is_refused(tmp_path: Path, monkeypatch: p
     ],
 )
 def test_a_message_that_is_no_message_is_named(data: bytes, tmp_path: Path) -> None:
-    recording = Recording(with_chunks(tmp_path / "a.mcap", chunk_body(messages(1, data))))
+    recording = RecordingFile(with_chunks(tmp_path / "a.mcap", chunk_body(messages(1, data))))
     with pytest.raises(InputError, match=r"a\.mcap stage") as caught:
         recording.table("stage")
     assert "\n" not in str(caught.value)
@@ -114,14 +113,16 @@ def test_a_message_that_is_no_message_is_named(data: bytes, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "5", "[]", "{", "\ud800".encode("utf-8", "replace").decode() + "{"])
 def test_a_header_that_is_no_object_is_named(text: str, tmp_path: Path) -> None:
-    recording = Recording(small(tmp_path / "a.mcap"))
+    recording = RecordingFile(small(tmp_path / "a.mcap"))
     recording._metadata["configuration"] = {"json": text}
     with pytest.raises(InputError, match=r"a\.mcap configuration.* wanted a JSON object"):
         _ = recording.configuration
 
 
 def test_a_column_that_is_missing_is_named(tmp_path: Path) -> None:
-    table = Recording(with_chunks(tmp_path / "a.mcap", chunk_body(messages(3, b'{"stamp_ns":1,"x_m":0.5}')))).table("stage")
+    table = RecordingFile(with_chunks(tmp_path / "a.mcap", chunk_body(messages(3, b'{"stamp_ns":1,"x_m":0.5}')))).table(
+        "stage"
+    )
     with pytest.raises(
         InputError, match='found "no column command_insertion_m", wanted a recording that has it: stamp_ns, x_m'
     ):
@@ -132,5 +133,5 @@ def test_replay_gets_only_messages_that_their_topic_allows(tmp_path: Path) -> No
     good = {"schema_version": 1, "stamp_ns": 5, "sequence": 0, "command_insertion_m": 0.01, "command_roll_rad": 0.0}
     bodies = [good | {"command_knob_rad": 0.0}, good, good | {"command_knob_rad": 1e300}]
     chunk = chunk_body(b"".join(messages(1, json.dumps(body).encode()) for body in bodies))
-    recording = Recording(with_chunks(tmp_path / "a.mcap", chunk))
+    recording = RecordingFile(with_chunks(tmp_path / "a.mcap", chunk))
     assert [recording.message("stage", index) is not None for index in range(3)] == [True, False, False]

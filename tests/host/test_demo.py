@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from host.cli.main import build
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from tests.small_disk import fill_up
 
 
@@ -20,4 +20,4 @@ def test_a_disk_that_fills_up_is_told_and_the_job_is_still_done(tmp_path: Path, 
     steps = json.loads(told.stdout)["steps"]
     assert steps["commanded"] == steps["on_pins"] == steps["reported"] != [0, 0, 0]
     (path,) = tmp_path.glob("*.mcap")
-    assert Recording(path).truncated
+    assert RecordingFile(path).truncated

@@ -14,7 +14,7 @@ import pytest
 
 from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
 from host.estimation.service import EstimationService, load_estimator
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import ForceSensor, Pose, Stage
 from protocol.zenoh_session import Session
@@ -211,7 +211,7 @@ def test_process_estimates_records_and_ends_in_order(tmp_path: Path) -> None:
     finally:
         child.kill()
         child.communicate()
-    recording = Recording(tmp_path / "a.mcap")
+    recording = RecordingFile(tmp_path / "a.mcap")
     assert not recording.truncated and recording.run["seed"] == "3"
     assert recording.catheter["name"] == "blazer_prime_xp" and recording.configuration["control"]["loop_hz"] == 1000
     assert {"stage", "pose/tip", "force/sensor", "force/estimate"} <= set(recording.topics)

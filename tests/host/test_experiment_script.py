@@ -10,7 +10,7 @@ import pytest
 
 from host.cli.experiment import experiment
 from host.commissioning.experiment_script import Script, check_script, perform, read_script, write_script
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.run.experiment_run import run_simulated
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
@@ -145,7 +145,7 @@ def test_without_go_nothing_is_commanded(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_the_simulated_rig_goes_where_the_script_says(tmp_path: Path) -> None:
-    recording = Recording(run_simulated(Script(**FREE), RIG, tmp_path, "native", 1, ()))
+    recording = RecordingFile(run_simulated(Script(**FREE), RIG, tmp_path, "native", 1, ()))
     tip = recording.table("pose/tip")
     last = tip["x_m"][-40:]
     assert last.mean() == pytest.approx(0.0035, abs=3e-4)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from host.cli.export import export as export_command
 from host.recordings.export import export
 from host.recordings.header import RecordingHeader
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.topics import Pose, RigState
@@ -28,7 +28,7 @@ HEADER = RecordingHeader(
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> RecordingFile:
     path = tmp_path_factory.mktemp("export") / "a.mcap"
     with RecordingWriter(path, HEADER) as writer:
         for frame in range(40):
@@ -53,10 +53,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
                     cause='a "quoted", cause; with; separators\nand lines',
                 ),
             )
-    return Recording(path)
+    return RecordingFile(path)
 
 
-def test_parquet_is_exact_and_knows_its_units(recording: Recording, tmp_path: Path) -> None:
+def test_parquet_is_exact_and_knows_its_units(recording: RecordingFile, tmp_path: Path) -> None:
     written = export(recording, "parquet", tmp_path / "new" / "folder")
     assert [path.name for path in written] == ["pose_tip.parquet", "state.parquet"]
     table = pyarrow.parquet.read_table(written[0])
@@ -67,7 +67,7 @@ def test_parquet_is_exact_and_knows_its_units(recording: Recording, tmp_path: Pa
     assert pyarrow.parquet.read_table(written[1]).column("cause").to_pylist() == recording.table("state")["cause"].tolist()
 
 
-def test_csv_reads_back_to_the_last_bit(recording: Recording, tmp_path: Path) -> None:
+def test_csv_reads_back_to_the_last_bit(recording: RecordingFile, tmp_path: Path) -> None:
     export(recording, "csv", tmp_path)
     with (tmp_path / "pose_tip.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -90,14 +90,14 @@ def run(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.stdout
 
 
-def test_command_says_what_it_wrote(recording: Recording, tmp_path: Path) -> None:
+def test_command_says_what_it_wrote(recording: RecordingFile, tmp_path: Path) -> None:
     status, output = run(str(recording.path), "--to", "parquet", str(tmp_path), "--json")
     said = json.loads(output)
     assert status == 0 and said["tables"] == {"pose/tip": 40, "state": 40} and not said["truncated"]
     assert all(Path(name).exists() for name in said["files"])
 
 
-def test_command_takes_a_recording_that_was_cut(recording: Recording, tmp_path: Path) -> None:
+def test_command_takes_a_recording_that_was_cut(recording: RecordingFile, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(recording.path.read_bytes()[:-20])
     status, output = run(str(cut), str(tmp_path / "tables"), "--json")

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from host.diagnosis.model.tables import read_table
 from host.recordings.foxglove import SCHEMAS, plain_schema
 from host.recordings.header import RecordingHeader
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.catheter import load_catheter
 from protocol.messages import json_schema
@@ -149,7 +149,7 @@ def test_the_scene_has_the_catheter_up_to_the_tip_at_its_rate(recording: Path) -
 
 
 def test_its_channels_are_not_among_ours(recording: Path) -> None:
-    assert set(Recording(recording).topics) == {"stage", "force/sensor", "pose/tip", "state", "log"}
+    assert set(RecordingFile(recording).topics) == {"stage", "force/sensor", "pose/tip", "state", "log"}
     columns = read_table(recording)
     assert columns["time_s"].size == 100 and (columns["force/sensor.force_N.2"] == 0.2).all()
 
@@ -164,11 +164,11 @@ def test_older_recordings_of_msgpack_read_as_before(tmp_path: Path) -> None:
         message = Pose(stamp_ns=5, arrival_ns=6, frame=1, missing=True)
         writer.add_message(channel, log_time=7, publish_time=5, data=encode(message, 3))
         writer.finish()
-    old = Recording(path)
+    old = RecordingFile(path)
     assert next(old.messages("pose/tip")) == msgpack.unpackb(encode(message, 3))
     assert old.table("pose/tip")["missing"].tolist() == [True] and np.isnan(old.table("pose/tip")["x_m"]).all()
 
 
 def test_nil_is_absent_in_the_file_and_none_when_read(recording: Path) -> None:
-    missing = [body for body in Recording(recording).messages("pose/tip") if body["missing"]]
+    missing = [body for body in RecordingFile(recording).messages("pose/tip") if body["missing"]]
     assert missing[0]["position_m"] is None and missing[0]["frame"] == 500

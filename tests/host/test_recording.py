@@ -27,7 +27,7 @@ from mcap.writer import Writer
 from host.recordings import writer as writer_module
 from host.recordings.header import RecordingHeader
 from host.recordings.index import file_end
-from host.recordings.recording import Recording, is_whole
+from host.recordings.recording import RecordingFile, is_whole
 from host.recordings.writer import RecordingWriter
 from protocol.topics import ForceEstimate, ForceSensor, Pose, RigState, Stage, columns
 from tests.small_disk import fill_up
@@ -69,7 +69,7 @@ def write(path: Path, count: int) -> Path:
 
 
 def test_what_is_written_reads_back_as_columns(tmp_path: Path) -> None:
-    recording = Recording(write(tmp_path / "a.mcap", 200))
+    recording = RecordingFile(write(tmp_path / "a.mcap", 200))
     assert not recording.truncated and recording.damaged_chunks == 0
     assert recording.topics == {"stage": 200, "pose/tip": 8}
     table = recording.table("stage")
@@ -86,7 +86,7 @@ def test_what_is_written_reads_back_as_columns(tmp_path: Path) -> None:
 
 
 def test_header_tells_where_it_comes_from(tmp_path: Path) -> None:
-    recording = Recording(write(tmp_path / "a.mcap", 1))
+    recording = RecordingFile(write(tmp_path / "a.mcap", 1))
     assert recording.run["seed"] == "7" and recording.run["rig"] == "simulated" and recording.run["clock"] == "virtual"
     assert recording.run["git_revision"] and recording.run["software_version"]
     assert recording.configuration == HEADER.configuration
@@ -94,7 +94,7 @@ def test_header_tells_where_it_comes_from(tmp_path: Path) -> None:
 
 
 def test_schema_in_the_file_names_units_and_columns(tmp_path: Path) -> None:
-    recording = Recording(write(tmp_path / "a.mcap", 30))
+    recording = RecordingFile(write(tmp_path / "a.mcap", 30))
     assert recording.units("stage")["command_roll_rad"] == "rad"
     assert recording.units("pose/tip")["z_m"] == "m"
     assert recording.schema("pose/tip")["title"] == "Pose"
@@ -178,7 +178,7 @@ def test_a_long_recording_is_read_by_its_index_and_keeps_no_index_in_memory(
     with path.open("rb") as stream:
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["pose/tip"])]
     assert times == [second * 1_000_000_000 for second in range(1001)]
-    assert is_whole(path) and Recording(path).topics == {"pose/tip": 1001}
+    assert is_whole(path) and RecordingFile(path).topics == {"pose/tip": 1001}
     path.write_bytes(path.read_bytes()[:-20])
     assert not is_whole(path)
 
@@ -188,12 +188,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("whole") / "a.mcap", 6000)
 
 
-def altered(whole: Path, share: float, change: Callable[[bytearray, int], bytearray]) -> Recording:
+def altered(whole: Path, share: float, change: Callable[[bytearray, int], bytearray]) -> RecordingFile:
     """A recording of the file `whole` with `change(content, place)` done to it, place at `share` of its length."""
     content = bytearray(whole.read_bytes())
     copy = whole.with_name("altered.mcap")
     copy.write_bytes(change(content, 8 + int(share * (len(content) - 9))))
-    return Recording(copy)
+    return RecordingFile(copy)
 
 
 @settings(max_examples=30, deadline=None)
@@ -211,7 +211,7 @@ def test_a_cut_at_the_end_loses_at_most_the_last_second(tmp_path: Path) -> None:
     writer = RecordingWriter(path, HEADER)
     for tick in range(5500):
         writer.write("stage", stage(tick * 1_000_000))
-    recording = Recording(path)
+    recording = RecordingFile(path)
     assert recording.truncated
     assert recording.topics["stage"] > 4500
     writer.close()
@@ -246,7 +246,7 @@ def test_full_disk_is_told_once_and_what_was_there_is_readable(tmp_path: Path, m
     writer.close()
     writer.close()
     assert len(told) == 1 and "disk is full" in told[0] and "readable" in told[0]
-    recording = Recording(path)
+    recording = RecordingFile(path)
     assert recording.truncated and recording.damaged_chunks == 0
     monkeypatch.undo()
 
@@ -272,7 +272,7 @@ def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
         child.send_signal(number)
         child.wait(timeout=PATIENCE_S)
         child.stdout.close()
-        recording = Recording(path)
+        recording = RecordingFile(path)
         assert recording.truncated is not whole
         kept = recording.topics["stage"]
         assert kept == 3000 if whole else 2000 < kept < 3000
@@ -281,14 +281,14 @@ def test_sigterm_closes_and_sigkill_leaves_it_readable(tmp_path: Path) -> None:
 def test_refusals_name_the_thing(tmp_path: Path) -> None:
     (tmp_path / "no.mcap").write_bytes(b"something else entirely")
     with pytest.raises(ValueError, match="wanted an MCAP recording"):
-        Recording(tmp_path / "no.mcap")
+        RecordingFile(tmp_path / "no.mcap")
     with pytest.raises(ValueError, match="wanted a readable recording"):
-        Recording(tmp_path / "missing.mcap")
+        RecordingFile(tmp_path / "missing.mcap")
     path = write(tmp_path / "a.mcap", 1)
     with pytest.raises(FileExistsError):
         RecordingWriter(path, HEADER)
     with pytest.raises(ValueError, match='"force/sensor", wanted one of pose/tip, stage'):
-        Recording(path).table("force/sensor")
+        RecordingFile(path).table("force/sensor")
 
 
 def test_wrong_message_for_a_topic_is_refused(tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_texts_and_flags_keep_their_types(tmp_path: Path) -> None:
         writer.write(
             "force/estimate", ForceEstimate(stamp_ns=1, frame="base", converged=False, published_ns=2, compute_us=3.0)
         )
-    recording = Recording(tmp_path / "a.mcap")
+    recording = RecordingFile(tmp_path / "a.mcap")
     assert recording.table("state")["cause"].tolist() == ["no fresh pose"]
     assert recording.table("force/estimate")["converged"].dtype == np.bool_
     assert np.isnan(recording.table("force/estimate")["czz_N2"]).all()

@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from host.recordings.header import RecordingHeader
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import Picture
 from host.recordings.writer import RecordingWriter
 from host.report.demo_summary import demo_result, print_summary
@@ -74,14 +74,14 @@ class Story:
             return "position"
         return "contact" if ms < 18000 else "retract"
 
-    def write(self, path: Path) -> Recording:
+    def write(self, path: Path) -> RecordingFile:
         header = RecordingHeader(
             "simulated", "virtual", CONFIGURATION, {"name": "blazer_prime_xp", "distal_length_m": 0.11}, 5
         )
         with RecordingWriter(path, header) as writer:
             for ms in range(0, 20000, 10):
                 self._tick(writer, ms)
-        return Recording(path)
+        return RecordingFile(path)
 
     def _tick(self, writer: RecordingWriter, ms: int) -> None:
         time_ns, mode = ms * MS, self.mode(ms)
@@ -199,11 +199,11 @@ class Story:
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def good(tmp_path_factory: pytest.TempPathFactory) -> RecordingFile:
     return Story().write(tmp_path_factory.mktemp("report") / "good.mcap")
 
 
-def test_figures_are_those_that_went_in(good: Recording) -> None:
+def test_figures_are_those_that_went_in(good: RecordingFile) -> None:
     summary = summarize(good)
     assert summary.target_force_N == 0.2 and summary.force_limit_N == 0.5
     assert summary.force_mean_N == pytest.approx(0.2, abs=1e-4)
@@ -220,7 +220,7 @@ def test_figures_are_those_that_went_in(good: Recording) -> None:
     assert summary.lost == {} and summary.worst_action == "none"
 
 
-def test_estimate_is_judged_along_the_force_direction(good: Recording) -> None:
+def test_estimate_is_judged_along_the_force_direction(good: RecordingFile) -> None:
     quality = summarize(good).estimate
     assert quality.median_sd_N == pytest.approx(0.03) and quality.median_delay_s == pytest.approx(0.005)
     assert quality.converged_share == 1.0
@@ -247,7 +247,7 @@ def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_pat
     assert says in " ".join([verdict.sentence, *verdict.remarks])
 
 
-def starved(tmp_path: Path) -> Recording:
+def starved(tmp_path: Path) -> RecordingFile:
     """A run that a busy computer ended: the loop was late, the dead man acted, poses were stale when it was back."""
     causes = {name: sentence for name, _, _, sentence in safety.CAUSES}
     words = "; ".join(causes[name] for name in ("board_fault", "pose_lost", "pose_stale"))
@@ -280,7 +280,7 @@ def test_missing_messages_are_counted(tmp_path: Path) -> None:
         for number in (0, 1, 2, 7, 8):
             writer._sequence["log"] = number
             writer.write("log", Log(stamp_ns=number, level="info", source="a", text="b"))
-    assert summarize(Recording(tmp_path / "a.mcap")).lost == {"log": 4}
+    assert summarize(RecordingFile(tmp_path / "a.mcap")).lost == {"log": 4}
 
 
 def test_a_time_without_change_is_one_span() -> None:
@@ -302,7 +302,7 @@ class Links(HTMLParser):
         self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "data", "srcset")]
 
 
-def test_report_is_one_file_that_loads_nothing(good: Recording, tmp_path: Path) -> None:
+def test_report_is_one_file_that_loads_nothing(good: RecordingFile, tmp_path: Path) -> None:
     page = write_report(good, tmp_path / "report.html").read_text(encoding="utf-8")
     links = Links()
     links.feed(page)
@@ -315,7 +315,7 @@ def test_report_is_one_file_that_loads_nothing(good: Recording, tmp_path: Path) 
     assert 'name="viewport"' in page and len(page) < 4_000_000
 
 
-def test_report_shows_figures_and_settings(good: Recording) -> None:
+def test_report_shows_figures_and_settings(good: RecordingFile) -> None:
     page = render(good)
     for text in (
         "0.200\u00a0N",
@@ -331,13 +331,13 @@ def test_report_shows_figures_and_settings(good: Recording) -> None:
     assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
 
 
-def test_ticks_beyond_the_period_are_not_passed_over(good: Recording) -> None:
+def test_ticks_beyond_the_period_are_not_passed_over(good: RecordingFile) -> None:
     assert "virtual time: the simulation waits" in render(good) and "0 late" not in lateness_of(summarize(good))
     assert lateness_of(replace(summarize(good), virtual=False)) == "0 late"
 
 
-def test_same_recording_same_report(good: Recording) -> None:
-    assert render(good) == render(Recording(good.path))
+def test_same_recording_same_report(good: RecordingFile) -> None:
+    assert render(good) == render(RecordingFile(good.path))
 
 
 def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
@@ -361,20 +361,20 @@ def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
         {"state", "force/estimate"},
     ],
 )
-def test_recordings_without_some_topics_are_reported_too(topics: set[str], good: Recording, tmp_path: Path) -> None:
+def test_recordings_without_some_topics_are_reported_too(topics: set[str], good: RecordingFile, tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "part.mcap", RecordingHeader("simulated", "wall", {}, {})) as writer:
         for topic in sorted(topics):
             for body in itertools.islice(good.messages(topic), 50):
                 writer.write_encoded(topic, msgpack.packb(body), body["stamp_ns"], 0)
-    page = render(Recording(tmp_path / "part.mcap"))
+    page = render(RecordingFile(tmp_path / "part.mcap"))
     assert "No contact" in page
     assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()
 
 
-def test_a_cut_recording_is_reported_as_such(good: Recording, tmp_path: Path) -> None:
+def test_a_cut_recording_is_reported_as_such(good: RecordingFile, tmp_path: Path) -> None:
     content = good.path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(content[: len(content) // 2])
-    assert "The recording ended early" in render(Recording(tmp_path / "cut.mcap"))
+    assert "The recording ended early" in render(RecordingFile(tmp_path / "cut.mcap"))
 
 
 @dataclass
@@ -412,7 +412,7 @@ CONTRACT_KEYS = {
 }
 
 
-def test_contract_json(good: Recording) -> None:
+def test_contract_json(good: RecordingFile) -> None:
     run = Ran(good.path, Ended([1, 2, 3], [1, 2, 3], [1, 2, 3]), {"faults": ["queue_overflow"], "crc_errors": 2})
     result = json.loads(json.dumps(plain(demo_result(good, run, Path("r.html"))), allow_nan=False))
     assert CONTRACT_KEYS <= set(result)
@@ -423,7 +423,7 @@ def test_contract_json(good: Recording) -> None:
     assert result["force_peak_N"] == pytest.approx(0.23) and result["contact_seconds"] == pytest.approx(16, abs=0.02)
 
 
-def test_table_for_people(good: Recording) -> None:
+def test_table_for_people(good: RecordingFile) -> None:
     run = Ran(good.path, Ended([1, 2, 4], [1, 2, 3], [1, 2, 3]), interrupted="SIGINT")
     buffer = io.StringIO()
     print_summary(demo_result(good, run, Path("r.html")), run, Console(file=buffer, width=160))

@@ -12,7 +12,7 @@ import pytest
 
 from host.commissioning.characterization import record_simulated, standard_sweeps
 from host.commissioning.rig_sweeps import describe, duration_s
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message
 from realtime.core.lines import FromRig, ToRig
@@ -82,7 +82,7 @@ def test_the_same_bytes_as_in_lock_step(rig: Rig, tmp_path: Path) -> None:
     bench = Bench(rig)
     bench.run()
     assert bench.loop.finished and not bench.loop.problem
-    other = Recording(record_simulated(rig, SHORT, tmp_path / "lock.mcap", 1, "native"))
+    other = RecordingFile(record_simulated(rig, SHORT, tmp_path / "lock.mcap", 1, "native"))
     assert bench.heard.count("stage") == pytest.approx(len(other.table("stage")["stamp_ns"]), abs=2)
     assert bench.heard.count("pose/tip") == len(other.table("pose/tip")["stamp_ns"])
     assert bench.world.edges[0] > 2 * 0.008 * rig.stages.insertion.steps_per_unit

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from host.recordings.drawn_shape import through, twin
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import Picture, causes_of
 from host.view.replay import Replay, read_findings
 from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer
@@ -94,7 +94,7 @@ def test_several_causes_are_told_apart_though_their_sentences_hold_semicolons() 
 
 def player(path: Path, **options: Any) -> tuple[Replay, list[float]]:
     now = [100.0]
-    replay = Replay(Recording(path), clock_s=lambda: now[0], **options)
+    replay = Replay(RecordingFile(path), clock_s=lambda: now[0], **options)
     replay.hello()
     return replay, now
 
@@ -179,7 +179,7 @@ def test_windows_of_a_diagnosis_are_placed_on_the_recordings_time(recording: Pat
 
 @pytest.fixture(scope="module")
 def port(recording: Path) -> Iterator[int]:  # noqa: F811
-    with running(ViewServer(Replay(Recording(recording)), free_port())) as server:
+    with running(ViewServer(Replay(RecordingFile(recording)), free_port())) as server:
         yield server.port
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.view.server import ADDRESS
 from protocol.rig_file import SIMULATED_RIG
 from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
@@ -78,7 +78,7 @@ def test_sigterm_ends_what_view_has_started(tmp_path: Path) -> None:
     child.send_signal(signal.SIGTERM)
     _, words = child.communicate(timeout=PATIENCE_S)
     (written,) = tmp_path.glob("view-*.mcap")
-    assert f"recording: {written}" in words and "Traceback" not in words and not Recording(written).truncated
+    assert f"recording: {written}" in words and "Traceback" not in words and not RecordingFile(written).truncated
     assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet
 from host.view.live import LiveRig
@@ -100,7 +100,7 @@ def test_a_recording_is_drawn_and_can_be_moved_about_in(browser: Any, size: tupl
         windows=[Window(subsystem="insertion", condition="after reversals", span_s=(0.2, 0.4))],
     )
     with (
-        running(ViewServer(Replay(Recording(recording), findings=findings), port := free_port())),
+        running(ViewServer(Replay(RecordingFile(recording), findings=findings), port := free_port())),
         OpenPage(browser, port, size) as open_page,
     ):
         page = open_page.page

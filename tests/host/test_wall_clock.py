@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet, Operator
 from sim.scenario import TARGET_M, ContactJob
@@ -39,5 +39,5 @@ def test_killing_a_process_in_contact(victim: str, tmp_path: Path) -> None:
         assert summary["peak_force_N"] < 0.55
     if victim == "realtime":
         assert summary["last_edge_s"] - summary["last_byte_s"] <= 0.100
-    read = Recording(recording)
+    read = RecordingFile(recording)
     assert read.topics["state"] > 0 and len(read.table("pose/tip")["x_m"]) > 0

@@ -14,17 +14,17 @@ from sim.concealed import nominal as concealed_nominal
 from sim.concealed import rig as concealed_rig
 from sim.concealed import suite as concealed
 from sim.concealed import system as concealed_system
-from sim.concealed.menu import MENU, UNLISTED
+from sim.concealed.scalable_effects import EFFECTS, UNLISTED
 from sim.concealed.signals import KINDS, QUIET_S, coloured, lost, presses, signal, windows
-from sim.concealed.suite import Plan
-from sim.concealed.system import Planted
+from sim.concealed.suite import ConcealedPlan
+from sim.concealed.system import ScaledEffect
 from sim.effects import PlantedEffect, pack
 
 GENERIC = ("transmission", "axis", "impedance")
 
 
-def plan(category: str, kind: str, number: int = 0, rho: float = 1.0, closed: bool = False) -> Plan:
-    return Plan(11, number, category, kind, closed, rho, number)
+def plan(category: str, kind: str, number: int = 0, rho: float = 1.0, closed: bool = False) -> ConcealedPlan:
+    return ConcealedPlan(11, number, category, kind, closed, rho, number)
 
 
 @pytest.mark.parametrize("cases", [1, 10, 24, 200, 333])
@@ -123,7 +123,7 @@ def test_a_calibration_starts_with_the_wall_in_reach() -> None:
 
 
 def test_a_mode_faster_than_the_recordings_is_refused() -> None:
-    mode = next(d for d in MENU["rig"] if (d.id, d.port) == ("resonance", "knob"))
+    mode = next(d for d in EFFECTS["rig"] if (d.id, d.port) == ("resonance", "knob"))
     assert mode.make(1.0)["frequency_Hz"] == 4.0
     with pytest.raises(ValueError, match="frequency_Hz: found 40"):
         mode.make(0.1)
@@ -131,10 +131,10 @@ def test_a_mode_faster_than_the_recordings_is_refused() -> None:
 
 @pytest.mark.parametrize("kind", ["rig", "transmission"])
 def test_every_dish_is_in_the_catalogue_at_every_size(kind: str) -> None:
-    for dish in MENU[kind]:
-        for size in (0.3 if dish.id == "resonance" else 0.02, 1.0, 8.0):
-            pack([PlantedEffect(dish.id, dish.port, dish.make(size))])
-            assert set(dish.compared) <= set(dish.make(size))
+    for effect in EFFECTS[kind]:
+        for size in (0.3 if effect.id == "resonance" else 0.02, 1.0, 8.0):
+            pack([PlantedEffect(effect.id, effect.port, effect.make(size))])
+            assert set(effect.compared) <= set(effect.make(size))
 
 
 @pytest.mark.parametrize("kind", GENERIC)
@@ -144,14 +144,14 @@ def test_every_dish_shows_and_grows(kind: str) -> None:
         sigma=np.full(2 if kind == "transmission" else 1, 1e-3),
     )
     system = concealed_system.generic(case)
-    for dish in [*MENU[kind], *UNLISTED[kind]]:
-        small, large = (concealed.measure(system, system.run([Planted(dish, s)]))[0] for s in (0.3, 2.0))
-        assert 0.0 < small < large, dish
+    for effect in [*EFFECTS[kind], *UNLISTED[kind]]:
+        small, large = (concealed.measure(system, system.run([ScaledEffect(effect, s)]))[0] for s in (0.3, 2.0))
+        assert 0.0 < small < large, effect
 
 
 @pytest.mark.parametrize("form", [d for d in UNLISTED["rig"]], ids=lambda d: d.form)
 def test_unlisted_forms_on_the_rig_follow_their_formula(form) -> None:  # type: ignore[no-untyped-def]
-    warp = concealed_system.Warp([Planted(form, 1.0)])
+    warp = concealed_system.Warp([ScaledEffect(form, 1.0)])
     t = np.arange(0.0, 6.0, 0.005)
     handle = np.column_stack([0.004 * np.sin(t), 1.2 * np.sin(0.7 * t), 0.4 + 0.3 * np.sin(1.3 * t)])
     out = np.array([warp(h, 0.005) for h in handle]) - handle
@@ -192,13 +192,13 @@ def test_a_rig_case_from_seed_to_files(tmp_path: Path) -> None:
 
 def test_a_slow_tone_leaves_delay_and_lag_open(tmp_path: Path) -> None:
     turn = concealed.PUZZLES.index("one_slow_tone")
-    label = concealed.make(Plan(11, 4, "unidentifiable", "rig", False, 1.0, turn), tmp_path)
+    label = concealed.make(ConcealedPlan(11, 4, "unidentifiable", "rig", False, 1.0, turn), tmp_path)
     assert (label["puzzle"], label["kind"]) == ("one_slow_tone", "transmission")
     assert {"latency", "rate_lag"} <= set(label["set"])
 
 
 def test_no_trace_of_the_truth_in_files_or_names(tmp_path: Path) -> None:
-    words = {d.id for kind in MENU for d in MENU[kind]} | {"rho", "truth", "null", "single", "pair", "outside", "seed"}
+    words = {d.id for kind in EFFECTS for d in EFFECTS[kind]} | {"rho", "truth", "null", "single", "pair", "outside", "seed"}
     seen = []
     for number, category in enumerate(("null", "single", "pair", "outside")):
         folder = tmp_path / f"{number}"
@@ -233,7 +233,7 @@ def test_a_stopped_generator_goes_on_where_it_was(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(concealed, "plans", lambda seed, cases: cheap)
     made, real = [], concealed.make
 
-    def stumbling(p: Plan, folder: Path) -> dict:  # type: ignore[type-arg]
+    def stumbling(p: ConcealedPlan, folder: Path) -> dict:  # type: ignore[type-arg]
         made.append(p.index)
         if made == [0, 1]:
             raise KeyboardInterrupt

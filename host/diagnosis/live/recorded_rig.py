@@ -18,7 +18,7 @@ from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.rig_recording import knob_gain, rig_of
 from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS
-from host.recordings.recording import Recording as RigRecording
+from host.recordings.recording import RecordingFile
 from protocol.catheter import Catheter, CosseratParameters
 from protocol.errors import InputError
 
@@ -40,7 +40,7 @@ class RecordedRig(Twin):
 
     def __init__(self, spec: NominalSpec) -> None:
         rig = rig_of(spec._files)
-        super().__init__(rig, catheter_of(RigRecording(spec._files[0]).catheter))
+        super().__init__(rig, catheter_of(RecordingFile(spec._files[0]).catheter))
         self.recorded_on = rig
         wanted = []
         for p in self.parameters:

@@ -14,8 +14,7 @@ from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
-from host.diagnosis.models.rig import FORCE, SHAFT, TIP
-from host.diagnosis.models.rig import Rig as RigChain
+from host.diagnosis.models.rig import FORCE, SHAFT, TIP, RigModel
 from host.diagnosis.models.rig_kernel import matrices, rotation_logs
 from host.mechanics.cosserat import CosseratSolution, solve_cosserat
 from protocol.catheter import Catheter, load_catheter
@@ -34,7 +33,7 @@ LATEST_NS = 60_000_000  # a frame waits so long for the stage's and the second t
 
 
 @dataclass(frozen=True)
-class Calibration:
+class TwinFit:
     """The twin fitted to a rig: nominal parameters, and the delay (s) with which poses follow handle and force."""
 
     theta: Array
@@ -65,7 +64,7 @@ def thinned(recording: Recording, every: int) -> Recording:
     )
 
 
-class Twin(RigChain):
+class Twin(RigModel):
     """The nominal chain of kind rig for a rig file; play and knob's curve are taken off the handle before (see Listener).
 
     The chain bends by linear elasticity, which is not enough for a hold at 0.2 N: what the rod model says instead is
@@ -83,7 +82,7 @@ class Twin(RigChain):
         self.shaft_offset_m = rig.tracker.shaft_sensor_offset_m
         self.softness = 1.0
 
-    def calibrate(self, recording: Recording, rest: Callable[[], None] = lambda: None) -> Calibration:
+    def calibrate(self, recording: Recording, rest: Callable[[], None] = lambda: None) -> TwinFit:
         """Offsets, softness and delay by Gauss-Newton on every EVERY-th frame of `recording` (its poses, free run)."""
         theta = np.array([p.grid[0] for p in self.parameters])
         scale = np.tile(np.repeat([3e-4, 4e-3], 3), 2)[:, None]
@@ -106,7 +105,7 @@ class Twin(RigChain):
             z[4] = min(max(z[4], 0.0), LONGEST_DELAY_S)
             r = errors(z)
         theta[list(OFFSETS)] += z[:3]
-        return Calibration(theta, float(z[4]), float(np.sqrt(np.mean(r**2))))
+        return TwinFit(theta, float(z[4]), float(np.sqrt(np.mean(r**2))))
 
     def prepare(self, recording: Recording) -> Segment:
         """As the chain does, but with the force as it was recorded: it is an average over a frame already."""
@@ -186,8 +185,8 @@ def _spec(rig: Rig, rigidity: float, torsion_to_bending: float) -> NominalSpec:
     )
 
 
-class Listener:
-    """Hears stage, poses and forces in any order of arrival; `rows` (n, columns) on an even grid of tracker frames."""
+class FrameCollector:
+    """Collects stage, poses and forces that arrive in any order; `rows` (n, columns) are on an even grid of frames."""
 
     def __init__(self, rig: Rig, keep_s: float) -> None:
         self._transmission = rig.transmission
@@ -200,7 +199,7 @@ class Listener:
         self.stamps_ns: deque[int] = deque(maxlen=round(keep_s * 1e9 / self.period_ns))
         self.rows: deque[Array] = deque(maxlen=self.stamps_ns.maxlen)
 
-    def hear(self, topic: str, message: Message) -> None:
+    def receive(self, topic: str, message: Message) -> None:
         """Take in one message; those of other topics are not looked at."""
         if isinstance(message, Stage) and message.encoder_insertion_m is not None:
             self._stage(message)

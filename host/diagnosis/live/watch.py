@@ -14,7 +14,7 @@ import numpy.typing as npt
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.noise import Noise
-from host.diagnosis.live.twin import Calibration, Listener, Twin
+from host.diagnosis.live.twin import FrameCollector, Twin, TwinFit
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.screening import screen
 from protocol.rig_file import Rig
@@ -75,9 +75,9 @@ class Watch:
         """`rest` is called between the steps of long computations: a rig on the same machine must not be starved."""
         self.settings, self._rest = settings or LiveSettings(), rest
         self.twin = Twin(rig)
-        self.listener = Listener(rig, max(self.settings.learn_s, 30.0))
+        self.frames = FrameCollector(rig, max(self.settings.learn_s, 30.0))
         self.candidate_effects = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
-        self.calibration: Calibration | None = None
+        self.calibration: TwinFit | None = None
         self.baseline: Baseline | None = None
         self._armed_at_ns: int | None = None
         self._next_ns = 0
@@ -85,7 +85,7 @@ class Watch:
         self.told = False
         self.score = 0.0
 
-    def hear(self, topic: str, message: Message) -> None:
+    def receive(self, topic: str, message: Message) -> None:
         """Take in one message of the rig."""
         if isinstance(message, RigState):
             armed = message.mode not in ("disarmed", "stopped")
@@ -93,7 +93,7 @@ class Watch:
                 self._armed_at_ns = None
             elif self._armed_at_ns is None:
                 self._armed_at_ns = message.stamp_ns
-        self.listener.hear(topic, message)
+        self.frames.receive(topic, message)
 
     @property
     def phase(self) -> str:
@@ -102,8 +102,8 @@ class Watch:
 
     def look(self) -> Alarm | None:
         """Call often; every `every_s` of the rig's time something is done. An alarm comes once for each mismatch."""
-        self.listener.settle()
-        stamps = self.listener.stamps_ns
+        self.frames.settle()
+        stamps = self.frames.stamps_ns
         if not stamps or stamps[-1] < self._next_ns or self._armed_at_ns is None:
             return None
         self._next_ns = stamps[-1] + round(self.settings.every_s * SECOND_NS)
@@ -114,11 +114,11 @@ class Watch:
         return self._compare()
 
     def _rows(self, seconds: float) -> int:
-        return min(len(self.listener.rows), round(seconds * SECOND_NS / self.listener.period_ns))
+        return min(len(self.frames.rows), round(seconds * SECOND_NS / self.frames.period_ns))
 
     def _learn(self) -> None:
         """Calibrates the twin on what was heard since arming, and notes how well it then agrees, second by second."""
-        recording = self.listener.recording(-self._rows(self.settings.learn_s))
+        recording = self.frames.recording(-self._rows(self.settings.learn_s))
         self.calibration = self.twin.calibrate(recording, self._rest)
         segment, residual = self._residual(-self._rows(self.settings.learn_s))
         residual = residual[:, segment.n // 4 :]  # the approach is not what the rest will be like
@@ -131,7 +131,7 @@ class Watch:
     def _residual(self, first: int) -> tuple[Segment, Array]:
         """Rows from `first` on as a segment of the twin, and measured minus expected (12, n)."""
         assert self.calibration is not None
-        segment = self.twin.prepare(self.calibration.applied(self.listener.recording(first)))
+        segment = self.twin.prepare(self.calibration.applied(self.frames.recording(first)))
         self.twin.correct(segment, self.calibration.theta)
         segment.y[POSE_ROWS:] = np.nan
         expected = self.twin.simulate(segment, self.calibration.theta, [])
@@ -142,7 +142,7 @@ class Watch:
         assert self.baseline is not None
         score = self._score(self._residual(-self._rows(self.settings.window_s))[1])
         self.score = float(np.max(score))
-        now_ns = self.listener.stamps_ns[-1]
+        now_ns = self.frames.stamps_ns[-1]
         if not np.max(score) > 1.0:
             self._since_ns, self.told = None, False
             return None
@@ -165,7 +165,7 @@ class Watch:
         return np.where(good, np.maximum(level, shift), 0.0)
 
     def _alarm(self, score: Array, since_s: float) -> Alarm:
-        now_ns, row = self.listener.stamps_ns[-1], int(np.argmax(score))
+        now_ns, row = self.frames.stamps_ns[-1], int(np.argmax(score))
         suspects = self._suspects(self._residual(-self._rows(since_s))[0])
         channel = self.twin.outputs[row].channel
         first, explained = (
@@ -220,15 +220,15 @@ class Watch:
 def warm_up(rig: Rig) -> None:
     """Runs everything once on made-up rows, so that kernels are compiled before the rig is listened to."""
     watcher = Watch(rig, LiveSettings(learn_s=4.0, window_s=2.0, settle_s=0.5))
-    period_ns = watcher.listener.period_ns
-    watcher.hear(
+    period_ns = watcher.frames.period_ns
+    watcher.receive(
         "state", RigState(stamp_ns=0, mode="hold", safety_action="none", cause="", poses_rejected=0, forces_rejected=0)
     )
     for frame in range(round(7.0 * SECOND_NS / period_ns)):
         now = frame * period_ns
         shift = 0.002 * math.sin(2e-9 * now)
         where = (0.0, -0.004 - (0.01 if now > 5 * SECOND_NS else 0.0), 0.02 + shift)
-        watcher.hear(
+        watcher.receive(
             "stage",
             Stage(
                 stamp_ns=now,
@@ -240,9 +240,9 @@ def warm_up(rig: Rig) -> None:
                 encoder_knob_rad=0.6 + shift,
             ),
         )
-        watcher.hear("force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=(0.0, 0.0, 0.05)))
+        watcher.receive("force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=(0.0, 0.0, 0.05)))
         for topic in ("pose/tip", "pose/shaft"):
-            watcher.hear(
+            watcher.receive(
                 topic,
                 Pose(
                     stamp_ns=now,
@@ -272,7 +272,7 @@ def watch(
     while not stop():
         heard = bus.take()
         for topic, message, _ in heard:
-            watcher.hear(topic, message)
+            watcher.receive(topic, message)
         alarm = watcher.look()
         if alarm is not None:
             count += 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from protocol.errors import InputError
 from protocol.rig_file import Rig, parse_rig
 
@@ -65,11 +65,11 @@ def rig_rows(path: Path) -> dict[str, Array]:
     return columns
 
 
-def _open(path: Path) -> Recording:
+def _open(path: Path) -> RecordingFile:
     if not path.is_file():
         raise InputError("recording", str(path), "a file that exists")
     try:
-        recording = Recording(path)
+        recording = RecordingFile(path)
     except ValueError as error:
         raise InputError("recording", str(error), "an MCAP recording of a rig") from None
     missing = [topic for topic in TOPICS if not recording.topics.get(topic)]
@@ -92,7 +92,7 @@ def _even(stamps: Array, period_s: float) -> Array:
     return np.concatenate(out)
 
 
-def _handle(recording: Recording, rig: Rig) -> tuple[Array, list[Array]]:
+def _handle(recording: RecordingFile, rig: Rig) -> tuple[Array, list[Array]]:
     """Times (n,), and insertion behind the known play, roll, knob behind its known curve."""
     table = recording.table("stage")
     axes = ("insertion_m", "roll_rad", "knob_rad")

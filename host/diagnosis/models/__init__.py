@@ -12,24 +12,24 @@ from protocol.errors import InputError
 def build(spec: NominalSpec) -> Model:
     """The nominal model of `spec`; the rig that recordings describe themselves is `live.recorded_rig`."""
     if spec.kind == "transmission":
-        from host.diagnosis.models.transmission import Transmission
+        from host.diagnosis.models.transmission import TransmissionModel
 
-        return cast(Model, Transmission(spec))
+        return cast(Model, TransmissionModel(spec))
     if spec.kind == "impedance":
-        from host.diagnosis.models.impedance import Impedance
+        from host.diagnosis.models.impedance import ImpedanceModel
 
-        return cast(Model, Impedance(spec))
+        return cast(Model, ImpedanceModel(spec))
     if spec.kind == "axis":
-        from host.diagnosis.models.axis import Axis
+        from host.diagnosis.models.axis import AxisModel
 
-        return cast(Model, Axis(spec))
+        return cast(Model, AxisModel(spec))
     if spec.kind == "rig":
-        from host.diagnosis.models.rig import Rig
+        from host.diagnosis.models.rig import RigModel
 
-        return Rig(spec)
-    from host.diagnosis.models.external import External
+        return RigModel(spec)
+    from host.diagnosis.models.external import ExternalModel
 
-    return External(spec)
+    return ExternalModel(spec)
 
 
 def channels_of(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:

@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
 
 
-class Axis:
+class AxisModel:
     """Nominal model of kind `axis`.
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and

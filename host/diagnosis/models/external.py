@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 Function = Callable[[dict[str, Array], dict[str, float], Array], dict[str, Array]]
 
 
-class External:
+class ExternalModel:
     """Nominal model of kind `callable`. A port at every input, before the function, and at every output, behind it."""
 
     kind = "callable"

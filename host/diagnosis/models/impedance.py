@@ -18,7 +18,7 @@ SMOOTHING_S = 0.03
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
 
-class Impedance:
+class ImpedanceModel:
     """Nominal model of kind `impedance`."""
 
     kind = "impedance"

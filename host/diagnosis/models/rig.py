@@ -65,7 +65,7 @@ def _unit(name: str) -> str:
     return name.rsplit("_", 1)[1] if name.endswith(("_m", "_N")) else ""
 
 
-class Rig:
+class RigModel:
     """Nominal model of kind `rig`. Outputs: tip position and turn, shaft position and turn, force; three rows each."""
 
     kind = "rig"

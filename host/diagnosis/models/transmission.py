@@ -14,7 +14,7 @@ from host.diagnosis.model.operators import lag
 Array = npt.NDArray[np.float64]
 
 
-class Transmission:
+class TransmissionModel:
     """Nominal model of kind `transmission`; several links may share channels."""
 
     kind = "transmission"

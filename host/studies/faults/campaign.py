@@ -19,7 +19,7 @@ import numpy as np
 
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.header import header_of
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -214,7 +214,7 @@ def _inject(run: FaultyScenario, plan: RunPlan) -> dict[str, Any]:
 def _read_back(path: Path, end_ns: int) -> tuple[bool, float]:
     """Whether the recording can be read, and the seconds at its end that it does not have."""
     try:
-        recording = Recording(path)
+        recording = RecordingFile(path)
     except ValueError:
         return False, 0.0
     return bool(recording.run), max((end_ns - recording.span_ns[1]) * 1e-9, 0.0) if recording.topics else end_ns * 1e-9

@@ -15,9 +15,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from host.studies.proof.scoring import gap_closed
 from sim.concealed.label import Label
-from sim.concealed.rig import Session
+from sim.concealed.rig import NoiselessRecordings
 from sim.concealed.suite import rebuild
-from sim.concealed.system import Planted, System, columns
+from sim.concealed.system import ScaledEffect, System, columns
 
 Array = np.ndarray
 Model = Callable[[Array, Array, Array], Array]  # features train (n, k), residuals (n, m), features held out -> (l, m)
@@ -37,17 +37,17 @@ def read_columns(path: Path) -> dict[str, Array]:
     return {name: table[name].to_numpy(zero_copy_only=False).astype(float) for name in table.column_names}
 
 
-def read_session(system: System, folder: Path) -> Session:
+def read_session(system: System, folder: Path) -> NoiselessRecordings:
     """The recordings of a case as the system's session."""
     tables = [read_columns(path) for path in sorted(folder.glob("[abc].*"))]
-    none = Session(
+    none = NoiselessRecordings(
         tuple(t["time_s"] for t in tables),
         *(tuple(np.zeros((len(t["time_s"]), k)) for t in tables) for k in _widths(system)),
     )
     names = list(columns(system, none, 0))[1:]
     k = _widths(system)[0]
     stacked = [np.column_stack([t[name] for name in names]) for t in tables]
-    return Session(none.time_s, tuple(x[:, :k] for x in stacked), tuple(x[:, k:] for x in stacked))
+    return NoiselessRecordings(none.time_s, tuple(x[:, :k] for x in stacked), tuple(x[:, k:] for x in stacked))
 
 
 def _widths(system: System) -> tuple[int, int]:
@@ -98,13 +98,13 @@ def _scores(label: Label, system: System, left: Array, explained: Array) -> dict
     return {"detected": bool(np.max(z) > 4.0), "gap_closed": gap_closed(label, {"fit": {"per_channel": per_channel}})}
 
 
-def _features(session: Session, i: int, system: System) -> Array:
+def _features(session: NoiselessRecordings, i: int, system: System) -> Array:
     """Inputs and their speeds (n, 2k), scaled to about one."""
     u = session.inputs[i]
     return np.hstack([u, np.gradient(u, system.period_s, axis=0)])
 
 
-def _learned(model: Model, session: Session, left: list[Array], system: System) -> Array:
+def _learned(model: Model, session: NoiselessRecordings, left: list[Array], system: System) -> Array:
     """Held-out residuals as `model` foretells them from inputs, trained on the others."""
     train = np.vstack([_features(session, i, system) for i in (0, 1)])
     middle, spread = train.mean(axis=0), np.maximum(train.std(axis=0), 1e-12)
@@ -153,13 +153,13 @@ def _distances(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2.0 * a @ b.T)
 
 
-def _oracle(system: System, planted: list[Planted], session: Session, left: list[Array]) -> Array:
+def _oracle(system: System, planted: list[ScaledEffect], session: NoiselessRecordings, left: list[Array]) -> Array:
     """The true module with its size fitted to the training recordings, beside nominal parameters as they are."""
     if not planted:
         return np.zeros_like(left[2])
 
     def apart(factor: float) -> tuple[float, Array]:
-        chosen = [Planted(p.dish, factor * p.size, p.start_s) for p in planted]
+        chosen = [ScaledEffect(p.effect, factor * p.size, p.start_s) for p in planted]
         model = system.run(chosen, session.inputs)
         rest = [system.apart(m, y) / system.sigma for m, y in zip(model.outputs, session.outputs, strict=True)]
         return float(np.nansum(np.vstack(rest[:2]) ** 2)), rest[2] * system.sigma

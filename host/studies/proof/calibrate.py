@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from host.studies.proof.calibration import Curve, Table, fit
+from host.studies.proof.calibration import CalibrationTable, Curve, fit
 from host.studies.proof.worlds.suite import read_labels
 from sim.concealed.label import Label
 
@@ -45,7 +45,7 @@ def statements(judged: Judged, kind: str) -> list[tuple[float, bool]]:
     return found
 
 
-def calibrated(runs: Sequence[Path], left_out: Sequence[str]) -> Table:
+def calibrated(runs: Sequence[Path], left_out: Sequence[str]) -> CalibrationTable:
     """Return the table fitted on all worlds of `runs` but those `left_out`."""
     used: Judged = []
     source: dict[str, Any] = {"left_out": sorted(left_out), "runs": []}
@@ -56,7 +56,7 @@ def calibrated(runs: Sequence[Path], left_out: Sequence[str]) -> Table:
         source["runs"].append({"seed": note["seed"], "cases": note["cases"], "worlds": sorted(taken)})
     effect, none = (statements(used, kind) for kind in ("effect", "none"))
     source["statements"] = {"effect": len(effect), "none": len(none)}
-    return Table(fit(effect) if effect else Curve(), fit(none) if none else Curve(), source)
+    return CalibrationTable(fit(effect) if effect else Curve(), fit(none) if none else Curve(), source)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

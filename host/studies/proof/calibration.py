@@ -45,7 +45,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Table:
+class CalibrationTable:
     """Curves of both kinds of statements, and what they were fitted on."""
 
     effect: Curve
@@ -64,10 +64,10 @@ class Table:
         path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def read(path: Path) -> Table:
+def read(path: Path) -> CalibrationTable:
     """Return the table that `Table.write` wrote. Raises OSError, KeyError, ValueError for a file that is none."""
     content = json.loads(path.read_text(encoding="utf-8"))
-    return Table(Curve(**content["effect"]), Curve(**content["none"]), content["source"])
+    return CalibrationTable(Curve(**content["effect"]), Curve(**content["none"]), content["source"])
 
 
 def fit(statements: Sequence[tuple[float, bool]]) -> Curve:

@@ -106,7 +106,7 @@ SETS = (
 
 
 @dataclass(frozen=True)
-class Result:
+class SetResult:
     """What came out for one set; errors in its unit."""
 
     name: str
@@ -152,7 +152,7 @@ def _numbers(path: Path) -> dict[str, Array]:
     return columns
 
 
-def judged(one: Set, folder: Path) -> Result:
+def judged(one: Set, folder: Path) -> SetResult:
     """Diagnose one set. Raises InputError where its recordings are missing."""
     began = time.process_time()
     if one.file:
@@ -166,7 +166,9 @@ def judged(one: Set, folder: Path) -> Result:
     before, after = _errors(one, found["fit"])
     right = bool(named) and named[0] in one.expected
     spent = time.process_time() - began
-    return Result(one.name, found["verdict"], named, right, one.scale * before, one.scale * after, one.hand, one.unit, spent)
+    return SetResult(
+        one.name, found["verdict"], named, right, one.scale * before, one.scale * after, one.hand, one.unit, spent
+    )
 
 
 def _errors(one: Set, fit: dict[str, Any]) -> tuple[float, float]:
@@ -179,7 +181,7 @@ def _errors(one: Set, fit: dict[str, Any]) -> tuple[float, float]:
     return float(row["rmse_before"]), float(row["rmse_after"])
 
 
-def markdown(results: Sequence[Result]) -> str:
+def markdown(results: Sequence[SetResult]) -> str:
     """Return the results as a table."""
     lines = ["| recordings | named | before | after | by hand | processor s |", "|---|---|---|---|---|---|"]
     for r in results:

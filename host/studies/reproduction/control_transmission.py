@@ -12,7 +12,7 @@ from host.commissioning.characterization import Characterization, KnobSweep, cha
 from host.commissioning.characterization_report import knob_picture, pictures_of
 from host.commissioning.sine_kinematics import CurveErrors, SineKinematics, compare, fit_sine_kinematics
 from host.commissioning.sweep_fits import Run, fit_knob
-from host.recordings.recording import Recording
+from host.recordings.recording import RecordingFile
 from host.recordings.writer import new_recording_path
 from host.report.figure_page import Section, verdict
 from host.report.style import ESTIMATED, MEASURED, TRUTH, ReportFigure
@@ -28,7 +28,7 @@ def sections(directory: Path, quick: bool, board: str = "native") -> tuple[list[
     """Drive the sweeps on the simulated rig, identify, compare with the thesis. The recording stays in `directory`."""
     rig = load_rig(SIMULATED_RIG)
     path = record_simulated(rig, standard_sweeps(rig, 1 if quick else 3), new_recording_path(directory, "sweeps"), 1, board)
-    found = characterize(Recording(path), rig)
+    found = characterize(RecordingFile(path), rig)
     loops = pictures_of(found)
     return [_insertion(found, loops[:2]), _roll(found, loops[2:4]), _knob(found), *_curves(found)], found
 

@@ -14,15 +14,15 @@ from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from sim.concealed import suite as concealed
 from sim.concealed import system as concealed_system
-from sim.concealed.suite import Drawn, Plan
+from sim.concealed.suite import ConcealedCase, ConcealedPlan
 
 
-def rig(seed: int, index: int) -> Drawn:
+def rig(seed: int, index: int) -> ConcealedCase:
     """A rig with nothing missing."""
-    return concealed.draw(Plan(seed, index, "null", "rig", bool(index % 2), 0.0, index))
+    return concealed.draw(ConcealedPlan(seed, index, "null", "rig", bool(index % 2), 0.0, index))
 
 
-def write(drawn: Drawn, force_noise_N: float, folder: Path) -> list[Path]:
+def write(drawn: ConcealedCase, force_noise_N: float, folder: Path) -> list[Path]:
     """Its recordings with a force sensor as noisy as told, and nominal.toml, in `folder`."""
     sigma = drawn.system.sigma.copy()
     sigma[12:15] = force_noise_N

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from host.diagnosis.live.twin import Listener
+from host.diagnosis.live.twin import FrameCollector
 from host.diagnosis.live.watch import Watch, watch
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
@@ -74,7 +74,7 @@ def _pose(plant: Plant, tool: int, now: int, frame: int, rng: np.random.Generato
 def alarms(effects: tuple[PlantedEffect, ...], seconds: float = END_S, seed: int = 1) -> list[Alarm]:
     watcher, found = Watch(RIG), []
     for _, topic, message in sorted(messages(effects, seconds, seed), key=lambda heard: heard[0]):
-        watcher.hear(topic, message)
+        watcher.receive(topic, message)
         alarm = watcher.look() if topic == "pose/shaft" else None
         found += [alarm] if alarm else []
     assert watcher.phase == "watching"
@@ -108,19 +108,19 @@ def test_the_twin_is_only_held_against_an_armed_rig() -> None:
     watcher = Watch(RIG)
     for _, topic, message in messages((), 3.0):
         if topic != "state":
-            watcher.hear(topic, message)
+            watcher.receive(topic, message)
             assert watcher.look() is None
     assert watcher.phase == "waiting"
 
 
 def test_rows_are_even_and_lost_frames_stay_empty() -> None:
-    listener = Listener(RIG, 5.0)
+    frames = FrameCollector(RIG, 5.0)
     for _, topic, message in sorted(messages((), 2.0), key=lambda heard: heard[0]):
         if not (isinstance(message, Pose) and message.frame in (20, 21, 22)):
-            listener.hear(topic, message)
-            listener.settle()
-    assert np.all(np.diff(listener.stamps_ns) == listener.period_ns)
-    recording = listener.recording(0)
+            frames.receive(topic, message)
+            frames.settle()
+    assert np.all(np.diff(frames.stamps_ns) == frames.period_ns)
+    recording = frames.recording(0)
     tip = recording.channels["tip_x_m"]
     assert np.isnan(tip[20:23]).all() and np.isfinite(tip).mean() > 0.7
     handle = recording.channels["handle_roll"]

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from sim.concealed import suite as concealed
-from sim.concealed.suite import Plan
+from sim.concealed.suite import ConcealedPlan
 
 SEED = 77
 DRAFTS = (
@@ -25,7 +25,7 @@ DRAFTS = (
 
 def build(folder: Path) -> list[dict]:  # type: ignore[type-arg]
     """Cases and seal as the generator leaves them, without its costly kinds. Returns the labels."""
-    plans = [Plan(SEED, i, category, kind, i % 2 == 0, rho, i) for i, (category, kind, rho) in enumerate(DRAFTS)]
+    plans = [ConcealedPlan(SEED, i, category, kind, i % 2 == 0, rho, i) for i, (category, kind, rho) in enumerate(DRAFTS)]
     folder = folder / "own"
     labels = [concealed.make(plan, folder / "cases" / plan.id) for plan in plans]
     (folder / "sealed").mkdir()

@@ -145,7 +145,7 @@ class Mechanism(Protocol):
 
 
 @dataclass(frozen=True)
-class Plan:
+class CasePlan:
     """What a case is to be. `turn` counts within its category, `attempt` the redraws."""
 
     world: str
@@ -179,7 +179,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnCase:
     """A case before noise."""
 
     setup: Setup
@@ -189,7 +189,7 @@ class Drawn:
     rho: float
 
 
-def plans(world: str, seed: int, cases: int, mechanisms: int) -> list[Plan]:
+def plans(world: str, seed: int, cases: int, mechanisms: int) -> list[CasePlan]:
     """Return the whole suite in the order of its shuffled case numbers. Raises ValueError for less than one case."""
     if cases < 1 or seed < 0:
         raise ValueError(f"cases and seed: found {cases} and {seed}, wanted at least 1 and at least 0")
@@ -203,7 +203,9 @@ def plans(world: str, seed: int, cases: int, mechanisms: int) -> list[Plan]:
     for number, k in enumerate(order):
         category, turn = drafts[k]
         rho = 0.0 if category == "null" else LEVELS[(turn + seed) % len(LEVELS)]
-        found.append(Plan(world, seed, number, category, (turn + seed) % mechanisms, (number + seed) % 2 == 0, rho, turn))
+        found.append(
+            CasePlan(world, seed, number, category, (turn + seed) % mechanisms, (number + seed) % 2 == 0, rho, turn)
+        )
     return found
 
 
@@ -247,14 +249,14 @@ def _shown(setup: Setup, left: Sequence[Columns]) -> bool:
     return sum(energy[:-1]) > LEAST_ENERGY and training >= 0.5 * rho
 
 
-def _pick(mechanism: Mechanism, plan: Plan, menu: Sequence[Plantable], skip: int = 0) -> tuple[Plantable, float]:
+def _pick(mechanism: Mechanism, plan: CasePlan, menu: Sequence[Plantable], skip: int = 0) -> tuple[Plantable, float]:
     """Return the effect of this turn and its sign; redraws go on through the menu."""
     rng = plan.stream(2 + skip)
     effect = menu[(plan.turn * 5 + plan.seed + plan.attempt * 3 + skip + int(rng.integers(len(menu)))) % len(menu)]
     return effect, -1.0 if effect.signed and rng.random() < 0.5 else 1.0
 
 
-def _attempt(mechanism: Mechanism, plan: Plan) -> Drawn | None:
+def _attempt(mechanism: Mechanism, plan: CasePlan) -> DrawnCase | None:
     setup = mechanism.draw(plan.stream(1), plan.closed_loop)
     planted: tuple[Planted, ...] = ()
     if plan.category != "null":
@@ -275,10 +277,10 @@ def _attempt(mechanism: Mechanism, plan: Plan) -> Drawn | None:
     left = mechanism.left(setup, traces)
     rho = size_of(setup, left)[0]
     good = rho < NULL_BELOW if not planted else _shown(setup, left) and rho > 0.4 * plan.rho
-    return Drawn(setup, planted, traces, left, rho) if good else None
+    return DrawnCase(setup, planted, traces, left, rho) if good else None
 
 
-def make(mechanisms: Sequence[Mechanism], plan: Plan) -> Case:
+def make(mechanisms: Sequence[Mechanism], plan: CasePlan) -> Case:
     """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if none does."""
     mechanism = mechanisms[plan.mechanism]
     for attempt in range(ATTEMPTS):
@@ -289,7 +291,7 @@ def make(mechanisms: Sequence[Mechanism], plan: Plan) -> Case:
     raise RuntimeError(f"{plan.world} {plan.id}: no {plan.category} case of {mechanism.name} and rho {plan.rho}")
 
 
-def _finished(mechanism: Mechanism, plan: Plan, drawn: Drawn) -> Case:
+def _finished(mechanism: Mechanism, plan: CasePlan, drawn: DrawnCase) -> Case:
     """Return the case with noise, drop-outs, nominal model and label."""
     setup, rng = drawn.setup, plan.stream(9)
     recordings: dict[str, Columns] = {}
@@ -309,7 +311,7 @@ def _finished(mechanism: Mechanism, plan: Plan, drawn: Drawn) -> Case:
     return Case(recordings, nominal, _label(mechanism, plan, drawn, held))
 
 
-def _label(mechanism: Mechanism, plan: Plan, drawn: Drawn, held: Mapping[str, float]) -> Label:
+def _label(mechanism: Mechanism, plan: CasePlan, drawn: DrawnCase, held: Mapping[str, float]) -> Label:
     """Return what the seal keeps."""
     rho, each = size_of(drawn.setup, drawn.left)
     order = sorted(each, key=lambda name: -each[name])

@@ -87,7 +87,7 @@ def suite(
     return hashlib.sha256(seal.read_bytes()).hexdigest()
 
 
-def _keep(folder: Path, plan: case.Plan) -> int:
+def _keep(folder: Path, plan: case.CasePlan) -> int:
     """Make one case and put its label behind the seal. Returns 1."""
     made = case.make(mechanisms(plan.world), plan)
     case.write(made, folder / "cases" / plan.id)
