@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -110,7 +109,7 @@ def problems(
     """Model, the problem at the rate that is fitted, and the problem at full rate."""
     model: Model = RecordedRig(spec) if spec.recorded_rig else build(spec)
     if spec.effect:
-        model = cast(Model, Known(model, spec.effect, recordings))
+        model = Known(model, spec.effect, recordings)
     factor = thinning(model, recordings)
     columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
     full = replace(_problem(model, recordings, columns), rules=rules)
@@ -137,8 +136,9 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
         found = noise_module.estimate([p.y[row] for p in segments], still)
-        if "noise" in segments[0].extra:  # of a difference that the model itself makes
-            found = sorted((p.extra["noise"] for p in segments), key=lambda noise: noise.sigma)[len(segments) // 2]
+        own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
+        if own:
+            found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
         noises.append(found)
         for segment in segments:
             segment.y[row, noise_module.wild(segment.y[row], found.sigma)] = np.nan
@@ -212,11 +212,10 @@ def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
     """`fit` simulated on the samples of `full`."""
     for segment, coarse in zip(full.segments, like.segments, strict=True):
         segment.start = coarse.start
-        settle = getattr(full.model, "settle", None)
-        if settle is not None and not fit.terms:
-            settle(segment, fit.values)
-        if "begin" in coarse.extra:
-            segment.extra["begin"] = coarse.extra["begin"]
+        if not fit.terms:
+            full.model.settle(segment, fit.values)
+        if segment.begin is not None and coarse.begin is not None:
+            segment.begin.values = coarse.begin.values
     again = replace(fit)
     again.residuals = [segment.y - full.simulate(segment, fit.terms, fit.values) for segment in full.segments]
     return again

@@ -140,9 +140,9 @@ def separation(trial: Problem, rival: Fit, known: Array) -> float:
 
 def trials(problem: Problem, best: Fit) -> list[tuple[Excitation, Problem]]:
     """Every excitation of the family with the best model's prediction of it as its record."""
-    own = getattr(plain(problem), "excitations", None)
+    own = problem.model.inner
     usual = at_rest(problem)
-    made = own(problem, best) if own is not None else excitations(problem)
+    made = own.excitations(problem, best) if own.on_rig else excitations(problem)
     out = []
     for excitation, channels in made:
         recording = synthetic(usual, excitation.time_s, channels)
@@ -153,9 +153,8 @@ def trials(problem: Problem, best: Fit) -> list[tuple[Excitation, Problem]]:
 def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | None:
     """A problem of one recording whose outputs are what `best` says; None where it says nothing finite."""
     segment = problem.model.prepare(recording)
-    settle = getattr(problem.model, "settle", None)
-    if settle is not None and not hasattr(plain(problem), "excitations"):
-        settle(segment, best.values[: len(problem.model.parameters)])
+    if not problem.model.inner.on_rig:
+        problem.model.settle(segment, best.values[: len(problem.model.parameters)])
     trial = Problem(problem.model, [segment], problem.noise, problem.scale, problem.columns)
     segment.y = problem.simulate(segment, best.terms, best.values)
     return trial if np.isfinite(segment.y).all() and np.max(np.abs(segment.y)) < 1e100 else None
@@ -163,15 +162,7 @@ def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | No
 
 def asked(problem: Problem) -> tuple[str, ...]:
     """Channels that a script sets."""
-    controller = getattr(getattr(plain(problem), "spec", None), "controller", None)
-    if controller is not None:
-        return (controller.reference,)
-    return tuple(getattr(plain(problem), "scripted", problem.model.quiet_inputs))
-
-
-def plain(problem: Problem) -> Any:
-    """The model without the effects that are known to it."""
-    return getattr(problem.model, "inner", problem.model)
+    return problem.model.inner.scripted
 
 
 def at_rest(problem: Problem) -> tuple[Recording, dict[str, float]]:

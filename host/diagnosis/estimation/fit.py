@@ -197,7 +197,7 @@ def reweigh(problem: Problem, fit: Fit) -> None:
         rms = float(np.sqrt(np.mean(together**2))) if together.size else 1.0
         problem.scale[index] = max(rms, problem.noise[index].sigma, 1e-12)
     for segment in problem.segments:
-        segment.extra["weight"] = problem.scale
+        segment.weight = problem.scale
 
 
 def finish(problem: Problem, fit: Fit) -> Fit:

@@ -17,28 +17,18 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 
 
-class Known:
+class Known(Model):
     """`inner` with effects of the vocabulary switched on; their parameters join the nominal ones and are refitted
     with them.
     """
 
     def __init__(self, inner: Model, effects: list[EffectSpec], recordings: list[Recording]) -> None:
-        self.inner = inner
-        for name in (
-            "kind",
-            "outputs",
-            "ports",
-            "quiet_inputs",
-            "screen_samples",
-            "scan_points",
-            "fit_samples",
-            "coarsest_s",
-            "travel",
-            "moves",
-            "unlisted_at",
-            "taken",
-        ):
-            setattr(self, name, getattr(inner, name))
+        self._inner = inner
+        self.kind, self.outputs, self.ports, self.quiet_inputs = inner.kind, inner.outputs, inner.ports, inner.quiet_inputs
+        self.screen_samples, self.scan_points = inner.screen_samples, inner.scan_points
+        self.fit_samples, self.coarsest_s = inner.fit_samples, inner.coarsest_s
+        self.travel, self.moves, self.unlisted_at = inner.travel, inner.moves, inner.unlisted_at
+        self.pointwise = inner.pointwise
         segments = [inner.prepare(recording) for recording in recordings]
         self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []
         for spec in effects:
@@ -48,23 +38,21 @@ class Known:
         self.own = len(inner.parameters)
         self.parameters = (*inner.parameters, *(p for _, parameters in self.active for p in parameters))
         self.taken = inner.taken | {f"{c.effect.id}:{c.form}@{c.port.name}" for c, _ in self.active}
-        if hasattr(inner, "settle"):
-            self.settle = lambda segment, theta: inner.settle(segment, theta[: self.own])
-        if hasattr(inner, "begin_anew"):
-            self.begin_anew = lambda segment, theta, active: inner.begin_anew(
-                segment, theta[: self.own], self.with_known(theta, active)
-            )
-        if hasattr(inner, "sensitivity"):
-            self.sensitivity = self._sensitivity
-            self.change = lambda segment, theta, *rest: inner.change(segment, theta[: self.own], *rest)  # type: ignore[attr-defined]
+
+    @property
+    def inner(self) -> Model:
+        """The model without the known effects."""
+        return self._inner
 
     def prepare(self, recording: Recording) -> Segment:
         """As the model without effects."""
-        return self.inner.prepare(recording)
+        return self._inner.prepare(recording)
 
     def guess(self, segments: list[Segment]) -> Array:
         """Start values of the model, then the values given for the effects."""
-        return np.concatenate([self.inner.guess(segments), [p.grid[0] for _, parameters in self.active for p in parameters]])
+        return np.concatenate(
+            [self._inner.guess(segments), [p.grid[0] for _, parameters in self.active for p in parameters]]
+        )
 
     def with_known(self, theta: Array, active: list[ActiveEffect]) -> list[ActiveEffect]:
         """`active` and the known ones, with their share of `theta`."""
@@ -76,19 +64,40 @@ class Known:
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (outputs, n) with the known effects at work."""
-        return self.inner.simulate(segment, theta[: self.own], self.with_known(theta, active))
+        return self._inner.simulate(segment, theta[: self.own], self.with_known(theta, active))
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """As the model without effects."""
-        return self.inner.motion(segment, port)
+        return self._inner.motion(segment, port)
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """As the model without effects."""
-        return self.inner.needs(segment, port, theta[: self.own], residual)
+        return self._inner.needs(segment, port, theta[: self.own], residual)
 
-    def _sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Any:
-        inner: Any = self.inner
-        return inner.sensitivity(segment, theta[: self.own], axis, self.with_known(theta, active))
+    def settle(self, segment: Segment, theta: Array) -> None:
+        """As the model without effects."""
+        self._inner.settle(segment, theta[: self.own])
+
+    def noise_of(self, segment: Segment) -> Any:
+        """As the model without effects."""
+        return self._inner.noise_of(segment)
+
+    def restarts(self, segments: list[Segment]) -> list[Array]:
+        """Those of the model, each with the values given for the effects."""
+        given = [p.grid[0] for _, parameters in self.active for p in parameters]
+        return [np.concatenate([theta, given]) for theta in self._inner.restarts(segments)]
+
+    def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Array:
+        """As the model with the known effects at work."""
+        return self._inner.sensitivity(segment, theta[: self.own], axis, self.with_known(theta, active))
+
+    def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
+        """As the model with the known effects at work."""
+        return self._inner.slopes(segment, theta[: self.own], self.with_known(theta, active))
+
+    def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:
+        """As the model."""
+        return self._inner.change(segment, theta[: self.own], slopes, candidate, values)
 
 
 def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:

@@ -118,12 +118,13 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
     """
     columns = []
     for segment in problem.segments:
-        if segment.fit.any() and hasattr(problem.model, "begin_anew") and "measured" in segment.extra:
-            begin, spread = segment.extra["begin"], segment.extra["measured"][1]
-            for k in range(2):
-                segment.extra["begin"] = begin + np.eye(2)[k] * spread[k]
+        begin = segment.begin
+        if segment.fit.any() and begin is not None:
+            values = begin.values
+            for k in np.flatnonzero(begin.spread > 0.0):
+                begin.values = values + np.eye(values.size)[k] * begin.spread[k]
                 columns.append(base - problem.stacked(fit.terms, fit.values))
-            segment.extra["begin"] = begin
+            begin.values = values
     used = [column for column in columns if np.any(column)]
     return np.array(used).T if used else np.zeros((base.size, 0))
 

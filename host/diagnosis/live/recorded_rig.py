@@ -17,7 +17,7 @@ from host.diagnosis.model.effect import Port
 from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.rig_recording import knob_gain, rig_of
-from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS
+from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS, RigSegment
 from host.recordings.recording import RecordingFile
 from protocol.catheter import Catheter, CosseratParameters
 from protocol.errors import InputError
@@ -35,8 +35,6 @@ class RecordedRig(Twin):
     Known play and knob curve are taken off the handle beforehand (rig_recording); offsets, slope, gain and bending
     stiffness are refitted.
     """
-
-    scripted = (*HANDLES, *FORCE)
 
     def __init__(self, spec: NominalSpec) -> None:
         rig = rig_of(spec._files)
@@ -56,7 +54,7 @@ class RecordedRig(Twin):
         self.outputs = self.outputs[:POSE_ROWS]
         self.ports = tuple(port for port in self.ports if port.name != "contact")
 
-    def prepare(self, recording: Recording) -> Segment:
+    def prepare(self, recording: Recording) -> RigSegment:
         """As the twin does, the force as it was averaged about each frame; it is no output."""
         segment = super().prepare(recording)
         segment.y = segment.y[:POSE_ROWS]
@@ -70,14 +68,25 @@ class RecordedRig(Twin):
         """As the chain has it; for the force sensor, the force along the wall's normal that the poses would need."""
         if port.name != "force_sensor":
             return super().needs(segment, port, theta, residual)
-        given = segment.extra["force"]
+        assert isinstance(segment, RigSegment)
+        given = segment.force
         base = self.simulate(segment, theta, [])
-        segment.extra["force"] = given + NUDGE_N * self.normal[:, None]
+        segment.force = given + NUDGE_N * self.normal[:, None]
         slope = (self.simulate(segment, theta, []) - base) / NUDGE_N
-        segment.extra["force"] = given
-        weight = segment.extra.get("weight", np.ones(POSE_ROWS))[:, None]
+        segment.force = given
+        weight = segment.weights()
         slope = np.where(np.isfinite(residual), slope, 0.0) / weight
         return np.asarray(np.sum(slope * np.nan_to_num(residual) / weight, axis=0) / (np.sum(slope**2, axis=0) + 1e-12))
+
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """Handle and force on the wall."""
+        return (*HANDLES, *FORCE)
+
+    @property
+    def on_rig(self) -> bool:
+        """Experiments run on the recorded rig."""
+        return True
 
     def excitations(self, problem: Problem, best: Fit) -> list[tuple[Excitation, dict[str, Array]]]:
         """Motions that this rig can make in an experiment."""

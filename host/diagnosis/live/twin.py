@@ -14,7 +14,7 @@ from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
-from host.diagnosis.models.rig import FORCE, SHAFT, TIP, RigModel
+from host.diagnosis.models.rig import FORCE, SHAFT, TIP, RigModel, RigSegment
 from host.diagnosis.models.rig_kernel import matrices, rotation_logs
 from host.mechanics.cosserat import CosseratSolution, solve_cosserat
 from protocol.catheter import Catheter, load_catheter
@@ -107,27 +107,29 @@ class Twin(RigModel):
         theta[list(OFFSETS)] += z[:3]
         return TwinFit(theta, float(z[4]), float(np.sqrt(np.mean(r**2))))
 
-    def prepare(self, recording: Recording) -> Segment:
+    def prepare(self, recording: Recording) -> RigSegment:
         """As the chain does, but with the force as it was recorded: it is an average over a frame already."""
         segment = super().prepare(recording)
-        segment.extra["force"] = np.vstack([np.nan_to_num(fill(recording.channels[name])) for name in FORCE])
-        segment.inputs["axial_force"] = self.normal @ segment.extra["force"]
+        segment.force = np.vstack([np.nan_to_num(fill(recording.channels[name])) for name in FORCE])
+        segment.inputs["axial_force"] = self.normal @ segment.force
         return segment
 
     def correct(self, segment: Segment, theta: Array) -> None:
         """Makes `simulate` of `segment` exact at `theta` (nominal parameters) without effects."""
-        segment.extra.pop("exact", None)
-        segment.extra["exact"] = self._exact(segment, theta) - super().simulate(segment, theta, [])
-        segment.extra["exact"][12:] = 0.0
+        assert isinstance(segment, RigSegment)
+        segment.exact = self._exact(segment, theta) - super().simulate(segment, theta, [])
+        segment.exact[12:] = 0.0
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n) of the chain, plus what the rod model adds where `correct` was called."""
-        return np.asarray(super().simulate(segment, theta, active) + segment.extra.get("exact", 0.0))
+        assert isinstance(segment, RigSegment)
+        chain = super().simulate(segment, theta, active)
+        return chain if segment.exact is None else np.asarray(chain + segment.exact)
 
-    def _exact(self, segment: Segment, theta: Array) -> Array:
+    def _exact(self, segment: RigSegment, theta: Array) -> Array:
         """Outputs (15, n) by the rod model, NaN where it has no equilibrium."""
         insertion, roll, kappa = self.links(segment, theta, [])
-        push, start = segment.extra["force"] * self.softness, None
+        push, start = segment.force * self.softness, None
         tip, shaft = np.full((2, 7, segment.n), np.nan)
         for i in range(segment.n):
             found = self._solve(insertion[i], roll[i], kappa[i], -push[:, i], start)
@@ -136,11 +138,11 @@ class Twin(RigModel):
                 tip[:, i] = [*found.tip_position_m, *found.tip_quaternion_wxyz]
                 shaft[:, i] = [*found.station_positions_m[0], *found.station_quaternions_wxyz[0]]
         rows = []
-        for pose, reference in zip((tip, shaft), segment.extra["reference"], strict=True):
+        for pose, reference in zip((tip, shaft), segment.reference, strict=True):
             good = np.isfinite(pose[0])
             turn = rotation_logs(reference, matrices(np.where(good, pose[3:], np.array([1.0, 0.0, 0.0, 0.0])[:, None])))
             rows += [pose[:3], np.where(good, turn, np.nan)]
-        return np.vstack([*rows, segment.extra["force"]])
+        return np.vstack([*rows, segment.force])
 
     def _solve(
         self, insertion: float, roll: float, kappa: float, force: Array, start: CosseratSolution | None

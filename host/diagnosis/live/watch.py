@@ -195,7 +195,7 @@ class Watch:
         assert b is not None and calibration is not None
         segment.y[:POSE_ROWS] -= b.mean[:, None]
         scale = np.concatenate([b.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
-        segment.extra["weight"] = scale
+        segment.weight = scale
         problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
         ranked = screen(problem, fit, self.candidate_effects, lambda what, part: self._rest())[: self.settings.suspects]

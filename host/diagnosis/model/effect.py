@@ -68,7 +68,7 @@ class Context:
     tolerance: float
     start: float = 0.0  # displacement needed at the first sample: start of memory
     source: Array | None = None
-    extra: dict[str, Any] = field(default_factory=dict)
+    equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
     _cache: dict[str, Array] = field(default_factory=dict)
 
     def moving(self, signal: Array) -> Array:

@@ -1,9 +1,10 @@
-"""The face that every nominal model shows the finder: outputs, ports, parameters, and one free-run simulation."""
+"""What every nominal model offers the finder: outputs, ports, parameters, and one free-run simulation."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,20 @@ class Output:
 
 
 @dataclass
+class Begin:
+    """The state from which one recording is simulated, and what is known of it beforehand, each (k,).
+
+    Copies of a segment share it: a state that is found anew holds for all of them.
+    """
+
+    names: tuple[str, ...]
+    measured: Array  # mean before the fit
+    spread: Array  # standard deviation before the fit; 0 where the state is known
+    values: Array
+    estimated: bool = True  # whether `Model.begin_anew` looks for it
+
+
+@dataclass
 class Segment:
     """One recording made ready for a model. `y` (outputs, n) is what was measured, NaN where missing or wild."""
 
@@ -35,53 +50,110 @@ class Segment:
     fit: Mask
     heldout: Mask
     inputs: dict[str, Array]
-    start: dict[str, float] = field(default_factory=dict)
-    extra: dict[str, Any] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)  # of ports, inputs, `output:port` and `motion:port`
+    tolerances: dict[str, float] = field(default_factory=dict)  # port -> movement below which nothing has moved
+    start: dict[str, float] = field(default_factory=dict)  # port -> displacement needed at the first sample
+    begin: Begin | None = None
+    weight: Array | None = None  # (outputs,) scale of each output's residual
+    equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
 
     @property
     def n(self) -> int:
         """Number of samples."""
         return self.recording.n
 
+    def weights(self) -> Array:
+        """Scale of each output's residual, (outputs, 1); ones before the first fit."""
+        return (np.ones(self.y.shape[0]) if self.weight is None else self.weight)[:, None]
 
-class Model(Protocol):
-    """A nominal model. `simulate` runs freely from the inputs; active effects change it at their ports."""
+
+class Model(ABC):
+    """A nominal model. `simulate` runs freely from the inputs; active effects change it at their ports.
+
+    What follows the abstract methods is optional: a model overrides what it has, and nothing asks whether it is there.
+    """
 
     kind: str
     outputs: tuple[Output, ...]
     ports: tuple[Port, ...]
     parameters: tuple[Parameter, ...]
     quiet_inputs: tuple[str, ...]
-    screen_samples: int  # about so many samples are enough to screen by
-    scan_points: int  # simulations that screening one candidate may take
-    fit_samples: int  # and so many to fit; beyond, samples are averaged
-    coarsest_s: float  # period beyond which they must not be averaged
-    travel: tuple[tuple[str, str, str], ...]  # signals a condition may speak of: words, key of Segment.inputs, unit
+    screen_samples: int = 20000  # about so many samples are enough to screen by
+    scan_points: int = 120  # simulations that screening one candidate may take
+    fit_samples: int = 1000000000  # and so many to fit; beyond, samples are averaged
+    coarsest_s: float = 0.0  # period beyond which they must not be averaged
+    travel: tuple[tuple[str, str, str], ...] = ()  # signals a condition may speak of: words, key of Segment.inputs, unit
     moves: dict[str, str]  # channel of the motion at each port of `unlisted_at`
-    unlisted_at: tuple[
-        tuple[str, str], ...
-    ]  # ports of an equation found by search: whose motion it is made of, where it is added
-    taken: frozenset[str]  # effects (id, or id:form) that the nominal model has already
+    # Ports of an equation found by search: whose motion it is made of, where it is added.
+    unlisted_at: tuple[tuple[str, str], ...] = ()
+    taken: frozenset[str] = frozenset()  # effects (id, or id:form) that the nominal model has already
+    pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined
 
+    @abstractmethod
     def prepare(self, recording: Recording) -> Segment:
         """Inputs filled and derived, outputs stacked."""
-        ...
 
-    def guess(self, segments: list[Segment]) -> Array:
-        """Start values of the nominal parameters."""
-        ...
-
+    @abstractmethod
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (outputs, n) for nominal parameters `theta` and active effects."""
-        ...
 
+    @abstractmethod
     def motion(self, segment: Segment, port: Port) -> Array:
         """Nominal signal (n,) at `port`, whose sizes set start values."""
-        ...
 
+    @abstractmethod
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """The displacement or force (n,) that `port` would need to explain `residual` (outputs, n)."""
-        ...
+
+    def guess(self, segments: list[Segment]) -> Array:
+        """Start values of the nominal parameters: those of the TOML."""
+        return np.array([p.grid[0] for p in self.parameters])
+
+    def simulate_all(self, segments: list[Segment], theta: Array, active: list[ActiveEffect]) -> list[Array]:
+        """Outputs of several recordings; a model that can runs them in parallel."""
+        return [self.simulate(segment, theta, active) for segment in segments]
+
+    def settle(self, segment: Segment, theta: Array) -> None:  # noqa: B027 - most models have nothing to settle
+        """Prepare the recording for these nominal parameters: a measured output that is an input too, freed of noise."""
+
+    def restarts(self, segments: list[Segment]) -> list[Array]:
+        """Further start values of the nominal parameters, for effects that hide them."""
+        return []
+
+    def noise_of(self, segment: Segment) -> Any:
+        """Noise (`estimation.noise.Noise`) of a difference that the model itself makes; None: estimated from the output."""
+        return None
+
+    def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Array:
+        """Change of outputs (outputs, n) per change of the signal at port `axis`, of a model that is `pointwise`."""
+        raise NotImplementedError(f"{self.kind}: outputs do not answer sample by sample")
+
+    def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
+        """What `change` needs, by port, for the ports at which a candidate can be screened without a simulation."""
+        return {}
+
+    def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:
+        """Linearized change of outputs (outputs, n) by a candidate at one of the ports of `slopes`."""
+        raise KeyError(candidate.port.name)
+
+    @property
+    def inner(self) -> Model:
+        """The model without effects that are known to it."""
+        return self
+
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """Channels that the script of an experiment sets."""
+        return self.quiet_inputs
+
+    @property
+    def on_rig(self) -> bool:
+        """Whether experiments run on a rig, within its limits (`excitations`)."""
+        return False
+
+    def excitations(self, problem: Any, best: Any) -> list[Any]:
+        """Motions of an experiment that a rig can make."""
+        raise NotImplementedError(f"{self.kind}: no rig to move")
 
 
 def tolerance_of(values: Array, span: float) -> float:
@@ -100,7 +172,7 @@ def apply_effects(
         return signal
     motion = signal
     span = float(np.ptp(motion)) or 1.0
-    tolerance = segment.extra.get(f"tolerance:{port}", 1e-3 * span)
+    tolerance = segment.tolerances.get(port, 1e-3 * span)
     for candidate, values in sorted(here, key=lambda effect: effect[0].effect.order):
         if kind is not None and candidate.effect.port != kind:
             continue
@@ -115,7 +187,7 @@ def apply_effects(
             tolerance,
             segment.start.get(port, 0.0),
             source,
-            segment.extra,
+            segment.equations,
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal
@@ -133,9 +205,9 @@ def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candi
     duration = max(float(segment.recording.time_s[-1]) for segment in used)
     source = np.concatenate([segment.inputs[candidate.source] for segment in used]) if candidate.source else np.ones(1)
     units = used[0].recording.units
-    unit = used[0].extra["units"][port.name]
+    unit = used[0].units[port.name]
     if candidate.effect.side == "output":
-        unit = used[0].extra["units"].get(f"output:{port.name}", unit)
+        unit = used[0].units.get(f"output:{port.name}", unit)
     span = max(high - low, 1e-12)
     return Scale(
         unit=unit,
@@ -148,10 +220,10 @@ def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candi
         dt_s=dt,
         duration_s=duration,
         timed=used[0].recording.timed,
-        source_unit=units.get(candidate.source, used[0].extra["units"].get(candidate.source, "")) or "1",
+        source_unit=units.get(candidate.source, used[0].units.get(candidate.source, "")) or "1",
         source_span=float(np.ptp(source)) or 1.0,
         source_rms=float(np.sqrt(np.mean(source**2))) or 1.0,
-        motion_unit=used[0].extra["units"].get(f"motion:{port.name}", unit),
+        motion_unit=used[0].units.get(f"motion:{port.name}", unit),
         motion_span=span,
     )
 

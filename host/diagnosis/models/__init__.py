@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from protocol.errors import InputError
@@ -14,15 +12,15 @@ def build(spec: NominalSpec) -> Model:
     if spec.kind == "transmission":
         from host.diagnosis.models.transmission import TransmissionModel
 
-        return cast(Model, TransmissionModel(spec))
+        return TransmissionModel(spec)
     if spec.kind == "impedance":
         from host.diagnosis.models.impedance import ImpedanceModel
 
-        return cast(Model, ImpedanceModel(spec))
+        return ImpedanceModel(spec)
     if spec.kind == "axis":
         from host.diagnosis.models.axis import AxisModel
 
-        return cast(Model, AxisModel(spec))
+        return AxisModel(spec)
     if spec.kind == "rig":
         from host.diagnosis.models.rig import RigModel
 

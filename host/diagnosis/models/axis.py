@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.force_kernel import run_axis, slot_array
-from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import (
+    ActiveEffect,
+    Begin,
+    Model,
+    Output,
+    Segment,
+    apply_effects,
+    filled,
+    stack,
+    tolerance_of,
+)
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives
 from host.diagnosis.models import balance
@@ -20,7 +31,18 @@ Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
 
 
-class AxisModel:
+@dataclass
+class AxisSegment(Segment):
+    """A recording with its smoothed motion, and what either way of comparing needs of it."""
+
+    x: Array = field(default_factory=lambda: np.zeros(0))  # (n,) reading, smoothed, and its rate
+    v: Array = field(default_factory=lambda: np.zeros(0))
+    substeps: int = 1  # of the integration, in one period
+    stages: Array | None = None  # (n, substeps, 3) recorded input at the stages of Runge-Kutta
+    balance: balance.Balance | None = None
+
+
+class AxisModel(Model):
     """Nominal model of kind `axis`.
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
@@ -29,10 +51,6 @@ class AxisModel:
     """
 
     kind = "axis"
-    fit_samples = 1000000000
-    coarsest_s = 0.0
-    screen_samples = 20000
-    scan_points = 120
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.axis is None:
@@ -72,14 +90,14 @@ class AxisModel:
         self.moves = {name: self.spec.output}
         self.quiet_inputs = (self.spec.input,)
 
-    def prepare(self, recording: Recording) -> Segment:
+    def prepare(self, recording: Recording) -> AxisSegment:
         """Input up-sampled to half sub-steps; start taken from the measured motion."""
         spec = self.spec
         names = [spec.input]
         if spec.controller is not None:
             names += [name for name in (spec.controller.reference, spec.controller.added) if name in recording.channels]
         y = stack(recording, [o.channel for o in self.outputs])
-        segment = Segment(recording, y, recording.fit, recording.heldout, filled(recording, names))
+        segment = AxisSegment(recording, y, recording.fit, recording.heldout, filled(recording, names))
         motion = fill(recording.channels[spec.output])
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
         x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
@@ -91,15 +109,13 @@ class AxisModel:
         }
         segment.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
-        segment.extra["measured"] = (np.array(begin), *_begin_spread(motion, x, recording.dt_s, window))
-        segment.extra.update(
-            begin=np.array(begin),
-            x=x,
-            v=v,
-            substeps=self._substeps(segment),
-            tolerance=tolerance_of(motion, float(np.ptp(motion))),
-        )
-        segment.extra["units"] = {
+        # Only a motion read as position is begun anew: its first speed is a derivative of noise, and its error rings on.
+        anew = self.free_run and spec.controller is None and spec.reads == "position"
+        spread = _begin_spread(motion, x, recording.dt_s, window)
+        segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), anew)
+        segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
+        segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
+        segment.units = {
             **self.units,
             name: self.units[spec.input],
             f"motion:{name}": self.units[spec.output],
@@ -107,12 +123,11 @@ class AxisModel:
             f"{name}_reading": self.units[spec.output],
         }
         if self.free_run:
-            segment.extra["stages"] = stages(segment.inputs[spec.input], segment.extra["substeps"], self.hold)
+            segment.stages = stages(segment.inputs[spec.input], segment.substeps, self.hold)
         else:
             segment.y = np.zeros_like(y)
-            segment.extra["force"] = spec.input
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
-            balance.prepare(segment, motion, seen, SMOOTHING_S, spec.hold)
+            segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, spec.hold)
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:
@@ -180,7 +195,8 @@ class AxisModel:
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs in free run. Shape (outputs, n)."""
-        spec, extra = self.spec, segment.extra
+        assert isinstance(segment, AxisSegment) and segment.begin is not None
+        spec = self.spec
         linear = np.zeros(4)
         for term, value in zip(spec.terms, theta, strict=True):
             linear[("mass", "damping", "stiffness", "offset").index(term)] = value
@@ -203,15 +219,18 @@ class AxisModel:
             reference = np.vstack([segment.inputs[c.reference], segment.inputs.get(c.added, load)])
         else:
             control, reference = np.zeros(0), load[None, :]
-        if not self.free_run:
-            return balance.error(segment, linear, force, p, segment.start.get(spec.subsystem, 0.0))
+        if segment.balance is not None:
+            measured = balance.Motion(
+                segment.x, segment.v, segment.tolerances[spec.subsystem], segment.start.get(spec.subsystem, 0.0)
+            )
+            return balance.error(segment.balance, segment, measured, linear, force, p)
         run = run_axis(
-            stages(force, extra["substeps"], self.hold) if drive else extra["stages"],
-            extra["substeps"],
+            segment.stages if segment.stages is not None and not drive else stages(force, segment.substeps, self.hold),
+            segment.substeps,
             segment.recording.dt_s,
             linear,
             p,
-            extra["begin"],
+            segment.begin.values,
             load,
             control,
             reference,
@@ -222,32 +241,22 @@ class AxisModel:
         motion = apply_effects(motion, active, f"{spec.subsystem}_reading", segment, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
 
-    def begin_anew(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> None:
-        """Position and speed at the first sample, as measured there and as the free run wants them, each by its own
-        variance.
+    def noise_of(self, segment: Segment) -> Noise | None:
+        """Noise of the force that a measured motion needs, from the spectra of both."""
+        assert isinstance(segment, AxisSegment)
+        return segment.balance.noise if segment.balance is not None else None
 
-        Only a motion read as position is begun so: its first speed is a derivative of noise, and its error rings on.
-        """
-        if not self.free_run or self.spec.controller is not None or self.spec.reads != "position":
-            return
-        begin, spread, _ = segment.extra["measured"]
-        segment.extra["begin"] = begin
-        r = segment.y[0] - self.simulate(segment, theta, active)[0]
-        columns = []
-        for k in range(2):
-            segment.extra["begin"] = begin + np.eye(2)[k] * spread[k]
-            columns.append((segment.y[0] - self.simulate(segment, theta, active)[0] - r) * -1.0)
-        used = np.isfinite(r)
-        A, b = np.array(columns).T[used], r[used]
-        sigma = float(np.sqrt(np.mean(b * b) * correlation_time(r))) or 1e-300
-        by = np.linalg.solve(A.T @ A / sigma**2 + np.eye(2), A.T @ b / sigma**2)
-        segment.extra["begin"] = begin + np.clip(by, -4.0, 4.0) * spread
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """The controller's reference where there is one."""
+        return (self.spec.controller.reference,) if self.spec.controller is not None else self.quiet_inputs
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """Motion at the force port, force at the drive, reading at the sensor."""
+        assert isinstance(segment, AxisSegment)
         if port.name == f"{self.spec.subsystem}_drive":
             return segment.inputs[self.spec.input]
-        return segment.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else segment.extra["x"]
+        return segment.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else segment.x
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of
@@ -261,15 +270,13 @@ class AxisModel:
         return np.asarray(residual[0] * size)
 
 
-def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> tuple[Array, float]:
-    """Standard deviations (2,) of position and speed at the first sample, read off a cubic over `window` samples; and
-    the noise.
-    """
+def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> Array:
+    """Standard deviations (2,) of position and speed at the first sample, read off a cubic over `window` samples."""
     first = slice(0, min(motion.size, 20 * window))
     noise = float(np.std((motion - smooth)[first])) * float(np.sqrt(window / max(window - 4.0, 1.0)))
     t = np.arange(window) * dt_s
     covariance = np.linalg.inv(np.vander(t / t[-1], 4, increasing=True).T @ np.vander(t / t[-1], 4, increasing=True))
-    return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300), noise
+    return np.maximum(1.5 * noise * np.sqrt(np.diag(covariance)[:2]) / np.array([1.0, t[-1]]), 1e-300)
 
 
 def stages(u: Array, substeps: int, hold: str) -> Array:

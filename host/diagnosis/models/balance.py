@@ -9,6 +9,8 @@ signal is differentiated; samples whose test function would reach over an end or
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import fftconvolve
@@ -26,14 +28,37 @@ HOLDS = ("linear", "zero", "band_limited")
 FINE = 32  # points a sample, to integrate a held force
 
 
-def prepare(segment: Segment, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None) -> None:
+@dataclass(frozen=True)
+class Balance:
+    """Test function of one recording, and what it leaves of the motion."""
+
+    input: str  # channel of the force
+    bump: Array  # (2 half + 1,) test function
+    held: Array  # its integral over what each sample of the force stands for
+    rows: Array  # (3, n) acceleration, speed and place of the motion under the test function
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Smoothed motion and speed (n,), the movement below which nothing has moved, and the friction held at first."""
+
+    x: Array
+    v: Array
+    tolerance: float
+    start: float
+
+
+def prepare(
+    segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None
+) -> Balance:
     """Test function, and the motion's (acceleration, speed, place) (3, n) under it.
 
     Its length follows the band in which the motion stands out of its noise; being the same for all terms it bends none of
     their coefficients.
 
-    motion: (n,), gaps bridged; seen: where motion and force were measured; hold: how the force runs between samples, None
-    for what fits best.
+    force: its channel; motion: (n,), gaps bridged; seen: where motion and force were measured; hold: how the force runs
+    between samples, None for what fits best.
     """
     dt_s, recording = segment.recording.dt_s, segment.recording
     sigma = estimate([motion], [quiescent([motion], dt_s, recording.timed)]).sigma
@@ -57,13 +82,12 @@ def prepare(segment: Segment, motion: Array, seen: npt.NDArray[np.bool_], least_
     fits = []
     for each in (hold,) if hold else HOLDS:
         held = _held(s, length, dt_s, each)
-        force = _along_record(segment.inputs[segment.extra["force"]], held)[kept]
-        found = np.linalg.lstsq(columns, force, rcond=1e-12)[0]
-        fits.append((float(np.sum((force - columns @ found) ** 2)), held, found[:3]))
+        applied = _along_record(segment.inputs[force], held)[kept]
+        found = np.linalg.lstsq(columns, applied, rcond=1e-12)[0]
+        fits.append((float(np.sum((applied - columns @ found) ** 2)), held, found[:3]))
     _, held, coefficients = min(fits, key=lambda item: item[0])
-    segment.extra.update(bump=bump, held_bump=held, balance=rows)
-    levels = white_level(motion), white_level(segment.inputs[segment.extra["force"]])
-    segment.extra["noise"] = _noise(coefficients, *levels, kernels, held)
+    levels = white_level(motion), white_level(segment.inputs[force])
+    return Balance(force, bump, held, rows, _noise(coefficients, *levels, kernels, held))
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
@@ -109,32 +133,28 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     )
 
 
-def applied(segment: Segment, force: Array) -> Array:
-    """Input (n,) under the test function, integrated as it is held between samples."""
-    return _along_record(force, segment.extra["held_bump"])
-
-
-def error(segment: Segment, linear: Array, force: Array, p: Array, start: float) -> Array:
+def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, force: Array, p: Array) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
     An effect of the drive changes the input `force` (n,), which is what is compared here: where it shrinks the
     input the error counts in the size of the recorded one, so that nothing is gained by shrinking.
     """
-    extra = segment.extra
-    a, v, x = extra["balance"]
+    recording = segment.recording
+    a, v, x = balance.rows
     need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
     if np.any(p):
         dry = along(
-            extra["x"],
-            extra["v"],
-            np.gradient(extra["v"], segment.recording.dt_s),
+            motion.x,
+            motion.v,
+            np.gradient(motion.v, recording.dt_s),
             np.zeros(segment.n),
-            segment.recording.time_s,
-            segment.recording.dt_s,
-            extra["tolerance"],
-            start,
+            recording.time_s,
+            recording.dt_s,
+            motion.tolerance,
+            motion.start,
             p,
         )
-        need = need + _along_record(dry, extra["bump"])
-    size = float(np.std(force)) / max(float(np.std(segment.inputs[extra["force"]])), 1e-300)
-    return np.asarray(need - applied(segment, force))[None, :] / min(max(size, 1e-6), 1.0)
+        need = need + _along_record(dry, balance.bump)
+    size = float(np.std(force)) / max(float(np.std(segment.inputs[balance.input])), 1e-300)
+    applied = _along_record(force, balance.held)
+    return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)

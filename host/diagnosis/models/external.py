@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from protocol.errors import InputError
 
@@ -20,15 +21,11 @@ Array = npt.NDArray[np.float64]
 Function = Callable[[dict[str, Array], dict[str, float], Array], dict[str, Array]]
 
 
-class ExternalModel:
+class ExternalModel(Model):
     """Nominal model of kind `callable`. A port at every input, before the function, and at every output, behind it."""
 
     kind = "callable"
-    fit_samples = 1000000000
-    coarsest_s = 0.0
-    screen_samples = 20000
     scan_points = 24
-    taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.callable is None:
@@ -82,9 +79,9 @@ class ExternalModel:
         units = dict(self.units)
         for channel in spec.inputs:
             values = segment.inputs[channel]
-            segment.extra[f"tolerance:{channel}"] = tolerance_of(values, float(np.ptp(values)))
+            segment.tolerances[channel] = tolerance_of(values, float(np.ptp(values)))
             units[f"output:{channel}"] = self.units[channel]
-        segment.extra["units"] = {**units, **{f"{channel}_reading": self.units[channel] for channel in spec.outputs}}
+        segment.units = {**units, **{f"{channel}_reading": self.units[channel] for channel in spec.outputs}}
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:
@@ -122,17 +119,9 @@ class ExternalModel:
         if port.name not in segment.inputs:
             return np.asarray(residual[self.spec.outputs.index(port.channels[0])])
         step = 1e-4 * (float(np.ptp(segment.inputs[port.name])) or 1.0)
-        moved = Segment(
-            segment.recording,
-            segment.y,
-            segment.fit,
-            segment.heldout,
-            {**segment.inputs, port.name: segment.inputs[port.name] + step},
-            segment.start,
-            segment.extra,
-        )
+        moved = replace(segment, inputs={**segment.inputs, port.name: segment.inputs[port.name] + step})
         slope = (self.simulate(moved, theta, []) - self.simulate(segment, theta, [])) / step
-        weight = np.asarray(segment.extra.get("weight", np.ones(len(self.outputs))))[:, None]
+        weight = segment.weights()
         s = np.where(np.isfinite(residual), slope, 0.0) / weight
         return np.asarray(
             np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)

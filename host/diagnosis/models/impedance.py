@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import numpy.typing as npt
 
@@ -9,7 +11,7 @@ from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.force_kernel import along, slot_array
-from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
 
@@ -18,7 +20,16 @@ SMOOTHING_S = 0.03
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
 
-class ImpedanceModel:
+@dataclass
+class MovedSegment(Segment):
+    """A recording with the derivatives (n,) of its motion."""
+
+    x: Array = field(default_factory=lambda: np.zeros(0))
+    v: Array = field(default_factory=lambda: np.zeros(0))
+    a: Array = field(default_factory=lambda: np.zeros(0))
+
+
+class ImpedanceModel(Model):
     """Nominal model of kind `impedance`."""
 
     kind = "impedance"
@@ -66,9 +77,9 @@ class ImpedanceModel:
         self.moves = {name: self.spec.input}
         self.quiet_inputs = (self.spec.input, *loads)
 
-    def prepare(self, recording: Recording) -> Segment:
+    def prepare(self, recording: Recording) -> MovedSegment:
         """Motion smoothed to velocity and acceleration without phase."""
-        segment = Segment(
+        segment = MovedSegment(
             recording,
             stack(recording, [self.spec.output]),
             recording.fit,
@@ -83,9 +94,10 @@ class ImpedanceModel:
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
         if noise < CLEAN * tolerance:
             x = motion  # smoothing would round its reversals, and friction with them
-        segment.extra.update(v=v, a=a, x=x, tolerance=tolerance)
+        segment.x, segment.v, segment.a = x, v, a
+        segment.tolerances[self.spec.subsystem] = tolerance
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
-        segment.extra["units"] = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
+        segment.units = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:
@@ -94,9 +106,9 @@ class ImpedanceModel:
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Force along the measured motion. Shape (1, n)."""
-        extra = segment.extra
+        assert isinstance(segment, MovedSegment)
         force = np.zeros(segment.n)
-        given = {"mass": extra["a"], "damping": extra["v"], "stiffness": extra["x"], "offset": 1.0}
+        given = {"mass": segment.a, "damping": segment.v, "stiffness": segment.x, "offset": 1.0}
         stiffness = 0.0
         for (term, source), value in zip(self.terms, theta, strict=True):
             force = force + value * (segment.inputs[source] if term == "load" else given[term])
@@ -111,13 +123,13 @@ class ImpedanceModel:
             load = segment.inputs[source] if source else np.zeros(segment.n)
             p = slot_array([*filled_slots, {"stiffness": float(stiffness)}])
             force = force + along(
-                extra["x"],
-                extra["v"],
-                extra["a"],
+                segment.x,
+                segment.v,
+                segment.a,
                 load,
                 segment.recording.time_s,
                 segment.recording.dt_s,
-                extra["tolerance"],
+                segment.tolerances[self.spec.subsystem],
                 segment.start.get(self.spec.subsystem, 0.0),
                 p,
             )

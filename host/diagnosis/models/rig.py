@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.noise import by_steps, estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Context, Parameter, Port
-from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, tolerance_of
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.model.operators import calm, fill
 from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, drag_along, matrices, rotation_logs, shapes
@@ -65,7 +66,18 @@ def _unit(name: str) -> str:
     return name.rsplit("_", 1)[1] if name.endswith(("_m", "_N")) else ""
 
 
-class RigModel:
+@dataclass
+class RigSegment(Segment):
+    """A recording with the force that loads the shape, and the rotations that turns are measured from."""
+
+    force: Array = field(default_factory=lambda: np.zeros((3, 0)))  # (3, n) on the wall, base frame
+    beyond: Array | None = None  # (3, n) part of the recorded force that simulation and noise do not explain
+    reference: tuple[Array, ...] = ()  # of tip and shaft
+    exact: Array | None = None  # (outputs, n) what the rod model says beyond the chain
+    kept: dict[Any, tuple[Array, ...]] = field(default_factory=dict)  # shapes of the last two runs
+
+
+class RigModel(Model):
     """Nominal model of kind `rig`. Outputs: tip position and turn, shaft position and turn, force; three rows each."""
 
     kind = "rig"
@@ -73,7 +85,7 @@ class RigModel:
     coarsest_s = 0.04
     screen_samples = 4000
     scan_points = 40
-    taken: frozenset[str] = frozenset()
+    pointwise = True
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.rig is None:
@@ -136,7 +148,7 @@ class RigModel:
         self.moves = {axis: f"handle_{axis}" for axis in AXES}
         self.quiet_inputs = tuple(HANDLES)
 
-    def prepare(self, recording: Recording) -> Segment:
+    def prepare(self, recording: Recording) -> RigSegment:
         """Poses as positions and rotation matrices; forces bridged; loads derived."""
         n = recording.n
         channels = recording.channels
@@ -146,14 +158,13 @@ class RigModel:
             inputs[f"motion:{axis}"] = inputs[f"handle_{axis}"]
         force = np.vstack([channels.get(name, missing) for name in FORCE])
         poses = [np.vstack([channels.get(name, missing) for name in names]) for names in (TIP, SHAFT)]
-        extra: dict[str, Any] = {
-            "force": np.vstack(
-                [calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)]
-            )
-        }
+        given = np.vstack(
+            [calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)]
+        )
+        tolerances = {}
         for axis in AXES:
             motion = inputs[f"handle_{axis}"]
-            extra[f"tolerance:{axis}"] = tolerance_of(motion, float(np.ptp(motion)))
+            tolerances[axis] = tolerance_of(motion, float(np.ptp(motion)))
         units = {
             "insertion": "m",
             "output:insertion": "m",
@@ -172,19 +183,17 @@ class RigModel:
             "handle_roll": "rad",
             "handle_knob": "rad",
         }
-        extra["units"] = units
-        inputs["axial_force"] = self.normal @ extra["force"]
+        inputs["axial_force"] = self.normal @ given
         theta = np.array([p.grid[0] for p in self.parameters])
         inputs["curvature"] = theta[4] * inputs["handle_knob"] + theta[5]
-        segment = Segment(
-            recording, np.full((len(self.outputs), n), np.nan), recording.fit, recording.heldout, inputs, extra=extra
-        )
-        given, extra["force"] = extra["force"], np.zeros((3, n))
+        nothing = np.full((len(self.outputs), n), np.nan)
+        segment = RigSegment(recording, nothing, recording.fit, recording.heldout, inputs, units, tolerances)
+        segment.force = np.zeros((3, n))
         run = self._run(segment, theta, [])
-        extra["force"] = given
-        extra["reference"] = (run["tip_R"], run["shaft_R"])
+        segment.force = given
+        segment.reference = (run["tip_R"], run["shaft_R"])
         rows = []
-        for pose, reference in zip(poses, extra["reference"], strict=True):
+        for pose, reference in zip(poses, segment.reference, strict=True):
             norm = np.sqrt(np.sum(pose[3:] ** 2, axis=0))
             good = np.isfinite(pose).all(axis=0) & (np.abs(norm - 1.0) < 0.05)
             turn = rotation_logs(reference, matrices(np.where(good, pose[3:], np.array([1.0, 0.0, 0.0, 0.0])[:, None])))
@@ -204,9 +213,10 @@ class RigModel:
         of contact. Where the sensor says next to nothing (noise above FAINT of the force), the simulated force goes on
         following the parameters in the fit, so that force and stiffness cannot drift off together.
         """
+        assert isinstance(segment, RigSegment)
         recorded = segment.y[12:15]
         if not np.isfinite(recorded).any():
-            segment.extra["force"] = self._run(segment, theta, [])["force"]
+            segment.force = self._run(segment, theta, [])["force"]
             return
         simulated = self.simulate(segment, theta, [])[12:15]
         sigmas = [
@@ -216,13 +226,13 @@ class RigModel:
             )
         ]
         beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
-        segment.extra["force"] = simulated + beyond
+        segment.force = simulated + beyond
         noise = max(self._force_noise(segment.recording, segment.inputs, recorded))[0]
-        if noise > FAINT * float(np.sqrt(np.mean(np.sum(segment.extra["force"] ** 2, axis=0)))):
-            segment.extra["beyond"] = beyond
+        if noise > FAINT * float(np.sqrt(np.mean(np.sum(segment.force**2, axis=0)))):
+            segment.beyond = beyond
         else:
-            segment.extra.pop("beyond", None)
-        segment.inputs["axial_force"] = self.normal @ segment.extra["force"]
+            segment.beyond = None
+        segment.inputs["axial_force"] = self.normal @ segment.force
 
     def guess(self, segments: list[Segment]) -> Array:
         """The calibrated values of the TOML."""
@@ -230,8 +240,9 @@ class RigModel:
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n), free run from the handle and the recorded force."""
+        assert isinstance(segment, RigSegment)
         run = self._run(segment, theta, active)
-        reference = segment.extra["reference"]
+        reference = segment.reference
         return np.vstack(
             [
                 run["tip"],
@@ -251,7 +262,7 @@ class RigModel:
             out.append(apply_effects(signal, active, axis, segment, "output"))
         return out[0], out[1], out[2]
 
-    def _run(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
+    def _run(self, segment: RigSegment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
         insertion, roll, kappa = self.links(segment, theta, active)
         n = segment.n
         state: dict[str, Any] = {
@@ -263,7 +274,7 @@ class RigModel:
             "load": np.zeros((3, n)),
             "point": np.zeros((3, n)),
             "point_at": np.zeros(n),
-            "push": segment.extra["force"],
+            "push": segment.force,
             "shift": np.zeros((3, n)),
             "normal": self.normal,
             "distal": self.spec.distal_length_m,
@@ -291,8 +302,8 @@ class RigModel:
         law = _changed(law, active, "contact", segment)
         normal_force = _pressed(law, self.normal @ soft, segment.recording.dt_s)
         force = self.normal[:, None] * normal_force
-        if "beyond" in segment.extra:
-            shape = self._shapes(segment, {**state, "push": force + segment.extra["beyond"]})
+        if segment.beyond is not None:
+            shape = self._shapes(segment, {**state, "push": force + segment.beyond})
         run = _posed(shape, state)
         if law["friction"]:
             along = run["tip"] - self.normal[:, None] * (self.normal @ run["tip"])
@@ -302,13 +313,13 @@ class RigModel:
         run["force"] = _vector(force, active, "force_sensor", segment)
         return _changed(run, active, "pose_sensor", segment)
 
-    def _shapes(self, segment: Segment, state: dict[str, Any]) -> tuple[Array, ...]:
+    def _shapes(self, segment: RigSegment, state: dict[str, Any]) -> tuple[Array, ...]:
         """Kernel call; the last two results are kept, since contact and sensors change without the shape."""
         key = tuple(
             hash(np.ascontiguousarray(state[name]).tobytes())
             for name in ("insertion", "roll", "kappa", "push", "extra", "load", "point", "point_at", "flex")
         )
-        kept: dict[Any, tuple[Array, ...]] = segment.extra.setdefault("kept", {})
+        kept = segment.kept
         if key not in kept:
             while len(kept) > 1:
                 kept.pop(next(iter(kept)))
@@ -331,8 +342,12 @@ class RigModel:
             )
         return kept[key]
 
-    def change(self, segment: Segment, theta: Array, S: dict[str, Array], candidate: Candidate, values: Array) -> Array:
-        """Linearized change of outputs (15, n) by a candidate at an axis, for screening. `S`: sensitivity of each axis."""
+    def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Array]:
+        """Sensitivity of the outputs (15, n) to each axis."""
+        return {axis: self.sensitivity(segment, theta, axis, active) for axis in AXES}
+
+    def change(self, segment: Segment, theta: Array, slopes: dict[str, Array], candidate: Candidate, values: Array) -> Array:
+        """Linearized change of outputs (15, n) by a candidate at an axis, for screening."""
         axis = candidate.port.name
         index = AXES.index(axis)
         q = segment.inputs[f"handle_{axis}"]
@@ -340,7 +355,7 @@ class RigModel:
         side = candidate.effect.side
         signal = q if side == "input" else gain * q + theta[2 * index + 1]
         moved = apply_effects(signal, [(candidate, values)], axis, segment, side) - signal
-        return np.asarray(S[axis] * (moved if side == "input" else moved / gain))
+        return np.asarray(slopes[axis] * (moved if side == "input" else moved / gain))
 
     def motion(self, segment: Segment, port: Port) -> Array:
         """Handle motion at the axes; else a signal of the port's unit that shows its size."""
@@ -359,15 +374,15 @@ class RigModel:
         itself at the sensors.
         """
         if port.name in AXES:
-            S = self.sensitivity(segment, theta, port.name)
-            weight = segment.extra.get("weight", np.ones(len(self.outputs)))[:12, None]
+            S = self.sensitivity(segment, theta, port.name, [])
+            weight = segment.weights()[:12]
             r = np.nan_to_num(residual[:12]) / weight
             s = np.where(np.isfinite(residual[:12]), S[:12], 0.0) / weight
             return np.asarray(np.sum(s * r, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300))
         row = 14 if port.name in ("contact", "force_sensor") else 0
         return np.asarray(residual[row])
 
-    def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect] | None = None) -> Array:
+    def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Array:
         """Change of outputs (15, n) per change of the signal that enters `axis`, by a central difference."""
         index = AXES.index(axis)
         step = 1e-5 if axis == "insertion" else 1e-4
@@ -375,7 +390,7 @@ class RigModel:
         for sign in (1.0, -1.0):
             moved = theta.copy()
             moved[2 * index + 1] += sign * step * theta[2 * index]
-            out.append(self.simulate(segment, moved, active or []))
+            out.append(self.simulate(segment, moved, active))
         return np.asarray((out[0] - out[1]) / (2.0 * step))
 
 
@@ -438,5 +453,5 @@ def _context(segment: Segment, source: str) -> Context:
         0.0,
         0.0,
         segment.inputs[source] if source else None,
-        segment.extra,
+        segment.equations,
     )

@@ -7,14 +7,14 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import ActiveEffect, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
 from host.diagnosis.model.nominal import LinkSpec, NominalSpec
 from host.diagnosis.model.operators import lag
 
 Array = npt.NDArray[np.float64]
 
 
-class TransmissionModel:
+class TransmissionModel(Model):
     """Nominal model of kind `transmission`; several links may share channels."""
 
     kind = "transmission"
@@ -76,10 +76,10 @@ class TransmissionModel:
         units: dict[str, str] = dict(self.units)
         for name, link in zip(self.names, self.links, strict=True):
             motion = segment.inputs[link.input]
-            segment.extra[f"tolerance:{name}"] = tolerance_of(motion, float(np.ptp(motion)))
+            segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
             units[name], units[f"output:{name}"] = self.units[link.input], self.units[link.output]
             units[f"{name}_reading"] = self.units[link.output]
-        segment.extra["units"] = units
+        segment.units = units
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from host.diagnosis.design.experiment import Design, plain, planned
+from host.diagnosis.design.experiment import Design, planned
 from host.diagnosis.pipeline import Diagnosis
 
 
@@ -15,11 +15,12 @@ def write_scripts(result: Diagnosis, folder: Path) -> list[Path]:
     out = []
     for number, design in enumerate(planned(result), start=1):
         path = folder / f"experiment_{number}"
-        if hasattr(plain(result.problem), "excitations"):
+        if result.model.inner.on_rig:
             from host.diagnosis.design.rig_experiment import script_of, write_script
 
-            model = plain(result.problem)
-            script = script_of(model, result.problem, result.found.best, design.excitation, design.inputs, design.says)
+            script = script_of(
+                result.model.inner, result.problem, result.found.best, design.excitation, design.inputs, design.says
+            )
             out.append(write_script(script, path.with_suffix(".toml")))
         else:
             out.append(write_table(result, design, path.with_suffix(".csv")))

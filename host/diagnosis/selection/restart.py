@@ -16,18 +16,18 @@ KEPT = 3
 def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -> list[Screened]:
     """Candidates that the refitted nominal model cannot vouch for, each with nominal parameters of its own to start from.
 
-    A model that offers `restarts` says which parameters are worth a try; those that leave the least with the effect are
+    A model with `restarts` says which parameters are worth a try; those that leave the least with the effect are
     kept.
     """
-    own = getattr(problem.model, "restarts", None)
     few = enough(problem)
+    begins = problem.model.restarts(few.segments) if any(c.effect.hides for c in candidate_effects) else []
     found = []
-    for candidate in candidate_effects if own is not None else ():
+    for candidate in candidate_effects if begins else ():
         if not candidate.effect.hides:
             continue
         term = term_of(problem, candidate, nominal)
         begin = starts(term, {}, {})
-        tried = [np.concatenate((theta, begin)) for theta in own(few.segments)]  # type: ignore[misc]
+        tried = [np.concatenate((theta, begin)) for theta in begins]
         tried.sort(key=lambda values: robust(few.stacked((term,), values))[0])
         item = Screened(candidate, term, (), 0.0, [begin] * KEPT)
         found.append(replace(item, nominal=[values[: -begin.size] for values in tried[:KEPT]]))

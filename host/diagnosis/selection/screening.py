@@ -129,7 +129,7 @@ def screen(
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
         term = _stepped(problem, fit, term_of(problem, candidate, fit))
-        quick = slopes is not None and candidate.port.name in slopes[0]
+        quick = candidate.port.name in slopes
         if not term.parameters:
             continue
         points = _scan(
@@ -160,26 +160,14 @@ def _resting(problem: Problem) -> set[str]:
     return found
 
 
-Slopes = list[dict[str, Array]]
+Slopes = dict[str, list[dict[str, Any]]]  # port -> of every segment that is fitted, what the model linearized there
 
 
-def _slopes(problem: Problem, fit: Fit) -> Slopes | None:
-    """Sensitivity of the outputs to each axis, per segment, where the model offers it."""
-    sensitivity = getattr(problem.model, "sensitivity", None)
-    if sensitivity is None:
-        return None
-    n = len(problem.model.parameters)
-    active, at = [], n
-    for term in fit.terms:
-        active.append((term.candidate, fit.values[at : at + len(term.parameters)]))
-        at += len(term.parameters)
-    axes = [port.name for port in problem.model.ports if port.kind.startswith("motion")]
-    return [
-        {axis: sensitivity(segment, fit.values[:n], axis, active) for axis in axes}
-        if segment.fit.any()
-        else {axis: segment.y for axis in axes}
-        for segment in problem.segments
-    ]
+def _slopes(problem: Problem, fit: Fit) -> Slopes:
+    """Ports at which the model answers without a simulation, with what it needs for that."""
+    parted = problem.parted(fit.terms, fit.values)
+    found = [problem.model.slopes(segment, *parted) for segment in problem.segments if segment.fit.any()]
+    return {name: found for name in found[0] if all(name in each for each in found)}
 
 
 def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slopes) -> Array:
@@ -187,10 +175,10 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
     term = terms[-1]
     n = len(problem.model.parameters)
     rows = []
-    for segment, S in zip(problem.segments, slopes, strict=True):
-        if segment.fit.any():
-            change = problem.model.change(segment, trial[:n], S, term.candidate, trial[-len(term.parameters) :])  # type: ignore[attr-defined]
-            rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
+    used = [segment for segment in problem.segments if segment.fit.any()]
+    for segment, S in zip(used, slopes[term.candidate.port.name], strict=True):
+        change = problem.model.change(segment, trial[:n], S, term.candidate, trial[-len(term.parameters) :])
+        rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
 
 
@@ -266,7 +254,7 @@ def _scan(
     Q: Array,
     rest: Array,
     most: int,
-    slopes: Slopes | None,
+    slopes: Slopes,
     lines: Array,
 ) -> list[Point]:
     """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`."""
@@ -281,10 +269,8 @@ def _scan(
             if p is not None:
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
-            fast = slopes is not None and term.candidate.port.name in slopes[0]
-            columns.append(
-                _fast(problem, terms, trial, slopes) if fast and slopes is not None else base - problem.stacked(terms, trial)
-            )
+            fast = term.candidate.port.name in slopes
+            columns.append(_fast(problem, terms, trial, slopes) if fast else base - problem.stacked(terms, trial))
         D = np.array(columns)
         B = D @ Q
         G, g = D @ D.T - B @ B.T, D @ rest

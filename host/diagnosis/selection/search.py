@@ -20,6 +20,7 @@ from host.diagnosis.estimation.fit import (
     reweigh,
     set_starts,
 )
+from host.diagnosis.estimation.initial_state import estimate_state
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Segment
@@ -56,22 +57,20 @@ class Found:
 
 def settle(problem: Problem, values: Array) -> None:
     """Lets a model that needs it prepare its recordings for these nominal parameters."""
-    own = getattr(problem.model, "settle", None)
-    for segment in problem.segments if own is not None else ():
-        own(segment, values)  # type: ignore[misc]
+    for segment in problem.segments:
+        problem.model.settle(segment, values)
     begin_anew(problem, Fit((), values))
 
 
 def begin_anew(problem: Problem, fit: Fit) -> None:
     """Lets a model that runs freely from a measured state find that state anew."""
-    own = getattr(problem.model, "begin_anew", None)
-    for segment in problem.segments if own is not None else ():
-        own(segment, *problem.parted(fit.terms, fit.values))  # type: ignore[misc]
+    for segment in problem.segments:
+        estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values))
 
 
 def refined(problem: Problem, fit: Fit) -> Fit:
     """`fit` brought to its end on all samples, together with the states that recordings begin from."""
-    for _ in range(2 if hasattr(problem.model, "begin_anew") else 1):
+    for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
         begin_anew(problem, fit)
         fit = minimize(problem, fit.terms, fit.values)
     return finish(problem, fit)
@@ -276,7 +275,7 @@ def _detour(
     set_starts(problem, begun)
     problem.scale[:] = scale
     for segment in problem.segments:
-        segment.extra["weight"] = problem.scale
+        segment.weight = problem.scale
     begin_anew(problem, best.best)
     return best
 

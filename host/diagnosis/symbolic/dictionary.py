@@ -85,7 +85,7 @@ class _Signal:
 
 def _signals(problem: Problem, fit: Fit, port: Port) -> Iterator[_Signal]:
     first = problem.segments[0]
-    units = first.recording.units | first.extra.get("units", {})
+    units = first.recording.units | first.units
     own = problem.model.moves[port.name]
     sources: dict[str, Callable[[Segment], Array]] = {own: _own(problem, fit, port)}
     for key in (*port.others, *port.loads):
@@ -155,14 +155,14 @@ def _product(a: Form, b: Form) -> Form:
 
 def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
     """The form as an effect at `port`: its size is to be refitted with everything else. Its values are laid out in
-    `Segment.extra` first (`lay_out`).
+    `Segment.equations` first (`lay_out`).
     """
 
     def parameters(s: Scale, which: str) -> tuple[Parameter, ...]:
         return (Parameter("amplitude", "", (size,), -np.inf, np.inf, linear=True, step=abs(size) or 1.0),)
 
     def apply(signal: Array, c: Context, p: Array, which: str) -> Array:
-        return np.asarray(signal + p[0] * c.extra["equations"][form.text])
+        return np.asarray(signal + p[0] * c.equations[form.text])
 
     effect = Effect(
         "unlisted",
@@ -180,7 +180,7 @@ def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
 def lay_out(segments: list[Segment], form: Form) -> None:
     """Values of a form for every recording, where its effect finds them."""
     for segment in segments:
-        segment.extra.setdefault("equations", {})[form.text] = form.evaluate(segment)
+        segment.equations[form.text] = form.evaluate(segment)
 
 
 def predict_residual(problem: Problem, fit: Fit, noise_sd: Array, only: str = "") -> list[PredictedPart]:
@@ -198,7 +198,7 @@ def predict_residual(problem: Problem, fit: Fit, noise_sd: Array, only: str = ""
         if forms:
             responses = _responses(problem, fit, ports[target], forms)
             found.append(_best(problem, fit, noise_sd, rates, forms, responses, ports[name].subsystem, ports[name]))
-            if hasattr(problem.model, "sensitivity") and not only:
+            if problem.model.pointwise and not only:
                 table = [r.table for r in responses]
                 found += [
                     _best(problem, fit, noise_sd, rates, forms, _alone(problem, row, table), output.subsystem, None)
@@ -231,13 +231,13 @@ class Response:
 
 
 def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> list[Response]:
-    sensitivity = getattr(problem.model, "sensitivity", None)
     nominal, active = problem.parted(fit.terms, fit.values)
     out = []
     for segment in problem.segments:
         table = np.array([np.nan_to_num(form.evaluate(segment)) for form in forms])
-        if sensitivity is not None:
-            out.append(Response(table, np.nan_to_num(sensitivity(segment, nominal, target.name, active))))
+        if problem.model.pointwise:
+            slope = problem.model.sensitivity(segment, nominal, target.name, active)
+            out.append(Response(table, np.nan_to_num(slope)))
             continue
         base = problem.simulate(segment, fit.terms, fit.values)
         need = float(np.nanstd(problem.model.needs(segment, target, nominal, segment.y - base))) or 1e-6
@@ -245,7 +245,7 @@ def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> l
         for index, (form, values) in enumerate(zip(forms, table, strict=True)):
             size = 0.1 * need / (float(np.std(values)) or 1.0)
             term = Term(equation_at(target, form), ())
-            segment.extra.setdefault("equations", {})[form.text] = values
+            segment.equations[form.text] = values
             moved = problem.model.simulate(segment, nominal, [*active, (term.candidate, np.array([size]))])
             whole[index] = np.nan_to_num((moved - base) / size)
         out.append(Response(table, whole=whole))

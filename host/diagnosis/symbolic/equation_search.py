@@ -74,12 +74,14 @@ def latent(problem: Problem, fit: Fit, segment: Segment, residual: Array, port: 
     """
     nominal, active = problem.parted(fit.terms, fit.values)
     seen = np.isfinite(residual)
-    slope = getattr(problem.model, "sensitivity", None)
-    if slope is None:
+    if not problem.model.pointwise:
         need = problem.model.needs(segment, port, nominal, residual)
         return np.where(seen.any(axis=0), need, np.nan), np.ones(segment.n)
     unit = np.array([noise.sigma for noise in problem.noise])[:, None]
-    s, r = np.where(seen, slope(segment, nominal, port.name, active), 0.0) / unit, np.where(seen, residual, 0.0) / unit
+    s, r = (
+        np.where(seen, problem.model.sensitivity(segment, nominal, port.name, active), 0.0) / unit,
+        np.where(seen, residual, 0.0) / unit,
+    )
     precision = np.sum(s * s, axis=0)
     return np.where(precision > 0.0, np.sum(s * r, axis=0) / np.maximum(precision, 1e-300), np.nan), precision
 

@@ -45,7 +45,7 @@ def test_micrometres_that_only_the_force_shows_are_seen(tmp_path: Path) -> None:
         roll, knob = segment.inputs["handle_roll"], segment.inputs["handle_knob"]
         shape = np.sin(roll) * knob
         moved = MICROMETRES * shape / np.std(shape)
-        residual += problem.model.sensitivity(segment, fit.values, "insertion") * moved  # type: ignore[attr-defined]
+        residual += problem.model.sensitivity(segment, fit.values, "insertion", []) * moved
     best = max(places(problem, fit), key=lambda place: place.log_likelihood)
     assert best.sure and best.subsystem == "insertion"
     assert "handle_roll" in best.forms[0][0].text and "handle_knob" in best.forms[0][0].text

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from host.diagnosis.model.nominal import effect_of, read_nominal
+from host.diagnosis.models.rig import RigSegment
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from host.diagnosis.report.page import switches
 from host.diagnosis.report.verdict import as_json
@@ -151,6 +152,6 @@ def test_a_force_that_drowns_in_noise_names_nothing(tmp_path: Path) -> None:
     drawn = noisy_force.rig(4711, 3)
     files = noisy_force.write(drawn, 0.1, tmp_path)
     result = noisy_force.judged(tmp_path, files)
-    assert all("beyond" in segment.extra for segment in result.problem.segments)
+    assert all(isinstance(segment, RigSegment) and segment.beyond is not None for segment in result.problem.segments)
     assert result.verdict == "nothing_missing"
     assert result.found.nominal.values[6] == pytest.approx(drawn.system.case.nominal[6], rel=0.3)
