@@ -19,7 +19,7 @@ def on_first(callback: Callable[[], None]) -> None:
 
 
 def listen() -> None:
-    """Start to listen to numba's compiler, if somebody wants to know. Called when numba is there."""
+    """Start to listen to numba's compiler, if a notice is wanted. Called when numba is there."""
     if _callback is None:
         return
     from numba.core import event

@@ -120,7 +120,7 @@ class StreamCounters:
     crc_errors: int = 0  # check sum, framing, length or id wrong
     lost: int = 0  # sequence numbers skipped
     repeated: int = 0  # the same sequence number twice in a row
-    restarts: int = 0  # sequence number before the last: the sender started anew
+    restarts: int = 0  # sequence number before the last: the sender started again
 
 
 class StreamDecoder:

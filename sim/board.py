@@ -207,7 +207,7 @@ class SimulatedBoard:
         return self._call(_REQUEST.pack(b"X", estop, limit_bits, len(uart_in), until_us, *counts) + uart_in)
 
     def power_cycle(self) -> None:
-        """Takes the supply away and brings it back: the board starts anew, with its boot count one higher."""
+        """Takes the supply away and brings it back: the board starts again, with its boot count one higher."""
         self._command(b"P")
 
     def reset(self) -> None:

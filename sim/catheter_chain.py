@@ -69,7 +69,8 @@ CHAIN_STATE = np.dtype(
         ("root", "f8", (3, 3)),
         ("tip", "f8", (3,)),
         ("tip_frame", "f8", (3, 3)),
-        # what planted effects write before each step: rest strain besides the wires', moments inside, forces on the joints
+        # what planted effects write before each step: unloaded strain in addition to the wires', moments inside, forces on
+        # the joints
         ("rest", "f8", (CELLS, 3)),
         ("moment", "f8", (CELLS, 3)),
         ("force", "f8", (CELLS, 3)),

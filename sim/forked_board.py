@@ -96,7 +96,7 @@ def forkable_board(kind: str) -> ForkableBoard:
 
 
 def _built_library() -> Path:
-    """The compiled library, made anew when a source is younger. Raises BoardUnavailable."""
+    """The compiled library, made again when a source is newer. Raises BoardUnavailable."""
     library = BUILD_DIR / "native_board.so"
     core = [path for path in sorted((FIRMWARE_DIR / "src").glob("*.c")) if path.name != "avr_main.c"]
     sources = [BOARD_SRC / "native_library.c", BOARD_SRC / "lockstep.c", *core]

@@ -12,7 +12,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Folder, Json, one_of, writable_folder
 
-# part -> module with run(directory, quick, progress) -> (sections, path of the report); imported only when asked for
+# part -> module with run(directory, quick, progress) -> (sections, path of the report); imported only when requested
 PARTS = {"mechanics": "host.studies.reproduction.mechanics", "control": "host.studies.reproduction.control"}
 
 

@@ -3,7 +3,7 @@
 Steps, each a room, arrows in this order: `model` (recordings, channels, data findings, operators) and `effects` (the
 vocabulary); `estimation` (fit, noise, evidence, intervals, rules); `models` (nominal models, one file a kind); `symbolic`
 (equations of recorded signals); `selection` (objective and decision rule are written there); `design` (experiments that
-tell models apart); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page).
+separate models); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page).
 """
 
 from __future__ import annotations

@@ -187,8 +187,8 @@ def diagnose(
     result.verdict = (
         "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
     )
-    if not located and rest.sure and rest.foretold is not None:
-        result.located = [_unexplained(full, found, rest.foretold.subsystem)]
+    if not located and rest.sure and rest.predicted is not None:
+        result.located = [_unexplained(full, found, rest.predicted.subsystem)]
     return result
 
 

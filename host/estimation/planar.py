@@ -156,7 +156,9 @@ def _result(arcs: Arcs, kappa: Array, row: Array) -> PlanarEstimate:
 
 
 class PlanarTracker:
-    """Tracking mode: each estimate starts from the one before, and starts anew where that one did not converge."""
+    """Tracking mode: each estimate starts from the one before, and starts again from none where that one did not
+    converge.
+    """
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ CURVATURE_TOLERANCE_rad = 1e-3  # the maximum-likelihood stage takes over from h
 EXACT_TOLERANCE_rad = 1e-10
 END_rad = 1e-10  # turning of the last step
 END_N = 1e-9  # force of the last step
-FORCE_LIMIT_N = 10.0  # a pose that asks for more is one that no force explains
+FORCE_LIMIT_N = 10.0  # a pose that needs more is one that no force explains
 CURVATURE_STEPS, LIKELIHOOD_STEPS = 50, 40
 # Keeps fewer than three arcs solvable: the pose is met up to this share of its covariance, 1e-4 m/N at 0.3 mm
 SOFTNESS_per_N_m = 1e-4

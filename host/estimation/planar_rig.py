@@ -130,7 +130,7 @@ class PlanarRigEstimator:
         tangent = tangent_of(np.asarray(reading.quaternion_wxyz))
         angle = math.atan2(float(tangent @ y_axis), float(tangent[2]))
         position = np.asarray(reading.position_m)
-        # more than half a turn is told apart by which way the shaft is bent
+        # more than half a turn is resolved by the direction in which the shaft is bent
         if abs(angle) > 0.5 * math.pi and angle * actuation.curvature_per_m < 0.0:
             angle += math.copysign(2.0 * math.pi, actuation.curvature_per_m)
         return np.array([position[2], float(position @ y_axis), angle])

@@ -52,7 +52,7 @@ def estimate_next(
 ) -> tuple[bool, float, float]:
     """One sample, from the last force x (3,) if that is `known`, else from none. Returns (converged, residual, cost).
 
-    Written: x, covariance (3, 3). Where the last force leads nowhere fair, the sample is begun anew.
+    Written: x, covariance (3, 3). Where the last force leads nowhere fair, the sample is started again without it.
     """
     settled, cost = False, 0.0
     if known:
@@ -178,7 +178,7 @@ class ForceTracker:
         self._scratch, self._force, self._known = new_scratch(len(self.offsets_m)), np.zeros(3), False
 
     def forget(self) -> None:
-        """The next sample starts anew (after a gap, or a change of catheter)."""
+        """The next sample starts without the last force (after a gap, or a change of catheter)."""
         self._known = False
 
     def update(

@@ -14,7 +14,7 @@ from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 logging.getLogger("toppra").setLevel(logging.ERROR)
-# Share of the stages' limits that a plan uses; the rest is for feedback.
+# Share of the stages' limits that a plan uses; the remainder is for feedback.
 SPEED_SHARE, ACCELERATION_SHARE = 0.8, 0.5
 
 

@@ -36,7 +36,7 @@ def git_revision() -> str:
 
 
 class RecordingHeader(NamedTuple):
-    """What must be known to understand a recording, besides its messages."""
+    """What must be known, in addition to its messages, to understand a recording."""
 
     rig: str
     clock: str

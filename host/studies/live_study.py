@@ -31,7 +31,7 @@ from sim.scenario import TARGET_M, ContactJob, Scenario
 from sim.world import World, simulated_plant
 
 ON_S, HOLD_S = 25.0, 32.0
-CHUNK_S = 600.0  # length of one run without an effect: a rig is armed anew several times a day
+CHUNK_S = 600.0  # length of one run without an effect: a rig is armed several times a day
 LAST_S = 8.0  # end of a run over which the residual is compared with the usual one
 DOUBLE = 2.0  # residual with an effect relative to the usual one, for the alarm's delay
 WITHIN_S = 3.0  # of its begin an effect of that size is to be reported

@@ -24,7 +24,7 @@ from realtime.core.process import RealtimeProcess
 from realtime.loop.latency import percentiles_us, run_cyclictest
 from realtime.loop.native_loop import LATENESS_BIN_NS, WORK_BIN_NS
 
-RECORDER_ONLY, IDLE = "nobody", "cyclictest"
+RECORDER_ONLY, IDLE = "recorder only", "cyclictest"
 SAYS = {RECORDER_ONLY: "only the recorder"} | KINDS
 ROUNDS = 3
 _SETTLED_S, _OVER_S = 2.0, 1.0

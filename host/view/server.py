@@ -139,7 +139,7 @@ class ViewServer:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        # The first frame loads and compiles the models: beside the loop, so that nothing waits for it.
+        # The first frame loads and compiles the models: on another thread than the loop, so that nothing waits for it.
         await asyncio.to_thread(self._source.frame)
         beat = asyncio.create_task(self._beat())
         yield

@@ -1,4 +1,4 @@
-"""What the kernel is asked for on behalf of the loop's thread: priority, locked memory, one CPU, shallow idle states.
+"""Requests to the kernel for the loop's thread: priority, locked memory, one CPU, shallow idle states.
 
 Each is used where allowed and left where not (containers, plain users); all of it is undone on leaving.
 """
@@ -42,7 +42,7 @@ class RealtimeReport:
 
     @property
     def warning(self) -> str | None:
-        """One line for people, or None where everything asked for was granted."""
+        """Describe what was refused in one line; None where every request was granted."""
         if not self.refused:
             return None
         return (

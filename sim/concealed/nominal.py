@@ -1,7 +1,7 @@
-"""The nominal chain of the catheter rig as the proof's generator knows it: what a rig engineer would calibrate.
+"""The nominal model of the catheter rig as the proof's generator knows it: what a rig engineer would calibrate.
 
 Written from the published description of kind `rig` (docs/diagnosis.md), apart from host's twin, so that sizes of planted
-effects can be stated relative to it and a crudely calibrated nominal file can be written beside the recordings.
+effects can be stated relative to it and a crudely calibrated nominal file can be written next to the recordings.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def apart(model: Array, outputs: Array) -> Array:
 
 
 def fit(start: Array, handle: Array, outputs: Array, sigma: Array, evaluations: int = 12, robust: bool = False) -> Array:
-    """Parameters (9,) that bring the nominal chain nearest to outputs (n, 17), channels weighed by sigma (15,)."""
+    """Parameters (9,) that bring the nominal model nearest to outputs (n, 17), channels weighed by sigma (15,)."""
 
     def errors(z: Array) -> Array:
         return np.nan_to_num(residual(start + z * _SCALE, handle, outputs) / sigma).ravel()

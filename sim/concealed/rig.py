@@ -129,7 +129,7 @@ def _mixed(rng: np.random.Generator, knob: float, deep: float, bent: bool) -> Ar
 
 
 def plant(case: RigCase, effects: Sequence[PlantedEffect]) -> Plant:
-    """The simulated plant without any of its habits: what is planted is all that is missing from the nominal chain."""
+    """The simulated plant without any of its habits: what is planted is all that is missing from the nominal model."""
     p = case.nominal
     rigidity = (p[6], p[6], nominal.TORSION_TO_BENDING * p[6])
     first = case.reference[0][0]

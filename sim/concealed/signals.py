@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 Array = np.ndarray
 KINDS = ("sweep", "multisine", "steps", "sine", "walk")
-QUIET_S = 2.5  # stillness at the start of every recording, from which noise can be told
+QUIET_S = 2.5  # stillness at the start of every recording, from which noise is estimated
 
 
 def signal(rng: np.random.Generator, kind: str, time_s: Array, fastest_Hz: float = 0.6) -> Array:
@@ -89,7 +89,7 @@ def presses(rng: np.random.Generator, time_s: Array) -> Array:
 def coloured(
     rng: np.random.Generator, shape: tuple[int, int], sigma: Array, share: float, correlation_s: float, dt_s: float
 ) -> Array:
-    """Noise (n, m) of standard deviation sigma (m,): a `share` of its energy first-order Markov, the rest white."""
+    """Noise (n, m) of standard deviation sigma (m,): a `share` of its energy first-order Markov, the remainder white."""
     a = np.exp(-dt_s / correlation_s)
     slow = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], rng.standard_normal((shape[0] + 400, shape[1])), axis=0)[400:]
     return np.asarray((np.sqrt(share) * slow + np.sqrt(1.0 - share) * rng.standard_normal(shape)) * sigma)

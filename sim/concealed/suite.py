@@ -1,7 +1,7 @@
 """Concealed cases: from a seed, a suite of recordings with physics left out, and the labels that a seal keeps apart.
 
 `python -m sim.concealed.suite --seed S --cases N --dir DIR` writes DIR/cases/ID/{a,b,c}.csv or .parquet with nominal.toml,
-and DIR/sealed/labels.json, whose sha256 it prints. Nothing under cases/ tells what was planted.
+and DIR/sealed/labels.json, whose sha256 it prints. Nothing under cases/ reveals what was planted.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ConcealedPlan:
     kind: str
     closed_loop: bool
     rho: float
-    turn: int  # the how-manieth of its category
+    turn: int  # number within its category, from 0
     attempt: int = 0
 
     @property
@@ -179,7 +179,7 @@ def _choose(
 
 
 def _null(plan: ConcealedPlan) -> ConcealedCase | None:
-    """Nothing planted, and the nominal chain good to a small part of the noise, even as calibrated on noisy recordings."""
+    """Nothing planted, and the nominal model good to a small part of the noise, even as calibrated on noisy recordings."""
     system = _system(plan)
     session = system.run([])
     rho, left = measure(system, session)
@@ -372,7 +372,7 @@ def make(plan: ConcealedPlan, folder: Path) -> dict[str, Any]:
 def _near(system: System, rng: np.random.Generator) -> Array:
     """Where a rig engineer's calibration starts: near the rig's own values, the wall within reach of the presses.
 
-    From behind their reach no force would tell the fit where the wall is.
+    Without a contact force the fit would not find the wall.
     """
     p = system.case.nominal.copy()
     p[[2, 4, 6, 8]] *= 1.0 + 0.05 * rng.standard_normal(4)

@@ -1,4 +1,4 @@
-"""One face for all families of concealed cases: run it, calibrate the nominal model, tell what is left, write tables."""
+"""One face for all families of concealed cases: run it, calibrate the nominal model, compute residuals, write tables."""
 
 from __future__ import annotations
 

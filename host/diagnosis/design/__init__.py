@@ -1,1 +1,1 @@
-"""Experiments that tell indistinguishable models apart, and their scripts."""
+"""Experiments that separate indistinguishable models, and their scripts."""

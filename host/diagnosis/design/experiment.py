@@ -1,6 +1,6 @@
-"""The recording that would tell two models apart: of a family of motions the one whose predictions differ most.
+"""The recording that would separate two models: of a family of motions the one whose predictions differ most.
 
-T-optimality (Atkinson & Fedorov 1975): the separation is what is left of the difference after the rival has adapted its
+T-optimality (Atkinson & Fedorov 1975): the separation is the remaining difference after the rival has adapted its
 parameters to the best model's prediction, as far as the present recordings let it; here by linearization, in units of
 what the best model leaves.
 """
@@ -26,13 +26,15 @@ from host.diagnosis.selection.search import Found
 Array = npt.NDArray[np.float64]
 LONGEST_S, MOST_SAMPLES = 40.0, 12000
 FINALISTS = 16
-PLAIN = 3.0  # separation from which a recording tells two models apart
+PLAIN = 3.0  # separation from which a recording separates two models
 INSIDE = (0.02, 0.98)  # quantiles of the recorded inputs that a motion stays between
 
 
 @dataclass(frozen=True)
 class Design:
-    """The best excitation against one rival. `separation`, and `had` by these recordings, in units of what is left."""
+    """The best excitation against one rival. `separation`, and `had` by these recordings, in units of the remaining
+    residual.
+    """
 
     candidate: Candidate
     other: Candidate
@@ -43,7 +45,7 @@ class Design:
 
     @property
     def says(self) -> str:
-        """One line for people."""
+        """Describe the excitation and its predicted separation in one line."""
         held = "".join(f", {name.replace('_', ' ')} at {value:.3g}" for name, value in self.excitation.held)
         doubt = "" if self.separation > PLAIN else " No motion of the family would tell them apart."
         return (
@@ -54,8 +56,8 @@ class Design:
 
 
 def design(problem: Problem, found: Found, standing: list[Standing], progress: Callable[[str, float], None]) -> list[Design]:
-    """For each pair that the recordings cannot tell apart, the motion that would; none where an equation of recorded
-    signals is in play, since motions that nobody recorded have no such signals.
+    """Design, for each pair that the recordings cannot separate, a motion that separates them; none where an equation of
+    recorded signals is involved, since a motion that was not recorded has no such signals.
     """
     out = []
     for stands in standing if all(term.candidate.effect.id != "unlisted" for term in found.best.terms) else ():

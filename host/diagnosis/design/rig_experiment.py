@@ -102,7 +102,7 @@ def followed(excitation: Excitation) -> bool:
 
 
 def tip_path(model: Any, best: Fit, handle: Array) -> Array:
-    """Tip (3, n) of the unloaded nominal chain."""
+    """Tip (3, n) of the unloaded nominal model."""
     gain, home, slope, turn, knob, bent = best.values[:6]
     exposed = np.maximum(model.spec.distal_length_m + gain * handle[0] + home, 1e-3)
     kappa = knob * handle[2] + bent

@@ -50,7 +50,7 @@ def apply_load(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Maxwell branch beside the spring."""
+    """Maxwell branch parallel to the spring."""
     return {"maxwell_stiffness": p[0], "maxwell_time": p[1]}
 
 

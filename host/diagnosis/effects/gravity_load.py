@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Weight per exposed length along the base axes, and the length whose weight the tip carries besides."""
+    """Weight per exposed length along the base axes, and the further length whose weight the tip carries."""
     weights = tuple(Parameter(f"weight_{a}", "N/m", (0.05,), linear=True) for a in "xyz")
     return (*weights, Parameter("tip_length", "m", (0.0, 0.03), 0.0, 0.5, step=0.01))
 

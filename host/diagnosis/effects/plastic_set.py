@@ -1,4 +1,4 @@
-"""Plastic set: the rest shape shifts after an overload and stays."""
+"""Plastic set: the unloaded shape shifts after an overload and stays."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
-HARMONICS = 4  # of the saw tooth: a smooth stand-in, so that a fit can follow it
+HARMONICS = 4  # of the saw tooth: a smooth approximation, so that a fit can follow it
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

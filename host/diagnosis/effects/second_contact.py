@@ -18,7 +18,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:
-    """Force back from an obstacle that stands beside the axis, where the free shaft would enter it."""
+    """Force back from an obstacle that stands at the side of the axis, where the free shaft would enter it."""
     straight = np.maximum(state["insertion"], 0.0)
     length = np.maximum(state["distal"] + np.minimum(state["insertion"], 0.0), 1e-3)
     kappa = np.where(np.abs(state["kappa"]) < 1e-6, 1e-6, state["kappa"])

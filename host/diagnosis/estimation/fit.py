@@ -73,7 +73,7 @@ class Problem:
         return nominal, active
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
-        """Measured minus simulated, NaN outside the part asked for (`fit`, `heldout` or `all`)."""
+        """Measured minus simulated, NaN outside the requested part (`fit`, `heldout` or `all`)."""
         out = []
         for segment in self.segments:
             mask = np.ones(segment.n, dtype=bool) if which == "all" else getattr(segment, which)

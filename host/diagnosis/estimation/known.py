@@ -130,7 +130,7 @@ def fits(candidate: Candidate, spec: EffectSpec) -> bool:
 
 
 def placed(candidate: Candidate, parameters: tuple[Parameter, ...], spec: EffectSpec) -> tuple[Parameter, ...]:
-    """`parameters` that start at the values given, renamed so that they tell effect and place. Raises InputError for a
+    """`parameters` that start at the values given, renamed after effect and place. Raises InputError for a
     key unknown.
     """
     from dataclasses import replace

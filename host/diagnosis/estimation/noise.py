@@ -33,7 +33,7 @@ class Noise:
         return float(np.clip(1.0 / (gain * gain * flat), 1.0, 1e4)) if gain > 0 and flat > 0 else 1.0
 
     def whiten(self, residual: Array) -> Array:
-        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN beside
+        """Innovations of `residual` (n,) under this noise, in units of their own standard deviation; NaN next to
         missing samples.
         """
         out = residual.copy()

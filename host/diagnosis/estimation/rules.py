@@ -27,7 +27,7 @@ class SelectionRules:
     decisive_log_likelihood: float = 25.0  # or: gain that needs no agreement of blocks, since few episodes may hold it
     least_error_reduction: float = 0.015  # share of some output's held-out error that has to go: idealization takes less
     least_excess_reduction: float = 0.10  # and share of what is above noise
-    further_error_reduction: float = 0.05  # of a further effect: what idealized formulas leave is no effect
+    further_error_reduction: float = 0.05  # of a further effect: a residual of idealized formulas is not an effect
     further_likelihood_ratio: float = 0.2  # and least gain over that of the effects before it,
     large_error_reduction: float = 0.3  # but for one that takes this share of the residual
     large_significance: float = 1e-6  # with blocks that agree so well

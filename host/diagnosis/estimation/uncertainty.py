@@ -24,7 +24,7 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     """Interval of every parameter (nominal, then effects) of `fit`; those held have none (value twice).
 
     Linearized at the fit, in each parameter's own scale (logarithm for positive ones). The half-width is the larger of two,
-    neither of which may be trusted alone: the level of what is left, each output's counted by its correlation time; and
+    neither of which may be trusted alone: the level of the residual, each output's counted by its correlation time; and
     the jackknife over blocks of at least four correlation times, whose quantile is Student's with as many degrees of
     freedom as blocks carry the parameter (Satterthwaite): sums of squared scores fall short where few blocks do (Bell and
     McCaffrey 2002). A module whose formula is not quite the true one errs alike all through one excitation and otherwise

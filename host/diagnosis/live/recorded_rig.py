@@ -55,7 +55,7 @@ class RecordedRig(Twin):
         self.ports = tuple(port for port in self.ports if port.name != "contact")
 
     def prepare(self, recording: Recording) -> RigSegment:
-        """As the twin does, the force as it was averaged about each frame; it is no output."""
+        """As the twin does, the force as it was averaged about each frame; it is not an output."""
         segment = super().prepare(recording)
         segment.y = segment.y[:POSE_ROWS]
         return segment
@@ -65,7 +65,7 @@ class RecordedRig(Twin):
         return super().simulate(segment, theta, active)[:POSE_ROWS]
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """As the chain has it; for the force sensor, the force along the wall's normal that the poses would need."""
+        """As the nominal model has it; for the force sensor, the force along the wall's normal that the poses would need."""
         if port.name != "force_sensor":
             return super().needs(segment, port, theta, residual)
         assert isinstance(segment, RigSegment)
@@ -93,7 +93,7 @@ class RecordedRig(Twin):
         return rig_excitations(self, problem, best)
 
     def settle(self, segment: Segment, theta: Array) -> None:
-        """Lets the rod model correct the chain at these nominal parameters."""
+        """Let the rod model correct the nominal model at these nominal parameters."""
         self.softness = self.rigidity / float(theta[EI])
         self.correct(segment, theta)
 

@@ -1,4 +1,6 @@
-"""The twin of a running rig: a row a tracker frame out of its messages; the chain of kind rig with the rod model."""
+"""The twin of a running rig: one row for each tracker frame from its messages; the nominal model of kind rig with the rod
+model.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ COLUMNS = (*HANDLES, *TIP, *SHAFT, *FORCE)
 KEPT_STAGES, KEPT_FORCES = 4000, 4000
 FORCE_HALF_NS = 5_000_000  # forces this near a frame are averaged into its row
 EVERY, ROUNDS = 4, 3
-OFFSETS = (1, 3, 5)  # places of insertion, roll and knob offset among the chain's parameters
+OFFSETS = (1, 3, 5)  # places of insertion, roll and knob offset among the nominal parameters
 LONGEST_DELAY_S = 0.025
 LATEST_NS = 60_000_000  # a frame waits so long for the stage's and the second tool's message
 
@@ -53,7 +55,7 @@ def delayed(recording: Recording, delay_s: float) -> Recording:
 
 
 def thinned(recording: Recording, every: int) -> Recording:
-    """Every so-manieth row."""
+    """Keep every `every`-th row of `recording`."""
     return replace(
         recording,
         time_s=recording.time_s[::every],
@@ -65,10 +67,10 @@ def thinned(recording: Recording, every: int) -> Recording:
 
 
 class Twin(RigModel):
-    """The nominal chain of kind rig for a rig file; play and knob's curve are taken off the handle before (see Listener).
+    """The nominal model of kind rig for a rig file; backlash and knob curve are applied before (see FrameCollector).
 
-    The chain bends by linear elasticity, which is not enough for a hold at 0.2 N: what the rod model says instead is
-    added, at the nominal parameters, so that effects act through the chain. The wall moves: forces are an input only.
+    The model bends by linear elasticity, which is not enough for a hold at 0.2 N: the rod model's difference is
+    added, at the nominal parameters, so that effects act through the model. The wall moves: forces are an input only.
     """
 
     def __init__(self, rig: Rig, catheter: Catheter | None = None) -> None:
@@ -108,7 +110,7 @@ class Twin(RigModel):
         return TwinFit(theta, float(z[4]), float(np.sqrt(np.mean(r**2))))
 
     def prepare(self, recording: Recording) -> RigSegment:
-        """As the chain does, but with the force as it was recorded: it is an average over a frame already."""
+        """As the nominal model does, but with the force as it was recorded: it is an average over a frame already."""
         segment = super().prepare(recording)
         segment.force = np.vstack([np.nan_to_num(fill(recording.channels[name])) for name in FORCE])
         segment.inputs["axial_force"] = self.normal @ segment.force
@@ -121,7 +123,7 @@ class Twin(RigModel):
         segment.exact[12:] = 0.0
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
-        """Outputs (15, n) of the chain, plus what the rod model adds where `correct` was called."""
+        """Outputs (15, n) of the nominal model, plus what the rod model adds where `correct` was called."""
         assert isinstance(segment, RigSegment)
         chain = super().simulate(segment, theta, active)
         return chain if segment.exact is None else np.asarray(chain + segment.exact)

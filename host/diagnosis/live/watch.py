@@ -23,7 +23,7 @@ from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 Array = npt.NDArray[np.float64]
 POSE_ROWS = 12
 SMALLEST_SHARE = 0.1  # of the mismatch that a cause has to explain to be named
-AS_GOOD = 1.15  # error beside the best cause's with which another still counts
+AS_GOOD = 1.15  # error relative to the best cause's with which another still counts
 IDLE_S = 0.02
 REST_S = 0.005
 SECOND_NS = 1_000_000_000
@@ -34,7 +34,7 @@ class LiveSettings:
     """learn_s of motion calibrate the twin; then every every_s the last window_s are looked at.
 
     level, shift: how far RMS (as a factor) and mean (in spreads of a mean over a window) may go before an alarm;
-    settle_s: so long it has to last; a cause is then sought in all that was heard since.
+    settle_s: so long it has to last; a cause is then sought in all that was received since.
     suspects: candidates fitted before one is named.
     """
 
@@ -66,7 +66,7 @@ class Suspect:
 
 
 class Watch:
-    """Hears the rig's messages; `look` gives an alarm when the last window is no longer what the twin expects.
+    """Receives the rig's messages; `look` gives an alarm when the last window is no longer what the twin expects.
 
     All time is the rig's own (stamps of its poses), so that recorded messages and virtual time do as well as a live rig.
     """
@@ -117,11 +117,11 @@ class Watch:
         return min(len(self.frames.rows), round(seconds * SECOND_NS / self.frames.period_ns))
 
     def _learn(self) -> None:
-        """Calibrates the twin on what was heard since arming, and notes how well it then agrees, second by second."""
+        """Calibrates the twin on what was received since arming, and notes how well it then agrees, second by second."""
         recording = self.frames.recording(-self._rows(self.settings.learn_s))
         self.calibration = self.twin.calibrate(recording, self._rest)
         segment, residual = self._residual(-self._rows(self.settings.learn_s))
-        residual = residual[:, segment.n // 4 :]  # the approach is not what the rest will be like
+        residual = residual[:, segment.n // 4 :]  # the approach differs from what follows
         mean, rms = np.nanmean(residual, axis=1), np.sqrt(np.nanmean(residual**2, axis=1))
         blocks = np.array_split(residual, max(3, round(0.75 * self.settings.learn_s)), axis=1)
         spread = np.std([np.nanmean(block, axis=1) for block in blocks], axis=0) / np.sqrt(self.settings.window_s)
@@ -267,7 +267,7 @@ class Bus(Protocol):
 def watch(
     rig: Rig, bus: Bus, publish: Callable[[Alarm], None], progress: Callable[[str], None], stop: Callable[[], bool]
 ) -> int:
-    """Watches until `stop`; publishes alarms, and tells what it does when that changes. How many alarms there were."""
+    """Watches until `stop`; publishes alarms, and logs its phase when it changes. Returns the number of alarms."""
     watcher, said, count = Watch(rig, rest=lambda: time.sleep(REST_S)), "", 0
     while not stop():
         heard = bus.take()

@@ -60,7 +60,7 @@ class Scale:
 
 @dataclass
 class Context:
-    """What an effect may look at besides the signal it changes."""
+    """Signals that an effect may read in addition to the one it changes."""
 
     time_s: Array
     dt_s: float
@@ -98,10 +98,10 @@ class Effect:
     `port`: motion (a kinematic signal), turn (an angle), force (a force balance), timing, limit, drift and mix (a scalar
     reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
-    `source`: what it depends on besides: "load" (a force), "drag" (a force or bend that presses), "other" (another channel).
-    `order`: place among the effects of one port, small first. `side`: motion ports only, before or after the nominal gain.
-    `apply(signal, context, values, form)`: the changed signal. Force ports give `slots` for the force kernel instead.
-    `contains`: ids of which this one is a generalization (nested pairs).
+    `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "other"
+    (another channel). `order`: place among the effects of one port, small first. `side`: motion ports only, before or after
+    the nominal gain. `apply(signal, context, values, form)`: the changed signal. Force ports give `slots` for the force
+    kernel instead. `contains`: ids of which this one is a generalization (nested pairs).
     """
 
     id: str

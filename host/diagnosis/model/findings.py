@@ -272,7 +272,7 @@ def _lead(recording: Recording, path: Pair) -> float:
 
 
 def _left(x: Array, y: Array) -> float:
-    """Variance of `y` (n,) that a positive gain on `x` (n,) leaves: one that lags by half a period is no lead."""
+    """Variance of `y` (n,) that a positive gain on `x` (n,) leaves: a lag of half a period does not count as a lead."""
     a, b = x - x.mean(), y - y.mean()
     across, spread = max(float(a @ b), 0.0), float(a @ a)
     return (float(b @ b) - (across**2 / spread if spread > 0.0 else 0.0)) / a.size
@@ -361,7 +361,7 @@ def _clipped(recording: Recording, name: str, driver: str, side: float) -> float
 
 
 def _excitation(recordings: list[Recording], paths: list[Pair], columns: dict[str, str], findings: list[Finding]) -> None:
-    """Inputs of one sinusoid, and inputs that never turn: effects that these recordings cannot tell apart or show."""
+    """Inputs of one sinusoid, and inputs that never turn: effects that these recordings cannot separate or show."""
     for path in paths:
         tones = [_tone(recording, path.output if path.law else path.input) for recording in recordings if recording.timed]
         name = columns[path.output if path.law else path.input]

@@ -1,4 +1,4 @@
-"""Recordings of a running rig as the chain of kind rig reads them: a row for each frame of the tracker."""
+"""Recordings of a running rig as the nominal model of kind rig reads them: a row for each frame of the tracker."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def rig_of(files: list[Path]) -> Rig:
 def rig_rows(path: Path) -> dict[str, Array]:
     """Columns of kind rig (docs/diagnosis.md), a row for each frame of the tracker.
 
-    handle_insertion_m is behind the play of the rig's configuration, handle_knob_rad behind its knob curve (curvature over
-    `knob_gain`): what is known of the transmission is taken off before anything is compared. Raises InputError.
+    handle_insertion_m is behind the backlash of the rig's configuration, handle_knob_rad behind its knob curve (curvature
+    over `knob_gain`): what is known of the transmission is taken off before anything is compared. Raises InputError.
     """
     recording = _open(path)
     rig = rig_of([path])

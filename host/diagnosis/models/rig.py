@@ -48,7 +48,7 @@ KEYS = {
     "wall_stiffness": "wall_stiffness_N_per_m",
 }
 AXES = ("insertion", "roll", "knob")
-FAINT = 0.5  # noise of the force sensor over RMS of the force, above which the force is taken from the chain
+FAINT = 0.5  # noise of the force sensor over RMS of the force, above which the force is taken from the model
 
 
 def rig_channels(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:

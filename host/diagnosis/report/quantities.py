@@ -1,4 +1,4 @@
-"""Quantities as people read them: millimetres, milliradians, millinewtons where the numbers are small."""
+"""Quantities in units that are easy to read: millimetres, milliradians, millinewtons where the numbers are small."""
 
 from __future__ import annotations
 

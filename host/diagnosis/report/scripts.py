@@ -11,7 +11,7 @@ from host.diagnosis.pipeline import Diagnosis
 
 
 def write_scripts(result: Diagnosis, folder: Path) -> list[Path]:
-    """One file for each experiment, beside the report. Raises OSError, InputError where a rig's limits forbid one."""
+    """Write one file for each experiment, next to the report. Raises OSError, InputError where a rig's limits forbid one."""
     out = []
     for number, design in enumerate(planned(result), start=1):
         path = folder / f"experiment_{number}"

@@ -16,7 +16,7 @@ from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, of_refused, posterior
 
-NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the rest is said not to be noise
+NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
 PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
 
@@ -97,7 +97,7 @@ def next_step(result: Diagnosis) -> str:
 
 
 def words(effect_id: str) -> str:
-    """An id as people write it."""
+    """Write an id with spaces."""
     return effect_id.replace("_", " ")
 
 
@@ -155,7 +155,7 @@ def _located(location: Location, result: Diagnosis) -> dict[str, Any]:
 
 
 def nominal_parameters(result: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Parameters of the nominal model as refitted beside the effects, with intervals."""
+    """Parameters of the nominal model as refitted together with the effects, with intervals."""
     return {
         p.key: {"value": float(v), "ci95": [float(a), float(b)]}
         for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, result.intervals, strict=False)

@@ -17,6 +17,6 @@ Decision. Forward selection: candidates are screened by projection on the residu
 are fitted in full, and the best of these enters if its evidence passes `SelectionRules`. A finer form of an active effect
 takes its place. Backward elimination: an effect that no longer earns its place leaves. Exchange: each effect is taken out
 and all candidates are tried in its place; the second-best first effects are tried as starts. What remains is put to
-simple forms of the recorded signals and to symbolic regression (`unlisted`). Rivals that the data do not tell apart are
+simple forms of the recorded signals and to symbolic regression (`unlisted`). Rivals that the data do not separate are
 listed (`equivalence`), and everything that was fitted gets its probability (`posterior`).
 """

@@ -1,4 +1,4 @@
-"""Models that the data cannot tell from the best: rivals in each effect's place, refitted, compared on held-out blocks."""
+"""Models that are indistinguishable from the best: rivals in each effect's place, refitted, compared on held-out blocks."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
 
 
 def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
-    """`standing` where known effects leave a rest that is no noise: the strongest may stand for something in no list."""
+    """`standing` where known effects leave more than noise: the strongest may replace an unlisted effect."""
     if not standing or not rest.doubtful:
         return standing
     first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
     named = standing[first]
-    forms = rest.foretold.forms if rest.foretold is not None else ()
+    forms = rest.predicted.forms if rest.predicted is not None else ()
     if not forms or any(other.effect.id == "unlisted" for other in named.alike):
         return standing
     unknown = equation_at(named.candidate.port, *forms[0])
@@ -66,7 +66,9 @@ def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
 def _better_said(
     problem: Problem, found: Found, candidate: Candidate, less: Fit, noise_sd: Array
 ) -> tuple[tuple[Candidate, float], ...]:
-    """An equation of no listed effect that does plainly better in the place of `candidate`: this may be a stand-in."""
+    """An equation of no listed effect that does plainly better in the place of `candidate`: then `candidate` may be the
+    wrong name.
+    """
     if candidate.effect.id == "unlisted":
         return ()
     for trial in equations_for(problem, less, candidate.port, noise_sd):
@@ -80,8 +82,8 @@ def _better_said(
 def _equals(
     problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, noise_sd: Array
 ) -> tuple[tuple[Candidate, ...], list[tuple[Candidate, float]]]:
-    """Rivals in the place of `candidate`: those that neither held-out samples nor all together tell from it, and all that
-    were refitted with their coarsened differences.
+    """Rivals in the place of `candidate`: those that neither held-out samples nor all together separate from it, and all
+    that were refitted with their coarsened differences.
     """
     best = found.best
     kept: list[Candidate] = []
@@ -128,6 +130,6 @@ def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: Selecti
         return True
     top = int(np.argmax(earned.independent * earned.log_ratio))
     best, other = (1.0 - np.exp(-gain.log_ratio[top]) for gain in (earned, rival))
-    idealized = earned.excesses[top] > 0.0  # where the best model leaves noise only, its formula is no idealization
+    idealized = earned.excesses[top] > 0.0  # where the best model leaves noise only, its formula is exact enough
     near = ahead.share < rules.equal_error or (idealized and best - other < rules.equal_mismatch * best)
     return bool(near and ahead.log_likelihood < rules.equal_likelihood_ratio * earned.log_likelihood)

@@ -1,6 +1,6 @@
 """Probabilities of what was fitted, and of none of these.
 
-For an effect of the extended model, M ranges over: the effect; its rivals, each refitted in its place beside the other
+For an effect of the extended model, M ranges over: the effect; its rivals, each refitted in its place with the other
 effects; an equation of recorded signals in its place; nothing there at all; and physics that no candidate has. With
 
     dl(M) = log-likelihood of the extended model - that of M

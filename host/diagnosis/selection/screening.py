@@ -76,7 +76,7 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
 class Screened:
     """A candidate with its promise by projection and the start values that earned it.
 
-    nominal: nominal parameters to start from beside each of `begin`, where they are not those of the fit so far.
+    nominal: nominal parameters to start from with each of `begin`, where they are not those of the fit so far.
     """
 
     candidate: Candidate
@@ -100,7 +100,7 @@ def screen(
     problem: Problem, fit: Fit, candidate_effects: list[Candidate], progress: Progress, known_Hz: tuple[float, ...] = ()
 ) -> list[Screened]:
     """Promise of every candidate: what its signature, seen past all active parameters, takes from the residual (grid
-    search). `known_Hz`: frequencies to try besides those that stand out.
+    search). `known_Hz`: further frequencies to try.
     """
     problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
@@ -183,7 +183,7 @@ def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slope
 
 
 def enough(problem: Problem) -> Problem:
-    """The problem with enough recordings to fit, spread over all; the rest neither fitted nor simulated."""
+    """The problem with enough recordings to fit, spread over all; the others neither fitted nor simulated."""
     used = [index for index, segment in enumerate(problem.segments) if segment.fit.any()]
     count = max(
         1, min(len(used), int(np.ceil(problem.model.screen_samples / max(problem.segments[index].n for index in used))))

@@ -45,7 +45,7 @@ class Step:
 
 @dataclass
 class Found:
-    """Nominal fit, best fit, the moves between, trials fitted beside the best structure, and its equations."""
+    """Nominal fit, best fit, the moves between, trials fitted with the best structure, and its equations."""
 
     nominal: Fit
     best: Fit
@@ -63,7 +63,7 @@ def settle(problem: Problem, values: Array) -> None:
 
 
 def begin_anew(problem: Problem, fit: Fit) -> None:
-    """Lets a model that runs freely from a measured state find that state anew."""
+    """Lets a model that runs freely from a measured state find that state again."""
     for segment in problem.segments:
         estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values))
 
@@ -244,7 +244,7 @@ def _detour(
     problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
 ) -> Found:
     """One effect that stands in for two can beat each of them alone: the first step's rivals are taken up where what
-    screening promises beside them would outdo all that was found.
+    screening promises together with them would outdo all that was found.
     """
     if not found.best.terms or problem.budget.spent():
         return found
@@ -287,7 +287,7 @@ def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:
 
 
 def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
-    """Each effect's rivals refitted beside the others: one that only stood in for several has to leave now."""
+    """Refit each effect's rivals together with the others: one that only replaced several has to leave now."""
     for term in best.terms:
         step = next((s for s in reversed(steps) if s.key == term.candidate.key), None)
         rest, values = without(best, problem, (term.candidate.key,))
@@ -310,8 +310,8 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
 def _exchange(
     problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
 ) -> None:
-    """Each of several effects taken out, and all candidates screened anew for its place: what was the best beside nothing
-    may not be the best beside the others.
+    """Each of several effects taken out, and all candidates screened again for its place: what was the best alone
+    may not be the best together with the others.
     """
     for _ in range(problem.rules.exchange_rounds):
         before = found.best.names

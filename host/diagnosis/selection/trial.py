@@ -142,7 +142,7 @@ def _plainly(trial: Trial, more: int) -> bool:
 
 
 def weighty(trial: Trial, earned: float) -> bool:
-    """Whether a trial earns enough beside the likelihood of what is named already; a finer shape is judged alone."""
+    """Whether a trial earns enough relative to the likelihood of what is named already; a finer shape is judged alone."""
     rules = trial.rules
     large = trial.both.share > rules.large_error_reduction and trial.heldout.p_value < rules.large_significance
     enough = trial.both.share > rules.further_error_reduction and (

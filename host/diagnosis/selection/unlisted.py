@@ -1,4 +1,4 @@
-"""What is left after the known effects: is it predictable, and does an equation found by search explain it."""
+"""The residual after the known effects: is it predictable, and does an equation found by search explain it."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Rest:
-    """What known effects leave. `foretold`: at the place where it is most so; `left`: share of the nominal mismatch still
+    """What known effects leave. `predicted`: its most predictable part; `left`: share of the nominal mismatch still
     there.
     """
 
-    foretold: PredictedPart | None
+    predicted: PredictedPart | None
     left: float
-    doubtful: bool = False  # known effects are named, but they are probably stand-ins
-    loud: bool = False  # more is left than noise can be, foretold or not
+    doubtful: bool = False  # known effects are named, but they are probably the wrong names
+    above_noise: bool = False  # more is left than noise can be, predicted or not
 
     @property
     def sure(self) -> bool:
         """Whether there is a mismatch that the finder knows to be there."""
-        return self.loud or (self.foretold is not None and self.foretold.sure)
+        return self.above_noise or (self.predicted is not None and self.predicted.sure)
 
 
 def left_over(problem: Problem, found: Found, noise_sd: Array) -> float:
@@ -75,14 +75,14 @@ def _power(problem: Problem, residuals: list[Array], row: int) -> float:
 
 
 def explain_rest(problem: Problem, found: Found, noise_sd: Array, progress: Progress) -> Rest:
-    """Looks at the rest, and adds an equation to `found.best` where one earns its place."""
+    """Test the remaining residual, and add an equation to `found.best` where one earns its place."""
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
     progress("testing whether the residual is predictable", 0.0)
     places = predict_residual(problem, found.best, noise_sd)
     rest = _rest(problem, found, noise_sd, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
-    if not rest.sure or rest.foretold is None or (crowd and rest.left < problem.rules.partial_share / crowd[0][1]):
+    if not rest.sure or rest.predicted is None or (crowd and rest.left < problem.rules.partial_share / crowd[0][1]):
         return rest
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
@@ -98,7 +98,7 @@ def _rest(problem: Problem, found: Found, noise_sd: Array, places: list[Predicte
     explained = fallen(problem, found.nominal.residuals, found.best.residuals, noise_sd)
     told = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
     left = max(left_over(problem, found, noise_sd), told)
-    return Rest(best, left, loud=_above_noise(problem, found, noise_sd))
+    return Rest(best, left, above_noise=_above_noise(problem, found, noise_sd))
 
 
 def _equation_instead(
@@ -137,7 +137,9 @@ def _equation_instead(
 
 
 def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], noise_sd: Array) -> bool:
-    """Whether the effects that an equation would replace gain as much beside it as they must to enter: then they stay."""
+    """Whether the effects that an equation would replace gain as much together with it as they must to enter: then they
+    stay.
+    """
     term = winner.fit.terms[-1]
     begin = np.concatenate((best.values, winner.fit.values[-len(term.parameters) :]))
     both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
@@ -147,7 +149,7 @@ def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, 
 
 
 def equations_for(problem: Problem, less: Fit, port: Port, noise_sd: Array) -> list[Trial]:
-    """The best forms of the library at `port`, or at the one whose reading it is, each refitted beside `less`."""
+    """The best forms of the library at `port`, or at the one whose reading it is, each refitted with `less`."""
     target = next((b for a, b in problem.model.unlisted_at if port.name in (a, b)), None)
     if target is None:
         return []

@@ -1,4 +1,4 @@
-"""Is the rest foretold by anything: simple forms of the recorded signals, each seen through the nominal model.
+"""Is the residual predicted by anything: simple forms of the recorded signals, each seen through the nominal model.
 
 A form is a product, a power, a wave or a memory (play, lag) of signals, of no parameter but its size. Its response is what
 the model's outputs would change if it were added at a port. Forms are weighed where the outputs are precise (in contact the
@@ -41,8 +41,8 @@ class Form:
 
 @dataclass(frozen=True)
 class PredictedPart:
-    """What the best forms at one place take from the rest. `forms`: the singles worth a refit with their sizes, best first;
-    `port`: None for a reading.
+    """What the best forms at one place take from the residual. `forms`: the single forms to refit with their sizes, best
+    first; `port`: None for a reading.
     """
 
     subsystem: str
@@ -57,7 +57,7 @@ class PredictedPart:
 
 
 def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
-    """The library at one port: its motion, the signals beside it, their rates, magnitudes, waves, memory and products."""
+    """The library at one port: its motion, further signals, their rates, magnitudes, waves, memory and products."""
     signals = [s for s in _signals(problem, fit, port) if s.span > 1e-9 * s.largest][:MOST_SIGNALS]
     timed = problem.segments[0].recording.timed
     factors = [_factors(s, timed) for s in signals]
@@ -282,7 +282,7 @@ def _best(
     subsystem: str,
     port: Port | None,
 ) -> PredictedPart:
-    """Greedy choice among `forms`, one more as long as held-out samples are foretold better."""
+    """Greedy choice among `forms`, one more as long as held-out samples are predicted better."""
     sums = _Sums(problem, fit, noise_sd, slopes, responses)
     best = PredictedPart(subsystem, port, 0.0, 1.0, 0.0, 0.0)
     chosen: list[int] = []
@@ -369,7 +369,7 @@ class _Sums:
         self.gram, self.pull = gram - cross @ self.inverse @ cross.T, pull - cross @ self.inverse @ start
 
     def gains(self, chosen: list[int]) -> Array:
-        """Fall of half the squared error by each form, beside those chosen."""
+        """Fall of half the squared error by each form, together with those chosen."""
         left, size = self.pull, np.diag(self.gram)
         if chosen:
             solved = np.linalg.lstsq(self.gram[np.ix_(chosen, chosen)], self.gram[chosen], rcond=1e-10)[0]

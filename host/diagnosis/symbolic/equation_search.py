@@ -1,4 +1,4 @@
-"""Unlisted physics: an equation for the latent signal, searched over memory operators, believed only after a refit."""
+"""Unlisted physics: an equation for the latent signal, searched over memory operators, accepted only after a refit."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def latent(problem: Problem, fit: Fit, segment: Segment, residual: Array, port: 
 
 
 def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
-    """Equations for the latent signal by genetic programming, on the samples to fit that tell of it; short ones first."""
+    """Equations for the latent signal by genetic programming, on the samples to fit that depend on it; short ones first."""
     from pyoperon.sklearn import SymbolicRegressor
 
     tables, targets, precisions = [], [], []

@@ -141,7 +141,7 @@ def run(only: Sequence[str], seed: int, report: Report) -> tuple[list[Row], dict
 
 
 def missing_of_contract(only: Sequence[str], missing: Mapping[str, str]) -> list[str]:
-    """Return one line for each row that had to be there and is not: those of CONTRACT, and those asked for by name."""
+    """Return one line for each row that had to be there and is not: those of CONTRACT, and those requested by name."""
     wanted = set(only) or CONTRACT
     return [f"{name}: {reason}" for name, reason in missing.items() if name in wanted]
 

@@ -16,7 +16,7 @@ from host.studies.control.runs import IRREGULAR, REGULAR, STILL, Held, with_cont
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 WANTED_N = 0.2
-PLAY_OFF_m = 0.0006  # the thesis knows the play to this
+PLAY_OFF_m = 0.0006  # the thesis knows the backlash to this
 TRACKER_NOISE_m = 0.0004  # of one axis, for positioning
 # The thesis' law with gains raised for a beating wall, as far as it does not ring on a still one.
 RETUNED = {"force_gain_m_per_N": 0.06, "force_integral_m_per_N_s": 0.03}

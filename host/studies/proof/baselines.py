@@ -105,7 +105,7 @@ def _features(session: NoiselessRecordings, i: int, system: System) -> Array:
 
 
 def _learned(model: Model, session: NoiselessRecordings, left: list[Array], system: System) -> Array:
-    """Held-out residuals as `model` foretells them from inputs, trained on the others."""
+    """Held-out residuals as `model` predicts them from inputs, trained on the others."""
     train = np.vstack([_features(session, i, system) for i in (0, 1)])
     middle, spread = train.mean(axis=0), np.maximum(train.std(axis=0), 1e-12)
     target = np.vstack(left[:2])
@@ -154,7 +154,7 @@ def _distances(a: Array, b: Array) -> Array:
 
 
 def _oracle(system: System, planted: list[ScaledEffect], session: NoiselessRecordings, left: list[Array]) -> Array:
-    """The true module with its size fitted to the training recordings, beside nominal parameters as they are."""
+    """The true module with its size fitted to the training recordings, with nominal parameters as they are."""
     if not planted:
         return np.zeros_like(left[2])
 

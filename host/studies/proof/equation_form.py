@@ -1,7 +1,7 @@
 """Whether an equation has the right form: its values, on the case's own recordings, follow those of the true one.
 
 Both are evaluated on the held-out recording; what gain and offset of the nominal model would absorb is taken out of both;
-the form is right where the rest of the one explains at least 90 % of the rest of the other.
+the form is right where the remainder of the one explains at least 90 % of the remainder of the other.
 """
 
 from __future__ import annotations

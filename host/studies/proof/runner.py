@@ -161,7 +161,7 @@ def generate(settings: Settings, world: str, progress: Progress) -> str:
 
 
 def _diagnosed(settings: Settings, folder: Path, folders: dict[str, Path], progress: Progress) -> dict[str, dict[str, Any]]:
-    """Verdicts of all cases of one world; those kept from an earlier run are not asked for again."""
+    """Verdicts of all cases of one world; those kept from an earlier run are not computed again."""
     kept = folder / "verdicts"
     kept.mkdir(exist_ok=True)
     todo = {name: path for name, path in folders.items() if not (kept / f"{name}.json").exists()}

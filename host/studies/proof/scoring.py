@@ -15,7 +15,7 @@ from sim.concealed.label import Label, PlantedTruth
 
 Array = np.ndarray
 CONFIDENT = 0.9  # stated probability from which on a name is a confident one
-SILENT_BELOW = 0.19  # rho under which nothing is promised: silence is no fault there
+SILENT_BELOW = 0.19  # rho under which nothing is promised: `nothing_missing` is not a fault there
 FROM_THE_BEGIN = {"clock_drift"}
 BEHIND = "behind the gain"  # in the equation of an effect that acts on the output of its link
 _UNITS = {"m", "rad", "N", "Nm", "s", "Hz", "per", "m2", "m3", "N2", "s2", "square", "share", "kg"}
@@ -145,7 +145,7 @@ def _wrong(label: Label, kind: Any, said: list[tuple[str, set[str]]], names: lis
 
 
 def _exact(said: list[tuple[str, set[str]]], names: list[set[str]]) -> bool:
-    """All effects named first by their own names, none beside them."""
+    """All effects named first by their own names, and no others."""
     if len(said) != len(names):
         return False
     left = list(names)
@@ -282,7 +282,9 @@ def _right(label: Label, kind: Any, said: list[tuple[str, set[str]]], facts: dic
 
 
 def _honest(label: Label, kind: Any, said: list[tuple[str, set[str]]]) -> bool:
-    """An undecidable case: silence where that is in the set, doubt, or a true name with another of the set beside it."""
+    """An undecidable case: `nothing_missing` where that is in the set, doubt, or a true name together with another of the
+    set.
+    """
     allowed = set(label["set"])
     if kind == "nothing_missing":
         return "nothing_missing" in allowed

@@ -1,4 +1,4 @@
-"""The proof's table: figures of all cases under the contract's names, and as rows for people."""
+"""The proof's table: figures of all cases under the contract's names, and as rows of text."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def worlds_markdown(tables: dict[str, Table], own: str) -> str:
 
 
 def markdown(table: Table, baselines: dict[str, dict[str, Any]]) -> str:
-    """The table beside its targets and the baselines, as markdown."""
+    """The table with its targets and the baselines, as markdown."""
     names = list(baselines)
     lines = [
         f"| figure | to reach | diagnose | {' | '.join(n.replace('_', ' ') for n in names)} |",

@@ -101,7 +101,7 @@ def _sweep(base: Gains, name: str, factors: tuple[float, ...]) -> dict[float, Th
 
 # The thesis prints no gains for Figs. 7.11 and 7.12, which come before its optimum. Its optimum is at the edge of what our
 # setting bears (K_pp 1.25 times as high is unstable), so that the statements are judged at half its K_pp; the optimum's own
-# figures stand beside.
+# figures are next to it.
 _JUDGED = Gains().scaled(K_pp=0.5)
 _FACTORS = {
     "K_pp": (0.25, 0.5, 1.0, 2.5),

@@ -25,7 +25,7 @@ function label(text, color) {
   return sprite;
 }
 
-// A computer without a graphics card draws by its processor: there smooth edges cost more than the rest of the picture.
+// A computer without a graphics card draws by its processor: there smooth edges cost more than all else in the picture.
 function drawnInSoftware() {
   const gl = document.createElement("canvas").getContext("webgl2");
   const names = gl?.getExtension("WEBGL_debug_renderer_info");

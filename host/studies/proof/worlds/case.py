@@ -20,7 +20,7 @@ SHARES = {"null": 0.30, "single": 0.40, "pair": 0.15, "outside": 0.15}
 LEVELS = (1.0, 0.5, 2.0, 4.0)
 ATTEMPTS = 30
 NULL_BELOW = 0.08  # largest rho that the nominal model may leave of a case with nothing planted
-LEAST_ENERGY = 150.0  # squared mismatch over squared noise, summed: below, no method could tell and the case is redrawn
+LEAST_ENERGY = 150.0  # squared mismatch over squared noise, summed: below, no method could find it and the case is redrawn
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def _scaled(mechanism: Mechanism, setup: Setup, effect: Plantable, rho: float, s
 
 
 def _shown(setup: Setup, left: Sequence[Columns]) -> bool:
-    """Return whether the recordings that are fitted show the mismatch, and strongly enough for anyone to tell."""
+    """Return whether the recordings that are fitted show the mismatch, and strongly enough to be found."""
     rho, each = size_of(setup, left)
     top = max(each, key=lambda name: each[name])
     energy = [float(np.sum(part[top] ** 2)) / setup.sigma[top] ** 2 for part in left]

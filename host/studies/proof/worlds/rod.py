@@ -72,7 +72,7 @@ def _shoot(length: float, k0: float, soft: Array, z: Array, weight: Array, end: 
 
 @njit(cache=True)
 def _miss(end: Array, z: Array, wall: Array, out: Array) -> None:
-    """Write what is left of m(L) = 0 and F = F_wall. wall: centre (3,), radius, stiffness."""
+    """Write the residuals of m(L) = 0 and F = F_wall. wall: centre (3,), radius, stiffness."""
     out[:3] = end[7:10] * 1e2
     away = end[:3] - wall[:3]
     far = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)

@@ -73,7 +73,7 @@ def _multisine(rng: np.random.Generator, slowest_hz: float, fastest_hz: float) -
 
 
 def noise(rng: np.random.Generator, n: int, sigma: float, share: float) -> Array:
-    """Return noise (n,) of standard deviation sigma: `share` of its energy Markov over ten samples, the rest white."""
+    """Return noise (n,) of standard deviation sigma: `share` of its energy Markov over ten samples, the remainder white."""
     a = float(np.exp(-0.1))
     slow = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], rng.standard_normal(n + 100))[100:]
     return np.asarray(sigma * (np.sqrt(share) * slow + np.sqrt(1.0 - share) * rng.standard_normal(n)))
