@@ -31,7 +31,7 @@ class Output:
 class Begin:
     """The state from which one recording is simulated, and what is known of it beforehand, each (k,).
 
-    Copies of a segment share it: a state that is found anew holds for all of them.
+    Copies of a segment share it: a state that is found again holds for all of them.
     """
 
     names: tuple[str, ...]

@@ -109,10 +109,10 @@ class AxisModel(Model):
         }
         segment.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
-        # Only a motion read as position is begun anew: its first speed is a derivative of noise, and its error rings on.
-        anew = self.free_run and spec.controller is None and spec.reads == "position"
+        # Only a motion read as position is started again: its first speed is a derivative of noise, and its error rings on.
+        again = self.free_run and spec.controller is None and spec.reads == "position"
         spread = _begin_spread(motion, x, recording.dt_s, window)
-        segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), anew)
+        segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
         segment.units = {
