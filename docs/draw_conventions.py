@@ -94,7 +94,7 @@ def plane(axes: Any) -> None:
 
 
 def main() -> None:
-    """Writes the picture."""
+    """Draw both frames and write the picture next to this file."""
     plt.rcParams["svg.hashsalt"] = "conventions"
     figure = plt.figure(figsize=(13, 6.5))
     space(figure.add_subplot(1, 2, 1, projection="3d"))

@@ -1,4 +1,4 @@
-"""Say that a kernel is being compiled: a command that is silent for a minute looks broken.
+"""Say that a kernel is being compiled: a command without output for a minute looks broken.
 
 Numba's event comes only where neither memory nor the cache on disk has the kernel. `kernel_locator`, which numba loads with
 the first cached kernel, starts to listen; so a process without kernels never imports numba for this.
@@ -35,6 +35,6 @@ def listen() -> None:
                 callback()
 
         def on_end(self, event: Any) -> None:
-            """Nothing to do."""
+            """Do nothing: numba's interface demands this method."""
 
     event.register("numba:compile", CompileListener())

@@ -6,7 +6,7 @@ import enum
 
 
 class Code(enum.IntEnum):
-    """An integer code with a name for people and messages."""
+    """An integer code with a name for messages and logs."""
 
     @property
     def label(self) -> str:

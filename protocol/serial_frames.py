@@ -115,7 +115,7 @@ class Field:
 
     @property
     def n_bytes(self) -> int:
-        """Bytes on the wire."""
+        """Return the field's length on the wire in bytes."""
         return WIRE_BYTES[self.wire] * self.count
 
 

@@ -145,7 +145,7 @@ class Watcher:
 
     @property
     def now_s(self) -> float:
-        """Time since the fault."""
+        """Return the time since the fault in s."""
         return (self.run.world.now_ns - self._begin_ns) * 1e-9
 
     def _detected(self, by: str) -> None:

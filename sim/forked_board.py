@@ -50,11 +50,11 @@ class LibraryBoard(SimulatedBoard):
         """Nothing to do: the copy has the state."""
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing: the native board has no process of its own."""
 
     @property
     def pid(self) -> int:
-        """Of this process."""
+        """Return the id of this process, in which the native board runs."""
         return os.getpid()
 
 

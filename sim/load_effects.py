@@ -163,7 +163,7 @@ def _material(e, p, chain, curvature: float, dt_s: float) -> None:  # type: igno
 
 
 @njit(cache=True)
-def _beside(e, chain) -> tuple[int, float]:  # type: ignore[no-untyped-def]
+def _nearest_link(e, chain) -> tuple[int, float]:  # type: ignore[no-untyped-def]
     """The joint beyond the obstacle along e3 and its share of the contact force (the next joint back has the remainder)."""
     for j in range(chain.cells - 1, 0, -1):
         here, beyond = chain.joint[j, 2], chain.joint[j - 1, 2]
@@ -175,7 +175,7 @@ def _beside(e, chain) -> tuple[int, float]:  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _press(e, chain, force_N: float) -> None:  # type: ignore[no-untyped-def]
     """Put the obstacle's push, against its direction, on the joints at its place."""
-    j, share = _beside(e, chain)
+    j, share = _nearest_link(e, chain)
     if j < 0 or force_N == 0.0:
         return
     for i in range(3):
@@ -194,7 +194,7 @@ def touch_elsewhere(effects: Array, p, chain, curvature: float, time_s: float, d
         e = effects[k]
         if e.port != code.SHAPE or e.code != code.SECOND_CONTACT or time_s < e.start_s:
             continue
-        j, share = _beside(e, chain)
+        j, share = _nearest_link(e, chain)
         old = e.s[0]
         if j < 0:
             e.s[0] = 0.0

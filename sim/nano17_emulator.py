@@ -72,4 +72,4 @@ class Nano17Emulator:
         return np.array(rows).reshape(-1, 7), self.config.rate_hz
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing: the emulated card holds no resource."""

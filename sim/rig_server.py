@@ -105,7 +105,7 @@ class RigServer:
         }
 
     def close(self) -> None:
-        """Gives the lines back."""
+        """Close the emulated tracker, the force sensor and the line of the board."""
         self.tracker.close()
         self.force_box.close()
         for fd in (self._board_line, self._board_end):

@@ -84,7 +84,7 @@ class Scenario:
 
     @property
     def now_ns(self) -> int:
-        """Virtual time."""
+        """Return the virtual time in ns."""
         return self.world.now_ns
 
     def stop(self) -> None:

@@ -36,7 +36,7 @@ class AuroraPty:
 
     @property
     def path(self) -> str:
-        """The device's name."""
+        """Return the path of the port to open."""
         return str(self._link) if self._link is not None else os.ttyname(self._slave)
 
     def plug(self) -> None:
@@ -118,7 +118,7 @@ class NetFtUdp:
                 self._link.sendto(record, self._peer or ("", 0))
 
     def close(self) -> None:
-        """End both servers."""
+        """End the servers of tracker and force sensor."""
         self.unplug()
         self._web.shutdown()
         self._web.server_close()

@@ -49,10 +49,10 @@ def calibrate(
     if json:
         write_json(report)
     else:
-        _print_for_people(report)
+        _print_table(report)
 
 
-def _print_for_people(report: dict[str, Any]) -> None:
+def _print_table(report: dict[str, Any]) -> None:
     for name, p in report["parameters"].items():
         note = "" if p["determined"] else "   not determined by the data"
         print(f"{name:>14} = {p['value']:.6g} {p['unit']}   95 %: {p['ci95'][0]:.6g} to {p['ci95'][1]:.6g}{note}")

@@ -58,7 +58,7 @@ def characterize(
         raise typer.Exit(1) from None
     files = write_calibration(found, loaded, rig, source, directory)
     for line in files.lines:
-        print(f"{line.name:<22} {line.value:>12}  {line.beside}", file=sys.stderr)
+        print(f"{line.name:<22} {line.value:>12}  {line.note}", file=sys.stderr)
     print(
         f"calibration: {files.calibration}\nrig file:    {files.rig_file}\npage:        {files.page}",
         file=sys.stderr,

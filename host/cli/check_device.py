@@ -36,13 +36,13 @@ def check_device(
         report = check_force_box(settings, port, seconds, udp_port, web_port)
     else:
         report = (check_tracker if device == "tracker" else check_board)(settings, port, seconds)
-    _print_for_people(report)
+    _print_table(report)
     if json:
         write_json({"device": report.device, "good": report.good, "figures": report.figures, "problems": report.problems})
     raise typer.Exit(0 if report.good else 1)
 
 
-def _print_for_people(report: DeviceReport) -> None:
+def _print_table(report: DeviceReport) -> None:
     from rich.console import Console
     from rich.table import Table
 

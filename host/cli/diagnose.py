@@ -79,7 +79,7 @@ def _watch(rig: str | None, json: bool) -> None:
 
 
 def summary(verdict: dict[str, Any]) -> list[str]:
-    """The verdict as lines for people."""
+    """Write the verdict as lines of text."""
     fit = verdict["fit"]
     lines = [f"data: {finding['says']}" for finding in verdict["data_findings"]]
     lines.append(verdict["verdict"].replace("_", " "))

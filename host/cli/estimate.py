@@ -31,14 +31,14 @@ def estimate(
     if json:
         write_json(answer)
     else:
-        _print_for_people(answer)
+        _print_table(answer)
     for warning in answer["warnings"]:
         typer.echo(f"seldinger: {warning}", err=True)
     if not answer["converged"]:
         raise typer.Exit(1)
 
 
-def _print_for_people(answer: dict[str, Any]) -> None:
+def _print_table(answer: dict[str, Any]) -> None:
     variances = [row[index] for index, row in enumerate(answer["covariance_N2"])]
     for name, value, variance in zip("xyz", answer["force_N"], variances, strict=False):
         deviation = f"standard deviation {math.sqrt(variance) * 1e3:.2f} mN"

@@ -51,7 +51,7 @@ def faults(
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     bad = [result for result in results if result.violations]
-    _print_for_people(results, bad)
+    _print_table(results, bad)
     if docs is not None:
         write_section(docs, "faults", page_section(results, seed, board))
     if json:
@@ -79,7 +79,7 @@ def _broken(result: RunResult) -> dict[str, object]:
     }
 
 
-def _print_for_people(results: list[RunResult], bad: list[RunResult]) -> None:
+def _print_table(results: list[RunResult], bad: list[RunResult]) -> None:
     """Print a row per fault, and every broken rule, on standard error."""
     from rich.console import Console
     from rich.table import Table

@@ -17,7 +17,7 @@ rig = typer.Typer(help="Check a rig file; show the effective configuration.", no
 
 @rig.callback()
 def _group() -> None:
-    """The rig file."""
+    """Group the commands on rig files."""
 
 
 @rig.command()

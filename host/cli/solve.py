@@ -30,7 +30,7 @@ def solve(
     if json:
         write_json(answer)
     else:
-        _print_for_people(answer)
+        _print_table(answer)
     if not answer["converged"]:
         typer.echo(
             f"seldinger: no equilibrium at full load ({answer['reason']}); the branch from the unloaded shape was followed "
@@ -40,7 +40,7 @@ def solve(
         raise typer.Exit(1)
 
 
-def _print_for_people(answer: dict[str, Any]) -> None:
+def _print_table(answer: dict[str, Any]) -> None:
     if not answer["converged"]:
         return
     tip = answer["tip"]

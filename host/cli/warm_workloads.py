@@ -126,7 +126,7 @@ def control_loop(folder: Path) -> None:
     from realtime.core.control_loop import run
     from realtime.loop.latency import check_latency
 
-    check_latency(tick, tick_parameters(load_rig(SIMULATED_RIG)), 1000, 0.2, None, beside_cyclictest=False, run=run)
+    check_latency(tick, tick_parameters(load_rig(SIMULATED_RIG)), 1000, 0.2, None, compare_cyclictest=False, run=run)
 
 
 def rig_processes(folder: Path) -> None:

@@ -32,7 +32,7 @@ def write_calibration(
     """Write calibration, rig file with it (checked by reading it back) and page into `directory`, named as the recording.
 
     Arguments: `rig_file`, whose [transmission] is replaced in the copy.
-    Raises: InputError where the result is no good rig file; OSError where the folder cannot be written.
+    Raises: InputError where the result is not a valid rig file; OSError where the folder cannot be written.
     """
     directory.mkdir(parents=True, exist_ok=True)
     section = transmission_toml(found)

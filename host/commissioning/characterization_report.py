@@ -51,7 +51,7 @@ def _bounded(value: Estimate, scale: float, digits: int) -> str:
 
 
 def lines_of(found: Characterization) -> list[TableRow]:
-    """The figures in people's units, each with its interval."""
+    """The figures in mm and degrees, each with its interval."""
     width, slope, roll, edges = found.insertion.width, found.insertion.slope, found.roll.slope, found.knob.edges_rad
     lines = [
         TableRow("Backlash of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),

@@ -162,7 +162,7 @@ def travel_of(points: Array, rig: Rig) -> dict[str, tuple[float, float]]:
     return out
 
 
-class Desk(Protocol):
+class RigControl(Protocol):
     """A rig as a script needs it, in virtual time or on the wall clock."""
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
@@ -174,7 +174,7 @@ class Desk(Protocol):
         ...
 
     def now_s(self) -> float:
-        """The rig's time."""
+        """Return the rig's clock, virtual or CLOCK_MONOTONIC (s)."""
         ...
 
     def mode(self) -> str:
@@ -182,48 +182,48 @@ class Desk(Protocol):
         ...
 
     def tip_m(self) -> Sequence[float] | None:
-        """Where the tip is."""
+        """Return the tip's position in the base frame (3,) in m; None before the first pose."""
         ...
 
 
-def perform(script: Script, desk: Desk, progress: Callable[[float], None] = lambda share: None) -> None:
+def perform(script: Script, control: RigControl, progress: Callable[[float], None] = lambda share: None) -> None:
     """Give `script` (checked before) to an armed rig: to the start, then row by row; at the end hold, or retract.
 
     Raises RuntimeError where a command is refused or the rig leaves its mode; it then gets the command to hold.
     """
     try:
-        _ask(desk, "target", "position", target_m=tuple(script.start_m))
-        if not desk.wait(WITHIN_S, lambda: _near(desk.tip_m(), script.start_m)):
+        _ask(control, "target", "position", target_m=tuple(script.start_m))
+        if not control.wait(WITHIN_S, lambda: _near(control.tip_m(), script.start_m)):
             raise RuntimeError(f"start not reached within {WITHIN_S:g} s")
         if script.motion == "contact":
-            _ask(desk, "target", "contact", target_m=tuple(script.touch_m), normal=tuple(script.into),
+            _ask(control, "target", "contact", target_m=tuple(script.touch_m), normal=tuple(script.into),
                  force_N=script.rows[0][1])  # fmt: skip
-            if not desk.wait(WITHIN_S, lambda: desk.mode() == "contact"):
+            if not control.wait(WITHIN_S, lambda: control.mode() == "contact"):
                 raise RuntimeError(f"no contact within {WITHIN_S:g} s")
-        desk.wait(REST_S)
-        begin_s, wanted = desk.now_s(), "contact" if script.motion == "contact" else "position"
+        control.wait(REST_S)
+        begin_s, wanted = control.now_s(), "contact" if script.motion == "contact" else "position"
         for row in script.rows:
-            desk.wait(max(begin_s + row[0] - desk.now_s(), 0.0))
-            if script.motion == "contact" and desk.mode() == "approach":
+            control.wait(max(begin_s + row[0] - control.now_s(), 0.0))
+            if script.motion == "contact" and control.mode() == "approach":
                 continue  # the wall went away for a moment; it is being followed
-            if desk.mode() != wanted:
-                raise RuntimeError(f"broken off at {row[0]:.1f} s: found the rig in mode {desk.mode()}, wanted {wanted}")
+            if control.mode() != wanted:
+                raise RuntimeError(f"broken off at {row[0]:.1f} s: found the rig in mode {control.mode()}, wanted {wanted}")
             if script.motion == "free":
-                _ask(desk, "target", "position", target_m=tuple(row[1:]))
+                _ask(control, "target", "position", target_m=tuple(row[1:]))
             else:
-                _ask(desk, "force", force_N=row[1])
+                _ask(control, "force", force_N=row[1])
             progress(row[0] / script.rows[-1][0])
-        desk.wait(REST_S)
+        control.wait(REST_S)
     except RuntimeError:
-        desk.give("hold")
+        control.give("hold")
         raise
     if script.motion == "contact":
-        _ask(desk, "target", "retract")
-        desk.wait(REST_S)
+        _ask(control, "target", "retract")
+        control.wait(REST_S)
 
 
-def _ask(desk: Desk, action: str, target: str = "none", **fields: Any) -> None:
-    answer = desk.give(action, target, **fields)
+def _ask(control: RigControl, action: str, target: str = "none", **fields: Any) -> None:
+    answer = control.give(action, target, **fields)
     if not answer.accepted:
         raise RuntimeError(f"{action} {target}: {answer.reason}")
 

@@ -268,7 +268,7 @@ def _evolution(cost: _Cost, size: int, evaluations: int, seed: int, pool: Execut
 
 
 def best_of(results: Sequence[Tuned]) -> Tuned:
-    """The least cost."""
+    """Return the result with the smallest cost."""
     return min(results, key=lambda result: result.cost_N)
 
 

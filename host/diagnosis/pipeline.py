@@ -25,7 +25,7 @@ from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
-from host.diagnosis.selection.equivalence import Standing, beside_unlisted, standings
+from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.search import Found, search
 from host.diagnosis.selection.unlisted import Rest, explain_rest
@@ -173,7 +173,7 @@ def diagnose(
     progress("examining the residual", 0.0)
     rest = explain_rest(problem, found, noise_sd, progress)
     progress("weighing what stands in their place", 0.0)
-    standing = beside_unlisted(standings(problem, found, noise_sd), rest)
+    standing = with_unlisted_rival(standings(problem, found, noise_sd), rest)
     progress("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
@@ -201,10 +201,10 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
         windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma)
         for p, r in zip(full.segments, residuals, strict=True)
     ]
-    told = _told(full, spans)
+    spans_s = _by_recording(full, spans)
     where = condition(full, residuals, top, max(1, sum(p.n for p in full.segments) // 20000))
     return Location(
-        subsystem, [full.model.outputs[row].channel for row in rows], told, where, _share(full, found, spans, top)
+        subsystem, [full.model.outputs[row].channel for row in rows], spans_s, where, _share(full, found, spans, top)
     )
 
 
@@ -263,7 +263,9 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
         ]
         share = _share(full, found, spans, top)
         where = condition(full, alone, top, max(1, sum(p.n for p in full.segments) // 20000))
-        out.append(Location(subsystem, [full.model.outputs[row].channel for row in rows], _told(full, spans), where, share))
+        out.append(
+            Location(subsystem, [full.model.outputs[row].channel for row in rows], _by_recording(full, spans), where, share)
+        )
     return out
 
 
@@ -302,7 +304,7 @@ def _weight(full: Problem, change: list[Array], row: int) -> float:
     )
 
 
-def _told(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
+def _by_recording(full: Problem, spans: list[list[tuple[float, float]]]) -> dict[str, list[tuple[float, float]]]:
     """Windows of every recording by its name, in the time of its file."""
     begins = [segment.recording.begin_s for segment in full.segments]
     return {

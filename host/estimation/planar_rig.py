@@ -120,10 +120,10 @@ class PlanarRigEstimator:
     def _roll(self, tip: PoseReading, actuation: Actuation) -> float:
         """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
         y_axis, normal = bending_plane(actuation.roll_rad)
-        lateral, beside = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
+        lateral, across = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
         seen = lateral * lateral / self._position_std_m**2
         held = 1.0 / self._known.roll_rad**2
-        return actuation.roll_rad - math.atan2(beside * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
+        return actuation.roll_rad - math.atan2(across * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
 
     @staticmethod
     def _planar(reading: PoseReading, y_axis: Array, actuation: Actuation) -> Array:

@@ -172,11 +172,11 @@ def keep(m: int, s: Scratch) -> None:
 @njit(cache=True, error_model="numpy", nogil=True)
 def damped_step(damping: float, s: Scratch) -> float:
     """s.vectors[2] = Levenberg-Marquardt step (3,), damped in proportion to the diagonal; returns its length in N."""
-    floor = 1e-9 * (s.information[0, 0] + s.information[1, 1] + s.information[2, 2]) + 1e-300
+    lower_limit = 1e-9 * (s.information[0, 0] + s.information[1, 1] + s.information[2, 2]) + 1e-300
     for i in range(3):
         for j in range(3):
             s.A[i, j] = s.information[i, j]
-        s.A[i, i] += damping * (s.information[i, i] + floor) + 1e-6 * floor
+        s.A[i, i] += damping * (s.information[i, i] + lower_limit) + 1e-6 * lower_limit
     inverse3(s.A[:3], s.inverse)
     step = s.vectors[2]
     apply3(s.inverse, s.vectors[1], step)

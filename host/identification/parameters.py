@@ -50,8 +50,8 @@ class ParametricModel:
 
     def scale(self) -> Array:
         """Natural size of a step in each parameter: a relative one for stiffness, else a part of the value."""
-        floor = {"m": 0.1 * self.catheter.distal_length_m, "1/m": 5.0}
-        return np.array([1.0 if p.logarithmic else max(abs(p.start), floor[p.unit]) for p in self.parameters])
+        smallest = {"m": 0.1 * self.catheter.distal_length_m, "1/m": 5.0}
+        return np.array([1.0 if p.logarithmic else max(abs(p.start), smallest[p.unit]) for p in self.parameters])
 
     def values(self, x: Array) -> dict[str, float]:
         """Parameters by name, SI, from the search's `x`."""

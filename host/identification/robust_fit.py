@@ -34,11 +34,11 @@ class ShapeModel(Protocol):
         ...
 
     def start(self) -> Array:
-        """First parameters."""
+        """Return the parameters (p,) from which the fit starts."""
         ...
 
     def scale(self) -> Array:
-        """Natural step of each parameter."""
+        """Return the natural step of each parameter (p,)."""
         ...
 
     def predict(self, x: Array, index: int, jacobian: bool = False) -> tuple[Array, Array] | None:
@@ -122,8 +122,8 @@ def gauss_newton(objective: Objective, start: Array, steps: int = STEPS) -> Robu
     value, gradient, matrix, _ = linear
     for _ in range(steps):
         scaled = matrix * np.outer(scale, scale)
-        floor = damping * (np.diag(scaled) + 1e-9 * np.trace(scaled) / x.size)
-        step = -scale * np.linalg.solve(scaled + np.diag(floor), scale * gradient)
+        damping_term = damping * (np.diag(scaled) + 1e-9 * np.trace(scaled) / x.size)
+        step = -scale * np.linalg.solve(scaled + np.diag(damping_term), scale * gradient)
         step *= min(1.0, 1.0 / max(float(np.abs(step / scale).max()), 1e-300))
         trial = objective.linearize(x + step)
         if trial is not None and trial[0] <= value:

@@ -85,7 +85,7 @@ def rate_of(seg: Array, m: Array, load: float) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def norm3(v: Array) -> float:
-    """Length of v (3,)."""
+    """Return the Euclidean norm of v (3,)."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 

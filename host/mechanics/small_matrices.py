@@ -29,7 +29,7 @@ def inverse3(A: Array, out: Array) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def multiply3(A: Array, B: Array, out: Array) -> None:
-    """Set out (3, 3) = A B."""
+    """Write the product A B of two matrices (3, 3) into out."""
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]

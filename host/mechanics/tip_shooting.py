@@ -51,7 +51,7 @@ class Room(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def length3(v: Array) -> float:
-    """Length of v (3,)."""
+    """Return the Euclidean norm of v (3,)."""
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 

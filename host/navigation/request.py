@@ -98,7 +98,7 @@ class PlanAnswer(NamedTuple):
     waypoints: int
 
     def as_json(self) -> dict[str, Any]:
-        """Columns by name, SI."""
+        """Return the plan as JSON: samples by column name, SI units."""
         return {
             "found": True,
             "duration_s": float(self.time_s[-1]),
@@ -113,7 +113,7 @@ class PlanAnswer(NamedTuple):
 
 
 class _World:
-    """The question that the planner asks: is this joint free?"""
+    """Return whether this joint is free of collisions; the planner calls it."""
 
     def __init__(self, request: PlanRequest, rig: Rig, folder: Path) -> None:
         self.reach = shape.reach_of(rig, load_catheter(rig.catheter.name).diameter_m)

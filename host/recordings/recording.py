@@ -452,7 +452,7 @@ def _columns(properties: dict[str, Any], bodies: Iterable[dict[str, Any]], count
 
 
 def _fits(value: Any, values: np.ndarray) -> bool:
-    """Return whether `value` is a row of `values`, without any silent conversion."""
+    """Return whether `value` is a row of `values`, without a conversion."""
     if values.ndim == 2:
         return isinstance(value, list) and len(value) == values.shape[1]
     if values.dtype == np.float64:

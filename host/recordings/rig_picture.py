@@ -39,7 +39,7 @@ class Picture:
         self._force_rows: deque[list[float | None]] = deque(maxlen=WAITING)
         self._estimate_rows: deque[list[float | None]] = deque(maxlen=WAITING)
         self._kept: dict[str, deque[list[float | None]]] = {name: deque(maxlen=KEPT) for name in ("rows", "estimates")}
-        self._heard = 0
+        self._received = 0
         self._causes = CauseWatch()
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._log_new = False
@@ -73,8 +73,8 @@ class Picture:
                     *(_rounded(value, 6) for value in (*tip, *target)),
                 ]
             )
-            self._heard += 1
-            if self._heard % KEEP_EVERY == 0:
+            self._received += 1
+            if self._received % KEEP_EVERY == 0:
                 self._kept["rows"].append(self._force_rows[-1])
         elif topic == "force/estimate":
             self._estimate_rows.append([_seconds(body["stamp_ns"]), *self._along(body)])
@@ -271,5 +271,5 @@ def _rounded(value: float | None, digits: int) -> float | None:
 
 
 def _list(values: Sequence[float] | None, digits: int) -> list[float]:
-    """Empty for nil."""
+    """Return rounded numbers; an absent value (nil) gives an empty list."""
     return [] if values is None else [round(float(value), digits) for value in values]

@@ -127,7 +127,7 @@ class GuardedFile:
         os.ftruncate(self._fd, self._whole)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file descriptor; `flush` has brought whole chunks to the disk."""
         os.close(self._fd)
 
 

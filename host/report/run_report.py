@@ -36,7 +36,7 @@ class TableRow(NamedTuple):
 
     name: str
     value: str
-    beside: str = ""
+    note: str = ""
 
 
 def write_report(recording: RecordingFile, target: str | Path) -> Path:
@@ -68,12 +68,12 @@ def render(recording: RecordingFile) -> str:
 
 
 def quantity(value: float, unit: str, digits: int) -> str:
-    """`value` with its unit as people read it; a dash where there is none."""
+    """`value` with its unit, rounded; a dash where there is none."""
     return f"{value:.{digits}f}{NBSP}{unit}" if math.isfinite(value) else "–"
 
 
 def duration(time_us: float) -> str:
-    """Return `time_us` (µs) as people read it: in µs below 10 ms, in ms above."""
+    """Return `time_us` (µs) with its unit: in µs below 10 ms, in ms above."""
     return quantity(time_us, "µs", 1) if time_us < 1e4 else quantity(time_us * 1e-3, "ms", 0)
 
 

@@ -30,7 +30,7 @@ class TimeSpan:
 
     @property
     def seconds(self) -> float:
-        """How long."""
+        """Return the duration in s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 

@@ -33,20 +33,20 @@ class SimulatedCommands:
         self._scenario = scenario
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """As Scenario.command."""
+        """Give a command and return its answer, as `Scenario.command` does."""
         answer: Acknowledgement = self._scenario.command(action, target, **fields)
         return answer
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """As Scenario.run."""
+        """Run for `seconds` of virtual time or until `until()`, as `Scenario.run` does."""
         return bool(self._scenario.run(seconds, until))
 
     def now_s(self) -> float:
-        """Virtual time."""
+        """Return the virtual time in s."""
         return float(self._scenario.now_ns * 1e-9)
 
     def mode(self) -> str:
-        """The loop's phase."""
+        """Return the label of the loop's phase."""
         return Phase(self._scenario.phase).label
 
     def tip_m(self) -> Sequence[float]:
@@ -91,7 +91,7 @@ class LiveCommands:
         self._state: RigState | None = None
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """As Commander.give."""
+        """Give a command and return its answer, as `Commander.give` does."""
         answer: Acknowledgement = self._commander.give(action, target, **fields)
         return answer
 
@@ -114,7 +114,7 @@ class LiveCommands:
             self._state = state
 
     def now_s(self) -> float:
-        """CLOCK_MONOTONIC."""
+        """Return CLOCK_MONOTONIC in s."""
         return time.monotonic()
 
     def mode(self) -> str:

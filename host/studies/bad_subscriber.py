@@ -107,7 +107,7 @@ class BadSubscriber:
             self.lives += 1
 
     def kill(self) -> None:
-        """Without a farewell."""
+        """Kill the process, so that it closes no connection properly."""
         self._child.kill()
         self._child.wait()
         assert self._child.stdout is not None

@@ -92,7 +92,7 @@ class LiveRow:
 
     @property
     def line(self) -> str:
-        """The row of the table."""
+        """Return the row of the table for this task."""
         name, job = self.task.planted, self.task.job
         size = f"{self.task.size:.2g}"
         if self.first is None:
@@ -100,8 +100,8 @@ class LiveRow:
             return f"| {name} | {job} | {size} | {self.residual_ratio:.1f} | {score} | | |"
         others = re.search(r"\(indistinguishable from (.*?)\)", self.first["words"])
         named = f"{self.first['subsystem']}: {self.first['effect'].replace('_', ' ')}"
-        told = others[1].replace("_", " ") if others else ""
-        return f"| {name} | {job} | {size} | {self.residual_ratio:.1f} | {self.delay_s:.1f} | {named} | {told} |"
+        also = others[1].replace("_", " ") if others else ""
+        return f"| {name} | {job} | {size} | {self.residual_ratio:.1f} | {self.delay_s:.1f} | {named} | {also} |"
 
 
 def round_trip(rig: Rig, seconds: float) -> Script:
@@ -149,8 +149,8 @@ def run(task: Task, board: str = "native") -> LiveRow:
             scenario.press(ContactJob(target_m=TARGET_M, force_N=0.2, hold_s=task.seconds))
         else:
             scenario.arm()
-            desk: Any = SimulatedCommands(scenario)
-            perform(round_trip(rig, task.seconds), desk)
+            control: Any = SimulatedCommands(scenario)
+            perform(round_trip(rig, task.seconds), control)
         return LiveRow(task, world.now_ns * 1e-9, tuple(map(_alarm, alarms)), max(scores), _ratio(watch))
 
 
@@ -204,7 +204,7 @@ def doubled(row: LiveRow) -> Task | None:
 
 
 def table(rows: Sequence[LiveRow]) -> str:
-    """The page's table."""
+    """Return the table of docs/live.md as markdown."""
     head = "| planted | job | size | residual, of the usual | alarm (s after) | named | also possible |"
     return "\n".join([head, "|---|---|---|---|---|---|---|", *(row.line for row in rows)])
 
@@ -275,7 +275,7 @@ def read_rows(path: Path) -> dict[str, LiveRow]:
 
 
 class Book:
-    """Runs tasks that are not yet in `path`, and appends each as soon as it is finished."""
+    """Runs tasks that are not yet in `path`, and appends each when it is finished."""
 
     def __init__(self, path: Path | None, board: str) -> None:
         """Read what is finished; path None keeps nothing."""

@@ -46,7 +46,7 @@ def grown_bytes(record: Callable[[int], None]) -> int:
 
 
 def main() -> None:
-    """Print both figures."""
+    """Print the memory that both MCAP writers need for two hours."""
     with tempfile.TemporaryDirectory() as folder:
         with RecordingWriter(Path(folder) / "ours.mcap", RecordingHeader("simulated", "virtual", {}, {})) as ours:
             os.fdatasync = lambda fd: None  # the disk is not what is measured

@@ -52,7 +52,7 @@ class SoakResult:
     problems: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures as a dictionary for JSON."""
         return asdict(self)
 
 

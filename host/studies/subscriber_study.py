@@ -63,9 +63,9 @@ class Study:
     cyclictest: np.ndarray | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures as a dictionary for JSON."""
         idle = None if self.cyclictest is None else _of(self.cyclictest, LATENESS_BIN_NS)
-        return {"beside": {kind: one.figures() for kind, one in self.measured.items()}, "cyclictest_us": idle}
+        return {"subscribers": {kind: one.figures() for kind, one in self.measured.items()}, "cyclictest_us": idle}
 
 
 def _of(histogram: np.ndarray, bin_ns: int) -> dict[str, float]:

@@ -52,7 +52,7 @@ class LiveRig:
             topic: session.zenoh.declare_subscriber(key(rig.name, topic), zenoh.handlers.RingChannel(depth))
             for topic, depth in DEPTHS.items()
         }
-        self._heard_s: float | None = None
+        self._received_s: float | None = None
         self.malformed = 0
 
     def hello(self) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class LiveRig:
         for topic, subscriber in self._subscribers.items():
             while (sample := subscriber.try_recv()) is not None:
                 self._take(topic, bytes(sample.payload))
-        silent_s = None if self._heard_s is None else round(time.monotonic() - self._heard_s, 2)
+        silent_s = None if self._received_s is None else round(time.monotonic() - self._received_s, 2)
         return {**self._picture.frame(), "silent_s": silent_s, "malformed": self.malformed}
 
     def _take(self, topic: str, payload: bytes) -> None:
@@ -82,7 +82,7 @@ class LiveRig:
             return
         self._picture.take(topic, msgpack.unpackb(payload))
         if topic == "state":
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
 
     def act(self, text: str) -> dict[str, Any]:
         """Send the command of a `Press`. What is malformed or not confirmed is never sent."""
@@ -96,7 +96,7 @@ class LiveRig:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
         answer = self._command(press.button)
         text = answer.reason.removeprefix(f"{answer.result}: ")
-        if answer.result == "unanswered" and self._heard_s is None:
+        if answer.result == "unanswered" and self._received_s is None:
             text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}
 
@@ -114,7 +114,7 @@ class LiveRig:
         return answer
 
     def close(self) -> None:
-        """Give the lease back."""
+        """Return the lease and close the commander."""
         self._commander.close()
 
 

@@ -98,7 +98,7 @@ class Page:
         self.dropped = 0
 
     def offer(self, frame: bytes) -> None:
-        """Never waits."""
+        """Queue a frame without waiting; the oldest waiting frame is dropped when the queue is full."""
         self.dropped += len(self._frames) == WAITING_FRAMES
         self._frames.append(frame)
         self._something.set()

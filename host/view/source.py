@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 
 class Source(Protocol):
-    """Asked by one thread only, except `act`, which may take its time on another."""
+    """Called by one thread only, except `act`, which may take its time on another."""
 
     def hello(self) -> dict[str, Any]:
         """What stays the same while the page is open: kind, rig, limits, and of a recording its span and windows."""

@@ -98,7 +98,7 @@ class Leaving:
     replies: list[Reply | None] = field(default_factory=list)
 
     def log(self, stamp_ns: int, level: str, source: str, text: str) -> None:
-        """Add a log line."""
+        """Add a line to the topic `log`; text beyond 500 characters is cut."""
         self.messages.append(("log", Log(stamp_ns=stamp_ns, level=level, source=source, text=text[:500])))
 
 

@@ -1,4 +1,4 @@
-"""Drives one stage after the other through sine sweeps, by the board's own set-points, and tells what came of it.
+"""Drives one stage after the other through sine sweeps, by the board's own set-points, and reports the result.
 
 The realtime side of a rig's characterization: the drivers of the loop, no control law. The same turn-taking as
 `realtime.core.lockstep`: bytes in, bytes out, one period a `step`.
@@ -48,7 +48,7 @@ class Sweep:
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """Return the sweep's duration in s."""
         return 2.0 * math.pi * self.cycles / self.rate_rad_per_s
 
     def at(self, time_s: float) -> np.ndarray:

@@ -105,7 +105,7 @@ class RigPorts:
             self.failures["force sensor"] = str(gone)
 
     def close(self) -> None:
-        """Give the lines back."""
+        """Close the lines and stop the force sensor's thread."""
         for line in self._opened:
             line.close()
         force = getattr(self, "_force", None)
@@ -136,10 +136,10 @@ class Pace(Protocol):
     """A clock to keep to: `realtime.loop.clock.Clock`, or a world that hands out its own time."""
 
     def now_ns(self) -> int:
-        """The time."""
+        """Return the clock's time in ns."""
 
     def sleep_until(self, deadline_ns: int) -> bool:
-        """Return when it is `deadline_ns`."""
+        """Sleep until `deadline_ns`, as `Clock.sleep_until` does."""
 
 
 def run_sweeps(

@@ -57,7 +57,7 @@ class BoardPort:
         return True
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the board's serial port."""
         self._port.close()
 
 

@@ -30,7 +30,7 @@ class GaugeReader(Protocol):
         """All samples since the last call (n, 7: six gauges and the thermistor, V) and their rate (Hz). Raises OSError."""
 
     def close(self) -> None:
-        """Release the card."""
+        """Release the data acquisition card."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Nano17Calibration:
             raise ValueError(f"zero_V: found shape {zero_V.shape}, wanted 6 finite voltages")
 
     def temperature_C(self, thermistor_V: float) -> float:
-        """Of the transducer."""
+        """Return the transducer's temperature in degrees Celsius from the thermistor's voltage (V)."""
         return self.thermistor_offset_C + self.thermistor_C_per_V * thermistor_V
 
     def wrench(self, gauges_V: np.ndarray, thermistor_V: float = 0.0) -> np.ndarray:
@@ -222,7 +222,7 @@ class NidaqmxReader:
         return block.reshape(-1, GAUGES + 1), self.rate_hz
 
     def close(self) -> None:
-        """Release the card."""
+        """Release the data acquisition card."""
         self._task.close()
 
 
@@ -243,7 +243,7 @@ class Nano17Thread(threading.Thread):
         self._halt = threading.Event()
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Read the card until `stop`; open it again after an error."""
         reported = ""
         while not self._halt.is_set():
             try:
@@ -273,7 +273,7 @@ class Nano17Thread(threading.Thread):
                 self._on_event(event)
 
     def stop(self) -> None:
-        """Ends the thread."""
+        """End the thread and wait up to 2 s for it."""
         self._halt.set()
         if self.is_alive():
             self.join(2.0)

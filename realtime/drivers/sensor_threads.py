@@ -67,7 +67,7 @@ class SensorThread(threading.Thread):
     def _lost(self, why: str) -> None:
         raise NotImplementedError
 
-    def _tell(self, events: list[DeviceEvent]) -> None:
+    def _report(self, events: list[DeviceEvent]) -> None:
         for event in events if self._on_event is not None else ():
             assert self._on_event is not None
             self._on_event(event)
@@ -103,7 +103,7 @@ class AuroraThread(SensorThread):
             apply_line_action(transport, action)
         if sending:
             transport.write(sending)
-        self._tell(self.client.take_events())
+        self._report(self.client.take_events())
         due_ns = self.client.next_due_ns
         wait_s = 0.0 if due_ns is None else min(max((due_ns - self._now_ns()) * 1e-9, 0.0), _MAX_WAIT_S)
         if not select.select([transport.fileno()], [], [], wait_s)[0]:
@@ -116,7 +116,7 @@ class AuroraThread(SensorThread):
 
     def _lost(self, why: str) -> None:
         self.client.lost(self._now_ns(), why)
-        self._tell(self.client.take_events())
+        self._report(self.client.take_events())
 
 
 class NetFtThread(SensorThread):
@@ -158,7 +158,7 @@ class NetFtThread(SensorThread):
         if self._bias_wanted.is_set():
             self._bias_wanted.clear()
             link.send(self.client.bias())
-        self._tell(self.client.take_events())
+        self._report(self.client.take_events())
         if not select.select([link], [], [], _MAX_WAIT_S)[0]:
             return
         datagram = link.recv(2048)
@@ -168,7 +168,7 @@ class NetFtThread(SensorThread):
 
     def _lost(self, why: str) -> None:
         self.client.lost(self._now_ns(), why)
-        self._tell(self.client.take_events())
+        self._report(self.client.take_events())
 
 
 def apply_line_action(transport: Transport, action: LineAction) -> None:

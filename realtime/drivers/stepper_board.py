@@ -100,7 +100,7 @@ class BoardStatus(NamedTuple):
 
 
 class LinkEvent(NamedTuple):
-    """One event: its kind, host time of arrival, a line for people, the command it answers ("" for none)."""
+    """One event: its kind, host time of arrival, a line of text, the command it answers ("" for none)."""
 
     kind: BoardEventKind
     stamp_ns: int

@@ -55,7 +55,7 @@ class SerialTransport:
         return int(self._port.fileno())
 
     def close(self) -> None:
-        """Closes the port."""
+        """Close the serial port."""
         self._port.close()
 
 

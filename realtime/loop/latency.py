@@ -62,7 +62,7 @@ def coarse(histogram: np.ndarray) -> list[int]:
 
 
 def text_histogram(columns: dict[str, np.ndarray], width: int = 30) -> str:
-    """The lateness histograms side by side, a bar per row and column, for people.
+    """The lateness histograms side by side, a bar per row and column, as text.
 
     Args: columns: heading -> histogram with bins of 1 us; width of the longest bar in characters.
     """
@@ -188,7 +188,7 @@ def check_latency(
     hz: int,
     seconds: float,
     realtime: RealtimeSettings | None,
-    beside_cyclictest: bool = True,
+    compare_cyclictest: bool = True,
     run: Callable[..., int] | None = None,
 ) -> LatencyResult:
     """Run the native loop with `tick` for `seconds`; where cyclictest is installed, it takes every other slice.
@@ -196,7 +196,7 @@ def check_latency(
     Args: params: the tick's PARAMS for this hz; realtime: what to ask of the kernel for both; run: as for `NativeLoop`.
     Both run with the same priority, CPU and background load, so the half that each gets is comparable.
     """
-    installed = beside_cyclictest and shutil.which("cyclictest") is not None
+    installed = compare_cyclictest and shutil.which("cyclictest") is not None
     slices = max(1, min(_SLICES, int(seconds // 2))) if installed else 1
     slice_s = seconds / (2 * slices if installed else slices)
     board, line = pty.openpty()

@@ -198,7 +198,7 @@ def run_loop(
     state: np.ndarray,
     schedule: Schedule,
 ) -> int:
-    """Tick until told to stop; see `make_loop`. Inlined, so that `tick` is a constant of the function that calls it.
+    """Tick until `stop` is set; see `make_loop`. Inlined, so that `tick` is a constant of the function that calls it.
 
     A loop for one known tick (`realtime.core.control_loop`) is then cached like any kernel; a closure cannot be.
     """

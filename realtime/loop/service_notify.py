@@ -39,15 +39,15 @@ class ServiceNotifier:
         return True
 
     def ready(self, status: str) -> bool:
-        """The service has started; `status` is one line for people."""
+        """Report that the service has started, with a status line."""
         return self._send(f"READY=1\nSTATUS={status}")
 
     def status(self, status: str) -> bool:
-        """One line for people."""
+        """Send the status line that `systemctl status` shows."""
         return self._send(f"STATUS={status}")
 
     def stopping(self) -> bool:
-        """The service has begun to stop."""
+        """Report that the service has begun to stop."""
         return self._send("STOPPING=1")
 
     def beat(self, heartbeat: int) -> bool:

@@ -27,7 +27,7 @@ PRESS: dict[str, Any] = {
 }  # fmt: skip
 
 
-class Desk:
+class RigControl:
     """A rig that obeys at once, and remembers what it was asked."""
 
     def __init__(self, refuse: str = "", mode: str = "") -> None:
@@ -121,19 +121,19 @@ def test_a_file_that_is_no_script_is_bad_input(tmp_path: Path) -> None:
 
 
 def test_commands_come_in_order_and_a_contact_ends_with_a_retract() -> None:
-    desk = Desk()
-    perform(Script(**FREE), desk)
-    assert desk.asked == [("target", "position")] * 9
-    desk = Desk()
-    perform(Script(**PRESS), desk)
-    assert desk.asked == [("target", "position"), ("target", "contact"), *[("force", "none")] * 3, ("target", "retract")]
+    control = RigControl()
+    perform(Script(**FREE), control)
+    assert control.asked == [("target", "position")] * 9
+    control = RigControl()
+    perform(Script(**PRESS), control)
+    assert control.asked == [("target", "position"), ("target", "contact"), *[("force", "none")] * 3, ("target", "retract")]
 
 
-@pytest.mark.parametrize("desk", [Desk(refuse="position"), Desk(refuse="force"), Desk(mode="stopped")])
-def test_a_refusal_or_a_stop_breaks_it_off_and_holds(desk: Desk) -> None:
+@pytest.mark.parametrize("control", [RigControl(refuse="position"), RigControl(refuse="force"), RigControl(mode="stopped")])
+def test_a_refusal_or_a_stop_breaks_it_off_and_holds(control: RigControl) -> None:
     with pytest.raises(RuntimeError):
-        perform(Script(**PRESS), desk)
-    assert desk.asked[-1] == ("hold", "none") and ("target", "retract") not in desk.asked
+        perform(Script(**PRESS), control)
+    assert control.asked[-1] == ("hold", "none") and ("target", "retract") not in control.asked
 
 
 def test_without_go_nothing_is_commanded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

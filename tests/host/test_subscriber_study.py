@@ -26,7 +26,7 @@ def test_the_page_has_a_row_for_each_kind_and_one_for_comparison() -> None:
     assert len(rows) == 4 and f"| {SAYS['view']}" in rows
     assert [float(cell) for cell in rows[f"| {SAYS['view']}"].strip("| ").split(" | ")[1:]][:3] == [1000, 2, 9.5]
     assert "| 3.5 |" in rows["| for comparison: cyclictest, which only wakes"]
-    figures = found.as_dict()["beside"]["view"]
+    figures = found.as_dict()["subscribers"]["view"]
     assert figures["missed"] == 2 and figures["queries_dropped"] == 7
     assert figures["threads_late_us"]["p50"] == pytest.approx(100.0)
     assert figures["lateness_us"]["p50"] == pytest.approx(9.5) and "max" not in figures["lateness_us"]

@@ -84,11 +84,11 @@ def _words(shape: str, size: float, unit: str, cycles: int, length: float, timed
     if not timed:
         return f"{shape} of {size:.3g} {unit}, {cycles} over the recording"
     rate = cycles / length
-    told = {
+    described = {
         "sine": f"{rate:.3g} Hz",
         "two tones": f"{rate:.3g} and {rate * np.sqrt(23.0):.3g} Hz",
         "nested triangles": f"{rate:.3g} Hz, then 0.55 and 0.3 of it",
         "steps": f"{2 * cycles + 1} levels, each held {length / (2 * cycles + 1):.2g} s",
         "sweep": f"{1 / length:.2g} to {2 * rate:.3g} Hz",
     }[shape]
-    return f"{shape} of {size:.3g} {unit}, {told}, {length:.3g} s"
+    return f"{shape} of {size:.3g} {unit}, {described}, {length:.3g} s"

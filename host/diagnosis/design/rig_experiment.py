@@ -77,7 +77,7 @@ def rig_excitations(model: Any, problem: Problem, best: Fit) -> list[tuple[Excit
 
 
 def still(n: int) -> dict[str, Array]:
-    """No force (n,)."""
+    """Return force channels (n,) that are zero."""
     return {name: np.zeros(n) for name in FORCE}
 
 
@@ -148,7 +148,7 @@ def script_of(
 
 
 def rounded(values: Array) -> list[float]:
-    """To the micrometre."""
+    """Round positions (m) to 1e-6, as a script states them."""
     return [round(float(v), 6) for v in values]
 
 

@@ -28,7 +28,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Coefficient of |v|."""
+    """Return the coefficient of |v| for the force kernel."""
     return {"viscous_asymmetry": p[0]}
 
 

@@ -7,7 +7,7 @@ from host.diagnosis.model.operators import play
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Width of the gap."""
+    """Return the width of the gap, in the motion's unit."""
     low = max(s.tolerance, 1e-4 * s.span)
     return (Parameter("width", s.unit, spread(max(low, 4e-3 * s.span), 0.6 * s.span, 10), low, 2.0 * s.span, log=True),)
 

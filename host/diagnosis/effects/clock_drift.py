@@ -15,7 +15,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Delay p[0] t."""
+    """Delay the signal (n,) by p[0] t."""
     return shift(signal, c.dt_s, p[0] * c.time_s)
 
 

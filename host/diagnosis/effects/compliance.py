@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Deflection per load."""
+    """Return the compliance: deflection per load."""
     return (Parameter("compliance", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), linear=True),)
 
 

@@ -32,7 +32,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """One-sided power law."""
+    """Return a one-sided power law for the force kernel."""
     return {"contact_stiffness": p[0], "contact_place": p[1], "contact_exponent": p[2]}
 
 

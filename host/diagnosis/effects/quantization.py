@@ -10,7 +10,7 @@ HARMONICS = 4  # of the saw tooth: a smooth approximation, so that a fit can fol
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Height of a step."""
+    """Return the height of a step, in the signal's unit."""
     return (Parameter("step", s.unit, (2.0 * s.need, 4.0 * s.need), 0.5 * s.need, 30.0 * s.need, step=0.01 * s.need),)
 
 

@@ -9,13 +9,13 @@ from host.diagnosis.model.operators import lag
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Time constant."""
+    """Return the time constant of the low pass (s)."""
     times = (0.1 * s.dt_s, *spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6))
     return (Parameter("time_constant", "s", times, 0.02 * s.dt_s, 0.3 * s.duration_s, log=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """First-order low pass."""
+    """Pass the signal (n,) through a first-order low pass of time constant p[0] (s)."""
     return lag(signal, c.dt_s, p[0], c.start)
 
 

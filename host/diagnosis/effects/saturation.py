@@ -23,7 +23,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Clipped at the limit."""
+    """Clip the signal (n,) at the upper, the lower or both limits, as `form` says."""
     if form == "both":
         u = (signal - p[0]) / p[2]
         edge = p[1] / p[2]

@@ -24,7 +24,7 @@ def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Force shifted."""
+    """Shift the force (3, n) by p (3,)."""
     return np.asarray(signal + p[:, None])
 
 

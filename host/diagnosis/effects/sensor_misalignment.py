@@ -31,7 +31,7 @@ def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Force turned."""
+    """Rotate the force (3, n) by the rotation vector p (3,) in rad."""
     return np.asarray(matrix(p) @ signal)
 
 

@@ -18,7 +18,7 @@ def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def apply_force(force: Array, c: Context, p: Array, form: str) -> Array:
-    """Force times 1 + p[0]."""
+    """Scale the force (3, n) by 1 + p[0]."""
     return np.asarray(force * (1.0 + p[0]))
 
 

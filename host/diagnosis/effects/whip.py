@@ -26,7 +26,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def apply_weak(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """x + A sin(x + phase)."""
+    """Return x + A sin(x + phase) for the roll angle x (n,) in rad."""
     return apply(signal, c, p, "weak")
 
 

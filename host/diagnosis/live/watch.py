@@ -82,7 +82,7 @@ class Watch:
         self._armed_at_ns: int | None = None
         self._next_ns = 0
         self._since_ns: int | None = None
-        self.told = False
+        self.reported = False
         self.score = 0.0
 
     def receive(self, topic: str, message: Message) -> None:
@@ -144,14 +144,14 @@ class Watch:
         self.score = float(np.max(score))
         now_ns = self.frames.stamps_ns[-1]
         if not np.max(score) > 1.0:
-            self._since_ns, self.told = None, False
+            self._since_ns, self.reported = None, False
             return None
         if self._since_ns is None:
             self._since_ns = now_ns
         since_s = (now_ns - self._since_ns) * 1e-9
-        if since_s < self.settings.settle_s or self.told:
+        if since_s < self.settings.settle_s or self.reported:
             return None
-        self.told = True
+        self.reported = True
         return self._alarm(score, since_s)
 
     def _score(self, residual: Array) -> Array:
@@ -270,8 +270,8 @@ def watch(
     """Watches until `stop`; publishes alarms, and logs its phase when it changes. Returns the number of alarms."""
     watcher, said, count = Watch(rig, rest=lambda: time.sleep(REST_S)), "", 0
     while not stop():
-        heard = bus.take()
-        for topic, message, _ in heard:
+        received = bus.take()
+        for topic, message, _ in received:
             watcher.receive(topic, message)
         alarm = watcher.look()
         if alarm is not None:
@@ -280,6 +280,6 @@ def watch(
         if watcher.phase != said:
             said = watcher.phase
             progress(said)
-        if not heard:
+        if not received:
             time.sleep(IDLE_S)
     return count

@@ -43,7 +43,7 @@ class Recording:
 
     @property
     def n(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return int(self.time_s.size)
 
 

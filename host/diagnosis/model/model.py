@@ -59,7 +59,7 @@ class Segment:
 
     @property
     def n(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return self.recording.n
 
     def weights(self) -> Array:

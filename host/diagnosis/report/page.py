@@ -22,7 +22,7 @@ class Line(NamedTuple):
 
     name: str
     value: str
-    beside: str = ""
+    note: str = ""
 
 
 class Row(NamedTuple):
@@ -107,7 +107,7 @@ def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
 
 
 def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
-    """Key figures."""
+    """Return the key figures at the top of the page."""
     fit = verdict["fit"]
     before, after, noise = (
         quantity(fit[key], fit["unit"]).replace(" ", NBSP) for key in ("rmse_before", "rmse_after", "noise_floor")
@@ -128,15 +128,15 @@ def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
 def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
     """When a place is at fault: the longest windows, recording by recording."""
     unit = "s" if timed else "samples"
-    told = []
+    shown = []
     for name, spans in place["windows_by_recording"].items():
         longest = sorted(sorted(spans, key=lambda s: s[0] - s[1])[:most])
         if spans:
             more = f" and {len(spans) - most} more" if len(spans) > most else ""
-            told.append(
+            shown.append(
                 f"{name}: " + ", ".join(f"{a:.{int(timed)}f} to {b:.{int(timed)}f} {unit}" for a, b in longest) + more
             )
-    return "; ".join(told[:most]) + (f"; and {len(told) - most} more recordings" if len(told) > most else "")
+    return "; ".join(shown[:most]) + (f"; and {len(shown) - most} more recordings" if len(shown) > most else "")
 
 
 def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
@@ -175,8 +175,8 @@ def comparisons(result: Diagnosis, verdict: dict[str, Any]) -> list[tuple[str, s
         for channel, error in channels.items():
             before, after = error["rmse_before"], error["rmse_after"]
             grew = any(text.startswith(f"{channel} in {recording}:") for text in verdict["worse"])
-            told = (quantity(before, units[channel]), quantity(after, units[channel]))
-            rows.append((recording, words(channel), *told, grew))
+            errors = (quantity(before, units[channel]), quantity(after, units[channel]))
+            rows.append((recording, words(channel), *errors, grew))
     return rows
 
 
@@ -192,8 +192,8 @@ def switches(result: Diagnosis) -> tuple[str, str]:
             continue
         texts = {key: text for key, text in (("source", c.source), ("form", c.form)) if text}
         numbers = {p.key: f"{float(v):.6g}" for p, v in zip(term.parameters, values, strict=True) if p.high > p.low}
-        told = [f"{key}={value}" for key, value in (texts | numbers).items()]
-        options.append(f"--effect '{c.effect.id}@{c.port.name}:{','.join(told)}'")
+        settings = [f"{key}={value}" for key, value in (texts | numbers).items()]
+        options.append(f"--effect '{c.effect.id}@{c.port.name}:{','.join(settings)}'")
         lines_ = [
             f'id = "{c.effect.id}"',
             f'at = "{c.port.name}"',

@@ -50,7 +50,7 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
     return out
 
 
-def beside_unlisted(standing: list[Standing], rest: Rest) -> list[Standing]:
+def with_unlisted_rival(standing: list[Standing], rest: Rest) -> list[Standing]:
     """`standing` where known effects leave more than noise: the strongest may replace an unlisted effect."""
     if not standing or not rest.doubtful:
         return standing
@@ -100,7 +100,7 @@ def _equals(
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
         refitted.append((trial.candidate, coarse(ahead, len(best.values) - len(other.values), problem.rules)))
-        if len(kept) < problem.rules.most_equals and _not_told(ahead, held, earned, rival, problem.rules):
+        if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
 
@@ -122,7 +122,7 @@ def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[T
     return sorted(kept.values(), key=lambda trial: -trial.score)
 
 
-def _not_told(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: SelectionRules) -> bool:
+def _indistinguishable(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: SelectionRules) -> bool:
     """Whether the best model is no more `ahead` of a rival than chance or the modules' own idealization explains."""
     if ahead.log_likelihood < rules.equal_log_likelihood or (
         ahead.p_value > rules.equal_significance and held.p_value > rules.equal_significance

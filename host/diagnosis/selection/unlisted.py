@@ -96,8 +96,8 @@ def explain_rest(problem: Problem, found: Found, noise_sd: Array, progress: Prog
 def _rest(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Rest:
     best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
     explained = fallen(problem, found.nominal.residuals, found.best.residuals, noise_sd)
-    told = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
-    left = max(left_over(problem, found, noise_sd), told)
+    predicted_share = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
+    left = max(left_over(problem, found, noise_sd), predicted_share)
     return Rest(best, left, above_noise=_above_noise(problem, found, noise_sd))
 
 

@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 ROWS = 2500
 LONGEST = 14  # symbols in an equation
 SEEDS = (1, 2)
-TELLING = 0.1  # precision of a sample, over the mean, from which it is searched
+INFORMATIVE = 0.1  # precision of a sample, over the mean, from which it is searched
 
 
 def features(problem: Problem, segment: Segment, port: Port) -> Array:
@@ -98,8 +98,8 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
         targets.append(z[mask])
         precisions.append(precision[mask])
     X, z, precision = np.concatenate(tables), np.concatenate(targets), np.concatenate(precisions)
-    telling = precision > TELLING * float(np.mean(precision))
-    X, z = X[telling], z[telling]
+    informative = precision > INFORMATIVE * float(np.mean(precision))
+    X, z = X[informative], z[informative]
     size = float(np.sqrt(np.mean(z**2))) or 1.0
     step = max(1, len(X) // ROWS)
     cut = len(X) // step * step

@@ -32,7 +32,7 @@ NOISE_m = 0.29e-3
 
 @njit(cache=True)
 def _feed(inputs: Any, force: Any, count: int) -> None:
-    """`count` periods later: a fresh force and board status at every one, a fresh pose at 40 Hz."""
+    """Advance by `count` periods: a fresh force and board status at every one, a fresh pose at 40 Hz."""
     inputs.now_ns += PERIOD_NS
     if count % (POSE_NS // PERIOD_NS) == 0:
         inputs.tip.count += 1
@@ -71,7 +71,7 @@ class BenchedLoop:
         self.run(APPROACH_TICKS // 3)
 
     def run(self, count: int) -> None:
-        """`count` periods."""
+        """Run `count` periods of the loop."""
         self._run(self.params, self.state, self.inputs, self.outputs, self.force, self.passed, count)
         self.passed += count
 

@@ -1,4 +1,4 @@
-"""Noiseless force estimation over a grid of forces and curvatures: how often exact, warned of, refused, silently wrong.
+"""Noiseless force estimation over a grid of forces and curvatures: counts exact, flagged, refused and wrong results.
 
 `python -m host.studies.benchmarks.force_grid` prints the counts. Grids: section 5.3.1, and all directions.
 """
@@ -95,7 +95,7 @@ def grid(
 
 
 def main() -> None:
-    """Print the counts."""
+    """Print how many forces of the grid were estimated exactly, with a warning, wrongly or not at all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--directions", type=int, default=36, help="on the circle, and again on the sphere")
     parser.add_argument("--catheters", nargs="+", default=["livewire", "steerocath_t"])

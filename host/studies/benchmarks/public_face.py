@@ -65,7 +65,7 @@ def face_cases(seed: int) -> list[FaceCase]:
 
 
 def repeated(call: Callable[[], object]) -> Callable[[int], object]:
-    """`call`, as often as told."""
+    """Call `call` repeatedly."""
 
     def run(repeats: int) -> object:
         for _ in range(repeats):

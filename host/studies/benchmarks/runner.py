@@ -17,7 +17,7 @@ Report = Callable[[str], None]
 Benchmark = Callable[[int, Report], list[Row]]
 
 # name -> "module:function". The function takes (seed, report) and returns rows made by `row_of`; `report` is progress
-# for people. A module or a peer that is not installed leaves its row out, with the reason; a row of CONTRACT that is left
+# to read. A module or a peer that is not installed leaves its row out, with the reason; a row of CONTRACT that is left
 # out makes the command fail.
 BENCHMARKS: dict[str, str] = {
     "pcar_direct": "host.studies.benchmarks.planar:direct",

@@ -88,7 +88,7 @@ class SolvePeer:
         self.position: Array | None = None
 
     def __call__(self) -> object:
-        """Solve the case once."""
+        """Solve the case once and keep the tip's position."""
         with np.errstate(all="ignore"):
             self.position = self._run()
         return self.position

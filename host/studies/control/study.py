@@ -205,7 +205,7 @@ _SECTION: dict[str, Callable[[_Runs], dict[str, Any]]] = {
 
 
 def table_lines(result: dict[str, Any]) -> list[str]:
-    """The table for people, a line a figure."""
+    """The table as text, one line for each figure."""
     lines: list[str] = []
     for name in SECTIONS:
         if name in result:

@@ -1,4 +1,4 @@
-"""The results of a fault campaign for people: the section of docs/reliability.md."""
+"""The results of a fault campaign: the section of docs/reliability.md."""
 
 from __future__ import annotations
 

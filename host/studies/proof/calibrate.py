@@ -60,7 +60,7 @@ def calibrated(runs: Sequence[Path], left_out: Sequence[str]) -> CalibrationTabl
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
+    """Fit the probability curves to finished runs and write them."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.calibrate")
     parser.add_argument("--dir", type=Path, action="append", required=True, help="folder of a finished run; may be repeated")
     parser.add_argument("--leave-out", action="append", default=[], help="world that is not used; may be repeated")

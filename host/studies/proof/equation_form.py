@@ -52,7 +52,7 @@ def _rest(x: Array, base: Array) -> Array:
 
 
 def _share(wanted: Array, found: Array) -> float:
-    """Squared correlation."""
+    """Return the squared correlation of two columns (n,)."""
     energy = float(wanted @ wanted) * float(found @ found)
     return float(wanted @ found) ** 2 / energy if energy > 1e-300 else 0.0
 

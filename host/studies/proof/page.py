@@ -55,8 +55,8 @@ def _failures(run: Path) -> str:
         for label, verdict in judged:
             if judge(label, verdict).right:
                 continue
-            told = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in verdict.get("effects") or [])
-            said = verdict.get("error") or f"{str(verdict.get('verdict')).replace('_', ' ')} {told}".strip()
+            named = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in verdict.get("effects") or [])
+            said = verdict.get("error") or f"{str(verdict.get('verdict')).replace('_', ' ')} {named}".strip()
             kind = f"{label['kind']}, {'closed' if label['closed_loop'] else 'open'}"
             truth = " + ".join(label["truth"]) or "nothing"
             lines.append(f"| {world} | {label['id'][5:]} | {kind} | {truth} | {label['rho']:.2f} | {said} |")
@@ -72,7 +72,7 @@ def write_between(page: Path, text: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
+    """Score a finished run and write or print its tables."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.page")
     parser.add_argument("--dir", type=Path, required=True, help="folder of the judged run")
     parser.add_argument("--calibrate-on", type=Path, action="append", default=[], help="folder of another finished run")

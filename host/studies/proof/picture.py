@@ -115,7 +115,7 @@ def _interval(key: str, parameter: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line."""
+    """Draw one case of a finished run."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.picture")
     parser.add_argument("--dir", type=Path, required=True, help="folder of a run of `seldinger prove`")
     parser.add_argument("--case", required=True)

@@ -196,7 +196,7 @@ def markdown(results: Sequence[SetResult]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
+    """Diagnose the sets of real recordings and print or write the results."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.real")
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("SELDINGER_DATA", "../shared/data")))
     parser.add_argument("--only", default="", help="only sets whose name holds this")

@@ -170,14 +170,14 @@ def window_f1(label: Label, verdict: dict[str, Any]) -> float | None:
 
     Windows are in the recordings' own time, which runs on through the session. None without true or reported windows.
     """
-    told = _joined([w for x in verdict.get("located") or [] for w in x.get("windows_s") or []])
-    if not label["windows_s"] or not told:
+    windows = _joined([w for x in verdict.get("located") or [] for w in x.get("windows_s") or []])
+    if not label["windows_s"] or not windows:
         return None
     edges = [0.0, 32.0, 66.0, math.inf]  # recordings of 30 s with pauses of 4 s between them
-    spoken = [(a, b) for a, b in itertools.pairwise(edges) if any(begin < b and end > a for begin, end in told)]
+    spoken = [(a, b) for a, b in itertools.pairwise(edges) if any(begin < b and end > a for begin, end in windows)]
     true = [[max(a, w[0]), min(b, w[1])] for a, b in spoken for w in label["windows_s"] if w[0] < b and w[1] > a]
-    shared = sum(max(0.0, min(e, f) - max(b, c)) for b, e in told for c, f in true)
-    both = sum(e - b for b, e in told) + sum(e - b for b, e in true)
+    shared = sum(max(0.0, min(e, f) - max(b, c)) for b, e in windows for c, f in true)
+    both = sum(e - b for b, e in windows) + sum(e - b for b, e in true)
     return 2.0 * shared / both if both > 0.0 else None
 
 

@@ -76,7 +76,7 @@ def _environment() -> dict[str, str]:
 
 
 def read_case(folder: Path) -> dict[str, bytes]:
-    """Files of one case."""
+    """Return file name -> content for all files of one case."""
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 

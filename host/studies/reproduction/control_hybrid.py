@@ -26,7 +26,7 @@ _NAMES = {
 
 
 def sections(quick: bool) -> list[Section]:
-    """All of 7.9 to 7.17."""
+    """Return the sections for figures 7.9 to 7.17."""
     optimum = best_gains(60 if quick else 400)
     return [_convergence(), *_gain_effects(), _optimum(optimum), _stiffness(optimum), *_heart(), _bode(8 if quick else 24)]
 

@@ -18,7 +18,7 @@ GAIN, NOISE_M = 0.3, 0.00029
 
 
 def sections() -> list[Section]:
-    """All four."""
+    """Return the four sections on kinematics."""
     return [_workspace(), *_polynomials(), _near_singularity()]
 
 

@@ -66,7 +66,7 @@ class RigRun(NamedTuple):
     wanted_N: float
 
     def late(self) -> Array:
-        """Force once settled."""
+        """Return the force (n,) in N after it has settled."""
         return self.force_N[self.settled]
 
     @property
@@ -190,7 +190,7 @@ def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
 
 
 def sections(quick: bool, board: str = "native", progress: Callable[[str], None] = lambda text: None) -> list[Section]:
-    """All of 7.20 to 7.27."""
+    """Return the sections for figures 7.20 to 7.27."""
     rig = thesis_rig()
     across_s, along_s = (15.0, 8.0) if quick else (HOLD_ACROSS_S, HOLD_ALONG_S)
     out = [_first(rig, across_s, board)]

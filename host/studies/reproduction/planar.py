@@ -248,17 +248,17 @@ def _figure_4(kappa0: float, number: str) -> Section:
 
 
 def figure_4_3() -> Section:
-    """Curvature 10 1/m."""
+    """Return figure 4.3: curvature 10 1/m."""
     return _figure_4(CURVATURES_PER_M[0], "4.3")
 
 
 def figure_4_4() -> Section:
-    """Curvature 20 1/m."""
+    """Return figure 4.4: curvature 20 1/m."""
     return _figure_4(CURVATURES_PER_M[1], "4.4")
 
 
 def figure_4_5() -> Section:
-    """Curvature 30 1/m."""
+    """Return figure 4.5: curvature 30 1/m."""
     return _figure_4(CURVATURES_PER_M[2], "4.5")
 
 

@@ -58,7 +58,7 @@ class Setting:
 
     @property
     def curvature_per_m(self) -> float:
-        """At the start."""
+        """Return the curvature at the start in 1/m."""
         return self.bend_rad / (load_catheter(self.catheter).distal_length_m + self.insertion_m)
 
 
@@ -72,7 +72,7 @@ class ThesisRun(NamedTuple):
 
     @property
     def time_s(self) -> Array:
-        """Seconds."""
+        """Return the time of each row (n,) in s."""
         return np.asarray(PERIOD_S * np.arange(self.force_N.size), np.float64)
 
 

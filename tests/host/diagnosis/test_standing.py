@@ -12,7 +12,7 @@ from host.diagnosis.effects.quantization import stepped
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.model.effect import Candidate, Parameter, Port
-from host.diagnosis.selection.equivalence import Standing, beside_unlisted
+from host.diagnosis.selection.equivalence import Standing, with_unlisted_rival
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
 from host.diagnosis.selection.unlisted import Rest
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart
@@ -44,8 +44,8 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
     form = Form("angle^2", lambda segment: segment.y[0] ** 2, 2)
     rest = Rest(PredictedPart("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
     weak, strong = (Standing(BACKLASH, Gain(gain, 1e-9, 0.2), Gain(gain, 1e-9, 0.2), ()) for gain in (10.0, 80.0))
-    assert [[c.name for c in s.alike] for s in beside_unlisted([weak, strong], rest)] == [[], ["unlisted@cable"]]
-    assert beside_unlisted([weak, strong], replace(rest, doubtful=False)) == [weak, strong]
+    assert [[c.name for c in s.alike] for s in with_unlisted_rival([weak, strong], rest)] == [[], ["unlisted@cable"]]
+    assert with_unlisted_rival([weak, strong], replace(rest, doubtful=False)) == [weak, strong]
 
 
 @pytest.mark.parametrize(

@@ -425,8 +425,8 @@ class Pad(ode.Press):
             x, v = float(data.qpos[0]), float(data.qvel[0])
             asked = wanted[step]
             if setup.closed_loop and step > lead + 5:  # a force loop around the servo, 5 ms late, on the noisy force
-                told = float(data.actuator_force[0]) + noise[min(step - lead - 5, noise.size - 1)]
-                slow[0] += 0.01 * ((p["stiffness"] * wanted[step] - told) / p["stiffness"] - slow[0])
+                sensed = float(data.actuator_force[0]) + noise[min(step - lead - 5, noise.size - 1)]
+                slow[0] += 0.01 * ((p["stiffness"] * wanted[step] - sensed) / p["stiffness"] - slow[0])
                 asked += 0.3 * slow[0]
             strange = Slider._strange(self, planted, c, x, v, time_s[step])  # type: ignore[arg-type]
             data.qfrc_applied[0] = strange
@@ -547,7 +547,7 @@ class Arm:
         )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings."""
+        """Run all recordings with `planted` and return their traces."""
         return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:

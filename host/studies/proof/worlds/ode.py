@@ -116,14 +116,14 @@ def _motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, .
 
 def _unlisted(place: str) -> tuple[Plantable, ...]:
     """Return effects that no entry of the vocabulary says."""
-    told = (
+    words = (
         ("product", "the motion is modulated by the other input"),
         ("fractional", "a share of the motion is its derivative of order one half"),
         ("other_squared", "the other input's speed, squared, carries the output along"),
     )
     return tuple(
         Plantable("unlisted", place, lambda s, c, key=key: {key: 0.08 * s}, signed=True, says=says)  # type: ignore[misc]
-        for key, says in told
+        for key, says in words
     )
 
 
@@ -358,7 +358,7 @@ class Press:
         )
 
     def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings."""
+        """Run all recordings with `planted` and return their traces."""
         return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:

@@ -113,11 +113,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int, default=1)
     given = parser.parse_args(arguments)
 
-    def told(done: int) -> None:
+    def report(done: int) -> None:
         print(done, file=sys.stderr, flush=True)
 
     try:
-        print(suite(given.world, given.seed, given.cases, given.dir, given.jobs, told))
+        print(suite(given.world, given.seed, given.cases, given.dir, given.jobs, report))
     except InputError as error:
         parser.exit(2, f"{error}\n")
 
