@@ -19,6 +19,7 @@ from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
+from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
 from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
@@ -27,6 +28,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
+from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.search import Found, search
 from host.diagnosis.selection.unlisted import Rest, explain_rest
 from host.diagnosis.symbolic.dictionary import lay_out
@@ -135,13 +137,15 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
     ]
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
-        found = noise_module.estimate([p.y[row] for p in segments], still)
+        # single wild samples would raise the noise by which they are found
+        tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
+        found = noise_module.estimate(tame, still)
         own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
         if own:
             found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
         noises.append(found)
         for segment in segments:
-            segment.y[row, noise_module.wild(segment.y[row], found.sigma)] = np.nan
+            segment.y[row, readings.wild(segment.y[row], found.sigma)] = np.nan
     return Problem(model, segments, noises, np.ones(len(model.outputs)), columns)
 
 
@@ -166,6 +170,7 @@ def diagnose(
         raise NothingToCompare(data.findings)
     model, problem, full = problems(spec, data.recordings, rules)
     problem.budget = budget
+    held = hold_between_samples(problem, [full] if full is not problem else [])
     candidate_effects = candidates(model.ports, problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, progress)
@@ -179,7 +184,7 @@ def diagnose(
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
-    result.findings = [*data.findings, *uncertain(problem, found.best, spans)]
+    result.findings = [*data.findings, *held, *uncertain(problem, found.best, spans)]
     result.designs = [] if budget.spent() else design(problem, found, standing, progress)
     result.stopped_early = budget.spent()
     piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects

@@ -29,6 +29,7 @@ class Known(Model):
         self.fit_samples, self.coarsest_s = inner.fit_samples, inner.coarsest_s
         self.travel, self.moves, self.unlisted_at = inner.travel, inner.moves, inner.unlisted_at
         self.pointwise = inner.pointwise
+        self.holds, self.hold, self.hold_stated = inner.holds, inner.hold, inner.hold_stated
         segments = [inner.prepare(recording) for recording in recordings]
         self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []
         for spec in effects:
@@ -47,6 +48,11 @@ class Known(Model):
     def prepare(self, recording: Recording) -> Segment:
         """As the model without effects."""
         return self._inner.prepare(recording)
+
+    def hold_as(self, segments: list[Segment], hold: str) -> None:
+        """As the model without effects."""
+        self._inner.hold_as(segments, hold)
+        self.hold = hold
 
     def guess(self, segments: list[Segment]) -> Array:
         """Start values of the model, then the values given for the effects."""

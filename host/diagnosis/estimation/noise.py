@@ -171,12 +171,3 @@ def by_steps(x: Array, sigma: float, correlation: float, longest: int = 8) -> tu
     rho = 1.0 - (size / level) ** 2
     first = int(np.argmax(rho < 0.05)) if np.any(rho < 0.05) else longest
     return level, max(correlation, 1.0 + 2.0 * float(np.sum(rho[:first])))
-
-
-def wild(values: Array, sigma: float) -> Mask:
-    """Samples that lie alone, far (12 sigma and 8 local spreads) from the median of their seven neighbours."""
-    line = fill(values)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, 3, mode="edge"), 7)
-    middle = np.median(windows, axis=1)
-    spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
-    return np.asarray((np.abs(line - middle) > 12.0 * sigma + 8.0 * spread) & np.isfinite(values))

@@ -7,6 +7,7 @@ is never changed. A channel that says nothing (constant, all missing) leaves not
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill, quantum, smooth_derivatives, smoothing_window, white_level
+from host.diagnosis.model.readings import Finding, coarse, counts, without_outliers
 
 Array = npt.NDArray[np.float64]
 
@@ -23,27 +25,18 @@ MISSING_SHARE = 0.3  # of a channel's samples, from which on missing ones are a 
 IRREGULAR = 0.2  # largest deviation of a period from the median one that counts as even
 OPPOSITE = -0.7  # correlation with what the model says, below which the sign is opposite
 EXPLAINED = 0.9  # share of the variance that a regression has to explain to say that columns are exchanged,
-UNEXPLAINED = 0.6  # and that the labelled order must stay below
+BETTER = 0.1  # and largest ratio of what it leaves unexplained to what the labelled order does
 EXACT = 1e-7  # residual over span below which a channel is a copy of another
 NOISY = 1e-6  # noise over span, from which on two channels cannot be alike by chance
 LEADS = 2  # samples by which an output may not come before its input
 FACTORS = {1e3: "1000 (milli)", 1e-3: "1/1000 (milli)", 1e6: "10^6 (micro)", 1e-6: "10^-6 (micro)"}
 FACTORS |= {180.0 / np.pi: "57.3 (degrees and radians)", np.pi / 180.0: "1/57.3 (degrees and radians)"}
-SAME_FACTOR = 0.02  # a gain this near to one of the factors above is a slip of units
+SAME_FACTOR = 0.02  # a gain this near to one of the factors above is a slip of units where the nominal gain is a default,
+NEAR_FACTOR = 0.4  # and this near (logarithm) where the nominal model gives parameters: those are not exact
+SLOW_s = 1.0  # sampling period from which the time column is probably not in seconds
 ONE_TONE = 0.995  # share of an input's power in one spectral line, from which on it is one sinusoid
 CLIPPED = 0.01  # share of samples at the largest reading, from which on it is a limit
 STEADY = 5  # samples in a row at the limit
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped or
-    saturated; `channel`: the column's name in the recordings.
-    """
-
-    id: str
-    channel: str
-    says: str
 
 
 @dataclass(frozen=True)
@@ -59,6 +52,8 @@ class Pair:
     reads: str = "position"
     gain: float | None = None  # what the nominal model says of it
     related: bool = True
+    stated: bool = False  # whether the nominal model's file states the gain, so that it is no default
+    values: tuple[float, ...] = ()  # of the terms `law`, 0 where the nominal model's file does not state one
 
 
 @dataclass(frozen=True)
@@ -78,7 +73,12 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str]) 
     recordings = _dead(recordings, vital, columns, findings)
     if not recordings:
         return Inspected([], findings)
-    _stamps(recordings, findings)
+    _stamps(spec.data.time, recordings, findings)
+    driven = {path.input if path.law and spec.impedance is not None else path.output for path in paths}
+    units = {key: channel.unit for key, channel in spec.channels.items()}
+    recordings = without_outliers(recordings, sorted(vital), columns, findings)
+    coarse(recordings, sorted(vital), driven, columns, units, findings)
+    _counted(recordings, sorted(vital), columns, units, findings)
     for path in paths:
         recordings = _compared(spec, recordings, path, columns, findings)
         if not recordings:
@@ -94,15 +94,34 @@ def pairs_of(spec: NominalSpec) -> list[Pair]:
     for link in spec.link:
         gain = spec.start("gain" if len(spec.link) == 1 else f"{link.subsystem}_gain", 1.0)[0]
         same = spec.channels[link.input].unit == spec.channels[link.output].unit
-        given = "gain" in spec.parameters or same
-        found.append(Pair(link.input, link.output, gain=gain if given else None))
+        stated = "gain" in spec.parameters or f"{link.subsystem}_gain" in spec.parameters
+        found.append(Pair(link.input, link.output, gain=gain if stated or same else None, stated=stated))
     if spec.axis is not None:
         law = tuple(term for term in spec.axis.terms if term != "offset")
-        found.append(Pair(spec.axis.input, spec.axis.output, law, spec.axis.reads))
+        found.append(Pair(spec.axis.input, spec.axis.output, law, spec.axis.reads, values=_stated(spec, law)))
     if spec.impedance is not None:
         law = tuple(term for term in spec.impedance.terms if term in ("mass", "damping", "stiffness"))
-        found.append(Pair(spec.impedance.output, spec.impedance.input, law, related=bool(law)))
+        path = Pair(spec.impedance.output, spec.impedance.input, law, related=bool(law), values=_stated(spec, law))
+        found.append(path)
     return found
+
+
+def _stated(spec: NominalSpec, law: Sequence[str]) -> tuple[float, ...]:
+    return tuple(spec.start(term, 0.0)[0] if term in spec.parameters else 0.0 for term in law)
+
+
+def _counted(
+    recordings: list[Recording],
+    names: list[str],
+    columns: dict[str, str],
+    units: dict[str, str],
+    findings: list[Finding],
+) -> None:
+    """Whole numbers where a unit says otherwise."""
+    for name in counts(recordings, names, columns, units):
+        says = f"Column {columns[name]} holds whole numbers only, called {units[name]}: these are probably counts. "
+        says += f"Give what one count is worth (channels.{name}.scale)."
+        findings.append(Finding("unit", columns[name], says))
 
 
 def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
@@ -136,8 +155,8 @@ def _seen(recording: Recording, name: str) -> float:
     return 1.0 if values is None else float(np.mean(np.isfinite(values)))
 
 
-def _stamps(recordings: list[Recording], findings: list[Finding]) -> None:
-    """Irregular stamps, and recordings of unlike sampling periods."""
+def _stamps(column: str | None, recordings: list[Recording], findings: list[Finding]) -> None:
+    """Irregular stamps, recordings of unlike sampling periods, and stamps that are probably no seconds."""
     uneven = [recording for recording in recordings if recording.timed and recording.jitter > IRREGULAR]
     if uneven:
         worst = max(uneven, key=lambda recording: recording.jitter)
@@ -153,6 +172,10 @@ def _stamps(recordings: list[Recording], findings: list[Finding]) -> None:
     if periods and max(periods) > 1.05 * min(periods):
         says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."
         findings.append(Finding("clock", "time", says))
+    if column is not None and periods and min(periods) >= SLOW_s:
+        says = f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples: it is probably in "
+        says += "milliseconds or microseconds. Every rate and time constant below is in its unit, not in seconds."
+        findings.append(Finding("unit", column, says))
 
 
 def _compared(
@@ -162,19 +185,12 @@ def _compared(
     input_column, output_column = columns[path.input], columns[path.output]
     copied = _copy(recordings, path.input, path.output)
     if copied is not None:
-        findings.append(
-            Finding(
-                "alias",
-                output_column,
-                f"Column {output_column} is column {input_column} times {copied[0]:.4g}"
-                + (f", {copied[1]} samples later" if copied[1] else "")
-                + ", noise included: it was computed from it, not measured. There is nothing to compare.",
-            )
-        )
-        return []
+        findings.append(Finding("alias", output_column, copied.sentence(output_column, input_column, recordings[0])))
+        if copied.whole:
+            return []
     for name in {name for recording in recordings for name in recording.channels} - {path.input, path.output}:
         copied = _copy(recordings, path.output, name)
-        if copied is not None and spec.kind != "rig":
+        if copied is not None and copied.whole and spec.kind != "rig":
             says = f"Column {columns[name]} is a copy of column {output_column}: it cannot explain it, and is left out."
             findings.append(Finding("alias", columns[name], says))
             recordings = [_with(recording, name, np.zeros(recording.n)) for recording in recordings]
@@ -189,29 +205,79 @@ def _with(recording: Recording, name: str, values: Array) -> Recording:
     return replace(recording, channels={**recording.channels, name: values})
 
 
-def _copy(recordings: list[Recording], a: str, b: str) -> tuple[float, int] | None:
-    """(gain, lag in samples) if `b` is `a` scaled and shifted in every recording, its noise included."""
-    found = []
-    for recording in recordings:
-        x, y = recording.channels.get(a), recording.channels.get(b)
-        if x is None or y is None:
+@dataclass(frozen=True)
+class _Copied:
+    """A channel that is another one, scaled and shifted. noisy: with the noise of that one, so that it was not measured."""
+
+    gain: float
+    offset: float
+    lag: float  # samples
+    noisy: bool
+
+    @property
+    def whole(self) -> bool:
+        """Whether the channel says nothing that the other does not say."""
+        return self.noisy or (self.lag == 0.0 and abs(self.gain - 1.0) < EXACT and self.offset == 0.0)
+
+    def sentence(self, copy: str, original: str, recording: Recording) -> str:
+        """What is said of it."""
+        if self.gain == 1.0 and self.offset == 0.0:
+            says = f"Column {copy} is column {original} in every sample"
+        else:
+            says = f"Column {copy} is column {original} times {self.gain:.4g}"
+        if self.lag:
+            late = f"{self.lag * recording.dt_s:.4g} s" if recording.timed else f"{self.lag:.4g} samples"
+            says += f", {late} later"
+        if self.whole:
+            return says + ", noise included: it was computed from it, not measured. There is nothing to compare."
+        return says + ", exactly and without any noise: was it measured, or computed from it?"
+
+
+def _copy(recordings: list[Recording], a: str, b: str) -> _Copied | None:
+    """How `b` is `a` scaled and shifted, alike in every recording and exact; None if it is not."""
+    found = [_copied(recording, a, b) for recording in recordings]
+    first = found[0] if found else None
+    if first is None:
+        return None
+    for other in found:
+        if other is None or abs(other.lag - first.lag) > 1e-3 or abs(other.gain - first.gain) > 1e-6 * abs(first.gain):
             return None
-        x, y = fill(x), fill(y)
-        if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
-            return None
-        dx, dy = np.diff(x, 2), np.diff(y, 2)
-        size = 1 << int(np.ceil(np.log2(2 * dx.size)))
-        across = np.fft.irfft(np.conj(np.fft.rfft(dx, size)) * np.fft.rfft(dy, size), size)
-        lag = int(np.argmax(np.abs(across)))
-        lag = lag - size if lag > size // 2 else lag
-        lag = 0 if abs(lag) > x.size // 10 or lag < 0 else lag
-        x, y = (x[: x.size - lag], y[lag:]) if lag else (x, y)
-        gain, offset = np.polyfit(x, y, 1)
-        exact = float(np.max(np.abs(y - gain * x - offset))) < EXACT * float(np.ptp(y))
-        if not exact or white_level(x) < NOISY * float(np.ptp(x)):
-            return None
-        found.append((float(gain), lag))
-    return found[0] if found and len({lag for _, lag in found}) == 1 else None
+    return replace(first, noisy=all(other is not None and other.noisy for other in found))
+
+
+def _copied(recording: Recording, a: str, b: str) -> _Copied | None:
+    """As `_copy`, of one recording: lags of whole samples and between two."""
+    x, y = recording.channels.get(a), recording.channels.get(b)
+    if x is None or y is None:
+        return None
+    x, y = fill(x), fill(y)
+    if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    if np.array_equal(x, y):
+        return _Copied(1.0, 0.0, 0.0, white_level(x) >= NOISY * float(np.ptp(x)))
+    dx, dy = np.diff(x, 2), np.diff(y, 2)
+    size = 1 << int(np.ceil(np.log2(2 * dx.size)))
+    across = np.fft.irfft(np.conj(np.fft.rfft(dx, size)) * np.fft.rfft(dy, size), size)
+    most = x.size // 10
+    near = int(np.argmax(np.abs(across[: most + 1])))
+    for lag in dict.fromkeys((0, near, max(near - 1, 0))):
+        now, before = x[1 : x.size - lag], x[: x.size - lag - 1]
+        columns = np.array([now, before, np.ones(now.size)]).T
+        late = y[lag + 1 :]
+        (p, q, offset), *_ = np.linalg.lstsq(columns, late, rcond=1e-12)
+        inside = slice(lag, None)  # what is held at the start is not yet the other's
+        left = (late - columns @ (p, q, offset))[inside]
+        if left.size < 50 or float(np.max(np.abs(left))) > EXACT * float(np.ptp(y)) or p * q < -EXACT * (p + q) ** 2:
+            continue
+        gain = float(p + q)
+        if gain == 0.0:
+            continue
+        whole = float(q / gain) + lag
+        near_whole = abs(whole - round(whole)) < 1e-4
+        return _Copied(
+            gain, float(offset), round(whole) if near_whole else whole, white_level(x) >= NOISY * float(np.ptp(x))
+        )
+    return None
 
 
 def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
@@ -229,17 +295,26 @@ def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], f
         findings.append(Finding("sign", output_column, says))
     if path.gain and abs(correlation) > 0.95:
         ratio = abs(gain / path.gain)
-        for factor, words in FACTORS.items():
-            if abs(ratio / factor - 1.0) < SAME_FACTOR:
-                says = f"Column {output_column} is {words} times what the nominal model says of {input_column}: "
-                says += "the unit of one of them is probably another (channels.*.scale)."
-                findings.append(Finding("unit", output_column, says))
+        factor = _factor(ratio, NEAR_FACTOR if path.stated else SAME_FACTOR)
+        if factor:
+            says = f"Column {output_column} is about {FACTORS[factor]} times what the nominal model says of {input_column}: "
+            says += "the unit of one of them is probably another (channels.*.scale)."
+            if path.stated:
+                says += f" The diagnosis goes on with {output_column} divided by that."
+                recordings = [_with(r, path.output, r.channels[path.output] / factor) for r in recordings]
+            findings.append(Finding("unit", output_column, says))
         swapped = abs(gain * path.gain - 1.0) < SAME_FACTOR and abs(path.gain**2 - 1.0) > 5.0 * SAME_FACTOR
         if swapped:
             says = f"The gain from {input_column} to {output_column} is the inverse of the nominal one: "
             says += "the two columns are probably exchanged."
             findings.append(Finding("swapped", output_column, says))
     return _causal(recordings, path, columns, findings)
+
+
+def _factor(ratio: float, near: float) -> float:
+    """The factor of a slip of units that `ratio` (positive) is within `near` (logarithm) of; 0 if there is none."""
+    away, best = min((abs(float(np.log(max(ratio, 1e-300) / factor))), factor) for factor in FACTORS)
+    return best if away < near else 0.0
 
 
 def _causal(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
@@ -307,9 +382,9 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
     straight = [regression(recording, path) for recording in used]
     explained = float(np.median([part[2] for part in straight]))
     force_column, motion_column = columns[path.input], columns[path.output]
-    if explained < UNEXPLAINED:
+    if 1.0 - explained > EXACT:
         crossed = float(np.median([regression(recording, path, exchanged=True)[2] for recording in used]))
-        if crossed > EXPLAINED:
+        if crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
             says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. The diagnosis goes on exchanged."
             findings.append(Finding("swapped", force_column, says))
@@ -327,6 +402,46 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
         says += f"negative. The diagnosis goes on with {force_column} reversed (channels.*.sign)."
         findings.append(Finding("sign", force_column, says))
         recordings = [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
+    return _in_units(recordings, path, straight, explained, columns, findings)
+
+
+def _in_units(
+    recordings: list[Recording],
+    path: Pair,
+    fits: list[tuple[Array, Array, float]],
+    explained: float,
+    columns: dict[str, str],
+    findings: list[Finding],
+) -> list[Recording]:
+    """Coefficients that all differ from the stated ones by one factor of units, or by that of time for each derivative."""
+    stated = np.abs(np.array(path.values))
+    found = np.median([np.abs(c) for c, _, _ in fits], axis=0)
+    sizes = np.median([rms for _, rms, _ in fits], axis=0)
+    told = (stated > 0.0) & (found > 0.0) & (sizes > 0.2 * np.max(sizes))
+    if explained < 0.5 or not told.any():
+        return recordings
+    ratios = found[told] / stated[told]
+    order = np.array([("stiffness", "damping", "mass").index(term) for term in path.law])[told]
+    force_column, motion_column = columns[path.input], columns[path.output]
+    factor = _factor(1.0 / float(np.exp(np.mean(np.log(ratios)))), NEAR_FACTOR)
+    if factor and np.ptp(np.log(ratios)) < 2.0 * NEAR_FACTOR:
+        says = f"{motion_column} over {force_column} is about {FACTORS[factor]} times what the nominal parameters say: "
+        says += (
+            f"the unit of one of them is probably another (channels.*.scale). The diagnosis goes on with {motion_column} "
+        )
+        says += "divided by that."
+        findings.append(Finding("unit", motion_column, says))
+        return [_with(r, path.output, r.channels[path.output] / factor) for r in recordings]
+    for thousands in (1e3, 1e6):
+        if order.any() and np.all(np.abs(np.log(ratios) - order * np.log(thousands)) < NEAR_FACTOR * np.maximum(order, 1)):
+            unit = "milliseconds" if thousands == 1e3 else "microseconds"
+            says = f"Nominal mass, damping and stiffness agree with the recordings if time is in {unit}, not in seconds. "
+            says += "The diagnosis goes on so."
+            findings.append(Finding("unit", "time", says))
+            return [
+                replace(r, time_s=r.time_s / thousands, dt_s=r.dt_s / thousands, begin_s=r.begin_s / thousands)
+                for r in recordings
+            ]
     return recordings
 
 

@@ -81,6 +81,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     MOMENT_C,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
+SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
 FOOT = 1.0 / (math.sqrt(10.0) - 1.0)  # of a parabola before its height is 0.1, in the time it takes from there to 1
 
 
@@ -148,26 +149,42 @@ def start_state(z: Array, start: float, load: float, p: Array) -> float:
 
 
 @njit(cache=True)
+def _foot(x: Array, top: int, near: int, i: int, tolerance: float) -> int:
+    """Last sample of a movement that has gone back by `tolerance` at sample i. top: its extreme; near: its last sample
+    within a tenth of `tolerance` of that.
+
+    Where the parabola through the extreme and its neighbours bends more than noise can, its vertex decides whether the
+    extreme sample has turned already; after a rest it is the foot of the parabola through `near` and i.
+    """
+    if 1 <= top < x.size - 1:
+        bend = x[top - 1] - 2.0 * x[top] + x[top + 1]
+        if abs(bend) > SHARP * tolerance:
+            return top - 1 if (x[top - 1] - x[top + 1]) / bend < 0.0 else top
+    return near - int(FOOT * (i - near) + 0.5)
+
+
+@njit(cache=True)
 def sides(x: Array, tolerance: float) -> Array:
     """Direction (n,) of the movement that each sample belongs to, +1 or -1, 0 before the first.
 
-    A movement has turned where it goes back by more than `tolerance`. It did so not there but where it set off: at the
-    foot of the parabola through the last sample within a tenth of `tolerance` and the first beyond it.
+    A movement has turned where it goes back by more than `tolerance`. It did so not there but where it set off (`_foot`).
     """
     out = np.zeros(x.size)
     high, low, at_high, at_low, begun, side = x[0], x[0], 0, 0, 0, 0.0
+    top, bottom = 0, 0
     for i in range(1, x.size):
+        top, bottom = i if x[i] > high else top, i if x[i] < low else bottom
         high, low = max(high, x[i]), min(low, x[i])
         at_high = i if x[i] > high - 0.1 * tolerance else at_high
         at_low = i if x[i] < low + 0.1 * tolerance else at_low
         if side >= 0.0 and x[i] < high - tolerance:
-            foot = max(at_high - int(FOOT * (i - at_high) + 0.5), begun)
+            foot = max(_foot(x, top, at_high, i, tolerance), begun)
             out[begun + 1 : foot + 1] = side
-            begun, side, low, at_low = foot, -1.0, x[i], i
+            begun, side, low, at_low, bottom = foot, -1.0, x[i], i, i
         elif side <= 0.0 and x[i] > low + tolerance:
-            foot = max(at_low - int(FOOT * (i - at_low) + 0.5), begun)
+            foot = max(_foot(x, bottom, at_low, i, tolerance), begun)
             out[begun + 1 : foot + 1] = side
-            begun, side, high, at_high = foot, 1.0, x[i], i
+            begun, side, high, at_high, top = foot, 1.0, x[i], i, i
     out[begun + 1 :] = side
     return out
 

@@ -87,6 +87,9 @@ class Model(ABC):
     # Ports of an equation found by search: whose motion it is made of, where it is added.
     unlisted_at: tuple[tuple[str, str], ...] = ()
     taken: frozenset[str] = frozenset()  # effects (id, or id:form) that the nominal model has already
+    holds: tuple[str, ...] = ()  # ways in which the input may run between its samples, where the model has a choice,
+    hold: str = ""  # the one that it takes,
+    hold_stated: bool = False  # and whether its file states it
     pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined
 
     @abstractmethod
@@ -115,6 +118,10 @@ class Model(ABC):
 
     def settle(self, segment: Segment, theta: Array) -> None:  # noqa: B027 - most models have nothing to settle
         """Prepare the recording for these nominal parameters: a measured output that is an input too, freed of noise."""
+
+    def hold_as(self, segments: list[Segment], hold: str) -> None:
+        """Let the input run between its samples as `hold` (of `holds`) says."""
+        raise NotImplementedError(f"{self.kind}: no choice of hold")
 
     def restarts(self, segments: list[Segment]) -> list[Array]:
         """Further start values of the nominal parameters, for effects that hide them."""

@@ -56,7 +56,9 @@ class AxisModel(Model):
         if spec.axis is None:
             raise ValueError("axis: found nothing, wanted a section")
         self.spec = spec.axis
-        self.hold = spec.axis.hold or "linear"
+        self.hold: str = spec.axis.hold or "linear"
+        self.hold_stated = spec.axis.hold is not None
+        self.holds = balance.HOLDS if spec.axis.controller is None else ()
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
         self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
@@ -127,8 +129,18 @@ class AxisModel(Model):
         else:
             segment.y = np.zeros_like(y)
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
-            segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, spec.hold)
+            segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
         return segment
+
+    def hold_as(self, segments: list[Segment], hold: str) -> None:
+        """Let the input run between its samples as `hold` says, in all that is derived from it."""
+        self.hold = hold
+        for segment in segments:
+            assert isinstance(segment, AxisSegment)
+            if self.free_run:
+                segment.stages = stages(segment.inputs[self.spec.input], segment.substeps, hold)
+            elif segment.balance is not None:
+                segment.balance = balance.held_as(segment.balance, segment, hold)
 
     def guess(self, segments: list[Segment]) -> Array:
         """Equation-error estimate in the frequency domain where the TOML gives no value: U = (-w^2 m + i w c + k) X."""

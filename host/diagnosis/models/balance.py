@@ -9,7 +9,7 @@ signal is differentiated; samples whose test function would reach over an end or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,10 @@ class Balance:
     held: Array  # its integral over what each sample of the force stands for
     rows: Array  # (3, n) acceleration, speed and place of the motion under the test function
     noise: Noise
+    kernels: Array  # (3, 2 half + 1) of the rows
+    support: Array  # (2 half + 1,) times of the test function, s
+    length: float  # half its length, s
+    sigma_motion: float  # white noise of the motion
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,14 @@ class Motion:
     start: float
 
 
-def prepare(
-    segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str | None
-) -> Balance:
+def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str) -> Balance:
     """Test function, and the motion's (acceleration, speed, place) (3, n) under it.
 
     Its length follows the band in which the motion stands out of its noise; being the same for all terms it bends none of
     their coefficients.
 
     force: its channel; motion: (n,), gaps bridged; seen: where motion and force were measured; hold: how the force runs
-    between samples, None for what fits best.
+    between samples.
     """
     dt_s, recording = segment.recording.dt_s, segment.recording
     sigma = estimate([motion], [quiescent([motion], dt_s, recording.timed)]).sigma
@@ -77,17 +79,30 @@ def prepare(
     first, last = np.maximum(np.arange(segment.n) - half, 0), np.minimum(np.arange(segment.n) + half + 1, segment.n)
     whole = (np.arange(segment.n) >= half) & (np.arange(segment.n) < segment.n - half) & (gap[last] == gap[first])
     segment.y[:, ~whole] = np.nan
-    kept = slice(half, segment.n - half)
-    columns = np.vstack([rows, np.ones(segment.n)])[:, kept].T
-    fits = []
-    for each in (hold,) if hold else HOLDS:
-        held = _held(s, length, dt_s, each)
-        applied = _along_record(segment.inputs[force], held)[kept]
-        found = np.linalg.lstsq(columns, applied, rcond=1e-12)[0]
-        fits.append((float(np.sum((applied - columns @ found) ** 2)), held, found[:3]))
-    _, held, coefficients = min(fits, key=lambda item: item[0])
-    levels = white_level(motion), white_level(segment.inputs[force])
-    return Balance(force, bump, held, rows, _noise(coefficients, *levels, kernels, held))
+    sigma_motion = white_level(motion)
+    held, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
+    return Balance(force, bump, held, rows, noise, kernels, s, length, sigma_motion)
+
+
+def held_as(balance: Balance, segment: Segment, hold: str) -> Balance:
+    """`balance` with the force running between its samples as `hold` says."""
+    recorded = segment.inputs[balance.input]
+    held, noise = _held_force(
+        recorded, balance.rows, balance.kernels, balance.support, balance.length, balance.sigma_motion, hold
+    )
+    return replace(balance, held=held, noise=noise)
+
+
+def _held_force(
+    recorded: Array, rows: Array, kernels: Array, s: Array, length: float, sigma_motion: float, hold: str
+) -> tuple[Array, Noise]:
+    """Weights of force samples under the test function, and the noise there."""
+    held = _held(s, length, float(s[1] - s[0]), hold)
+    half = s.size // 2
+    kept = slice(half, recorded.size - half)
+    columns = np.vstack([rows, np.ones(recorded.size)])[:, kept].T
+    found: Array = np.asarray(np.linalg.lstsq(columns, _along_record(recorded, held)[kept], rcond=1e-12)[0])
+    return held, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, white_level(recorded), kernels, held)
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:

@@ -17,6 +17,8 @@ from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
+DEGREE = 5  # of the local polynomial that is differentiated,
+WIDER = 1.45  # and its window over that of a cubic that passes as much noise
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
 
@@ -89,10 +91,13 @@ class ImpedanceModel(Model):
         motion = segment.inputs[self.spec.input]
         noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
         window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
-        x, v, a = smooth_derivatives(motion, recording.dt_s, window)
-        segment.inputs[f"motion:{self.spec.subsystem}"] = motion
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
-        if noise < CLEAN * tolerance:
+        clean = noise < CLEAN * tolerance
+        if not clean:
+            window = round(WIDER * window) | 1
+        x, v, a = smooth_derivatives(motion, recording.dt_s, window, DEGREE)
+        segment.inputs[f"motion:{self.spec.subsystem}"] = motion
+        if clean:
             x = motion  # smoothing would round its reversals, and friction with them
         segment.x, segment.v, segment.a = x, v, a
         segment.tolerances[self.spec.subsystem] = tolerance

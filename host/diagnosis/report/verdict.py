@@ -16,6 +16,7 @@ from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, of_refused, posterior
 
+REMARKS = ("excitation", "outliers", "quantized", "hold")  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
 PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
@@ -80,7 +81,7 @@ def next_step(result: Diagnosis) -> str:
     named = effects(result)
     if result.stopped_early:
         return "Diagnose again with a longer time budget: the search was stopped before its end."
-    first = next((f for f in result.findings if f.id != "excitation" and (f.id, f.channel) != ("clock", "time")), None)
+    first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) != ("clock", "time")), None)
     if first is not None:
         return f"Put the data right first ({first.id}: {first.channel}), then diagnose again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]

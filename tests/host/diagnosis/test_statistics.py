@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from host.diagnosis.estimation import noise
 from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
 from host.diagnosis.estimation.uncertainty import _jackknife
+from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.locate import inside, joined, windows
@@ -58,7 +59,7 @@ def test_whitened_noise_is_white() -> None:
 def test_wild_samples_are_found_and_steps_are_not() -> None:
     y = np.where(np.arange(300) > 150, 1.0, 0.0) + 0.001 * np.random.default_rng(0).normal(size=300)
     y[40] = 9.0
-    assert np.flatnonzero(noise.wild(y, 0.001)).tolist() == [40]
+    assert np.flatnonzero(readings.wild(y, 0.001)).tolist() == [40]
 
 
 @settings(max_examples=8, deadline=None)

@@ -1,0 +1,168 @@
+"""One channel by itself: samples that stand alone, codes for a lost reading, coarse steps, raw counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.operators import fill, quantum
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+ALONE = 12.0  # noise standard deviations from the median of the neighbours, and
+LOCAL = 8.0  # local spreads, from which a sample stands alone
+MOVES = 5.0  # deviations of the other samples over noise, from which a channel carries a motion and no single blows
+CODES = 3  # returns to the same value, from which that is a code for a lost reading
+LONGEST_CODE = 50  # samples in a row of such a code
+COARSEST = 500.0  # steps in the range of a channel, below which its resolution is said
+FEW_LEVELS = 20  # levels up to which a channel may be a switched signal
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped,
+    saturated, outliers, quantized or hold; `channel`: the column's name in the recordings.
+    """
+
+    id: str
+    channel: str
+    says: str
+
+
+def wild(values: Array, sigma: float) -> Mask:
+    """Samples of `values` (n,) that stand alone, far from the median of their seven neighbours. sigma: noise."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(fill(values), 3, mode="reflect"), 7)
+    middle = np.median(windows, axis=1)
+    spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
+    away = np.abs(fill(values) - middle)
+    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * quantum(values)) & np.isfinite(values))
+
+
+def scatter(values: Array) -> float:
+    """Robust standard deviation of the samples about the median of their neighbours: noise that single samples do not
+    raise.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(fill(values), 3, mode="reflect"), 7)
+    return float(1.4826 * np.median(np.abs(fill(values) - np.median(windows, axis=1))))
+
+
+def lost(values: Array) -> Mask:
+    """Samples of a code for a lost reading: one value, again and again, that the channel jumps to and back from."""
+    line = fill(values)
+    step = np.abs(np.diff(line))
+    moved = step[step > 0.0]
+    if moved.size < 10:
+        return np.zeros(line.size, dtype=bool)
+    far = max(ALONE * float(np.median(moved)), 4.0 * float(np.quantile(moved, 0.9)))
+    starts = np.flatnonzero(step > far) + 1
+    found = np.zeros(line.size, dtype=bool)
+    codes: dict[float, list[slice]] = {}
+    for first in starts:
+        last = first
+        while last < line.size and last - first <= LONGEST_CODE and line[last] == line[first]:
+            last += 1
+        ends = last < line.size and last - first <= LONGEST_CODE and abs(line[last] - line[first]) > far
+        if ends and (line[last] - line[first]) * (line[first - 1] - line[first]) > 0.0:
+            codes.setdefault(float(line[first]), []).append(slice(int(first), int(last)))
+    for spans in codes.values():
+        if len(spans) >= CODES:
+            for span in spans:
+                found[span] = True
+    ordinary = np.count_nonzero(~found) > 0.5 * line.size
+    return found & np.isfinite(values) if ordinary else np.zeros(line.size, dtype=bool)
+
+
+def without_outliers(
+    recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """Recordings in which samples of the channels `names` that are no readings are missing; a finding says how many.
+
+    Single samples of a channel that holds still otherwise are left: those may be blows, and meant.
+    """
+    for name in names:
+        count = total = 0
+        first = ""
+        cleaned = []
+        for recording in recordings:
+            values = recording.channels.get(name)
+            if values is None or np.count_nonzero(np.isfinite(values)) < 50:
+                cleaned.append(recording)
+                continue
+            noise = scatter(values)
+            bad = wild(values, noise)
+            rest = np.where(bad, np.nan, values)
+            if float(np.nanstd(rest)) <= MOVES * noise:
+                bad = np.zeros(values.size, dtype=bool)
+            bad |= lost(values)
+            if bad.any():
+                where = recording.begin_s + float(recording.time_s[int(np.argmax(bad))])
+                unit = "s" if recording.timed else "samples"
+                first = first or f"first at {where:.4g} {unit} of {recording.name}"
+                recording = replace(recording, channels={**recording.channels, name: np.where(bad, np.nan, values)})
+            count, total = count + int(bad.sum()), total + values.size
+            cleaned.append(recording)
+        recordings = cleaned
+        if count:
+            column = columns.get(name, name)
+            says = f"{count} of {total} samples of column {column} are outliers, far from their neighbours ({first}). "
+            says += "They are left out of the comparison."
+            findings.append(Finding("outliers", column, says))
+    return recordings
+
+
+def resolution(values: Array, switched: bool) -> float:
+    """Step in which a channel reads, 0 if it is not visibly coarse. switched: few levels may be meant."""
+    step = quantum(values)
+    if step > 0.0:
+        return step
+    good = values[np.isfinite(values)]
+    levels = np.unique(good)
+    if switched or not 3 <= levels.size <= FEW_LEVELS or good.size < 10 * levels.size:
+        return 0.0
+    steps = np.diff(levels)
+    smallest = float(np.min(steps))
+    even = np.abs(steps / smallest - np.round(steps / smallest)) < 1e-3
+    return smallest if bool(even.all()) else 0.0
+
+
+def coarse(
+    recordings: list[Recording],
+    names: list[str],
+    driven: set[str],
+    columns: dict[str, str],
+    units: dict[str, str],
+    findings: list[Finding],
+) -> None:
+    """Channels that read in steps, of which fewer than `COARSEST` make their range. driven: outputs, whose few levels are
+    not meant.
+    """
+    for name in names:
+        found = [r.channels[name] for r in recordings if name in r.channels and np.isfinite(r.channels[name]).any()]
+        steps = [resolution(values, name not in driven) for values in found]
+        spans = [float(np.nanmax(values) - np.nanmin(values)) for values in found]
+        if not steps or min(steps) <= 0.0 or max(spans) > COARSEST * max(steps):
+            continue
+        step, column, unit = max(steps), columns.get(name, name), units.get(name, "")
+        says = f"Column {column} reads in steps of {step:.4g} {unit}".rstrip()
+        says += f", 1/{max(spans) / step:.0f} of its range: what changes it by less than half a step cannot be seen."
+        findings.append(Finding("quantized", column, says))
+
+
+def counts(recordings: list[Recording], names: list[str], columns: dict[str, str], units: dict[str, str]) -> list[str]:
+    """Channels that hold whole numbers only, many of them, though their unit is none of whole numbers."""
+    found = []
+    for name in names:
+        values = [r.channels[name][np.isfinite(r.channels[name])] for r in recordings if name in r.channels]
+        together = np.concatenate(values) if values else np.zeros(0)
+        whole = together.size > 0 and bool(np.all(together == np.round(together)))
+        if (
+            whole
+            and np.unique(together).size > FEW_LEVELS
+            and units.get(name, "") in ("rad", "m", "m/s", "m/s2", "N", "N m")
+        ):
+            found.append(name)
+    return found
