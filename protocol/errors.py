@@ -43,5 +43,7 @@ def reason(error: Exception) -> Description:
 def _short(value: object, limit: int = 80) -> str:
     if isinstance(value, Description):
         return str(value)
-    text = json.dumps(value) if isinstance(value, (dict, list, str, int, float, bool, type(None))) else str(value)
+    text = (
+        json.dumps(value, default=str) if isinstance(value, (dict, list, str, int, float, bool, type(None))) else str(value)
+    )
     return text if len(text) <= limit else text[: limit - 3] + "..."

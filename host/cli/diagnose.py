@@ -38,6 +38,9 @@ def diagnose(
         list[str] | None,
         typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as the report gives it."),
     ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Run the code that the nominal TOML names, whoever may have written it.")
+    ] = False,
 ) -> None:
     """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""
     if live:
@@ -49,9 +52,16 @@ def diagnose(
         raise InputError("--nominal", "nothing", "a TOML file")
     if out is not None:
         writable_folder("--out", out)
+    _say_what_runs(nominal, trust)
     with Progress(quiet) as progress:
         verdict = run(
-            recordings or [], nominal, without=without or [], known=effect or [], data_folder=data, progress=progress
+            recordings or [],
+            nominal,
+            without=without or [],
+            known=effect or [],
+            data_folder=data,
+            time_budget_s=time_budget,
+            progress=progress,
         )
     if out is not None:
         report = verdict.write(out)
@@ -62,6 +72,22 @@ def diagnose(
         write_json(verdict.as_dict())
     else:
         print("\n".join(summary(verdict.as_dict())))
+
+
+def _say_what_runs(nominal: str, trust: bool) -> None:
+    """One line about the code that the nominal TOML runs. Raises InputError where another user may have written it."""
+    from host.diagnosis.model.nominal import nominal_path, read_nominal
+    from host.diagnosis.model.trust import check_owner, code_of, code_path
+
+    path = nominal_path(nominal)
+    spec = read_nominal(path)
+    what = code_of(spec)
+    if not what:
+        return
+    code = code_path(spec)
+    if not trust:
+        check_owner(path, *([code] if code is not None else []))
+    print(f"seldinger diagnose: {path} runs {what} with your rights", file=sys.stderr)
 
 
 def _watch(rig: str | None, json: bool) -> None:

@@ -171,6 +171,9 @@ def diagnose(
     model, problem, full = problems(spec, data.recordings, rules)
     problem.budget = budget
     held = hold_between_samples(problem, [full] if full is not problem else [])
+    cost = model.announce(problem.segments, model.guess(problem.segments))
+    if cost:
+        progress(cost, 0.0)
     candidate_effects = candidates(model.ports, problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, progress)

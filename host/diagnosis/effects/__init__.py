@@ -40,4 +40,5 @@ def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = 
                 form for form in effect.forms if not {f"{effect.id}:{form}", f"{effect.id}:{form}@{port.name}"} & left_out
             ]
             found += [Candidate(effect, port, source, form) for source in sources for form in forms]
+        found += [Candidate(effect, port) for effect in port.offers if effect.id not in left_out]
     return found

@@ -60,8 +60,12 @@ class Problem:
 
     def simulate(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> Array:
         """Outputs (outputs, n) of one recording."""
-        out = self.model.simulate(segment, *self.parted(terms, values))
-        return np.where(np.abs(out) < 1e150, out, 1e150)
+        return self.simulate_all([segment], terms, values)[0]
+
+    def simulate_all(self, segments: list[Segment], terms: tuple[Term, ...], values: Array) -> list[Array]:
+        """Outputs (outputs, n) of several recordings; a simulation that ran away is far from every recording."""
+        found = self.model.simulate_all(segments, *self.parted(terms, values))
+        return [np.where(np.abs(out) < 1e150, out, 1e150) for out in found]
 
     def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[ActiveEffect]]:
         """Nominal parameters, and every effect with its own."""
@@ -86,10 +90,10 @@ class Problem:
     def stacked(self, terms: tuple[Term, ...], values: Array) -> Array:
         """Weighted residuals of the samples to fit, one vector; missing samples are zero."""
         rows = []
-        for segment in self.segments:
-            if segment.fit.any():
-                r = (segment.y - self.simulate(segment, terms, values))[:, segment.fit] / self.scale[:, None]
-                rows.append(np.clip(np.nan_to_num(r, nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
+        used = [segment for segment in self.segments if segment.fit.any()]
+        for segment, out in zip(used, self.simulate_all(used, terms, values), strict=True):
+            r = (segment.y - out)[:, segment.fit] / self.scale[:, None]
+            rows.append(np.clip(np.nan_to_num(r, nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
         return np.concatenate(rows)
 
 
@@ -202,7 +206,8 @@ def reweigh(problem: Problem, fit: Fit) -> None:
 
 def finish(problem: Problem, fit: Fit) -> Fit:
     """`fit` with its residuals on every sample."""
-    fit.residuals = [segment.y - problem.simulate(segment, fit.terms, fit.values) for segment in problem.segments]
+    found = problem.simulate_all(problem.segments, fit.terms, fit.values)
+    fit.residuals = [segment.y - out for segment, out in zip(problem.segments, found, strict=True)]
     return fit
 
 

@@ -80,6 +80,14 @@ class Known(Model):
         """As the model without effects."""
         return self._inner.needs(segment, port, theta[: self.own], residual)
 
+    def simulate_all(self, segments: list[Segment], theta: Array, active: list[ActiveEffect]) -> list[Array]:
+        """Outputs of several recordings with the known effects at work."""
+        return self._inner.simulate_all(segments, theta[: self.own], self.with_known(theta, active))
+
+    def announce(self, segments: list[Segment], theta: Array) -> str:
+        """As the model without effects."""
+        return self._inner.announce(segments, theta[: self.own])
+
     def settle(self, segment: Segment, theta: Array) -> None:
         """As the model without effects."""
         self._inner.settle(segment, theta[: self.own])
@@ -104,6 +112,10 @@ class Known(Model):
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:
         """As the model."""
         return self._inner.change(segment, theta[: self.own], slopes, candidate, values)
+
+    def answer(self, slope: Any, moved: Array) -> Array:
+        """As the model."""
+        return self._inner.answer(slope, moved)
 
 
 def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:

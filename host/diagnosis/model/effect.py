@@ -137,6 +137,7 @@ class Port:
     loads: tuple[str, ...] = ()
     others: tuple[str, ...] = ()
     drags: tuple[str, ...] = ()
+    offers: tuple[Effect, ...] = ()  # parameters of a simulator that compete as effects, of this port alone
     held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
 
 

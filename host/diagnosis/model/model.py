@@ -116,6 +116,10 @@ class Model(ABC):
         """Outputs of several recordings; a model that can runs them in parallel."""
         return [self.simulate(segment, theta, active) for segment in segments]
 
+    def announce(self, segments: list[Segment], theta: Array) -> str:
+        """What a diagnosis will cost where simulations take long; nothing where they do not."""
+        return ""
+
     def settle(self, segment: Segment, theta: Array) -> None:  # noqa: B027 - most models have nothing to settle
         """Prepare the recording for these nominal parameters: a measured output that is an input too, freed of noise."""
 
@@ -142,6 +146,10 @@ class Model(ABC):
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:
         """Linearized change of outputs (outputs, n) by a candidate at one of the ports of `slopes`."""
         raise KeyError(candidate.port.name)
+
+    def answer(self, slope: Any, moved: Array) -> Array:
+        """Change of outputs (outputs, n) when the signal at a port of `slopes` changes by `moved` (n,)."""
+        raise NotImplementedError(f"{self.kind}: no linearized port")
 
     @property
     def inner(self) -> Model:

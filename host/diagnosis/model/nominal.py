@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import AliasChoices, Field, PrivateAttr, model_validator
+from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
 from protocol.errors import Description, InputError, reason
 from protocol.requests import Request, validate
@@ -20,6 +21,7 @@ class ChannelSpec(Request):
     unit: str = ""
     sign: Literal[-1, 1] = 1
     offset: float = 0.0
+    session_offset: bool = False  # an offset of its own in every recording, estimated (kinds that run a simulator)
 
 
 class SegmentSpec(Request):
@@ -43,10 +45,71 @@ class DataSpec(Request):
 
 
 class ParameterSpec(Request):
-    """A nominal parameter: start value and whether it is refitted."""
+    """A nominal parameter: start value, whether it is refitted, bounds of the fit, and unit."""
 
     value: float
     free: bool = True
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+
+    @model_validator(mode="after")
+    def _inside(self) -> ParameterSpec:
+        low, high = self.bounds()
+        if not low <= self.value <= high:
+            raise ValueError(f"low <= value <= high, with value {self.value:g}")
+        return self
+
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the fit; infinite where none is given."""
+        return (-math.inf if self.low is None else self.low, math.inf if self.high is None else self.high)
+
+
+class OfferSpec(Request):
+    """A parameter of the simulator that is nominally `off` and competes with the effects, under an id of the vocabulary."""
+
+    id: str
+    parameter: str
+    subsystem: str = ""
+    off: float = 0.0
+    low: float = 0.0
+    high: float
+    tried: list[float] = []  # values that screening tries; left out, five between the bounds
+    unit: str = ""
+
+    @model_validator(mode="after")
+    def _inside(self) -> OfferSpec:
+        if not self.low <= self.off <= self.high or self.low >= self.high:
+            raise ValueError(f"low <= off <= high and low < high, with off {self.off:g}")
+        return self
+
+
+class StateSpec(Request):
+    """A state at the first sample of a recording that no output shows: mean and standard deviation before the fit."""
+
+    value: float = 0.0
+    spread: float = Field(gt=0)
+
+
+class SimulatorSpec(Request):
+    """What every kind that runs a simulator has: channels that go in and come out, ports, and states at the first sample.
+
+    `ports`: channel -> subsystem in the verdict; channels without one belong to `subsystem`.
+    """
+
+    inputs: list[str]
+    outputs: list[str] = Field(min_length=1)
+    subsystem: str = "model"
+    ports: dict[str, str] = {}
+    load: list[str] = []
+    states: dict[str, StateSpec] = {}
+
+    @model_validator(mode="after")
+    def _ports_exist(self) -> SimulatorSpec:
+        for name in self.ports:
+            if name not in (*self.inputs, *self.outputs):
+                raise ValueError(f"ports of inputs or outputs, not {name}")
+        return self
 
 
 class LinkSpec(Request):
@@ -100,14 +163,93 @@ class ImpedanceSpec(Request):
     terms: list[Literal["mass", "damping", "stiffness", "load", "offset"]] = ["stiffness", "offset"]
 
 
-class CallableSpec(Request):
-    """A Python function `name(inputs, parameters, time_s) -> outputs`, dictionaries of arrays (n,)."""
+class CallableSpec(SimulatorSpec):
+    """A Python function `name(inputs, parameters, time_s) -> outputs`, dictionaries of arrays (n,).
 
-    function: str
-    inputs: list[str]
-    outputs: list[str]
-    subsystem: str = "model"
-    load: list[str] = []
+    A function with a fourth argument gets the state at the first sample: each output and its rate (`angle`,
+    `angle_rate`), and `states`. `function`: `module:name`, or from Python the function itself. `workers`: processes that
+    may run recordings in parallel (threads, where processes cannot be forked).
+    """
+
+    function: Any
+    workers: int = Field(default=1, ge=1, le=64)
+
+    @field_validator("function")
+    @classmethod
+    def _runs(cls, function: Any) -> Any:
+        if not isinstance(function, str) and not callable(function):
+            raise ValueError("module:name of a Python function, or from Python the function itself")
+        return function
+
+
+Coefficient = float | str  # a number, or an expression of parameters
+
+
+class FeedbackSpec(Request):
+    """A loop around a linear model: its first input is the controller's output plus what `input` recorded.
+
+    controller: transfer function from reference minus output to input (of s, or of z with `period_s`).
+    """
+
+    reference: str
+    output: str
+    numerator: list[Coefficient] = Field(min_length=1)
+    denominator: list[Coefficient] = Field(default=[1.0], min_length=1)
+
+
+class LinearSpec(SimulatorSpec):
+    """Transfer function (one input, one output; falling powers of s or z), or state space, of any order.
+
+    Coefficients are numbers or expressions of parameters. `period_s`: of a discrete model, left out for a continuous one;
+    `hold`: its input between samples.
+    """
+
+    subsystem: str = "plant"
+    numerator: list[Coefficient] | None = None
+    denominator: list[Coefficient] | None = None
+    A: list[list[Coefficient]] | None = None
+    B: list[list[Coefficient]] | None = None
+    C: list[list[Coefficient]] | None = None
+    D: list[list[Coefficient]] | None = None
+    period_s: float | None = Field(default=None, gt=0)
+    hold: Literal["zero", "linear"] = "zero"
+    feedback: FeedbackSpec | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> LinearSpec:
+        transfer = self.numerator is not None and self.denominator is not None
+        space = self.A is not None and self.B is not None and self.C is not None
+        if transfer == space:
+            raise ValueError("either numerator and denominator, or A, B and C (and D)")
+        if transfer and (len(self.inputs), len(self.outputs)) != (1, 1):
+            raise ValueError("one input and one output for a transfer function; A, B, C and D for more")
+        return self
+
+
+class MujocoSpec(SimulatorSpec):
+    """A model file of MuJoCo (MJCF). `actuators`, `sensors`: channel -> name in the file.
+
+    A parameter is named `element.attribute` (`hinge.damping`, `forearm.mass`, `motor.gear`). `offers`: what competes
+    besides [[offer]]: `all` that MuJoCo has for the joints, actuators and bodies in use, or `none`.
+    """
+
+    model: str
+    subsystem: str = "mechanism"
+    actuators: dict[str, str] = {}
+    sensors: dict[str, str] = {}
+    offers: Literal["all", "none"] = "all"
+
+
+class FmuSpec(SimulatorSpec):
+    """A functional mock-up unit for co-simulation (FMI 2.0 or 3.0). `variables`: channel -> variable where the names differ.
+
+    `initial`: state (an output, its `_rate`, or one of `states`) -> variable that is set to it before the run.
+    """
+
+    model: str
+    variables: dict[str, str] = {}
+    initial: dict[str, str] = {}
+    step_s: float | None = Field(default=None, gt=0)
 
 
 class RigSpec(Request):
@@ -137,25 +279,48 @@ class NominalSpec(Request):
     """A whole nominal TOML."""
 
     name: str
-    kind: Literal["transmission", "axis", "impedance", "callable", "rig"]
+    kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "fmu", "rig"]
     data: DataSpec = DataSpec()
     channels: dict[str, ChannelSpec] = {}
-    parameters: dict[str, float | ParameterSpec] = {}
+    parameters: dict[str, ParameterSpec] = {}
     link: list[LinkSpec] = []
     axis: AxisSpec | None = None
     impedance: ImpedanceSpec | None = None
     callable: CallableSpec | None = None
+    linear: LinearSpec | None = None
+    mujoco: MujocoSpec | None = None
+    fmu: FmuSpec | None = None
+    offer: list[OfferSpec] = []
     rig: RigSpec | None = None
     effect: list[EffectSpec] = []
     _folder: str = PrivateAttr(default=".")
     _files: list[Path] = PrivateAttr(default=[])
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _a_number_is_a_value(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        return {name: {"value": value} if isinstance(value, int | float) else value for name, value in given.items()}
 
     @model_validator(mode="after")
     def _section_present(self) -> NominalSpec:
         section = {"transmission": "link"}.get(self.kind, self.kind)
         if not getattr(self, section):
             raise ValueError(f"kind {self.kind} wants a section [{section}]")
+        if self.simulator is None:
+            if self.offer:
+                raise ValueError(f"[[offer]] with a kind that runs a simulator, not kind {self.kind}")
+            sessions = [name for name, channel in self.channels.items() if channel.session_offset]
+            if sessions:
+                raise ValueError(f"session_offset ({sessions[0]}) with a kind that runs a simulator, not kind {self.kind}")
         return self
+
+    @property
+    def simulator(self) -> SimulatorSpec | None:
+        """The section of a kind that runs a simulator."""
+        sections = {"callable": self.callable, "linear": self.linear, "mujoco": self.mujoco, "fmu": self.fmu}
+        return sections.get(self.kind)
 
     @property
     def folder(self) -> str:
@@ -169,8 +334,8 @@ class NominalSpec(Request):
 
     def start(self, name: str, default: float) -> tuple[float, bool]:
         """Start value of nominal parameter `name`, and whether it may be refitted."""
-        given = self.parameters.get(name, default)
-        return (given.value, given.free) if isinstance(given, ParameterSpec) else (float(given), True)
+        given = self.parameters.get(name)
+        return (given.value, given.free) if given is not None else (float(default), True)
 
 
 def effect_of(text: str) -> EffectSpec:

@@ -49,8 +49,8 @@ def channels_of(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:
                 optional.add(spec.axis.controller.added)
     if spec.impedance is not None:
         names += [spec.impedance.input, spec.impedance.output, *spec.impedance.load, *spec.impedance.others]
-    if spec.callable is not None:
-        names += [*spec.callable.inputs, *spec.callable.outputs, *spec.callable.load]
+    if spec.simulator is not None:
+        names += [*spec.simulator.inputs, *spec.simulator.outputs, *spec.simulator.load]
     for name in names:
         if name not in spec.channels:
             raise InputError(name, "no such channel", "one of [channels]: " + ", ".join(spec.channels))

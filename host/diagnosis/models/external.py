@@ -1,143 +1,136 @@
-"""A Python function as nominal model; effects act on what goes into it and on what comes out."""
+"""A Python function as nominal model: `name(inputs, parameters, time_s)` or, with the initial state, a fourth argument."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import importlib.util
+import inspect
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_all_start_methods, get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import Segment
 from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.models.simulated import SimulatedModel, SimulatorRun
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
-Function = Callable[[dict[str, Array], dict[str, float], Array], dict[str, Array]]
+Function = Callable[..., Mapping[str, Array]]
 
 
-class ExternalModel(Model):
-    """Nominal model of kind `callable`. A port at every input, before the function, and at every output, behind it."""
+class ExternalModel(SimulatedModel):
+    """Nominal model of kind `callable`. The same arguments have to give the same outputs: they are kept."""
 
     kind = "callable"
-    scan_points = 24
 
     def __init__(self, spec: NominalSpec) -> None:
         if spec.callable is None:
             raise ValueError("callable: found nothing, wanted a section")
-        self.spec = spec.callable
-        self.function = function_of(self.spec.function, spec.folder)
-        self.units = {name: channel.unit for name, channel in spec.channels.items()}
-        inputs, outputs, name = self.spec.inputs, self.spec.outputs, self.spec.subsystem
-        self.outputs = tuple([Output(output, self.units[output], name) for output in outputs])
-        loads = tuple(self.spec.load)
-        self.ports: tuple[Port, ...] = tuple(
-            [
-                Port(
-                    channel,
-                    "motion+turn" if self.units[channel] == "rad" else "motion",
-                    name,
-                    tuple(outputs),
-                    loads,
-                    tuple(other for other in inputs if other != channel),
-                )
-                for channel in inputs
-            ]
+        self.spec, self.folder = spec.callable, spec.folder
+        self.function: Function = (
+            function_of(self.spec.function, spec.folder) if isinstance(self.spec.function, str) else self.spec.function
         )
-        self.ports += tuple(
-            [
-                Port(f"{channel}_reading", "drift+timing+limit+mix", name, (channel,), loads, tuple(inputs))
-                for channel in outputs
-            ]
-        )
-        parameters = []
-        for key in spec.parameters:
-            value, free = spec.start(key, 0.0)
-            bounds = (-np.inf, np.inf) if free else (value, value)
-            parameters.append(Parameter(key, "", (value,), *bounds, step=abs(value) or 1.0))
-        self.parameters = tuple(parameters)
-        self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in dict.fromkeys((*inputs, *loads)))
-        self.unlisted_at = tuple((channel, channel) for channel in inputs)
-        self.moves = {channel: channel for channel in inputs}
-        self.quiet_inputs = tuple(dict.fromkeys((*inputs, *loads)))
+        self.takes_initial = arguments_of(self.function) > 3
+        super().__init__(spec, spec.callable, spec.offer)
+        self.offs = {offer.parameter: offer.off for offer in spec.offer}
+        self._pool: Executor | None = None
+        if self.spec.workers > 1:
+            # Forked workers have the function without importing it; elsewhere threads serve what frees the interpreter.
+            self._pool = (
+                ProcessPoolExecutor(self.spec.workers, get_context("fork"), _begin_worker, (self.function,))
+                if "fork" in get_all_start_methods()
+                else ThreadPoolExecutor(self.spec.workers)
+            )
 
-    def prepare(self, recording: Recording) -> Segment:
-        """Inputs bridged, outputs stacked."""
-        spec = self.spec
-        segment = Segment(
-            recording,
-            stack(recording, spec.outputs),
-            recording.fit,
-            recording.heldout,
-            filled(recording, list(self.quiet_inputs)),
-        )
-        units = dict(self.units)
-        for channel in spec.inputs:
-            values = segment.inputs[channel]
-            segment.tolerances[channel] = tolerance_of(values, float(np.ptp(values)))
-            units[f"output:{channel}"] = self.units[channel]
-        segment.units = {**units, **{f"{channel}_reading": self.units[channel] for channel in spec.outputs}}
-        return segment
+    @property
+    def label(self) -> str:
+        """The function's name."""
+        return self.spec.function if isinstance(self.spec.function, str) else getattr(self.function, "__name__", "function")
 
-    def guess(self, segments: list[Segment]) -> Array:
-        """Start values of the TOML."""
-        return np.array([p.grid[0] for p in self.parameters])
+    def initial_state(self, segment: Segment) -> tuple[list[str], list[float], list[float]]:
+        """As every simulator; nothing for a function of three arguments."""
+        return super().initial_state(segment) if self.takes_initial else ([], [], [])
 
-    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
-        """Every output (outputs, n). Raises InputError where the function does not give what it should."""
-        given = {name: apply_effects(segment.inputs[name], active, name, segment, None) for name in self.spec.inputs}
-        values = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
-        found = self.function(given, values, segment.recording.time_s)
-        rows = []
-        for name in self.spec.outputs:
-            row = np.asarray(found[name] if isinstance(found, dict) and name in found else np.nan, dtype=np.float64)
-            if row.shape != (segment.n,):
-                raise InputError(
-                    "callable.function",
-                    f"{self.spec.function} gave {name} of shape {row.shape}",
-                    f"a dictionary with {name} of shape ({segment.n},)",
-                )
-            rows.append(apply_effects(row, active, f"{name}_reading", segment, None))
-        return np.vstack(rows)
+    def run(
+        self, inputs: dict[str, Array], parameters: dict[str, float], time_s: Array, initial: dict[str, float]
+    ) -> Mapping[str, Array]:
+        """Call the function; offered parameters that are off are given with their nominal value."""
+        return self._call(self._arguments(SimulatorRun(inputs, parameters, time_s, initial)))
 
-    def motion(self, segment: Segment, port: Port) -> Array:
-        """The input at its port, or the measured output."""
-        if port.name in segment.inputs:
-            return segment.inputs[port.name]
-        row = segment.y[self.spec.outputs.index(port.channels[0])]
-        return np.where(np.isfinite(row), row, np.nanmedian(row))
+    def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
+        """Outputs of each of `runs`, in parallel where the file says that the function can."""
+        if self._pool is None or len(runs) < 2:
+            return super().run_many(runs)
+        call = _call_in_worker if isinstance(self._pool, ProcessPoolExecutor) else self._call
+        arguments = [self._arguments(run) for run in runs]
+        return [self._checked(run, found) for run, found in zip(runs, self._pool.map(call, arguments), strict=True)]
 
-    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their
-        noise.
-        """
-        if port.name not in segment.inputs:
-            return np.asarray(residual[self.spec.outputs.index(port.channels[0])])
-        step = 1e-4 * (float(np.ptp(segment.inputs[port.name])) or 1.0)
-        moved = replace(segment, inputs={**segment.inputs, port.name: segment.inputs[port.name] + step})
-        slope = (self.simulate(moved, theta, []) - self.simulate(segment, theta, [])) / step
-        weight = segment.weights()
-        s = np.where(np.isfinite(residual), slope, 0.0) / weight
-        return np.asarray(
-            np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)
-        )
+    def _arguments(self, run: SimulatorRun) -> tuple[Any, ...]:
+        given = (run.inputs, {**self.offs, **run.parameters}, run.time_s)
+        return (*given, run.initial) if self.takes_initial else given
+
+    def _call(self, arguments: tuple[Any, ...]) -> Mapping[str, Array]:
+        return self.function(*arguments)
+
+
+_in_worker: list[Function] = []  # the function of a worker process
+
+
+def _begin_worker(function: Function) -> None:
+    _in_worker[:] = [function]
+
+
+def _call_in_worker(arguments: tuple[Any, ...]) -> Mapping[str, Array]:
+    return {name: np.asarray(row, dtype=np.float64) for name, row in _in_worker[0](*arguments).items()}
+
+
+def arguments_of(function: Function) -> int:
+    """Number of positional arguments that `function` takes."""
+    try:
+        kinds = [p.kind for p in inspect.signature(function).parameters.values()]
+    except (TypeError, ValueError):
+        return 3
+    return sum(kind in (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD) for kind in kinds)
 
 
 def function_of(text: str, folder: str) -> Function:
-    """The function that `text` (module:name) stands for; modules are looked for in `folder` too. Raises InputError."""
+    """The function that `text` (module:name) stands for. Raises InputError.
+
+    A module in `folder` comes first and has a name of its own in the interpreter: two folders may hold modules of one
+    name.
+    """
     module, _, name = text.partition(":")
+    path = module_path(module, folder)
     sys.path.insert(0, folder)
     try:
-        found: Any = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        found: Any = getattr(_loaded(path) if path is not None else importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise InputError("callable.function", f"{text} ({error})", "module:name of a Python function") from None
     finally:
         sys.path.remove(folder)
     if not callable(found):
         raise InputError("callable.function", text, "module:name of a Python function")
-    return found
+    return found  # type: ignore[no-any-return]
+
+
+def module_path(module: str, folder: str) -> Path | None:
+    """The file of `module` in `folder`; None if it is installed elsewhere."""
+    path = Path(folder, *module.split(".")).with_suffix(".py")
+    return path if module and path.is_file() else None
+
+
+def _loaded(path: Path) -> Any:
+    key = f"nominal_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}_{path.stem}"
+    found = importlib.util.spec_from_file_location(key, path)
+    assert found is not None and found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    sys.modules[key] = module
+    found.loader.exec_module(module)
+    return module

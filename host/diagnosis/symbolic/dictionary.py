@@ -239,6 +239,11 @@ def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> l
             slope = problem.model.sensitivity(segment, nominal, target.name, active)
             out.append(Response(table, np.nan_to_num(slope)))
             continue
+        slopes = problem.model.slopes(segment, nominal, active)
+        if target.name in slopes:
+            answers = [problem.model.answer(slopes[target.name], np.asarray(values)) for values in table]
+            out.append(Response(table, whole=np.nan_to_num(np.array(answers))))
+            continue
         base = problem.simulate(segment, fit.terms, fit.values)
         need = float(np.nanstd(problem.model.needs(segment, target, nominal, segment.y - base))) or 1e-6
         whole = np.zeros((len(forms), *base.shape))

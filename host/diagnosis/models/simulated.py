@@ -1,0 +1,408 @@
+"""A simulator as nominal model: ports at what goes in and what comes out, and parameters that it offers as effects.
+
+A kind of simulator defines `run`; everything else is here. The simulator's outputs are kept by what went in, so that an
+effect behind it costs no simulation. For screening, each input is linearized: the change of the outputs after a step of
+the input is measured once, and a candidate there is screened with it if that predicts a second simulation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import fftconvolve
+
+from host.diagnosis.effects import library
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.effect import Candidate, Effect, Parameter, Port, Scale, spread
+from host.diagnosis.model.model import (
+    ActiveEffect,
+    Begin,
+    Model,
+    Output,
+    Segment,
+    apply_effects,
+    filled,
+    stack,
+    tolerance_of,
+)
+from host.diagnosis.model.nominal import NominalSpec, OfferSpec, SimulatorSpec
+from host.diagnosis.model.operators import fill, smooth_derivatives
+from protocol.errors import InputError
+
+Array = npt.NDArray[np.float64]
+KEPT_BYTES = 64_000_000  # of outputs kept by what went in
+BEGIN_S = 0.02  # length of the first samples that the state is read from, where the period allows
+BEGIN_SAMPLES = 7  # and at least so many
+STEP = 0.01  # of an input's span: step by which it is linearized
+TRUSTED = 0.25  # error of a linearized input relative to a simulation, up to which candidates are screened with it
+FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in full, about: told beforehand
+FITS = 10  # candidates that are fitted in full, about
+MOST_DYNAMIC = 4096  # samples of a step response that are used
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """Change of the outputs per change of one input.
+
+    `prompt` (outputs, n): sample by sample; `impulse` (outputs, k): as a convolution. One of them is there.
+    """
+
+    active: list[ActiveEffect]  # at this input
+    prompt: Array | None = None
+    impulse: Array | None = None
+
+    def to(self, moved: Array) -> Array:
+        """Change of the outputs (outputs, n) when the input changes by `moved` (n,)."""
+        if self.prompt is not None:
+            return np.asarray(self.prompt * moved)
+        assert self.impulse is not None
+        return np.asarray(fftconvolve(self.impulse, moved[None, :], axes=1)[:, : moved.size])
+
+
+@dataclass(frozen=True)
+class SimulatorRun:
+    """What goes into one simulation. inputs: (n,) by channel."""
+
+    inputs: dict[str, Array]
+    parameters: dict[str, float]
+    time_s: Array
+    initial: dict[str, float]
+
+    @cached_property
+    def key(self) -> Hashable:
+        """Equal for runs that give the same outputs."""
+        digest = hashlib.blake2b(repr((self.parameters, self.initial)).encode(), digest_size=16)
+        for signal in (self.time_s, *self.inputs.values()):
+            digest.update(np.ascontiguousarray(signal).tobytes())
+        return digest.digest()
+
+
+class SimulatedModel(Model):
+    """Base of the kinds `callable`, `linear`, `mujoco` and `fmu`."""
+
+    scan_points = 24
+
+    def __init__(self, spec: NominalSpec, section: SimulatorSpec, offers: list[OfferSpec]) -> None:
+        self.section, self.specified = section, spec
+        self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        self.session_offsets = [name for name in (*section.inputs, *section.outputs) if spec.channels[name].session_offset]
+        inputs, outputs = section.inputs, section.outputs
+        self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
+        self.ports = (*self._signal_ports(), *self._offered_ports(offers))
+        parameters = []
+        for key, declared in spec.parameters.items():
+            low, high = declared.bounds() if declared.free else (declared.value, declared.value)
+            step = abs(declared.value) or (high - low if np.isfinite(high - low) else 1.0) or 1.0
+            parameters.append(Parameter(key, declared.unit, (declared.value,), low, high, step=step))
+        self.parameters = tuple(parameters)
+        self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in dict.fromkeys((*inputs, *section.load)))
+        self.unlisted_at = tuple((channel, channel) for channel in inputs)
+        self.moves = {channel: channel for channel in inputs}
+        self.quiet_inputs = tuple(dict.fromkeys((*inputs, *section.load)))
+        self.calls, self.call_s = 0, 0.0  # simulations of one recording so far, and the time they took
+        self._kept: OrderedDict[Hashable, Array] = OrderedDict()
+
+    @abstractmethod
+    def run(
+        self, inputs: dict[str, Array], parameters: dict[str, float], time_s: Array, initial: dict[str, float]
+    ) -> Mapping[str, Array]:
+        """Outputs by channel, each (n,), of one simulation.
+
+        inputs: (n,) by channel. parameters: nominal ones, and those offered that are not off. initial: each output and
+        its rate at the first sample (`angle`, `angle_rate`), and the declared states.
+        """
+
+    def subsystem_of(self, channel: str) -> str:
+        """Subsystem that a verdict names for `channel`."""
+        return self.section.ports.get(channel, self.section.subsystem)
+
+    def _signal_ports(self) -> list[Port]:
+        section, loads = self.section, tuple(self.section.load)
+        found = []
+        for channel in section.inputs:
+            kind = "motion+turn" if self.units[channel] == "rad" else "motion"
+            others = tuple(other for other in section.inputs if other != channel)
+            found.append(Port(channel, kind, self.subsystem_of(channel), tuple(section.outputs), loads, others))
+        for channel in section.outputs:
+            kind, subsystem = "drift+timing+limit+mix", self.subsystem_of(channel)
+            found.append(Port(f"{channel}_reading", kind, subsystem, (channel,), loads, tuple(section.inputs)))
+        return found
+
+    def _offered_ports(self, offers: list[OfferSpec]) -> list[Port]:
+        """A port for every offered parameter, with its one effect."""
+        found: list[Port] = []
+        for offer in offers:
+            if offer.parameter in self.specified.parameters:
+                raise InputError("offer.parameter", offer.parameter, "a parameter that is not under [parameters]")
+            if offer.parameter in {port.name for port in found}:
+                raise InputError("offer.parameter", offer.parameter, "one [[offer]] for each parameter")
+            effect = offered(offer)
+            subsystem = offer.subsystem or self.section.subsystem
+            found.append(Port(offer.parameter, "offered", subsystem, tuple(self.section.outputs), offers=(effect,)))
+        return found
+
+    def prepare(self, recording: Recording) -> Segment:
+        """Inputs bridged, outputs stacked, the state at the first sample read off the outputs."""
+        section = self.section
+        segment = Segment(
+            recording,
+            stack(recording, section.outputs),
+            recording.fit,
+            recording.heldout,
+            filled(recording, list(self.quiet_inputs)),
+        )
+        segment.units = dict(self.units)
+        for channel in section.inputs:
+            values = segment.inputs[channel]
+            segment.tolerances[channel] = tolerance_of(values, float(np.ptp(values)))
+            segment.units[f"output:{channel}"] = self.units[channel]
+        for port in self.ports:
+            if port.offers:
+                segment.units[port.name] = ""
+            elif port.name.endswith("_reading"):
+                segment.units[port.name] = self.units[port.channels[0]]
+        segment.begin = self._begin(segment)
+        return segment
+
+    def _begin(self, segment: Segment) -> Begin | None:
+        """State at the first sample with its standard deviations; session offsets are part of it."""
+        names, means, sds = self.initial_state(segment)
+        for name in self.session_offsets:
+            values = segment.recording.channels[name]
+            names, means = [*names, f"offset:{name}"], [*means, 0.0]
+            sds = [*sds, float(np.nanmax(values) - np.nanmin(values)) or 1.0]
+        if not names:
+            return None
+        return Begin(tuple(names), np.array(means), np.array(sds), np.array(means))
+
+    def initial_state(self, segment: Segment) -> tuple[list[str], list[float], list[float]]:
+        """Names, means and standard deviations of the state that `run` is given."""
+        names, means, sds = [], [], []
+        for row, name in zip(segment.y, self.section.outputs, strict=True):
+            (value, rate), (value_sd, rate_sd) = first_state(row, segment.recording.dt_s)
+            names += [name, f"{name}_rate"]
+            means += [value, rate]
+            sds += [value_sd, rate_sd]
+        for name, state in self.section.states.items():
+            names, means, sds = [*names, name], [*means, state.value], [*sds, state.spread]
+        return names, means, sds
+
+    def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
+        """Every output (outputs, n). Raises InputError where the simulator does not give what it should."""
+        return self.simulate_all([segment], theta, active)[0]
+
+    def simulate_all(self, segments: list[Segment], theta: Array, active: list[ActiveEffect]) -> list[Array]:
+        """Outputs of several recordings; those whose run is not kept are run together."""
+        runs = [self._run_of(segment, theta, active) for segment in segments]
+        new = {run.key: run for run in runs if run.key not in self._kept}
+        began = time.perf_counter()
+        wholes = dict(zip(new, self.run_many(list(new.values())), strict=True))
+        if new:
+            self.calls, self.call_s = self.calls + len(new), self.call_s + time.perf_counter() - began
+        out = []
+        for segment, run in zip(segments, runs, strict=True):
+            whole = wholes[run.key] if run.key in wholes else self._kept[run.key]
+            self._keep(run.key, whole)
+            rows = []
+            for row, name in zip(whole, self.section.outputs, strict=True):
+                moved = row + self._begin_of(segment).get(f"offset:{name}", 0.0)
+                rows.append(apply_effects(moved, active, f"{name}_reading", segment, None))
+            out.append(np.vstack(rows))
+        return out
+
+    def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
+        """Outputs (outputs, n) of each of `runs`."""
+        return [self._checked(run, self.run(run.inputs, run.parameters, run.time_s, run.initial)) for run in runs]
+
+    @staticmethod
+    def _begin_of(segment: Segment) -> dict[str, float]:
+        begin = segment.begin
+        return {} if begin is None else dict(zip(begin.names, map(float, begin.values), strict=True))
+
+    def _run_of(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> SimulatorRun:
+        begin = self._begin_of(segment)
+        given = {}
+        for name in self.section.inputs:
+            signal = segment.inputs[name] + begin.get(f"offset:{name}", 0.0)
+            given[name] = apply_effects(signal, active, name, segment, None)
+        values = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
+        for candidate, its in active:
+            if candidate.port.offers:
+                values[candidate.port.name] = float(its[0])
+        # A reading with an offset of its own begins that much away from the state.
+        initial = {
+            name: value - begin.get(f"offset:{name}", 0.0) for name, value in begin.items() if not name.startswith("offset:")
+        }
+        return SimulatorRun(given, values, segment.recording.time_s, initial)
+
+    def _checked(self, run: SimulatorRun, found: Mapping[str, Array]) -> Array:
+        rows = []
+        for name in self.section.outputs:
+            row = np.asarray(found[name] if isinstance(found, Mapping) and name in found else np.nan, dtype=np.float64)
+            if row.shape != run.time_s.shape:
+                raise InputError(
+                    f"{self.kind}.outputs",
+                    f"{name} of shape {row.shape} from {self.label}",
+                    f"a dictionary with {name} of shape {run.time_s.shape}",
+                )
+            rows.append(row)
+        return np.vstack(rows)
+
+    def _keep(self, key: Hashable, whole: Array) -> None:
+        self._kept[key] = whole
+        self._kept.move_to_end(key)
+        while len(self._kept) * whole.nbytes > KEPT_BYTES and len(self._kept) > 1:
+            self._kept.popitem(last=False)
+
+    @property
+    def label(self) -> str:
+        """Name of the simulator in messages."""
+        return self.kind
+
+    def announce(self, segments: list[Segment], theta: Array) -> str:
+        """What the diagnosis costs in simulations, from one simulation of each recording that is fitted."""
+        used = [segment for segment in segments if segment.fit.any()]
+        before, spent = self.calls, self.call_s
+        self.simulate_all(used, theta, [])
+        each = (self.call_s - spent) / max(self.calls - before, 1)
+        offers = sum(len(effect.parameters(UNSCALED, "")[0].grid) for port in self.ports for effect in port.offers)
+        screening = len(used) * (2 * len(self.section.inputs) + offers + len(self.parameters))
+        fits = len(used) * FITS * (FIT_CALLS + 10 * len(self.parameters))
+        return (
+            f"one simulation takes {each * 1e3:.3g} ms; a round of screening takes about {screening} of them "
+            f"({screening * each:.0f} s), the fits of a round up to {fits} ({fits * each:.0f} s)"
+        )
+
+    def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, StepResponse]:
+        """Step response of the outputs for each input that answers linearly enough, by two simulations.
+
+        The simulator alone is linearized, about the inputs that the active effects leave of the recorded ones.
+        """
+        behind = [effect for effect in active if effect[0].port.name not in self.section.inputs]
+        given = {name: apply_effects(segment.inputs[name], active, name, segment, None) for name in self.section.inputs}
+        changed = replace(segment, inputs={**segment.inputs, **given})
+        base = self.simulate(changed, theta, behind)
+        found = {}
+        for name in self.section.inputs:
+            here = [effect for effect in active if effect[0].port.name == name]
+            size = STEP * (float(np.ptp(given[name])) or 1.0)
+            step = (self._moved(changed, theta, behind, name, np.full(segment.n, size)) - base) / size
+            trial = 0.5 * size * _trial(given[name])
+            change = self._moved(changed, theta, behind, name, trial) - base
+            answers = [StepResponse(here, prompt=step), StepResponse(here, impulse=_impulse(step))]
+            error, best = min((_misfit(answer.to(trial), change), k) for k, answer in enumerate(answers))
+            if error < TRUSTED:
+                found[name] = answers[best]
+        return found
+
+    def _moved(self, segment: Segment, theta: Array, active: list[ActiveEffect], name: str, by: Array) -> Array:
+        moved = replace(segment, inputs={**segment.inputs, name: segment.inputs[name] + by})
+        return self.simulate(moved, theta, active)
+
+    def change(
+        self, segment: Segment, theta: Array, slopes: dict[str, StepResponse], candidate: Candidate, values: Array
+    ) -> Array:
+        """Linearized change of the outputs (outputs, n) by a candidate at an input, after the effects that act there."""
+        name = candidate.port.name
+        here, u = slopes[name].active, segment.inputs[name]
+        before = apply_effects(u, here, name, segment, None)
+        return slopes[name].to(apply_effects(u, [*here, (candidate, values)], name, segment, None) - before)
+
+    def answer(self, slope: StepResponse, moved: Array) -> Array:
+        """Change of the outputs (outputs, n) when an input changes by `moved` (n,)."""
+        return slope.to(moved)
+
+    def motion(self, segment: Segment, port: Port) -> Array:
+        """The input at its port, or the measured output."""
+        if port.name in segment.inputs:
+            return segment.inputs[port.name]
+        row = segment.y[self.section.outputs.index(port.channels[0])]
+        return np.where(np.isfinite(row), row, np.nanmedian(row))
+
+    def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
+        """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their
+        noise.
+        """
+        if port.name not in segment.inputs:
+            return np.asarray(residual[self.section.outputs.index(port.channels[0])])
+        step = 1e-4 * (float(np.ptp(segment.inputs[port.name])) or 1.0)
+        moved = self._moved(segment, theta, [], port.name, np.full(segment.n, step))
+        slope = (moved - self.simulate(segment, theta, [])) / step
+        weight = segment.weights()
+        s = np.where(np.isfinite(residual), slope, 0.0) / weight
+        return np.asarray(
+            np.sum(s * np.nan_to_num(residual) / weight, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300)
+        )
+
+
+UNSCALED = Scale("", 1.0, 0.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True)
+
+
+def offered(offer: OfferSpec) -> Effect:
+    """The effect that `offer` stands for: its words are those of the vocabulary. Raises InputError for an id outside it."""
+    known = {effect.id for effect in library()}
+    if offer.id not in known:
+        raise InputError("offer.id", offer.id, "one of " + ", ".join(sorted(known)))
+    name = offer.parameter.rpartition(".")[2]
+    positive = offer.low >= 0.0 and offer.off == offer.low
+    size = offer.high - offer.low
+    if offer.tried:
+        tried = tuple(offer.tried)
+    elif positive:
+        tried = spread(offer.low + 1e-3 * size, offer.low + 0.4 * size, 5)
+    else:
+        tried = tuple(float(v) for v in np.linspace(offer.low, offer.high, 7)[1:-1] if abs(v - offer.off) > 1e-3 * size)
+    positive = positive and offer.low == 0.0
+    low = 1e-6 * size if positive else offer.low
+    parameter = Parameter(name, offer.unit, tried, low, offer.high, log=positive, step=0.05 * size)
+
+    def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+        return (parameter,)
+
+    says = f"{offer.id.replace('_', ' ')}: the simulator's {offer.parameter} is {{{name}}} and not {offer.off:g}."
+    return Effect(offer.id, "offered", 0, parameters, says, f"{offer.parameter} = {name}", at_rest=True)
+
+
+def first_state(row: Array, dt_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Value and rate of an output (n,) at its first sample, and their standard deviations.
+
+    A cubic over the first samples gives both; the scatter of the samples about the smoothed output gives the deviations.
+    """
+    y = fill(row)
+    window = max(BEGIN_SAMPLES, round(BEGIN_S / dt_s) | 1)
+    window = min(window, y.size | 1)
+    x, v, _ = smooth_derivatives(y, dt_s, window)
+    first = slice(0, min(y.size, 20 * window))
+    noise = float(np.std((y - x)[first])) * float(np.sqrt(window / max(window - 4.0, 1.0)))
+    t = np.arange(window) / (window - 1.0)
+    V = np.vander(t, 4, increasing=True)
+    sd = 1.5 * noise * np.sqrt(np.diag(np.linalg.inv(V.T @ V))[:2]) / np.array([1.0, (window - 1.0) * dt_s])
+    return (float(x[0]), float(v[0])), (max(float(sd[0]), 1e-300), max(float(sd[1]), 1e-300))
+
+
+def _trial(u: Array) -> Array:
+    """A change (n,) of size one that has what candidates change: memory of the direction, and a late copy."""
+    centred = (u - u.mean()) / (float(np.std(u)) or 1.0)
+    late = np.concatenate([np.full(5, centred[0]), centred[:-5]])
+    return np.asarray(0.5 * np.sign(np.gradient(u)) + 0.5 * late)
+
+
+def _impulse(step: Array) -> Array:
+    """Impulse response (outputs, k) from a step response (outputs, n)."""
+    return np.diff(step[:, :MOST_DYNAMIC], axis=1, prepend=0.0)
+
+
+def _misfit(predicted: Array, change: Array) -> float:
+    """Error of a predicted change (outputs, n) relative to the change, of the output it fits worst."""
+    size = np.sqrt(np.mean(change**2, axis=1))
+    error = np.sqrt(np.mean((predicted - change) ** 2, axis=1))
+    seen = size > 1e-9 * float(np.max(size, initial=0.0))
+    return float(np.max(error[seen] / size[seen], initial=0.0)) if np.isfinite(error).all() else np.inf

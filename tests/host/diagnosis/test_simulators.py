@@ -1,0 +1,201 @@
+"""Simulators as nominal models: what they offer competes, they are told where a recording starts, and runs are reused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from numba import njit
+from typer.testing import CliRunner
+
+import seldinger as sd
+from host.cli.diagnose import diagnose as diagnose_command
+from host.diagnosis.model.effect import Array
+from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import prepare
+from protocol.errors import InputError
+
+DT_S = 0.005
+
+
+@njit(cache=True)
+def slide(u: Array, x0: float, v0: float, mass: float, damping: float, stiffness: float, friction: float) -> Array:
+    """Position of a sprung slide with dry friction, force held between samples, 20 steps a sample."""
+    out = np.empty(u.size)
+    x, v, h = x0, v0, DT_S / 20
+    for i in range(u.size):
+        out[i] = x
+        for _ in range(20):
+            v += h * (u[i] - damping * v - stiffness * x) / mass
+            held = h * friction / mass
+            v = v - held if v > held else v + held if v < -held else 0.0
+            x += h * v
+    return out
+
+
+def simulator(inputs: dict[str, Array], p: dict[str, float], time_s: Array, initial: dict[str, float]) -> dict[str, Array]:
+    """The slide as a callable; `dry` is nominally off."""
+    x = slide(inputs["force"], initial["x"], initial["x_rate"], 0.5, p["damping"], p["stiffness"], p["dry"])
+    return {"x": x}
+
+
+NOMINAL: dict[str, Any] = {
+    "name": "slide",
+    "kind": "callable",
+    "data": {"time": "t"},
+    "channels": {"force": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
+    "callable": {
+        "function": simulator,
+        "inputs": ["force"],
+        "outputs": ["x"],
+        "ports": {"force": "motor", "x": "scale"},
+        "subsystem": "slide",
+    },
+    "parameters": {
+        "damping": {"value": 1.0, "low": 0.0, "high": 50.0, "unit": "N s/m"},
+        "stiffness": {"value": 80.0, "low": 1.0, "high": 1000.0, "unit": "N/m"},
+    },
+    "offer": [{"id": "coulomb_friction", "parameter": "dry", "high": 20.0, "unit": "N"}],
+}
+
+
+def recorded(seed: int, dry: float, samples: int = 1500) -> dict[str, Array]:
+    """A recording that is cut from motion: its first two seconds are thrown away."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples + 400) * DT_S
+    f = sum(4.0 / (1 + k) * np.sin(2 * np.pi * w * t + rng.uniform(0, 6.28)) for k, w in enumerate((0.37, 0.83, 1.61)))
+    x = slide(f, 0.0, 0.0, 0.5, 3.0, 100.0, dry) + 2e-5 * rng.standard_normal(t.size)
+    return {"t": t[400:] - t[400], "f": f[400:], "x": x[400:]}
+
+
+@pytest.mark.slow
+def test_a_parameter_that_the_simulator_offers_is_named() -> None:
+    verdict = sd.diagnose([recorded(k, 0.6) for k in range(3)], NOMINAL)
+    (effect,) = verdict.effects
+    assert (effect["id"], effect["subsystem"], effect["port"]) == ("coulomb_friction", "slide", "dry")
+    assert effect["parameters"]["dry_N"]["value"] == pytest.approx(0.6, rel=0.05)
+    fitted = verdict.as_dict()["fit"]["nominal_parameters"]
+    assert fitted["stiffness_N_per_m"]["value"] == pytest.approx(100.0, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_recording_cut_from_motion_is_no_missing_physics() -> None:
+    verdict = sd.diagnose([recorded(k, 0.0) for k in range(3)], NOMINAL)
+    assert verdict.verdict == "nothing_missing"
+    fit = verdict.as_dict()["fit"]
+    assert fit["rmse_after"] < 1.2 * 2e-5
+    assert fit["nominal_parameters"]["damping_N_s_per_m"]["value"] == pytest.approx(3.0, rel=0.02)
+
+
+def tables(*recordings: dict[str, Array]) -> list[Table]:
+    return [Table(f"r{k}", columns) for k, columns in enumerate(recordings)]
+
+
+def test_ports_have_subsystems_of_their_own() -> None:
+    model, _, _ = prepare(nominal_of(NOMINAL), tables(recorded(1, 0.0, 300)))
+    assert {port.name: port.subsystem for port in model.ports} == {"force": "motor", "x_reading": "scale", "dry": "slide"}
+
+
+def test_the_same_run_is_simulated_once() -> None:
+    model, problem, _ = prepare(nominal_of(NOMINAL), tables(recorded(1, 0.0, 300)))
+    theta = model.guess(problem.segments)
+    first = model.simulate(problem.segments[0], theta, [])
+    calls = model.calls  # type: ignore[attr-defined]
+    assert np.array_equal(first, model.simulate(problem.segments[0], theta, []))
+    assert model.calls == calls  # type: ignore[attr-defined]
+    theta[0] *= 1.1
+    model.simulate(problem.segments[0], theta, [])
+    assert model.calls == calls + 1  # type: ignore[attr-defined]
+
+
+def test_every_recording_may_have_an_offset_of_its_own() -> None:
+    nominal = {**NOMINAL, "channels": {**NOMINAL["channels"], "x": {"column": "x", "unit": "m", "session_offset": True}}}
+    given = []
+    for k, offset in enumerate((0.01, -0.02)):
+        columns = recorded(k, 0.0, 1200)
+        given.append({**columns, "x": columns["x"] + offset})
+    from host.diagnosis.selection.search import fit_nominal, refined
+
+    _, problem, _ = prepare(nominal_of(nominal), tables(*given))
+    fit = refined(problem, fit_nominal(problem))
+    found = [dict(zip(s.begin.names, s.begin.values, strict=True))["offset:x"] for s in problem.segments if s.begin]
+    assert found[0] - found[1] == pytest.approx(0.03, abs=2e-4)
+    assert dict(zip(("damping", "stiffness"), fit.values, strict=True))["stiffness"] == pytest.approx(100.0, rel=0.03)
+
+
+def test_what_is_linearized_predicts_a_simulation() -> None:
+    from host.diagnosis.effects import candidates
+
+    model, problem, _ = prepare(nominal_of(NOMINAL), tables(recorded(1, 0.0, 800)))
+    segment, theta = problem.segments[0], np.array([3.0, 100.0])
+    slopes = model.slopes(segment, theta, [])
+    late = next(c for c in candidates(model.ports, True) if c.key == "latency@force")
+    change = model.change(segment, theta, slopes, late, np.array([0.01]))
+    exact = model.simulate(segment, theta, [(late, np.array([0.01]))]) - model.simulate(segment, theta, [])
+    assert np.max(np.abs(change - exact)) < 0.01 * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "wanted"),
+    [
+        ("offer", [{"id": "glue", "parameter": "dry", "high": 1.0}], "offer.id"),
+        ("offer", [{"id": "backlash", "parameter": "dry", "high": -1.0}], "low <= off <= high"),
+        ("offer", [{"id": "backlash", "parameter": "damping", "high": 1.0}], "offer.parameter"),
+        ("parameters", {"damping": {"value": 3.0, "low": 5.0}}, "low <= value <= high"),
+        ("callable", {**NOMINAL["callable"], "ports": {"y": "motor"}}, "ports"),
+        ("callable", {**NOMINAL["callable"], "function": 3}, "module:name"),
+    ],
+)
+def test_a_nominal_that_cannot_be_is_bad_input(key: str, value: Any, wanted: str) -> None:
+    with pytest.raises(InputError, match=wanted):
+        prepare(nominal_of({**NOMINAL, key: value}), tables(recorded(1, 0.0, 300)))
+
+
+MODULE = "def reach(inputs, parameters, time_s):\n    return {'y': parameters['gain'] * FACTOR * inputs['u']}\n"
+TOML = """
+name = "lever"
+kind = "callable"
+data = {time = "t"}
+channels = {u = {column = "u", unit = "m"}, y = {column = "y", unit = "m"}}
+callable = {function = "lever:reach", inputs = ["u"], outputs = ["y"], workers = 2}
+parameters = {gain = 1.0}
+"""
+
+
+def lever(folder: Path, factor: float) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "lever.py").write_text(MODULE.replace("FACTOR", str(factor)))
+    (folder / "lever.toml").write_text(TOML)
+    return folder / "lever.toml"
+
+
+def test_modules_of_one_name_in_two_folders_are_two_and_run_in_parallel(tmp_path: Path) -> None:
+    from host.diagnosis.model.nominal import read_nominal
+
+    t = np.arange(100) * 0.01
+    for factor in (2.0, 3.0):
+        spec = read_nominal(lever(tmp_path / f"f{factor:.0f}", factor))
+        model, problem, _ = prepare(spec, tables(*[{"t": t, "u": np.sin(k * t), "y": t} for k in (1, 2, 3)]))
+        out = model.simulate_all(problem.segments, np.array([1.0]), [])
+        assert np.allclose(out[2][0], factor * np.sin(3 * t))
+
+
+def test_code_that_others_may_write_is_refused(tmp_path: Path) -> None:
+    nominal = lever(tmp_path / "shared", 1.0)
+    t = np.arange(100) * 0.01
+    np.savez(tmp_path / "r.npz", t=t, u=np.sin(t), y=np.sin(t))
+    arguments = [str(tmp_path / "r.npz"), "--nominal", str(nominal), "--json", "--time-budget", "0"]
+    app = typer.Typer()
+    app.command()(diagnose_command)
+    os.chmod(nominal.with_suffix(".py"), 0o666)
+    with pytest.raises(InputError, match=r"lever\.py runs code and may be written by every user"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+    trusted = CliRunner().invoke(app, [*arguments, "--trust"], catch_exceptions=False)
+    assert trusted.exit_code == 0 and "with your rights" in trusted.stderr
+    os.chmod(nominal.with_suffix(".py"), 0o644)
+    assert CliRunner().invoke(app, arguments, catch_exceptions=False).exit_code == 0
