@@ -39,7 +39,8 @@ def diagnose(
         typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as the report gives it."),
     ] = None,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Run the code that the nominal TOML names, whoever may have written it.")
+        bool,
+        typer.Option("--trust", help="Run the code that the nominal TOML names even if another user may have written it."),
     ] = False,
 ) -> None:
     """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""

@@ -229,8 +229,8 @@ class LinearSpec(SimulatorSpec):
 class MujocoSpec(SimulatorSpec):
     """A model file of MuJoCo (MJCF). `actuators`, `sensors`: channel -> name in the file.
 
-    A parameter is named `element.attribute` (`hinge.damping`, `forearm.mass`, `motor.gear`). `offers`: what competes
-    besides [[offer]]: `all` that MuJoCo has for the joints, actuators and bodies in use, or `none`.
+    A parameter is named `element.attribute` (`hinge.damping`, `forearm.mass`, `motor.gear`). `offers`: what competes,
+    and [[offer]]: `all` that MuJoCo has for the joints, actuators and bodies in use, or `none`.
     """
 
     model: str

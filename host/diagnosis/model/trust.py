@@ -29,7 +29,7 @@ def code_path(spec: NominalSpec) -> Path | None:
 
 
 def check_owner(*paths: Path) -> None:
-    """Refuse code that somebody else could have written.
+    """Refuse code that another user could have written.
 
     Raises:
         InputError: a file that belongs to another user (root apart), that others may write, or that lies in a folder
