@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, SupportsFloat
 
+from protocol.stop_client import PathAnswer
 from protocol.topics import Command, Reply, check_name
 
 LIFE_NS = 500_000_000
@@ -22,12 +23,14 @@ _PROMPT_NS = 100_000_000
 class Acknowledgement:
     """Result of a command. `reason`: why it was refused; empty when it was accepted.
 
-    result: as in Reply, or `unanswered`: it may or may not have been carried out.
+    result: as in Reply, or `unanswered`: it may or may not have been carried out; or, of a stop, `not confirmed`: the rig's
+    own state did not show it in time. paths: of a stop, what each path to the rig answered.
     """
 
     accepted: bool
     reason: str
     result: str
+    paths: tuple[PathAnswer, ...] = ()
 
 
 class Asker(Protocol):

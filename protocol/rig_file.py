@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import ipaddress
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from protocol import board_pins, loop_margin
 from protocol.errors import InputError, reason
+from protocol.local_paths import LocalPaths, local_paths
 from protocol.requests import wanted_of
 from protocol.topics import check_name
 from protocol.zenoh_access import Network, check_network_endpoint
@@ -245,10 +247,21 @@ class Safety(_Section):
 
 
 class Zenoh(_Section):
-    """Zenoh endpoints: where the model process listens, where the others connect."""
+    """How programs of this computer reach the rig: the folder of its sockets, and endpoints that are opened in addition.
 
-    listen: list[str]
-    connect: list[str]
+    The model process listens on a unix socket in `folder` and on `listen`; the others connect to `connect`, where that is
+    empty to the socket. An endpoint tcp/127.0.0.1:PORT admits every program of every user of this computer.
+    """
+
+    folder: str = ""
+    listen: list[str] = []
+    connect: list[str] = []
+
+    @model_validator(mode="after")
+    def _absolute(self) -> Zenoh:
+        if self.folder and not re.fullmatch(r"/[^\s#?;]*", self.folder):
+            raise ValueError("folder: an absolute path without spaces, #, ? and ;")
+        return self
 
 
 class NetworkAccess(_Section):
@@ -287,7 +300,7 @@ class Rig(_Section):
     board: BoardSection
     control: ControlSection
     safety: Safety
-    zenoh: Zenoh
+    zenoh: Zenoh = Zenoh()
     network: NetworkAccess = NetworkAccess()
 
     @model_validator(mode="after")
@@ -327,6 +340,21 @@ class Rig(_Section):
     def stage(self, axis: int) -> StageSection:
         """The stage of axis 0 insertion, 1 roll or 2 knob."""
         return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
+
+    @property
+    def local(self) -> LocalPaths:
+        """The rig's folder on this computer."""
+        return local_paths(self.name, self.zenoh.folder)
+
+    @property
+    def listen_endpoints(self) -> list[str]:
+        """Where the model process listens for programs of this computer."""
+        return [self.local.endpoint, *self.zenoh.listen]
+
+    @property
+    def connect_endpoints(self) -> list[str]:
+        """Where all other processes connect."""
+        return self.zenoh.connect or [self.local.endpoint]
 
     @property
     def access(self) -> Network | None:

@@ -14,6 +14,9 @@ from typing import Any
 
 import zenoh
 
+from protocol.local_paths import SOCKET_MODE, LocalPaths
+from protocol.reply_seal import is_proved
+from protocol.rig_file import Rig
 from protocol.topics import MAX_PAYLOAD_BYTES, TOPICS, Command, Message, Reply, decode, encode, key, request_key, topic_of
 from protocol.zenoh_access import Network, check_network_endpoint, client_settings, network_settings
 
@@ -180,13 +183,21 @@ class Everything:
 class RequestServer:
     """Answers requests, one at a time: answer(name, payload) -> Reply, None for no reply at all.
 
+    prove(payload) -> proof goes with each reply, so that a client can refuse replies of other programs.
+
     `name` is the last part of the key that a request came on. Across machines the access control of the session that
     listens there lets a certificate ask under its own name only. Requests wait in a ring of zenoh's: what a flood puts
     there beyond what one thread takes in its turns is dropped, and costs the other threads of this process nothing.
     """
 
-    def __init__(self, session: zenoh.Session, rig: str, answer: Callable[[str, bytes], Reply | None]) -> None:
-        self._prefix, self._give = f"{key(rig, 'request')}/", answer
+    def __init__(
+        self,
+        session: zenoh.Session,
+        rig: str,
+        answer: Callable[[str, bytes], Reply | None],
+        prove: Callable[[bytes], bytes] | None = None,
+    ) -> None:
+        self._prefix, self._give, self._prove = f"{key(rig, 'request')}/", answer, prove
         self.failures = 0
         self._queryable = session.declare_queryable(
             request_key(rig, "*"), zenoh.handlers.RingChannel(_REQUESTS_WAITING), complete=True
@@ -218,7 +229,8 @@ class RequestServer:
             try:
                 reply = self._give(name, b"" if query.payload is None else bytes(query.payload))
                 if reply is not None and "*" not in name:
-                    query.reply(query.key_expr, encode(reply))
+                    said = encode(reply)
+                    query.reply(query.key_expr, said, attachment=None if self._prove is None else self._prove(said))
             except Exception:  # one request must not end the answering of all others, a stop among them
                 self.failures += 1
                 logger.exception("request from %s failed", name[:40])
@@ -238,16 +250,41 @@ class Session:
 
     listen, connect: endpoints, as in `check_endpoint`; network: for other machines too. Normally one process
     listens and the others connect to it; those also reach each other through it. Who starts first does not matter.
+    local: the rig's folder on this computer; with it only replies that the realtime process has proved are taken.
     Raises ValueError for an endpoint that leaves this machine, OSError where it cannot listen.
     """
 
-    def __init__(self, rig: str, listen: list[str], connect: list[str], network: Network | None = None) -> None:
+    def __init__(
+        self,
+        rig: str,
+        listen: list[str],
+        connect: list[str],
+        network: Network | None = None,
+        local: LocalPaths | None = None,
+    ) -> None:
         key(rig, "state")
-        self.rig = rig
+        self.rig, self.local = rig, local
         self._servers: list[RequestServer] = []
         self.zenoh = _open(
             configuration(listen, connect, network), listen + list(network.listen if network is not None else ())
         )
+
+    @classmethod
+    def of_rig(cls, rig: Rig) -> Session:
+        """A session that connects to the rig of a rig file on this computer."""
+        return cls(rig.name, [], rig.connect_endpoints, local=rig.local)
+
+    @classmethod
+    def hub(cls, rig: Rig) -> Session:
+        """The session at which all others of the rig meet: on the socket in its folder, and where the rig file says.
+
+        Raises InputError for a folder that other users can write, OSError where it cannot listen.
+        """
+        paths = rig.local.prepare()
+        session = cls(rig.name, rig.listen_endpoints, [], rig.access, paths)
+        if paths.zenoh_socket.exists():  # zenoh leaves it to its user alone; the folder's group is to connect
+            paths.zenoh_socket.chmod(SOCKET_MODE)
+        return session
 
     @classmethod
     def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
@@ -257,7 +294,7 @@ class Session:
         """
         key(rig, "state")
         session = cls.__new__(cls)
-        session.rig, session._servers = rig, []
+        session.rig, session.local, session._servers = rig, None, []
         session.zenoh = _open(zenoh.Config.from_json5(json.dumps(client_settings(endpoint, keys))), [])
         return session
 
@@ -273,27 +310,50 @@ class Session:
         """All topics, for who records."""
         return Everything(self.zenoh, self.rig)
 
-    def serve_requests(self, answer: Callable[[str, bytes], Reply | None]) -> RequestServer:
+    def serve_requests(
+        self, answer: Callable[[str, bytes], Reply | None], prove: Callable[[bytes], bytes] | None = None
+    ) -> RequestServer:
         """Answer requests with `answer`; see RequestServer."""
-        server = RequestServer(self.zenoh, self.rig, answer)
+        server = RequestServer(self.zenoh, self.rig, answer, prove)
         self._servers.append(server)
         return server
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        """Send `command`, wait for its reply; None where no answer arrives in time: it may or may not have arrived."""
+        """Send `command`, wait for its reply; None where no answer arrives in time: it may or may not have arrived.
+
+        Every program that says it answers requests gets the command: an impostor cannot keep it from the rig. Of the
+        replies the first counts that is one to this command and, on the rig's computer, is proved.
+        """
         try:
             replies = self.zenoh.get(
                 request_key(self.rig, command.commander),
                 payload=encode(command),
                 timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
+            for answer in replies:
+                reply = self._reply_of(answer, command)
+                if reply is not None:
+                    return reply
         except zenoh.ZError:
-            return None
-        for reply in replies:
-            if reply.ok is not None:
-                return decode(Reply, bytes(reply.ok.payload))
+            pass
         return None
+
+    def _reply_of(self, answer: zenoh.Reply, command: Command) -> Reply | None:
+        if answer.ok is None:
+            return None
+        payload = bytes(answer.ok.payload)
+        proof = b"" if answer.ok.attachment is None else bytes(answer.ok.attachment)
+        if self.local is not None and not is_proved(self.local.reply_key, payload, proof):
+            return None
+        try:
+            reply = decode(Reply, payload)
+        except ValueError:
+            return None
+        # What cannot be read as a command has no id to be answered under.
+        return reply if reply.id == command.id or reply.result == "malformed" else None
 
     def close(self) -> None:
         """Undeclare everything, close the links and end the threads that answer."""

@@ -6,7 +6,7 @@ import msgpack
 import zenoh
 
 CLIENT = '{mode: "client", connect: {endpoints: ["%s"], timeout_ms: -1}, scouting: {multicast: {enabled: false}}}'
-where = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7451"
+where = sys.argv[1] if len(sys.argv) > 1 else "unixsock-stream//run/seldinger/zenoh.sock"
 config = zenoh.Config.from_file(where) if where.endswith(".json5") else zenoh.Config.from_json5(CLIENT % where)
 with zenoh.open(config) as session:
     latest = session.declare_subscriber("seldinger/v1/*/state", zenoh.handlers.RingChannel(1))

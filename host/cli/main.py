@@ -40,6 +40,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "plan": ("host.cli.plan", "plan", "Plan a path of the tip past obstacles, from a JSON request."),
     "faults": ("host.cli.faults", "faults", "Inject faults in every phase on the simulated rig; report their detection."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
+    "stop": ("host.cli.stop", "stop", "Stop the rig over every path; say whether its own state confirms it."),
     "check-device": (
         "host.cli.check_device",
         "check_device",

@@ -1,24 +1,36 @@
-"""A commander on the wall clock: the same, and a thread that keeps its lease as long as it is wanted."""
+"""A commander on the wall clock: its lease is kept by a thread, and a stop goes over every path and is confirmed."""
 
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
-from protocol.commander import Acknowledgement, Asker, CommandSender
+from protocol.commander import Acknowledgement, CommandSender
+from protocol.stop_client import CONFIRM_S, PathAnswer, stop_by_socket, stop_over
+from protocol.topics import RigState
+from protocol.zenoh_session import Session
 
 RENEW_S = 1.0
+# Phases in which the loop moves nothing.
+STOPPED_MODES = ("stopped", "disarmed")
+_POLL_S = 0.002
 
 
 class Commander(CommandSender):
     """`protocol.commander.CommandSender` whose lease is renewed in the background, from `take` to `release` or `close`.
 
+    A stop is sent over zenoh and, on the rig's computer, over the realtime process's own socket at the same time. It is
+    accepted only if the rig's own state shows it within `confirm_s`.
+
     Use as a context, or `close` it: an unclosed one keeps others from commanding as long as its process lives.
     """
 
-    def __init__(self, session: Asker, name: str, **options: Any) -> None:
+    def __init__(self, session: Session, name: str, *, confirm_s: float = CONFIRM_S, **options: Any) -> None:
         super().__init__(session, name, **options)
         self._wanted, self._ending = threading.Event(), threading.Event()
+        self._zenoh, self._confirm_s = session, confirm_s
+        self._states = session.latest("state")
         self.lost = ""
         self._keeper: threading.Thread | None = None
 
@@ -42,6 +54,41 @@ class Commander(CommandSender):
             self._wanted.clear()
             return super().release()
 
+    def stop(self) -> Acknowledgement:
+        """Stop over every path at once. Accepted if the rig's own state shows the stop within `confirm_s`.
+
+        Only disarming and arming lead out of it. Needs no lease, is obeyed late too.
+        """
+        local = self._zenoh.local
+        paths = {"zenoh": self.stop_by_zenoh}
+        if local is not None:
+            paths["socket"] = lambda: stop_by_socket(local)
+        return stop_result(stop_over(paths))
+
+    def stop_by_zenoh(self) -> PathAnswer:
+        """Stop over zenoh alone, and wait until the rig's published state shows it or `confirm_s` is over."""
+        self._states.take()
+        answer = super().stop()
+        if answer.result == "unanswered":
+            return PathAnswer(
+                "zenoh", False, False, "no answer: the model process or the realtime process is dead or stalled"
+            )
+        if not answer.accepted:
+            return PathAnswer("zenoh", True, False, answer.reason)
+        begin_s, mode = time.monotonic(), "no state"
+        while True:
+            state = self._states.take()
+            if isinstance(state, RigState):
+                mode = state.mode
+            after_s = time.monotonic() - begin_s
+            if mode in STOPPED_MODES:
+                return PathAnswer("zenoh", True, True, f"{mode}, seen {after_s * 1e3:.0f} ms after the answer")
+            if after_s > self._confirm_s:
+                return PathAnswer(
+                    "zenoh", True, False, f"accepted, but the rig's state is {mode} after {after_s * 1e3:.0f} ms"
+                )
+            time.sleep(_POLL_S)
+
     def close(self) -> None:
         """Release what is held and end the thread."""
         if self._wanted.is_set():
@@ -63,4 +110,12 @@ class Commander(CommandSender):
         self.close()
 
 
-__all__ = ["Acknowledgement", "Commander"]
+def stop_result(paths: tuple[PathAnswer, ...]) -> Acknowledgement:
+    """Return the result of a stop that was sent over `paths`: accepted if the rig confirmed it on one of them."""
+    if any(path.confirmed for path in paths):
+        return Acknowledgement(True, "", "accepted", paths)
+    said = "; ".join(f"{path.path}: {path.text}" for path in paths)
+    return Acknowledgement(False, f"not confirmed: {said}. Use the emergency stop", "not confirmed", paths)
+
+
+__all__ = ["Acknowledgement", "Commander", "stop_result"]

@@ -217,7 +217,7 @@ def connect(
 
             session = Session.remote(read.name, endpoint, Path(keys))
         else:
-            session = Session(read.name, [], read.zenoh.connect)
+            session = Session.of_rig(read)
         return RigConnection(read, session, name)
     except ValueError as error:
         raise InputError.from_sentence(str(error)) from None

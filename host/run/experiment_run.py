@@ -130,7 +130,7 @@ class LiveCommands:
 
 def run_live(script: Script, rig: Rig, progress: Callable[[float], None]) -> None:
     """Perform `script` on the running rig of the rig file; its own services record. Raises RuntimeError."""
-    with Session(rig.name, [], rig.zenoh.connect) as session, Commander(session, "experiment") as commander:
+    with Session.of_rig(rig) as session, Commander(session, "experiment") as commander:
         commands = LiveCommands(session, commander)
         taken = commander.take()
         if not taken.accepted:

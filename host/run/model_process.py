@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         rig = load_rig(options.rig)
         estimator = load_estimator(options.estimator, rig)
-        session = Session(rig.name, rig.zenoh.listen, [], rig.access)
+        session = Session.hub(rig)
     except (ValueError, OSError) as error:
         print(f"seldinger estimator: {error}", file=sys.stderr)
         return 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import numpy as np
 from host.recordings.writer import new_recording_path
 from host.run.commander import Commander
 from host.run.demo import DemoRun, DemoSettings, Progress
+from protocol.local_paths import LocalPaths
 from protocol.rig_file import load_rig
 from protocol.topics import LoopTiming, RigState
 from protocol.zenoh_session import Session
@@ -33,16 +33,16 @@ _STOP_TIMEOUT_S = 20.0  # for all to end of themselves; a recorder that is kille
 class Fleet:
     """The three processes. Use as a context: leaving it stops everything in order.
 
-    loop: with the realtime process; without it the caller runs the loop, on `ports`. endpoint: where it listens, one
-    of its own, so that fleets do not meet.
+    loop: with the realtime process; without it the caller runs the loop, on `ports`. endpoint: where it listens, in a
+    folder of its own, so that fleets do not meet.
     """
 
     def __init__(self, settings: DemoSettings, recording: Path, loop: bool = True) -> None:
         self._settings, self._recording, self._loop = settings, recording, loop
-        self.endpoint = f"tcp/127.0.0.1:{_free_port()}"
         self.ports: dict[str, Any] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
         self.rig_file = Path(self._folder.name) / "rig.toml"
+        self.endpoint = LocalPaths(Path(self._folder.name)).endpoint
         self.processes: dict[str, subprocess.Popen[str]] = {}
         self.rig_summary: dict[str, Any] = {}
 
@@ -59,9 +59,7 @@ class Fleet:
 
     def _start(self) -> None:
         text = self._settings.rig_file.read_text(encoding="utf-8")
-        self.rig_file.write_text(with_endpoint(text, self.endpoint), encoding="utf-8")
-        if load_rig(self.rig_file).zenoh.listen != [self.endpoint]:
-            raise OSError(f"{self._settings.rig_file}: found no section [zenoh] that could be given a port of its own")
+        self.rig_file.write_text(with_folder(text, Path(self._folder.name)), encoding="utf-8")
         rig = str(self.rig_file)
         planted = [word for text in self._settings.effects for word in ("--effect", text)]
         self.ports = ports = json.loads(
@@ -120,7 +118,7 @@ class Fleet:
     def wait_for_state(self, seconds: float = _START_TIMEOUT_S) -> None:
         """Wait for the loop's first state. Raises OSError where a process ends, or none comes in time."""
         rig, until = load_rig(self.rig_file), time.monotonic() + seconds
-        with Session(rig.name, [], rig.zenoh.connect) as session:
+        with Session.of_rig(rig) as session:
             states = session.latest("state")
             while states.take() is None:
                 if self.dead():
@@ -167,7 +165,7 @@ class Operator:
 
     def __init__(self, fleet: Fleet) -> None:
         rig = load_rig(fleet.rig_file)
-        self._fleet, self.session = fleet, Session(rig.name, [], rig.zenoh.connect)
+        self._fleet, self.session = fleet, Session.of_rig(rig)
         self.commander = Commander(self.session, "demo")
         self._states, self._loops = self.session.latest("state"), self.session.latest("loop")
         self.state: RigState | None = None
@@ -289,15 +287,7 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     operator.commander.disarm()
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def with_endpoint(text: str, endpoint: str) -> str:
-    """The rig file's text with the endpoints in its section [zenoh] replaced, so that two runs do not meet."""
-    before, zenoh, after = re.split(r"^(\[zenoh\])", text, maxsplit=1, flags=re.M)
-    own, other, rest = re.match(r"(.*?)(^\[|\Z)(.*)", after, flags=re.M | re.S).groups()  # type: ignore[union-attr]
-    own = re.sub(r"^(listen|connect)(\s*=\s*)\[[^\]]*\]", rf'\1\2["{endpoint}"]', own, flags=re.M)
-    return before + zenoh + own + other + rest
+def with_folder(text: str, folder: Path) -> str:
+    """The rig file's text with a section [zenoh] that keeps its sockets in `folder`, so that two runs do not meet."""
+    without = re.sub(r"^\[zenoh\].*?(?=^\[|\Z)", "", text, flags=re.M | re.S)
+    return f'{without.rstrip()}\n\n[zenoh]\nfolder = "{folder}"\n'

@@ -106,7 +106,7 @@ def study(kinds: Sequence[str], seconds: float, board: str = "native") -> Study:
 
 def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[str, MeasuredLoop]) -> None:
     loop = process.loop
-    with bad_subscriber(kind, process.rig.name, process.rig.zenoh.connect[0]) as bad:
+    with bad_subscriber(kind, process.rig.name, process.rig.connect_endpoints[0]) as bad:
         late, work, before, flooded = loop.lateness.copy(), loop.work.copy(), loop.snapshot(), process.counts().flooded
         one = measured.setdefault(kind, MeasuredLoop(np.zeros_like(late), np.zeros_like(work)))
         end = time.monotonic() + seconds

@@ -96,6 +96,8 @@ class LiveRig:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
         answer = self._command(press.button)
         text = answer.reason.removeprefix(f"{answer.result}: ")
+        if press.button == "stop" and answer.accepted:
+            text = "confirmed by " + ", ".join(f"{path.path} ({path.text})" for path in answer.paths if path.confirmed)
         if answer.result == "unanswered" and self._received_s is None:
             text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}

@@ -34,7 +34,7 @@ def serve(source: Source, port: int, title: str, report: Report) -> None:
 def serve_rig(rig_file: Path, port: int, report: Report) -> None:
     """Serve the running rig of `rig_file`. Raises InputError."""
     rig = load_rig(rig_file)
-    with Session(rig.name, [], rig.zenoh.connect) as session, contextlib.closing(LiveRig(rig, session)) as source:
+    with Session.of_rig(rig) as session, contextlib.closing(LiveRig(rig, session)) as source:
         serve(source, port, f"rig {rig.name}", report)
 
 

@@ -5,18 +5,23 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import uuid
 from typing import Any
 
 import numpy as np
 
+from protocol.enums import Phase
+from protocol.reply_seal import ReplySeal
 from protocol.rig_file import Rig
-from protocol.topics import CommandCounts, Log, LoopTiming, Reply
+from protocol.stop_client import CONFIRM_S
+from protocol.topics import Command, CommandCounts, Log, LoopTiming, Message, Reply, encode
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import control_loop, telemetry
 from realtime.core.lines import force_config, tracker_config
 from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
+from realtime.core.stop_listener import Peer, StopListener
 from realtime.drivers.board_port import RETRY_S, BoardPort
 from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
 from realtime.drivers.transport import open_serial
@@ -26,6 +31,9 @@ from realtime.loop.scheduling import RealtimeSettings
 
 _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command reply commander".split()
 _POLL_S = 0.005
+# A stop over the socket waits so long for the core; then it ends the loop, and the board stops the stages by itself.
+_CORE_BUSY_S = 0.05
+_STOPPED = (Phase.STOPPED, Phase.DISARMED)
 logger = logging.getLogger("seldinger.realtime")
 
 
@@ -35,7 +43,8 @@ class RealtimeProcess:
     Each thread hands what arrived to the core, one thread at a time; the compiled loop reads the core's records from
     mailboxes and is the only one that writes to the board.
 
-    Raises OSError where the board's port does not open within `open_timeout_s`, or zenoh cannot connect as asked.
+    Raises OSError where the board's port does not open within `open_timeout_s`, zenoh cannot connect as asked, or another
+    realtime process of this rig runs.
     """
 
     def __init__(
@@ -54,8 +63,12 @@ class RealtimeProcess:
         self._mailboxes = input_mailboxes(INPUTS, numbered=False)
         records = {name: box.record[0] for name, box in self._mailboxes.items()}
         self.core = RigCore(rig, records, self._timing, force_source)
+        paths = rig.local.prepare()
+        self._unpublished: list[tuple[str, Message]] = []
         self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s)
-        self._session = Session(rig.name, [], rig.zenoh.connect)
+        self._session = Session.of_rig(rig)
+        self._stops = StopListener(paths.stop_socket, self.stop_by_socket, self.status)
+        self._seal = ReplySeal(paths.reply_key)
         self._publishers = {name: self._session.publisher(name) for name in _TOPICS}
         self._estimates = self._session.latest("force/estimate")
         self.loop = NativeLoop(
@@ -89,7 +102,8 @@ class RealtimeProcess:
     def start(self) -> None:
         """Answer commands, compile, start the loop and all threads."""
         # Without a cache, compiling takes more than a minute on a busy machine. Until then commands are refused and say so.
-        self._requests = self._session.serve_requests(self.request)
+        self._stops.start()
+        self._requests = self._session.serve_requests(self.request, self._seal.prove)
         self.log("info", "starting: the loop is being compiled")
         self.loop.prepare()
         self.loop.start()
@@ -101,8 +115,13 @@ class RealtimeProcess:
 
     def stop(self) -> None:
         """Disarm, let the stages come to rest, end the loop and the threads, close the ports."""
-        with self._lock:
-            self._send(self.core.shut_down())
+        self._stops.close()
+        # A core that does not come back must not keep the loop from being ended: without set-points the board stops.
+        if self._lock.acquire(timeout=1.0):
+            try:
+                self._send(self.core.shut_down())
+            finally:
+                self._lock.release()
         time.sleep(0.1)
         self._stopping.set()
         self._board_thread.join(1.0)
@@ -122,6 +141,51 @@ class RealtimeProcess:
         """Answer what commander `name` asks; called on a thread of zenoh's."""
         return self._step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
+    def status(self) -> dict[str, Any]:
+        """Return the rig's phase and whether the loop runs, for the stop socket."""
+        return {
+            "rig": self.rig.name,
+            "phase": self.core.phase.label,
+            "loop_runs": self.loop.alive,
+            "board_link": self.core.link.phase.value,
+        }
+
+    def stop_by_socket(self, peer: Peer) -> dict[str, Any]:
+        """Stop the rig for a program at the stop socket; return what was done and whether the rig's state shows it.
+
+        If the core does not take the command, because a thread that works in it hangs, the loop is ended: without
+        set-points the board stops the stages after its dead-man time.
+        """
+        begin_ns, before = time.monotonic_ns(), self.core.phase
+        now_ns = self.clock.now_ns()
+        try:
+            stop = Command(
+                stamp_ns=now_ns,
+                id=uuid.uuid4().hex,
+                commander=peer.commander,
+                lease="",
+                expires_ns=now_ns,
+                action="stop",
+                target="none",
+            )
+            request = CommandRequest(peer.commander, encode(stop))
+            line = Log(stamp_ns=now_ns, level="warning", source="stop socket", text=f"stop from {peer}")
+            self._take(Arrived(requests=[request], log_lines=[line]), _CORE_BUSY_S)
+            while self.core.phase not in _STOPPED and time.monotonic_ns() - begin_ns < CONFIRM_S * 1e9:
+                time.sleep(0.001)
+                self._take(Arrived(), _CORE_BUSY_S)
+        except Exception as failure:  # whatever fails in the core, a stop is not lost
+            self.loop.stop()
+            busy = isinstance(failure, TimeoutError)
+            why = "the core does not answer" if busy else f"the core failed ({type(failure).__name__})"
+            text = f"{why}: the loop was ended, the board stops the stages by its dead man"
+            logger.error("stop socket: %s", text)
+            return {**self.status(), "confirmed": False, "text": text}
+        after_ms = (time.monotonic_ns() - begin_ns) * 1e-6
+        confirmed = self.core.phase in _STOPPED
+        text = f"{before.label}, {self.core.phase.label} after {after_ms:.1f} ms"
+        return {**self.status(), "confirmed": confirmed, "after_ms": round(after_ms, 3), "text": text}
+
     def counts(self) -> CommandCounts:
         """Return who holds the lease, and what became of the commands so far."""
         return self.core.gate.state()
@@ -132,18 +196,32 @@ class RealtimeProcess:
 
     def _step(self, arrived: Arrived) -> Leaving:
         """Take the core one step further, with all ticks that have run meanwhile, and publish what comes of it."""
-        with self._lock:
+        leaving = self._take(arrived)
+        with self._publish_lock:
+            messages, self._unpublished = self._unpublished, []
+            for topic, message in messages:
+                if isinstance(message, Log):
+                    logger.log(getattr(logging, message.level.upper()), "%s: %s", message.source, message.text)
+                self._publishers[topic].put(message)
+        return leaving
+
+    def _take(self, arrived: Arrived, wait_s: float = -1.0) -> Leaving:
+        """Take the core one step further; what is to be published waits for the next `_step`.
+
+        Raises TimeoutError where another thread works in the core for longer than `wait_s` (-1: waits without a limit).
+        """
+        if not self._lock.acquire(timeout=wait_s):
+            raise TimeoutError
+        try:
             records = self.loop.telemetry.drain()
             outputs = records["outputs"].view(np.recarray)
             arrived.ticks = [Tick(int(number), outputs[i]) for i, number in enumerate(records["loop"]["tick"])]
             arrived.loop_runs = self.loop.alive
             leaving = self.core.step(self.clock.now_ns(), arrived)
             self._send(leaving)
-        with self._publish_lock:
-            for topic, message in leaving.messages:
-                if isinstance(message, Log):
-                    logger.log(getattr(logging, message.level.upper()), "%s: %s", message.source, message.text)
-                self._publishers[topic].put(message)
+            self._unpublished += leaving.messages
+        finally:
+            self._lock.release()
         return leaving
 
     def _send(self, leaving: Leaving) -> None:

@@ -17,8 +17,9 @@ import zenoh
 from cryptography import x509
 
 from host.run.commander import Commander
-from host.run.wall_clock import with_endpoint
+from host.run.wall_clock import with_folder
 from host.security import keys
+from protocol.local_paths import LocalPaths
 from protocol.topics import Command, ForceSensor, Message, Reply, encode, key, request_key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE, Network, client_settings
 from protocol.zenoh_session import Session
@@ -167,10 +168,10 @@ def test_nobody_outside_publishes_or_answers_for_the_rig(laboratory: Laboratory,
 
 
 def test_the_model_process_opens_the_way_in_that_the_rig_file_describes(laboratory: Laboratory, tmp_path: Path) -> None:
-    local, outside = (f"{kind}/127.0.0.1:{free_port()}" for kind in ("tcp", "tls"))
-    text = with_endpoint(RIG_FILE.read_text(encoding="utf-8"), local)
+    local, outside = LocalPaths(tmp_path).endpoint, f"tls/127.0.0.1:{free_port()}"
+    text = RIG_FILE.read_text(encoding="utf-8")
     section = keys.network_lines(laboratory.folder, outside)
-    (tmp_path / "rig.toml").write_text(text[: text.index("[network]")] + section, encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(with_folder(text[: text.index("[network]")] + section, tmp_path), encoding="utf-8")
     child = subprocess.Popen(
         [
             sys.executable,

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from host.run.commander import Commander
-from host.run.wall_clock import with_endpoint
+from host.run.wall_clock import with_folder
 from host.security import keys
 from host.studies.bad_subscriber import KINDS, BadSubscriber, bad_subscriber
-from protocol.rig_file import load_rig
+from protocol.commander import CommandSender
+from protocol.local_paths import SERVICE_FOLDER, LocalPaths
+from protocol.rig_file import load_rig, parse_rig
 from protocol.topics import TOPICS, Command, Message, Reply, RigState
 from protocol.zenoh_access import Network
 from protocol.zenoh_session import Session
@@ -33,9 +34,10 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "subscriber.py"
 
 def test_two_fleets_do_not_meet() -> None:
     text = RIG_FILE.read_text(encoding="utf-8")
-    data, own = tomllib.loads(text), tomllib.loads(with_endpoint(text, "tcp/127.0.0.1:1234"))
-    assert own["zenoh"] == {"listen": ["tcp/127.0.0.1:1234"], "connect": ["tcp/127.0.0.1:1234"]}
+    data, own = tomllib.loads(text), tomllib.loads(with_folder(text, Path("/run/other")))
+    assert own["zenoh"] == {"folder": "/run/other"}
     assert own | {"zenoh": data["zenoh"]} == data
+    assert parse_rig(own).connect_endpoints == ["unixsock-stream//run/other/zenoh.sock"]
 
 
 def misbehaved(kind: str, bad: BadSubscriber | None, run: Scenario) -> bool:
@@ -106,7 +108,7 @@ def test_a_stop_gets_through_a_flood() -> None:
         server = rig.serve_requests(lambda name, payload: gate.answer(name, payload)[1])
         with bad_subscriber("flooding", "simulated", endpoint):
             until(lambda: gate.counts["flooded"] >= 500, "a flood")
-            assert Commander(console, "console", timeout_s=PATIENCE_S).stop().accepted and done == ["stop"]
+            assert CommandSender(console, "console", timeout_s=PATIENCE_S).stop().accepted and done == ["stop"]
         assert server is not None
 
 
@@ -136,7 +138,7 @@ SHOWN = ["2.500 s  contact  0.123 N  no fresh pose\n"] * 2
 def test_the_example_reads_on_this_machine() -> None:
     program, endpoint = EXAMPLE.read_text(encoding="utf-8"), f"tcp/127.0.0.1:{free_port()}"
     assert len(program.splitlines()) <= 15 and "import host" not in program and "protocol" not in program
-    assert "tcp/127.0.0.1:7451" in program and load_rig(RIG_FILE).zenoh.listen == ["tcp/127.0.0.1:7451"]
+    assert LocalPaths(SERVICE_FOLDER).endpoint in program and load_rig(RIG_FILE).zenoh.listen == []
     with Session("simulated", [endpoint], []) as session:
         assert lines_of_the_example([endpoint], session, program) == SHOWN
 

@@ -131,13 +131,14 @@ def test_buttons_reach_the_rig_and_its_answer_comes_back(live: tuple[Session, Li
     for text, action, target in (
         ('{"button": "arm", "confirmed": true}', "arm", "none"),
         ('{"button": "hold", "confirmed": true}', "hold", "none"),
-        ('{"button": "stop"}', "stop", "none"),
     ):
         until(
             lambda text=text: (answer := view.act(text))["text"] == "no board" and answer["result"] == "refused",
             f"the rig's answer to {action}",
         )
         assert (obeyed[-1].action, obeyed[-1].target) == (action, target)
+    answer = view.act('{"button": "stop"}')
+    assert answer["result"] == "not confirmed" and "no board" in answer["text"] and "emergency stop" in answer["text"]
     assert {command.action for command in obeyed} == {"arm", "hold", "stop"}
 
 
@@ -167,18 +168,13 @@ def test_what_is_malformed_or_not_confirmed_is_never_sent(text: str) -> None:
     assert allowed or answer["result"] in ("malformed", "refused")
 
 
-class Unanswering:
-    """A rig that is not there."""
-
-    def ask(self, command: Command, timeout_s: float = 1.0) -> None:
-        """Nobody answers."""
-
-
 def test_no_answer_is_said(live: tuple[Session, LiveRig, list[Command]]) -> None:
     there, view, _ = live
-    view._commander = Commander(Unanswering(), "view")
-    answer = view.act('{"button": "stop"}')
-    assert answer["result"] == "unanswered" and "may still be starting" in answer["text"]
-    publish_until_seen(there, view)
-    answer = view.act('{"button": "stop"}')
-    assert answer["result"] == "unanswered" and "may or may not have received" in answer["text"]
+    with Session(there.rig, [], []) as alone:
+        view._commander = Commander(alone, "view", timeout_s=0.1)
+        answer = view.act('{"button": "hold", "confirmed": true}')
+        assert answer["result"] == "unanswered" and "may still be starting" in answer["text"]
+        assert view.act('{"button": "stop"}')["result"] == "not confirmed"
+        publish_until_seen(there, view)
+        answer = view.act('{"button": "hold", "confirmed": true}')
+        assert answer["result"] == "unanswered" and "may or may not have received" in answer["text"]

@@ -159,7 +159,7 @@ def test_a_failure_while_answering_leaves_the_others_answered(endpoint: str) -> 
     def answer(name: str, payload: bytes) -> Reply:
         if name == "bad":
             raise RuntimeError("broken")
-        return Reply(stamp_ns=5, id="c1", result="accepted")
+        return Reply(stamp_ns=5, id=decode(Command, payload).id, result="accepted")
 
     with Session("simulated", [endpoint], []) as rig, Session("simulated", [], [endpoint]) as console:
         server = rig.serve_requests(answer)

@@ -37,11 +37,8 @@ def answered(ask: Callable[[], Acknowledgement]) -> Acknowledgement:
 
 
 def test_commands_are_answered_while_the_loop_compiles(board: str, tmp_path: Path) -> None:
-    endpoint = f"unixsock-stream/{tmp_path}/rig.sock"
-    data = read_rig_data(RIG_FILE)
-    data["zenoh"] |= {"listen": [endpoint], "connect": [endpoint]}
-    rig = parse_rig(data)
-    with Session(rig.name, [endpoint], []) as session:
+    rig = parse_rig(read_rig_data(RIG_FILE) | {"zenoh": {"folder": str(tmp_path)}})
+    with Session.hub(rig) as session:
         states, commander = session.latest("state"), CommandSender(session, "console", timeout_s=PATIENCE_S)
         process = RealtimeProcess(rig, board_port=board, tracker_port="/nowhere")
         compiled, prepare = threading.Event(), process.loop.prepare

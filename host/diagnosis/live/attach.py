@@ -39,7 +39,7 @@ def attach(rig_file: str | None, report: Callable[[str], None], on_alarm: Callab
 
     report("loading models")
     warm_up(rig)
-    with Session(rig.name, [], rig.zenoh.connect) as session:
+    with Session.of_rig(rig) as session:
         alarms = session.publisher("alarm")
 
         def publish(alarm: Alarm) -> None:
