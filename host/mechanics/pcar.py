@@ -202,12 +202,6 @@ def kinematic_jacobian(arcs: Arcs, curvature_per_m: ArrayLike) -> Array:
     return arcs.length_m * np.stack([-work[kernels.ARM_Y], work[kernels.ARM_X], np.ones(arcs.length_m.size)])
 
 
-def kinematic_second_derivatives(arcs: Arcs, curvature_per_m: ArrayLike) -> Array:
-    """d2(x, y at the tip) / d(curvatures)2, (2, n, n), m3; that of the angle is zero."""
-    unit = np.eye(2)
-    return np.stack([_second_variation_of_work(arcs, curvature_per_m, unit[k], NO_DRAG) for k in range(2)])
-
-
 def _second_variation_of_work(arcs: Arcs, curvature_per_m: ArrayLike, force: Array, drag: Array) -> Array:
     _, work = _evaluated(arcs, curvature_per_m, force, drag)
     index = np.arange(arcs.length_m.size)
@@ -224,11 +218,6 @@ def static_residual(
     delta = kappa - arcs.unloaded_curvature_per_m
     elastic = arcs.EI_N_m2 * delta * (1.0 + arcs.cubic_stiffening_m2 * delta**2)
     return np.asarray(arcs.length_m * (work[kernels.MOMENT] - elastic))
-
-
-def static_jacobian(arcs: Arcs, curvature_per_m: ArrayLike) -> Array:
-    """Differentiate P by (Fx, Fy), (n, 2), m2: the first two rows of the kinematic Jacobian, transposed. Source: (2.17)."""
-    return kinematic_jacobian(arcs, curvature_per_m)[:2].T
 
 
 def tangent_stiffness(

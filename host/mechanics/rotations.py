@@ -97,25 +97,11 @@ def vector_of_quaternion(q: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def rotate(q: Array, v: Array) -> Array:
-    """Vector v (3,) turned by the unit quaternion q (4,)."""
-    R = rotation_matrix(q)
-    return np.array([R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2] for i in range(3)])
-
-
-@njit(cache=True, nogil=True)
 def turn_back(q: Array, v: Array, out: Array) -> None:
     """Set out (3,) = vector v (3,) turned by the inverse of the unit quaternion q (4,)."""
     R = rotation_matrix(q)
     for i in range(3):
         out[i] = R[0, i] * v[0] + R[1, i] * v[1] + R[2, i] * v[2]
-
-
-@njit(cache=True, nogil=True)
-def angle_between(p: Array, q: Array) -> float:
-    """Angle in rad of the turn from the unit quaternion p (4,) to q (4,)."""
-    v = vector_of_quaternion(quaternion_product(conjugate(p), q))
-    return float(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
 
 
 @njit(cache=True, nogil=True)

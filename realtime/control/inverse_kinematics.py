@@ -121,12 +121,6 @@ def bend_of_reach(ratio: float, beyond: bool) -> float:
 
 
 @njit(cache=True)
-def curvature_of_lateral(lateral_m: float, length_m: float) -> float:
-    """Curvature (1/m, not negative) of an arc of `length_m` whose end is `lateral_m` off the axis, below the fold."""
-    return bend_of_reach(lateral_m / length_m, False) / length_m
-
-
-@njit(cache=True)
 def bend_and_insertion(config: KinematicsParams, lateral_m: float, axial_m: float) -> tuple[float, float]:
     """Curvature (1/m) and insertion (m) that put the unloaded tip `lateral_m` >= 0 off and `axial_m` along the axis.
 

@@ -23,7 +23,6 @@ from host.mechanics.cosserat import CosseratSolution, PointLoad, solve_cosserat
 from host.mechanics.cosserat_kernels import ALL_TANGENTS, EXACT, FINE, POSE, ROW, WORK, sweep
 from host.mechanics.rod import rod_record
 from host.mechanics.rotations import (
-    angle_between,
     conjugate,
     quaternion_of_matrix,
     quaternion_of_vector,
@@ -36,6 +35,7 @@ from host.mechanics.tip_shooting import QUICK_BELOW, load_number
 from protocol.catheter import Catheter, PcarParameters, load_catheter
 from protocol.errors import InputError
 from tests.host.rod_cases import SPATIAL, random_catheter, rod_of, uniform_catheter, unit
+from tests.host.rotation_angle import angle_between
 from tests.references import make_spatial
 
 Array = NDArray[np.float64]

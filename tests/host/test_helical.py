@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.helical import chain_of, solve_helical, tip_of
 from host.mechanics.helical_kernels import back_substitute, factorize, place, screw, work_of_force
-from host.mechanics.rotations import angle_between, quaternion_of_vector, rotation_matrix
+from host.mechanics.rotations import quaternion_of_vector, rotation_matrix
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from tests.host.rod_cases import random_catheter, rod_of, uniform_catheter, unit
+from tests.host.rotation_angle import angle_between
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,6 @@ LATEST_S = 0.03  # an encoder reading is never taken for older than this
 POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 
-def is_rig_recording(path: Path) -> bool:
-    """Whether `path` can be a recording of a rig by its name."""
-    return path.name.lower().endswith(".mcap")
-
-
 def rig_of(files: list[Path]) -> Rig:
     """The rig that all `files` were recorded on, from the configuration each carries. Raises InputError."""
     found: Rig | None = None
