@@ -1,7 +1,7 @@
 """The folder in which a rig's processes meet on their own computer: sockets, and the key of its replies.
 
 The folder belongs to the user of the rig's processes, and its group may enter it. Its permissions are the access control:
-whoever can enter it may read and command, all others of the computer may not.
+a program that can enter it may read and command, all others of the computer may not.
 """
 
 from __future__ import annotations

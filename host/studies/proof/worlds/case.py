@@ -100,6 +100,22 @@ class Setup:
     parameters: dict[str, float]
     style: dict[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def drawn(
+        cls,
+        rng: np.random.Generator,
+        scales: Scales,
+        stamps: tuple[Array, ...],
+        closed_loop: bool,
+        sigma: dict[str, float],
+        parameters: dict[str, float],
+        style: dict[str, Any],
+        lost: float = 0.0,
+    ) -> Setup:
+        """Return the setup with a seed and a share of coloured noise (0 to 0.4) drawn from `rng`."""
+        seed, share = int(rng.integers(2**31)), float(rng.uniform(0.0, 0.4))
+        return cls(scales, stamps, closed_loop, seed, sigma, share, lost, parameters, style)
+
     def noise(self, recording: int, channel: str) -> Array:
         """Return the noise (n,) of one channel: the same in the recording as in what a controller read."""
         order = sorted(self.sigma).index(channel)
@@ -142,6 +158,17 @@ class Mechanism(Protocol):
     def nominal(self, setup: Setup) -> dict[str, Any]:
         """Return the nominal model as the content of its TOML, without `data.heldout`."""
         ...
+
+
+class SeparateRecordings:
+    """Base of mechanisms whose recordings are simulated one by one."""
+
+    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
+        """Run all recordings with `planted`. Raises ValueError where the effect's size is impossible."""
+        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+
+    def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,17 @@ import numpy as np
 
 from host.studies.proof.worlds import ode, rod, signals
 from host.studies.proof.worlds import operators as op
-from host.studies.proof.worlds.case import Columns, Make, Mechanism, Plantable, Planted, Scales, Setup, Trace
+from host.studies.proof.worlds.case import (
+    Columns,
+    Make,
+    Mechanism,
+    Plantable,
+    Planted,
+    Scales,
+    SeparateRecordings,
+    Setup,
+    Trace,
+)
 from host.studies.proof.worlds.nominal_rod import DISTAL_M, NAMES, TORSION_TO_BENDING, tips
 
 Array = np.ndarray
@@ -40,7 +50,7 @@ def _handle_effects() -> tuple[Plantable, ...]:
     return tuple(found)
 
 
-class Pressed:
+class Pressed(SeparateRecordings):
     """Catheter on a sphere that moves with heart and breath."""
 
     name: str = "rod"
@@ -88,14 +98,8 @@ class Pressed:
             "aside_m": float(rng.uniform(-6e-3, 6e-3)),
         }
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.4 else 0.0
-        return Setup(
-            scales, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), lost,
-            dict(zip(NAMES, values, strict=True)), style,
-        )  # fmt: skip
-
-    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings. Raises ValueError where the rod finds no equilibrium."""
-        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+        parameters = dict(zip(NAMES, values, strict=True))
+        return Setup.drawn(rng, scales, stamps, closed_loop, sigma, parameters, style, lost=lost)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         stamps, style = setup.stamps[i], setup.style

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from host.studies.proof.worlds import ode, signals
-from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, Setup, Trace
+from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, SeparateRecordings, Setup, Trace
 from host.studies.proof.worlds.nominal_arm import torques
 
 Array = np.ndarray
@@ -119,17 +119,7 @@ class Gear(ode.Link):
         sigma = {"load_rad": gain * motion * float(np.exp(rng.uniform(np.log(2e-3), np.log(1e-2))))}
         style = {"fastest_Hz": fastest, "every": every}
         parameters = {"gain": gain, "offset": 0.0}
-        return Setup(
-            scales,
-            stamps,
-            closed_loop,
-            int(rng.integers(2**31)),
-            sigma,
-            float(rng.uniform(0.0, 0.4)),
-            0.0,
-            parameters,
-            style,
-        )
+        return Setup.drawn(rng, scales, stamps, closed_loop, sigma, parameters, style)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), gain = setup.scales, _clock(setup, i), setup.parameters["gain"]
@@ -407,10 +397,7 @@ class Pad(ode.Press):
             "gain": stiffness,
         }
         sigma = {"force_N": force * float(np.exp(rng.uniform(np.log(2e-3), np.log(1e-2)))), "motion_m": 2e-6 * motion}
-        return Setup(
-            found, stamps, closed_loop, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), 0.0, parameters,
-            {"fastest_Hz": fastest, "every": every},
-        )  # fmt: skip
+        return Setup.drawn(rng, found, stamps, closed_loop, sigma, parameters, {"fastest_Hz": fastest, "every": every})
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), p, every = setup.scales, _clock(setup, i), setup.parameters, setup.style["every"]
@@ -515,7 +502,7 @@ _LINKS = {
 _STIFF, _DAMP = np.array([150.0, 60.0]), np.array([8.0, 3.0])
 
 
-class Arm:
+class Arm(SeparateRecordings):
     """Two-link arm under joint servos: angles in, torques out, by a Python function with the drawing's link data."""
 
     name: str = "arm"
@@ -542,13 +529,7 @@ class Arm:
         sigma = dict.fromkeys(self.outputs, force * float(np.exp(rng.uniform(np.log(3e-3), np.log(1e-2)))))
         parameters = {**_LINKS, "damping_1": float(rng.uniform(0.05, 0.3)), "damping_2": float(rng.uniform(0.02, 0.1))}
         style = {"fastest_Hz": min(fastest, 2.0), "every": every}
-        return Setup(
-            found, stamps, True, int(rng.integers(2**31)), sigma, float(rng.uniform(0.0, 0.4)), 0.0, parameters, style
-        )
-
-    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings with `planted` and return their traces."""
-        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+        return Setup.drawn(rng, found, stamps, True, sigma, parameters, style)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), every = setup.scales, _clock(setup, i), setup.style["every"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from host.studies.proof.worlds import drive, signals
 from host.studies.proof.worlds import operators as op
-from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, Setup, Trace
+from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, SeparateRecordings, Setup, Trace
 
 Array = np.ndarray
 LEAD_S = 3.0  # longest part of the motion that is cut off before a window, in units of the slowest period
@@ -177,7 +177,7 @@ def _half_derivative(x: Array, h: float, c: Scales) -> Array:
     return total / 8.0
 
 
-class Link:
+class Link(SeparateRecordings):
     """Motion in, motion out: output = gain * input + offset."""
 
     name: str = "link"
@@ -195,21 +195,7 @@ class Link:
         parameters = {"gain": gain, "offset": 0.1 * motion * float(rng.standard_normal())}
         style = {"fastest_Hz": fastest, "late_s": float(rng.uniform(1e-3, 8e-3)), "begin_s": float(rng.uniform(0.0, 100.0))}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.4 else 0.0
-        return Setup(
-            scales,
-            stamps,
-            closed_loop,
-            int(rng.integers(2**31)),
-            sigma,
-            float(rng.uniform(0.0, 0.4)),
-            lost,
-            parameters,
-            style,
-        )
-
-    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings; a loop is iterated until its correction settles."""
-        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+        return Setup.drawn(rng, scales, stamps, closed_loop, sigma, parameters, style, lost=lost)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         grid, h = fine_grid(setup, i)
@@ -323,7 +309,7 @@ _PRESS_OUTSIDE = (
 )
 
 
-class Press:
+class Press(SeparateRecordings):
     """Motion in, force out: force = damping * speed + stiffness * motion + offset."""
 
     name: str = "press"
@@ -345,21 +331,7 @@ class Press:
         }
         style = {"fastest_Hz": fastest, "late_s": float(rng.uniform(1e-3, 8e-3))}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.4 else 0.0
-        return Setup(
-            scales,
-            stamps,
-            closed_loop,
-            int(rng.integers(2**31)),
-            sigma,
-            float(rng.uniform(0.0, 0.4)),
-            lost,
-            parameters,
-            style,
-        )
-
-    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings with `planted` and return their traces."""
-        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+        return Setup.drawn(rng, scales, stamps, closed_loop, sigma, parameters, style, lost=lost)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         grid, h = fine_grid(setup, i)
@@ -505,7 +477,7 @@ _AXIS_OUTSIDE = (
 )
 
 
-class Axis:
+class Axis(SeparateRecordings):
     """Force in, motion out: mass, damping, with or without a spring."""
 
     outputs: tuple[str, ...] = ("position_m",)
@@ -544,21 +516,7 @@ class Axis:
         late = max(1, round(float(rng.uniform(1e-3, 6e-3)) / scales.period_s))
         style = {"fastest_Hz": fastest, "held": bool(closed_loop or rng.random() < 0.5), "late": late}
         lost = float(rng.uniform(0.002, 0.02)) if rng.random() < 0.3 and self.sprung else 0.0
-        return Setup(
-            scales,
-            stamps,
-            closed_loop,
-            int(rng.integers(2**31)),
-            sigma,
-            float(rng.uniform(0.0, 0.4)),
-            lost,
-            parameters,
-            style,
-        )
-
-    def run(self, setup: Setup, planted: Sequence[Planted]) -> list[Trace]:
-        """Run all recordings. Raises ValueError where the motion runs away."""
-        return [self._one(setup, planted, i) for i in range(len(setup.stamps))]
+        return Setup.drawn(rng, scales, stamps, closed_loop, sigma, parameters, style, lost=lost)
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int, p: Array | None = None) -> Trace:
         c, stamps, own = setup.scales, setup.stamps[i], setup.parameters
