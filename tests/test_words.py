@@ -40,6 +40,10 @@ REPLACED = {
     r"nominal chain": "nominal model",
     r"mend(?:s|ed|ing)?": "correct, repair",
 }
+# Parts of names in code that are metaphors or replaced words.
+NAME_PARTS = set(
+    "desk dish heard hearing hears told telling tells foretold foretell believed whoever nobody somebody people".split()
+)
 PATTERN = re.compile("|".join(rf"(?P<w{index}>\b(?:{words})\b)" for index, words in enumerate(REPLACED)), re.IGNORECASE)
 INSTEAD = list(REPLACED.values())
 
@@ -83,6 +87,17 @@ def test_strings_use_the_glossary() -> None:
         for path in SOURCES
         for line, text in strings_of(path.read_text(encoding="utf-8"))
         for fault in found_in(re.sub(r"`[^`]*`", "", text))
+    ]
+    assert found == []
+
+
+def test_names_use_the_glossary() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{token.start[0]}: {token.string}"
+        for path in SOURCES
+        for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+        if token.type == tokenize.NAME
+        and NAME_PARTS & {part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", token.string)}
     ]
     assert found == []
 

@@ -417,11 +417,11 @@ def _in_units(
     stated = np.abs(np.array(path.values))
     found = np.median([np.abs(c) for c, _, _ in fits], axis=0)
     sizes = np.median([rms for _, rms, _ in fits], axis=0)
-    told = (stated > 0.0) & (found > 0.0) & (sizes > 0.2 * np.max(sizes))
-    if explained < 0.5 or not told.any():
+    usable = (stated > 0.0) & (found > 0.0) & (sizes > 0.2 * np.max(sizes))
+    if explained < 0.5 or not usable.any():
         return recordings
-    ratios = found[told] / stated[told]
-    order = np.array([("stiffness", "damping", "mass").index(term) for term in path.law])[told]
+    ratios = found[usable] / stated[usable]
+    order = np.array([("stiffness", "damping", "mass").index(term) for term in path.law])[usable]
     force_column, motion_column = columns[path.input], columns[path.output]
     factor = _factor(1.0 / float(np.exp(np.mean(np.log(ratios)))), NEAR_FACTOR)
     if factor and np.ptp(np.log(ratios)) < 2.0 * NEAR_FACTOR:

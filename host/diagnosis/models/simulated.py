@@ -43,7 +43,7 @@ BEGIN_S = 0.02  # length of the first samples that the state is read from, where
 BEGIN_SAMPLES = 7  # and at least so many
 STEP = 0.01  # of an input's span: step by which it is linearized
 TRUSTED = 0.25  # error of a linearized input relative to a simulation, up to which candidates are screened with it
-FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in full, about: told beforehand
+FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in full; printed beforehand
 FITS = 10  # candidates that are fitted in full, about
 MOST_DYNAMIC = 4096  # samples of a step response that are used
 
