@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections import deque
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from host.view.connections import LimitedHttp
 from host.view.source import Source, refusal
 
 ADDRESS = "127.0.0.1"
@@ -28,6 +30,11 @@ WAITING_FRAMES = 4
 MAX_PAGES, MAX_ASKED_AT_ONCE, MAX_MESSAGE_BYTES = 8, 4, 1024
 # A page that takes nothing for so long is gone: its connection is given up.
 STUCK_S = 10.0
+# The web socket's own pings: a client that answers none in this time is disconnected.
+PING_S = 5.0
+# What a page sends every second, so that pages in use and idle connections are distinguished.
+PRESENT = '"present"'
+REPLACED = "closed, because newer pages were opened; reload to open it again"
 STATIC = Path(__file__).parent / "static"
 _POLICY = (
     "default-src 'self'; style-src 'self'; script-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -95,7 +102,10 @@ class Page:
         self._frames: deque[bytes] = deque(maxlen=WAITING_FRAMES)
         self._answers: deque[bytes] = deque(maxlen=2 * MAX_ASKED_AT_ONCE)
         self._something = asyncio.Event()
+        self.replaced = asyncio.Event()
         self.dropped = 0
+        # Loop time of the newest message; minus infinity before the first: an idle client gives way before a page in use.
+        self.received_s = -math.inf
 
     def offer(self, frame: bytes) -> None:
         """Queue a frame without waiting; the oldest waiting frame is dropped when the queue is full."""
@@ -123,7 +133,7 @@ class ViewServer:
 
     def __init__(self, source: Source, port: int) -> None:
         self._source, self.port = source, port
-        self.pages: set[Page] = set()
+        self.pages: dict[Page, None] = {}  # in the order of their opening
         self.app = Guard(
             Starlette(
                 lifespan=self._lifespan,
@@ -161,27 +171,34 @@ class ViewServer:
             await asyncio.sleep(due_s - clock())
 
     async def _rig(self, socket: WebSocket) -> None:
-        if len(self.pages) >= MAX_PAGES:
-            await socket.close(1013, f"{MAX_PAGES} pages are open already")
-            return
         await socket.accept()
         page = Page(socket)
-        await socket.send_text(orjson.dumps({"hello": self._source.hello()}).decode())
-        self.pages.add(page)
-        tasks = [asyncio.create_task(page.send_on()), asyncio.create_task(self._listen(socket, page))]
+        await asyncio.wait_for(socket.send_text(orjson.dumps({"hello": self._source.hello()}).decode()), STUCK_S)
+        # A new page always gets in, so that a stop button can always be opened; the one without use for longest goes.
+        if len(self.pages) >= MAX_PAGES:
+            oldest = min(self.pages, key=lambda other: other.received_s)
+            self.pages.pop(oldest, None)
+            oldest.replaced.set()
+        self.pages[page] = None
+        tasks = [
+            asyncio.create_task(page.send_on()),
+            asyncio.create_task(self._listen(socket, page)),
+            asyncio.create_task(page.replaced.wait()),
+        ]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 with contextlib.suppress(WebSocketDisconnect, TimeoutError):
                     task.result()
         finally:
-            self.pages.discard(page)
+            self.pages.pop(page, None)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             if socket.application_state is not WebSocketState.DISCONNECTED:
+                code, reason = (1013, REPLACED) if page.replaced.is_set() else (1000, "")
                 with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):
-                    await asyncio.wait_for(socket.close(), 1.0)
+                    await asyncio.wait_for(socket.close(code, reason), 1.0)
 
     async def _listen(self, socket: WebSocket, page: Page) -> None:
         """Take in what the page asks; each is answered, none waits for another."""
@@ -190,7 +207,10 @@ class ViewServer:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
                 return
+            page.received_s = asyncio.get_running_loop().time()
             text = message.get("text")
+            if text == PRESENT:
+                continue
             if text is None or len(text.encode()) > MAX_MESSAGE_BYTES:
                 page.answer(refusal(f"message: found no text of at most {MAX_MESSAGE_BYTES} bytes, wanted one"))
                 continue
@@ -213,7 +233,10 @@ class ViewServer:
             log_level="warning",
             ws_max_size=4 * MAX_MESSAGE_BYTES,
             ws_max_queue=8,
+            http=LimitedHttp,
             ws="websockets-sansio",
+            ws_ping_interval=PING_S,
+            ws_ping_timeout=PING_S,
             server_header=False,
             timeout_graceful_shutdown=1,
         )

@@ -23,13 +23,14 @@ from hypothesis import strategies as st
 from host.recordings.drawn_shape import through, twin
 from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import Picture, causes_of
+from host.view import connections
 from host.view.replay import Replay, read_findings
-from host.view.server import ADDRESS, WAITING_FRAMES, Guard, Page, ViewServer
+from host.view.server import ADDRESS, MAX_PAGES, PRESENT, WAITING_FRAMES, Guard, Page, ViewServer
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from realtime.control import safety
 from tests.host.test_foxglove import header, recording  # noqa: F401 - a fixture
-from tests.waiting import free_port
+from tests.waiting import PATIENCE_S, free_port
 
 MS = 1_000_000
 PORT = 8447
@@ -363,3 +364,57 @@ def test_the_guard_names_what_it_refuses() -> None:
 
     assert problem() == "" and "reading" in problem(method="POST")
     assert "Host" in problem(headers=[]) and "Host" in problem(headers=[(b"host", b"localhost:8447")] * 2)
+
+
+def idle_clients(kind: str, port: int, count: int) -> list[socket.socket]:
+    """Connections that do nothing: bare, with half a request, or web sockets that never send."""
+    if kind == "web sockets":
+        return [open_socket(port, f"{ADDRESS}:{port}", f"http://{ADDRESS}:{port}") for _ in range(count)]
+    clients = [socket.create_connection((ADDRESS, port)) for _ in range(count)]
+    for client in clients if kind == "half requests" else []:
+        client.sendall(b"GET / HTTP/1.1\r\nHost: ")
+    return clients
+
+
+class Commanded(Slow):
+    def frame(self) -> dict[str, Any]:
+        return {}
+
+    def act(self, text: str) -> dict[str, Any]:
+        return {"action": json.loads(text)["button"], "result": "accepted", "text": ""}
+
+
+def pressed(page: websockets.sync.client.ClientConnection) -> str:
+    page.send('{"button": "stop"}')
+    while "answer" not in (received := json.loads(page.recv(timeout=PATIENCE_S))):
+        pass
+    return str(received["answer"]["result"])
+
+
+@pytest.mark.parametrize("kind", ["bare", "half requests", "web sockets"])
+def test_fifty_idle_sockets_keep_no_stop_button_out(kind: str) -> None:
+    with running(ViewServer(Commanded(), port := free_port())) as server:
+        own = {"origin": f"http://{ADDRESS}:{port}", "proxy": None}
+        with websockets.sync.client.connect(f"ws://{ADDRESS}:{port}/rig", **own) as first:  # type: ignore[arg-type]
+            first.send(PRESENT)
+            assert pressed(first) == "accepted"
+            idle = idle_clients(kind, port, 50)
+            assert httpx.get(f"http://{ADDRESS}:{port}/", timeout=PATIENCE_S).status_code == 200
+            with websockets.sync.client.connect(f"ws://{ADDRESS}:{port}/rig", **own) as page:  # type: ignore[arg-type]
+                assert pressed(page) == "accepted" and pressed(first) == "accepted", "a page in use stays"
+                assert len(server.pages) <= MAX_PAGES
+        for client in idle:
+            client.close()
+
+
+def test_a_half_open_request_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_S", 0.2)
+    with running(ViewServer(Commanded(), port := free_port())):
+        for kind in ("bare", "half requests"):
+            (client,) = idle_clients(kind, port, 1)
+            client.settimeout(PATIENCE_S)
+            try:
+                assert client.recv(1) == b""
+            except ConnectionResetError:
+                pass
+            client.close()

@@ -6,6 +6,9 @@ import {Player} from "/static/player.js";
 import {Traces} from "/static/traces.js";
 
 const RETRY_MS = 1000;
+// The server closes the pages that were without use for longest when too many are open: this one says that it is in use.
+const PRESENT_MS = 1000;
+const REPLACED = 1013;
 const element = id => document.getElementById(id);
 const page = {hello: null, socket: null, frames: 0, newest: null, scene: null, jumps: 0, origin: null};
 window.seldinger = page;
@@ -117,9 +120,13 @@ function connect() {
     else if (message.answer && message.answer.action !== "play") controls.answered(message.answer);
     else if (message.frame) ready.then(() => take(message.frame));
   });
+  const present = () => socket.readyState === WebSocket.OPEN && socket.send('"present"');
+  socket.addEventListener("open", present);
+  const telling = setInterval(present, PRESENT_MS);
   socket.addEventListener("close", event => {
+    clearInterval(telling);
     link(event.reason || "no server", "bad");
-    setTimeout(connect, RETRY_MS);
+    if (event.code !== REPLACED) setTimeout(connect, RETRY_MS);
   });
 }
 
