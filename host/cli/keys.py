@@ -11,9 +11,11 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json
+from protocol.errors import Description, InputError, reason
 
 keys = typer.Typer(help="Certificates for access from other machines (docs/security.md).", no_args_is_help=True)
 Directory = Annotated[Path, typer.Option("--directory", "-d", help="Folder of authority and certificates.")]
+PassphraseFile = Annotated[Path | None, typer.Option(help="File with the passphrase of the authority's key, on one line.")]
 KEYS = Path("keys")
 EXPIRES_SOON = datetime.timedelta(days=30)
 
@@ -27,11 +29,16 @@ def _group() -> None:
 def init(
     directory: Directory = KEYS,
     laboratory: Annotated[str, typer.Option(help="Name of the laboratory, for the authority's certificate.")] = "laboratory",
+    passphrase: Annotated[bool, typer.Option("--passphrase", help="Ask for a passphrase that protects the key.")] = False,
+    passphrase_file: PassphraseFile = None,
 ) -> None:
     """Make the laboratory's authority. Refused where there is one: all its certificates would become invalid."""
     from host.security.keys import make_authority
 
-    folder = make_authority(directory, laboratory)
+    secret = _read_passphrase(passphrase_file) if passphrase_file is not None else ""
+    if passphrase and not secret:
+        secret = typer.prompt("Passphrase of the authority's key", hide_input=True, confirmation_prompt=True, err=True)
+    folder = make_authority(directory, laboratory, secret)
     print(
         f"authority in {folder}; its key.pem gives command over every rig: keep it off the rigs, and back it up",
         file=sys.stderr,
@@ -46,13 +53,21 @@ def issue(
     address: Annotated[list[str] | None, typer.Option(help="Of a rig: IP address or host name; may be repeated.")] = None,
     connect: Annotated[str, typer.Option(help="Of a reader or commander: the rig, as tls/ADDRESS:PORT.")] = "",
     days: Annotated[int, typer.Option(help="How long it is valid.")] = 365,
+    passphrase_file: PassphraseFile = None,
 ) -> None:
     """Issue a key and a certificate, in a folder to be copied to that machine; print the lines that the rig file needs."""
-    from host.security.keys import CLIENT_FILE, network_lines
+    from host.security.keys import CLIENT_FILE, has_passphrase, network_lines
     from host.security.keys import issue as issue_certificate
 
     addresses = address or []
-    one = issue_certificate(directory, name, role, addresses=addresses, days=days, connect=connect)
+    secret = _read_passphrase(passphrase_file) if passphrase_file is not None else ""
+    if not secret and has_passphrase(directory):
+        if not sys.stdin.isatty():
+            raise InputError(
+                "--passphrase-file", Description("nothing"), "a file with the passphrase of the authority's key"
+            )
+        secret = typer.prompt("Passphrase of the authority's key", hide_input=True, err=True)
+    one = issue_certificate(directory, name, role, addresses=addresses, days=days, connect=connect, passphrase=secret)
     print(f"{one.folder}: {one.role} {one.name}, serial {one.serial}, until {one.expires:%Y-%m-%d}", file=sys.stderr)
     if connect:
         print(
@@ -62,6 +77,19 @@ def issue(
     print("lines for the rig file, for all certificates issued here:", file=sys.stderr)
     port = connect or (f"tls/{_bracketed(addresses[0])}:7448" if addresses else "")
     print(network_lines(directory, port), end="")
+
+
+def _read_passphrase(path: Path) -> str:
+    """The first line of a file. Raises InputError where there is none, or others can read the file."""
+    try:
+        if path.stat().st_mode & 0o077:
+            raise InputError("--passphrase-file", str(path), "a file that only its user can read (chmod 600)")
+        line = path.read_text(encoding="utf-8").partition("\n")[0]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("--passphrase-file", reason(error), "a readable file") from None
+    if not line:
+        raise InputError("--passphrase-file", str(path), "a file with a passphrase on its first line")
+    return line
 
 
 @keys.command()

@@ -86,7 +86,8 @@ class GuardedFile:
     """The file under the MCAP writer: the first failed write cuts the file back to its last whole chunk and ends it."""
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        # A recording may come from a patient's procedure: for its user and group alone.
+        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         self._position = 0
         self._whole = 0
         self.error: OSError | None = None

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 from protocol.topics import check_name
 from protocol.zenoh_access import (
     CA_FILE,
@@ -48,8 +48,10 @@ class Issued:
     folder: Path
 
 
-def make_authority(directory: Path, laboratory: str = "laboratory") -> Path:
+def make_authority(directory: Path, laboratory: str = "laboratory", passphrase: str = "") -> Path:
     """A new authority in `directory`: its certificate, and its key, which never leaves the folder (0600).
+
+    passphrase: with one the key is encrypted, and every later use needs it.
 
     Raises InputError where there is one already: all certificates of the old one would be worthless.
     """
@@ -69,24 +71,39 @@ def make_authority(directory: Path, laboratory: str = "laboratory") -> Path:
     certificate = builder.sign(key, hashes.SHA256())
     directory.mkdir(parents=True, exist_ok=True)
     _make_private(folder)
-    _write(folder / KEY_FILE, _key_pem(key), 0o600)
+    _write(folder / KEY_FILE, _key_pem(key, passphrase), 0o600)
     _write(folder / CA_FILE, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
     return folder
 
 
+def has_passphrase(directory: Path) -> bool:
+    """Whether the key of the authority in `directory` is encrypted."""
+    try:
+        return b"ENCRYPTED" in (directory / CA_FOLDER / KEY_FILE).read_bytes()
+    except OSError:
+        return False
+
+
 def issue(
-    directory: Path, name: str, role: str, *, addresses: Sequence[str] = (), days: int = DAYS, connect: str = ""
+    directory: Path,
+    name: str,
+    role: str,
+    *,
+    addresses: Sequence[str] = (),
+    days: int = DAYS,
+    connect: str = "",
+    passphrase: str = "",
 ) -> Issued:
     """A key and a certificate for `name` in a folder of its own: what that machine needs, and nothing else.
 
     role: `rig` for the machine that listens, at `addresses` (IP addresses and host names by which others reach it);
     `reader` or `commander` for the others. connect: the rig's endpoint, `tls/ADDRESS:PORT`; with it the folder gets a
-    zenoh configuration that holds all of it (0600).
+    zenoh configuration that holds all of it (0600). passphrase: of the authority's key.
 
-    Raises InputError: no authority, a bad name or role or address, a folder that is there already.
+    Raises InputError: no authority, a wrong passphrase, a bad name or role or address, a folder that is there already.
     """
     _check(name, role, addresses, days)
-    ca_key, ca = _authority(directory)
+    ca_key, ca = _authority(directory, passphrase)
     folder = directory / name
     _check_connect(connect)
     if folder.exists():
@@ -182,12 +199,19 @@ def _alternative(address: str) -> x509.GeneralName:
         return x509.DNSName(address)
 
 
-def _authority(directory: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+def _authority(directory: Path, passphrase: str) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
     folder = directory / CA_FOLDER
+    encrypted = has_passphrase(directory)
+    if encrypted and not passphrase:
+        raise InputError("passphrase", Description("none"), "that of the authority's key, which is encrypted")
     try:
-        key = serialization.load_pem_private_key((folder / KEY_FILE).read_bytes(), None)
+        key_bytes = (folder / KEY_FILE).read_bytes()
+        key = serialization.load_pem_private_key(key_bytes, passphrase.encode() if encrypted else None)
         ca = x509.load_pem_x509_certificate((folder / CA_FILE).read_bytes())
     except (OSError, ValueError, TypeError) as error:
+        if encrypted and isinstance(error, ValueError):
+            found = Description("one that does not open the key")
+            raise InputError("passphrase", found, "that of the authority's key") from None
         raise InputError(
             "directory", f"no authority in {folder} ({str(error)[:80]})", "one made by `seldinger keys init`"
         ) from None
@@ -237,8 +261,11 @@ def _issued(folder: Path, certificate: x509.Certificate) -> Issued:
     return Issued(name, role, f"{certificate.serial_number:x}", certificate.not_valid_after_utc, folder)
 
 
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+def _key_pem(key: ec.EllipticCurvePrivateKey, passphrase: str = "") -> bytes:
+    protection: serialization.KeySerializationEncryption = serialization.NoEncryption()
+    if passphrase:
+        protection = serialization.BestAvailableEncryption(passphrase.encode())
+    return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, protection)
 
 
 def _make_private(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import io
 import json
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import zenoh
 from host.cli.main import main
 from host.run.service_units import UnitSettings, unit_texts
 from host.security import keys
+from protocol.errors import InputError
 from protocol.rig_file import load_rig, parse_rig, read_rig_data
 from tests.realtime.conftest import RIG_FILE
 
@@ -140,3 +142,28 @@ def test_the_installed_model_process_may_talk_to_the_peers_and_the_loop_may_not(
     assert "10.0.0.7" not in texts["seldinger-realtime.service"]
     closed = unit_texts(UnitSettings(Path("/etc/rig.toml"), 1), parse_rig(data))
     assert "IPAddressAllow=localhost \n" in closed["seldinger-host.service"]
+
+
+def test_a_key_with_a_passphrase_opens_with_it_alone(tmp_path: Path) -> None:
+    keys.make_authority(tmp_path, passphrase="correct horse")
+    assert keys.has_passphrase(tmp_path) and b"ENCRYPTED" in (tmp_path / "authority" / "key.pem").read_bytes()
+    for wrong in ("", "wrong"):
+        with pytest.raises(InputError, match="passphrase: found"):
+            keys.issue(tmp_path, "analysis", "reader", passphrase=wrong)
+    assert keys.issue(tmp_path, "analysis", "reader", passphrase="correct horse").role == "reader"
+
+
+def test_the_command_reads_the_passphrase_from_a_file_that_is_its_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = tmp_path / "passphrase"
+    secret.write_text("correct horse\n")
+    secret.chmod(0o644)
+    words = ["-d", str(tmp_path / "keys"), "--passphrase-file", str(secret)]
+    assert run(monkeypatch, "init", *words) == 2 and "chmod 600" in capsys.readouterr().err
+    secret.chmod(0o600)
+    assert run(monkeypatch, "init", *words) == 0
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    assert run(monkeypatch, "issue", "analysis", "--role", "reader", *words[:2]) == 2
+    assert "--passphrase-file: found nothing" in capsys.readouterr().err
+    assert run(monkeypatch, "issue", "analysis", "--role", "reader", *words) == 0

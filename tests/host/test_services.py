@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from host.cli.install_services import install_services
+from host.run import installation_check
+from host.run.installation_check import writable_by_others
 from host.run.service_units import UnitSettings, install, undo, unit_texts
 from protocol.errors import InputError
 from protocol.rig_file import load_rig, parse_rig, read_rig_data
@@ -160,3 +162,49 @@ def test_the_simulated_rig_and_the_control_loop_run_as_services_and_come_back_di
             assert control.run_until(lambda: control.starts == 2 and control.ready, PATIENCE_S)
             assert control.status.startswith("disarmed")
             assert control.stop() == 0 and control.history[-1] == "stopping"
+
+
+def test_what_others_can_write_is_not_installed(tmp_path: Path) -> None:
+    user = os.geteuid()
+    mine = tmp_path / "rig.toml"
+    mine.write_text("")
+    mine.chmod(0o644)
+    assert writable_by_others(mine, {user}) == ""
+    assert "belongs to user" in writable_by_others(mine, {user + 1})
+    mine.chmod(0o646)
+    assert "every user" in writable_by_others(mine, {user})
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o777)
+    assert "every user" in writable_by_others(folder, {user})
+    folder.chmod(0o1777)
+    assert writable_by_others(folder, {user}) == "", "the sticky bit keeps others from replacing files"
+
+
+@pytest.mark.parametrize("weak", ["interpreter", "checkout", "--rig"])
+def test_the_refusal_names_what_is_weak_and_the_command_that_corrects_it(
+    weak: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(installation_check, "_user_ids", lambda name: [os.geteuid()])
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "interpreter"))
+    paths = {name: tmp_path / name / "file" for name in ("interpreter", "checkout", "--rig")}
+    for path in paths.values():
+        path.parent.mkdir()
+        path.write_text("")
+    installation_check.check_installation(*paths.values())
+    paths[weak].parent.chmod(0o777)
+    with pytest.raises(InputError, match="every user can write") as refused:
+        installation_check.check_installation(*paths.values())
+    assert refused.value.key == weak and "chmod -R go-w" in str(refused.value)
+
+
+def test_a_module_in_the_checkout_that_others_can_write_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation_check, "_user_ids", lambda name: [os.geteuid()])
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    module = tmp_path / "host" / "run" / "module.py"
+    module.parent.mkdir(parents=True)
+    module.write_text("")
+    installation_check.check_installation(tmp_path / "python", tmp_path, tmp_path / "rig.toml")
+    module.chmod(0o666)
+    with pytest.raises(InputError, match=r"module\.py"):
+        installation_check.check_installation(tmp_path / "python", tmp_path, tmp_path / "rig.toml")
