@@ -11,8 +11,11 @@ import signal
 import sys
 import time
 import tty
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
+
+import numpy as np
 
 from protocol.rig_file import load_rig
 from realtime.loop.service_notify import ServiceNotifier
@@ -28,11 +31,30 @@ SLICE_NS = 1_000_000
 CATCH_UP_SLICES = 5
 
 
-class RigServer:
-    """Owns the world and its lines. `serve` until `stop`."""
+@dataclass
+class Interval:
+    """What was true between two marks, on the rig's own clock: peak force, last step edge, force at the end."""
 
-    def __init__(self, world: World) -> None:
+    name: str
+    begin_s: float
+    end_s: float = 0.0
+    last_edge_s: float | None = None
+    peak_force_N: float = 0.0
+    force_N: float = 0.0
+
+
+class RigServer:
+    """Owns the world and its lines. `serve` until `stop`.
+
+    commands: a file descriptor with lines for it, -1 for none: `unplug board`, `unplug tracker`, `mark NAME`.
+    """
+
+    def __init__(self, world: World, commands: int = -1) -> None:
         self.world = world
+        self._commands, self._words = commands, b""
+        if commands >= 0:
+            os.set_blocking(commands, False)
+        self.intervals = [Interval("start", 0.0)]
         self._board_line, self._board_end = pty.openpty()
         tty.setraw(self._board_end)
         os.set_blocking(self._board_line, False)
@@ -66,6 +88,7 @@ class RigServer:
                 self.longest_stall_ns, self.longest_stall_at_ns = now_ns - last_ns, self.world.now_ns
             last_ns = now_ns
             manager.beat(self.world.now_ns)
+            self._obey()
             for _ in range(CATCH_UP_SLICES):
                 if self.world.now_ns + SLICE_NS > now_ns - begin_ns:
                     break
@@ -74,20 +97,56 @@ class RigServer:
             if ahead_ns > 0:
                 time.sleep(ahead_ns * 1e-9)
 
+    def unplug_board(self) -> None:
+        """Pull the board's cable: its port is gone, and the program that has it open gets an error."""
+        for fd in (self._board_line, self._board_end):
+            if fd >= 0:
+                os.close(fd)
+        self._board_line = self._board_end = -1
+
+    def _obey(self) -> None:
+        """Carry out the lines that have come."""
+        if self._commands < 0:
+            return
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(self._commands, 4096)
+            self._words += data
+            if not data:
+                self._commands = -1
+        *lines, self._words = self._words.split(b"\n")
+        for line in lines:
+            word, _, name = line.decode("ascii", "replace").partition(" ")
+            if word == "mark":
+                self.intervals.append(Interval(name, self.world.now_ns * 1e-9))
+            elif (word, name) == ("unplug", "board"):
+                self.unplug_board()
+            elif (word, name) == ("unplug", "tracker"):
+                self.tracker.unplug()
+
     def _slice(self) -> None:
         data = b""
-        with contextlib.suppress(BlockingIOError):
-            data = os.read(self._board_line, 4096)
+        if self._board_line >= 0:
+            with contextlib.suppress(BlockingIOError):
+                data = os.read(self._board_line, 4096)
         if data:
             self.last_byte_ns = self.world.now_ns
         out = self.world.advance(self.world.now_ns + SLICE_NS, data)
         if self.world.slice is not None and len(self.world.slice.edge_cycle):
             self.last_edge_ns = self.world.now_ns
-        if out:
+        self._note()
+        if out and self._board_line >= 0:
             with contextlib.suppress(BlockingIOError):
                 os.write(self._board_line, out)
         self.tracker.step(self.world.now_ns)
         self.force_box.step(self.world.now_ns)
+
+    def _note(self) -> None:
+        now = self.intervals[-1]
+        now.end_s = self.world.now_ns * 1e-9
+        if self.last_edge_ns == self.world.now_ns:
+            now.last_edge_s = now.end_s
+        now.force_N = float(np.linalg.norm(self.world.plant.contact_force_N))
+        now.peak_force_N = max(now.peak_force_N, now.force_N)
 
     def summary(self) -> dict[str, object]:
         """What the rig itself counted, for a test or a report."""
@@ -101,6 +160,7 @@ class RigServer:
             "last_byte_s": self.last_byte_ns * 1e-9,
             "last_edge_s": self.last_edge_ns * 1e-9,
             "peak_force_N": world.peak_force_N,
+            "intervals": [asdict(interval) for interval in self.intervals],
             "board": world.board.kind,
         }
 
@@ -108,8 +168,7 @@ class RigServer:
         """Close the emulated tracker, the force sensor and the line of the board."""
         self.tracker.close()
         self.force_box.close()
-        for fd in (self._board_line, self._board_end):
-            os.close(fd)
+        self.unplug_board()
 
 
 def _ask_for_priority() -> None:
@@ -140,6 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--ports-file", type=Path, help="Where to write the ports, for a service's EnvironmentFile.")
     parser.add_argument("--free", action="store_true", help="No wall within reach, for sweeps.")
     parser.add_argument("--effect", type=parse, action="append", default=[], help="ID@PORT:NAME=VALUE,start_s=VALUE")
+    parser.add_argument("--commands", action="store_true", help="Obey lines on standard input: unplug board, mark NAME, ...")
     options = parser.parse_args(arguments)
     _ask_for_priority()
     rig = load_rig(options.rig)
@@ -149,7 +209,7 @@ def main(arguments: list[str] | None = None) -> int:
     with SimulatedBoard(options.board) as board:
         world = World(rig, plant, board, options.seed)
         world.advance(SLICE_NS, b"")
-        server = RigServer(world)
+        server = RigServer(world, sys.stdin.fileno() if options.commands else -1)
 
         def on_signal(number: int, frame: FrameType | None) -> None:
             server.stop()

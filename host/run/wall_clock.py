@@ -72,7 +72,9 @@ class Fleet:
                 self._settings.board,
                 "--seed",
                 str(self._settings.seed),
+                "--commands",
                 *planted,
+                commands=True,
             )
         )
         print(f"watch with: seldinger diagnose --live --rig {rig}", file=sys.stderr, flush=True)
@@ -104,9 +106,22 @@ class Fleet:
                 answers=False,
             )
 
-    def _spawn(self, name: str, module: str, *arguments: str, answers: bool = True) -> str:
+    def tell_rig(self, line: str) -> None:
+        """Give the simulated rig a line: `unplug board`, `unplug tracker` or `mark NAME` (`sim.rig_server`)."""
+        commands = self.processes["rig"].stdin
+        assert commands is not None
+        commands.write(f"{line}\n")
+        commands.flush()
+
+    def _spawn(self, name: str, module: str, *arguments: str, answers: bool = True, commands: bool = False) -> str:
         log = open(Path(self._folder.name) / f"{name}.log", "w", encoding="utf-8")
-        process = subprocess.Popen([sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, stderr=log, text=True)
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE if commands else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
         self.processes[name] = process
         assert process.stdout is not None
         line = process.stdout.readline() if answers else ""
