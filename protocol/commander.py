@@ -116,6 +116,20 @@ class CommandSender:
         """Away from the tissue, then stop."""
         return self.give("target", "retract")
 
+    def jog(
+        self, axis: str, travel_unit: float, speed_unit_per_s: float, direction: Sequence[float] | None = None
+    ) -> Acknowledgement:
+        """Move `axis` (insertion, roll, knob; or tip along `direction`, unit, base frame) a short way, then hold."""
+        return self.give("jog", axis=axis, travel_unit=travel_unit, speed_unit_per_s=speed_unit_per_s, direction=direction)
+
+    def zero(self) -> Acknowledgement:
+        """Make the force sensor's present load its zero; the tip has to hang free."""
+        return self.give("zero")
+
+    def mark(self, note: str) -> Acknowledgement:
+        """Put a note into log and recording. Needs no lease."""
+        return self.give("mark", note=note)
+
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
         """Any command (fields as in `protocol.topics.Command`), under the lease, which is renewed before it ends."""
         try:
@@ -123,7 +137,7 @@ class CommandSender:
             if action == "stop":
                 return self._stop()
             with self._lock:
-                if self._lease and action not in ("hold", "release"):
+                if self._lease and action not in ("hold", "release", "mark"):
                     self._renew()
                 return _said(self._ask(action, target, **fields))
         except (TypeError, ValueError) as error:

@@ -34,6 +34,7 @@ class Phase(Code):
     CONTACT = 4
     RETRACT = 5
     STOPPED = 6
+    JOG = 7
 
 
 class SafetyAction(Code):
@@ -55,6 +56,16 @@ class CommandKind(Code):
     CONTACT = 3
     RETRACT = 4
     STOP = 5
+    JOG = 6
+
+
+class JogAxis(Code):
+    """What a jog moves: the tip along a direction, or one axis. The axes are in the order of the rig file."""
+
+    INSERTION = 0
+    ROLL = 1
+    KNOB = 2
+    TIP = 3
 
 
 class ForceSource(Code):

@@ -6,7 +6,7 @@ import math
 import re
 from typing import Annotated, ClassVar, NamedTuple
 
-from protocol.enums import CommandKind, Phase, SafetyAction
+from protocol.enums import CommandKind, JogAxis, Phase, SafetyAction
 from protocol.messages import (
     MAX_PAYLOAD_BYTES,
     SCHEMA_VERSION,
@@ -57,8 +57,11 @@ __all__ = [
 
 FRAMES = ("base", "tip")
 LOG_LEVELS = ("info", "warning", "error")
-ACTIONS = ("clock", "take", "release", "arm", "disarm", "target", "force", "hold", "stop", "clear_fault")
-TARGETS = tuple(kind.label for kind in CommandKind if kind is not CommandKind.STOP)
+ACTIONS = (
+    "clock", "take", "release", "arm", "disarm", "target", "force", "hold", "jog", "zero", "mark", "stop", "clear_fault"
+)  # fmt: skip
+TARGETS = tuple(kind.label for kind in CommandKind if kind not in (CommandKind.STOP, CommandKind.JOG))
+JOG_AXES = ("none", *JogAxis.labels())
 RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
 _XYZ_m = ("x_m", "y_m", "z_m")
@@ -96,6 +99,9 @@ Speed_m_per_s = Annotated[float, bounds("m/s", -100.0, 100.0)]
 Force_N = Annotated[float, bounds("N", -1000.0, 1000.0)]
 # What a command may ask for at all; the rig's own limit is lower (protocol.rig_file.HARD_MAX_FORCE_N).
 AllowedForce_N = Annotated[float, bounds("N", 0.0, 1.0)]
+# One jog is short: who wants more commands it again, or goes to a point. The rig bounds both further (`operator_commands`).
+JogTravel = Annotated[float, bounds("", -1.0, 1.0)]
+JogSpeed = Annotated[float, bounds("", 0.0, 10.0)]
 Torque_Nm = Annotated[float, bounds("N m", -100.0, 100.0)]
 # An unobservable direction has a standard deviation of up to 1e6 N: it says that nothing is known there.
 Covariance_N2 = Annotated[float, bounds("N^2", -1e12, 1e12)]
@@ -274,7 +280,7 @@ class Command(Message, frozen=True, kw_only=True):
 
     id: Annotated[Text, doc("unique to this command; the same id twice is refused")]
     commander: Annotated[Text, doc("commander; must be the name in the key that it came on")]
-    lease: Annotated[Text, doc("the lease under which it is given; clock, take, hold and stop need none")] = ""
+    lease: Annotated[Text, doc("the lease under which it is given; clock, take, hold, mark and stop need none")] = ""
     expires_ns: Annotated[Stamp_ns, doc("not to be executed after this time, on the rig's clock")]
     action: Annotated[str, choice("what to do", ACTIONS)]
     target: Annotated[str, choice("kind of the target; none unless action is target", TARGETS)]
@@ -288,6 +294,18 @@ class Command(Message, frozen=True, kw_only=True):
     ) = None
     force_N: Annotated[AllowedForce_N | None, doc("force to hold along the normal")] = None
     fault: Annotated[U8, doc("fault code that clear_fault clears, 0 for all")] = 0
+    axis: Annotated[str, choice("what a jog moves; none unless action is jog", JOG_AXES)] = "none"
+    direction: (
+        Annotated[
+            tuple[UnitPart, ...], columns_of("unit vector along which a jog moves the tip, base frame", _triple("along"))
+        ]
+        | None
+    ) = None
+    travel_unit: Annotated[
+        JogTravel | None, doc("how far a jog moves; m for the tip and insertion, rad for roll and knob")
+    ] = None
+    speed_unit_per_s: Annotated[JogSpeed | None, doc("how fast a jog moves, in that unit")] = None
+    note: Annotated[Text, doc("what a mark notes")] = ""
 
     def check(self) -> None:
         """Check that each action carries what it needs, and that expiry comes after issue."""
@@ -309,6 +327,16 @@ class Command(Message, frozen=True, kw_only=True):
             self.force_N is None or self.normal is None or abs(math.hypot(*self.normal) - 1) > 1e-3
         ):
             raise ValueError("Command: found no force_N or no unit normal, wanted both for contact")
+        if (self.action == "jog") == (self.axis == "none"):
+            raise ValueError(
+                f"Command.axis: found {self.axis} with action {self.action}, wanted an axis with action jog, none without"
+            )
+        if self.action == "jog" and (self.travel_unit is None or self.speed_unit_per_s is None):
+            raise ValueError("Command: found no travel_unit or no speed_unit_per_s, wanted both for jog")
+        if self.axis == "tip" and (self.direction is None or abs(math.hypot(*self.direction) - 1) > 1e-3):
+            raise ValueError("Command.direction: found no unit vector, wanted one for a jog of the tip")
+        if self.action == "mark" and not self.note.strip():
+            raise ValueError("Command.note: found an empty text, wanted a note for mark")
 
 
 class Reply(Message, frozen=True, kw_only=True):

@@ -46,6 +46,18 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "check_device",
         "Read one device of a rig and report whether it is fit for use.",
     ),
+    "status": ("host.cli.drive", "status", "Show a running rig on one screen, the first cause first."),
+    "arm": ("host.cli.drive", "arm", "Power the stages of the running rig; they hold."),
+    "disarm": ("host.cli.drive", "disarm", "Bring the stages to rest and disarm the board."),
+    "jog": ("host.cli.drive", "jog", "Move one axis, or the tip along a direction, a short way."),
+    "goto": ("host.cli.drive", "goto", "Bring the tip to a point in free space."),
+    "touch": ("host.cli.drive", "touch", "Approach the tissue along a normal and hold a force."),
+    "force": ("host.cli.drive", "force", "Change the force of the touch that goes on."),
+    "hold": ("host.cli.drive", "hold", "Stay where the rig is; needs no lease."),
+    "retract": ("host.cli.drive", "retract", "Withdraw the tip from the tissue, then stop."),
+    "clear": ("host.cli.drive", "clear", "Clear latched causes and faults; leaves the rig disarmed."),
+    "zero": ("host.cli.drive", "zero", "Make the present load of the force sensor its zero."),
+    "mark": ("host.cli.drive", "mark", "Put a note with the rig's time into log and recording."),
     "home": ("host.cli.home", "home", "Find the home switch of an axis; the stage moves."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
     "install-services": (
@@ -61,6 +73,9 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "warm": ("host.cli.warm", "warm", "Compile every kernel that a command needs, on all cores."),
     "latency-check": ("host.cli.latency_check", "latency_check", "Measure how punctual the loop is on this machine."),
 }
+
+# Commands whose arguments may begin with a minus, such as -2mm.
+NEGATIVE_VALUES = ("jog", "goto", "touch", "force")
 
 COMPILES = (
     "seldinger: compiling kernels, which takes up to some minutes; `seldinger warm` compiles all of them once, on all cores"
@@ -88,7 +103,8 @@ def build(argv: list[str]) -> typer.Typer:
     if isinstance(target, typer.Typer):
         app.add_typer(target, name=called, help=line)
     else:
-        app.command(called, help=line)(target)
+        values = {"ignore_unknown_options": True} if called in NEGATIVE_VALUES else None
+        app.command(called, help=line, context_settings=values)(target)
     return app
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from host.run.commander import Acknowledgement, Commander
+from protocol.enums import JogAxis
 from protocol.errors import InputError
+from protocol.jog_limits import fastest_jog
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import TOPICS, Message
 from protocol.zenoh_session import Latest, Session
@@ -30,7 +33,8 @@ class RigConnection:
     """A connection to one rig; use it as a context.
 
     Reading needs nothing. `take` takes the lease, which is kept until `release` or the end of the context; with it `arm`,
-    `goto`, `touch`, `force`, `retract`, `disarm` and `clear_fault` command the rig. `hold` and `stop` need no lease.
+    `goto`, `touch`, `force`, `jog`, `retract`, `zero`, `disarm` and `clear_fault` command the rig. `hold`, `mark` and
+    `stop` need no lease.
     A command that the rig refuses raises CommandRefused with the rig's reason.
     """
 
@@ -150,6 +154,32 @@ class RigConnection:
         """Stop. Needs no lease; only disarming and arming lead out of it. Raises CommandRefused where no answer came."""
         self._said("stop", self._commander.stop())
 
+    def jog(self, axis: str, travel: float, speed: float | None = None, direction: Sequence[float] | None = None) -> None:
+        """Move one axis, or the tip, a short way, then hold. Ends early where it touches something. Returns at once.
+
+        Parameters:
+            axis: "insertion", "roll", "knob", or "tip". travel: m for tip and insertion, rad for roll and knob; the sign is
+                the direction. speed: m/s or rad/s; default half of the greatest that the rig allows.
+            direction: (3,) unit vector for the tip, base frame.
+
+        Raises:
+            InputError: no such axis.
+            CommandRefused: the rig says which limit binds.
+        """
+        if axis not in JogAxis.labels():
+            raise InputError("axis", axis, "one of " + ", ".join(JogAxis.labels()))
+        if speed is None:
+            speed = 0.5 * fastest_jog(self.rig, JogAxis[axis.upper()])
+        self._said("jog", self._commander.jog(axis, travel, speed, direction))
+
+    def zero(self) -> None:
+        """Make the force sensor's present load its zero; the tip has to hang free. Raises CommandRefused."""
+        self._said("zero", self._commander.zero())
+
+    def mark(self, note: str) -> None:
+        """Put a note (at most 500 characters) into log and recording. Needs no lease. Raises CommandRefused."""
+        self._said("mark", self._commander.mark(note))
+
     def clear_fault(self) -> None:
         """Clear latched faults and leave the rig disarmed. Raises CommandRefused."""
         self._said("clear_fault", self._commander.clear_fault())
@@ -209,15 +239,21 @@ def connect(
         ...     print(rig.status()["phase"])
     """
     read = rig if isinstance(rig, Rig) else load_rig(SIMULATED_RIG if rig == "simulated" else os.fspath(rig))
+    session = open_session(read, endpoint, keys)
+    try:
+        return RigConnection(read, session, name)
+    except ValueError as error:
+        session.close()
+        raise InputError.from_sentence(str(error)) from None
+
+
+def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[str] | None = None) -> Session:
+    """Open a session of `rig`, on this machine or, with `endpoint` and `keys`, on another. Raises as `connect` does."""
     if (endpoint is None) != (keys is None):
         raise InputError("keys" if keys is None else "endpoint", "nothing", "endpoint and keys together, or neither")
     try:
         if endpoint is not None and keys is not None:
-            from pathlib import Path
-
-            session = Session.remote(read.name, endpoint, Path(keys))
-        else:
-            session = Session.of_rig(read)
-        return RigConnection(read, session, name)
+            return Session.remote(rig.name, endpoint, Path(keys))
+        return Session.of_rig(rig)
     except ValueError as error:
         raise InputError.from_sentence(str(error)) from None

@@ -33,16 +33,19 @@ _STOP_TIMEOUT_S = 20.0  # for all to end of themselves; a recorder that is kille
 class Fleet:
     """The three processes. Use as a context: leaving it stops everything in order.
 
-    loop: with the realtime process; without it the caller runs the loop, on `ports`. endpoint: where it listens, in a
-    folder of its own, so that fleets do not meet.
+    loop: with the realtime process; without it the caller runs the loop, on `ports`. own_folder: use the folder of the rig
+    file, so that commands find the rig without being told, unless a rig runs there; otherwise a folder of its own, so that
+    fleets do not meet. endpoint: where it listens.
     """
 
-    def __init__(self, settings: DemoSettings, recording: Path, loop: bool = True) -> None:
+    def __init__(self, settings: DemoSettings, recording: Path, loop: bool = True, own_folder: bool = False) -> None:
         self._settings, self._recording, self._loop = settings, recording, loop
         self.ports: dict[str, Any] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
         self.rig_file = Path(self._folder.name) / "rig.toml"
-        self.endpoint = LocalPaths(Path(self._folder.name)).endpoint
+        own = load_rig(settings.rig_file).local
+        self._sockets = own if own_folder and not own.stop_socket.exists() else LocalPaths(Path(self._folder.name))
+        self.endpoint = self._sockets.endpoint
         self.processes: dict[str, subprocess.Popen[str]] = {}
         self.rig_summary: dict[str, Any] = {}
 
@@ -59,7 +62,7 @@ class Fleet:
 
     def _start(self) -> None:
         text = self._settings.rig_file.read_text(encoding="utf-8")
-        self.rig_file.write_text(with_folder(text, Path(self._folder.name)), encoding="utf-8")
+        self.rig_file.write_text(with_folder(text, self._sockets.folder), encoding="utf-8")
         rig = str(self.rig_file)
         planted = [word for text in self._settings.effects for word in ("--effect", text)]
         self.ports = ports = json.loads(

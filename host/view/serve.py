@@ -53,8 +53,10 @@ def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[P
     report("starting the simulated rig")
     recording = new_recording_path(directory, "view")
     try:
-        with Fleet(DemoSettings(rig_file=rig_file), recording) as fleet:
+        with Fleet(DemoSettings(rig_file=rig_file), recording, own_folder=True) as fleet:
             fleet.wait_for_state()
+            if load_rig(rig_file).local.endpoint != fleet.endpoint:
+                report(f"another rig has the rig file's folder; commands to this one need --rig {fleet.rig_file}")
             yield fleet.rig_file
     finally:
         report(f"recording: {recording}")

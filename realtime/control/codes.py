@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.enums import BoardState, CommandKind, ControlLaw, ForceSource, Phase, SafetyAction
+from protocol.enums import BoardState, CommandKind, ControlLaw, ForceSource, JogAxis, Phase, SafetyAction
 
 (
     PHASE_DISARMED,
@@ -12,11 +12,19 @@ from protocol.enums import BoardState, CommandKind, ControlLaw, ForceSource, Pha
     PHASE_CONTACT,
     PHASE_RETRACT,
     PHASE_STOPPED,
+    PHASE_JOG,
 ) = (int(phase) for phase in Phase)
 ACTION_NONE, ACTION_WARN, ACTION_HOLD, ACTION_RETRACT, ACTION_STOP = (int(action) for action in SafetyAction)
-COMMAND_NONE, COMMAND_HOLD, COMMAND_POSITION, COMMAND_CONTACT, COMMAND_RETRACT, COMMAND_STOP = (
-    int(kind) for kind in CommandKind
-)
+(
+    COMMAND_NONE,
+    COMMAND_HOLD,
+    COMMAND_POSITION,
+    COMMAND_CONTACT,
+    COMMAND_RETRACT,
+    COMMAND_STOP,
+    COMMAND_JOG,
+) = (int(kind) for kind in CommandKind)
+JOG_INSERTION, JOG_TIP = int(JogAxis.INSERTION), int(JogAxis.TIP)
 SOURCE_SENSOR, SOURCE_ESTIMATE = (int(source) for source in ForceSource)
 LAW_THESIS, LAW_PREDICTIVE = (int(law) for law in ControlLaw)
 BOARD_FAULT = int(BoardState.FAULT)

@@ -140,6 +140,15 @@ def go(
 
 
 @njit(cache=True)
+def follow(state: PredictiveState, hybrid: HybridState, axis: int, speed: float, reversal_depth_m: float) -> None:
+    """Follow a joint command of which only `axis` moves, at `speed` (m/s or rad/s)."""
+    state.goal_speed_m_per_s, state.reversal_depth_m = 0.0, reversal_depth_m
+    for i in range(N_AXES):
+        state.speed[i] = speed if i == axis else 0.0
+        state.joint_at_crossing[i] = state.joint_after_crossing[i] = hybrid.joint[i]
+
+
+@njit(cache=True)
 def touch(state: PredictiveState, force_N: float, depth_m: float) -> None:
     """Begin contact: the force set-point starts from the present force (N), with the free tip at `depth_m` (m)."""
     state.force_setpoint_N, state.away_s, state.goal_speed_m_per_s = max(force_N, 0.0), 0.0, 0.0

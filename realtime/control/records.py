@@ -66,6 +66,10 @@ class CommandRecord:
     target_m: Floats = real("m", "requested tip position", 3)
     normal: Floats = real("", "outward normal of the wall, unit, towards the tip", 3)
     force_N: float = real("N", "requested force along the inward normal")
+    jog_axis: int = whole("", "a JogAxis: what a jog moves")
+    jog_direction: Floats = real("", "unit vector along which a jog moves the tip, base frame", 3)
+    jog_travel: float = real("m, rad", "how far a jog moves")
+    jog_speed: float = real("m/s, rad/s", "how fast a jog moves")
     clear: int = whole("", "rises by one when the operator clears latched causes")
     watch: int = whole("", "causes that the supervision found, a bit set of `safety.CAUSES`")
 
@@ -256,6 +260,14 @@ class HybridState:
     above_ns: int = whole("ns", "since when the force has been beyond its threshold; 0: it is not")
 
 
+class JogState:
+    """A jog that goes on (`jog`)."""
+
+    left: float = real("m, rad", "way that is left")
+    target_m: Floats = real("m", "where a jog of the tip ends", 3)
+    least_force_N: float = real("N", "least force since the jog began")
+
+
 class TipOffsetParams:
     """Learning of the tip's offset (`tip_offset`)."""
 
@@ -417,6 +429,7 @@ class State:
     tip_offset: TipOffsetState = part(TipOffsetState, "offset of the tip")
     wall: WallState = part(WallState, "motion of the wall")
     predictive: PredictiveState = part(PredictiveState, "the predictive law")
+    jog: JogState = part(JogState, "the jog that goes on")
 
 
 class Outputs:

@@ -14,6 +14,7 @@ from realtime.control import (
     free_tip,
     hybrid,
     inverse_kinematics,
+    jog,
     predictive,
     predictor,
     safety,
@@ -29,14 +30,17 @@ from realtime.control.codes import (
     BOARD_FAULT,
     COMMAND_CONTACT,
     COMMAND_HOLD,
+    COMMAND_JOG,
     COMMAND_POSITION,
     COMMAND_RETRACT,
     COMMAND_STOP,
+    JOG_TIP,
     LAW_PREDICTIVE,
     PHASE_APPROACH,
     PHASE_CONTACT,
     PHASE_DISARMED,
     PHASE_HOLD,
+    PHASE_JOG,
     PHASE_POSITION,
     PHASE_RETRACT,
     PHASE_STOPPED,
@@ -66,8 +70,8 @@ def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> 
     joint, flank = free_tip.joint_at(state.history, inputs.tip.stamp_ns)
     if flank == 0.0:
         return
-    free_phase = state.phase == PHASE_HOLD or state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH
-    free = free_phase and state.force.smooth_N < params.hybrid.contact_force_N
+    moving = state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH or state.phase == PHASE_JOG
+    free = (moving or state.phase == PHASE_HOLD) and state.force.smooth_N < params.hybrid.contact_force_N
     tip_offset.apply(params.tip_offset, params.kinematics, state.tip_offset, joint, inputs.tip, state.normal, touching, free)
     if touching:
         wall_observer.take_pose(params.wall, state.wall, inputs.tip.stamp_ns, inputs.tip.position_m, state.normal)
@@ -242,12 +246,25 @@ def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, 
 
 
 @njit(cache=True)
+def _start_jog(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
+    """Begin the commanded jog, or hold if it cannot be done. A jog that goes on is extended without a bump."""
+    continued = state.phase == PHASE_JOG
+    if jog.is_sensible(params.predictor, command, state.hybrid.goal_m if continued else tip_m):
+        _enter(params, state, PHASE_JOG, tip_m)
+        jog.start(state.jog, command, state.hybrid.goal_m, continued)
+    else:
+        _enter(params, state, PHASE_HOLD, tip_m)
+
+
+@njit(cache=True)
 def _follow_command(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
     """Set the phase that a new command wants of the armed loop."""
     if command.kind == COMMAND_HOLD:
         _enter(params, state, PHASE_HOLD, tip_m)
     elif command.kind == COMMAND_RETRACT:
         _enter(params, state, PHASE_RETRACT, tip_m)
+    elif command.kind == COMMAND_JOG:
+        _start_jog(params, state, command, tip_m)
     elif not _sensible(params, command):
         _enter(params, state, PHASE_HOLD, tip_m)
     elif command.kind == COMMAND_POSITION:
@@ -312,6 +329,11 @@ def _control_thesis(params: Params, state: State, command: CommandRecord, tip_m:
         hybrid.move_goal(goal_m, command.target_m, step_m)
     elif state.phase == PHASE_APPROACH:
         hybrid.move_goal(goal_m, _approach_target(command), step_m)
+    elif state.phase == PHASE_JOG and command.jog_axis == JOG_TIP:
+        hybrid.move_goal(goal_m, state.jog.target_m, command.jog_speed * period_s)
+    elif state.phase == PHASE_JOG:
+        jog.advance(state.jog, hy.joint, command.jog_axis, command.jog_speed, period_s)
+        return
     elif state.phase == PHASE_CONTACT:
         for i in range(3):
             goal_m[i] = command.target_m[i]
@@ -335,6 +357,12 @@ def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: f
         speed = share * params.hybrid.approach_speed_m_per_s
         approach = predictive.Move(_approach_target(command), speed, period_s)
         predictive.go(law, own, hy, params.kinematics, offset_m, approach, depth_m)
+    elif state.phase == PHASE_JOG and command.jog_axis == JOG_TIP:
+        along = predictive.Move(state.jog.target_m, command.jog_speed, period_s)
+        predictive.go(law, own, hy, params.kinematics, offset_m, along, depth_m)
+    elif state.phase == PHASE_JOG:
+        speed = jog.advance(state.jog, hy.joint, command.jog_axis, command.jog_speed, period_s)
+        predictive.follow(own, hy, command.jog_axis, speed, depth_m)
     elif state.phase == PHASE_CONTACT:
         slide = predictive.Move(command.target_m, law.slide_speed_m_per_s, period_s)
         contact = predictive.Contact(
@@ -352,6 +380,18 @@ def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: f
 
 
 @njit(cache=True)
+def _end_jog(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
+    """Hold where a jog is done or meets something. Without a fresh force a jog is as blind as any motion in free space."""
+    threshold_N = params.hybrid.contact_force_N
+    if state.force.source == SOURCE_ESTIMATE:
+        threshold_N *= _NOISY_FACTOR
+    fresh = inputs.now_ns - state.force.age_from_ns <= params.safety.force_timeout_ns
+    touches = fresh and jog.touches(state.jog, inputs.command, state.force.force_N, threshold_N)
+    if touches or jog.is_done(state.jog, state.stage, params.stage, inputs.command.jog_axis, state.hybrid.goal_m):
+        _enter(params, state, PHASE_HOLD, tip_m)
+
+
+@njit(cache=True)
 def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, force_N: float) -> None:
     """Advance the joint command by one tick according to the phase."""
     if state.phase == PHASE_RETRACT:
@@ -359,6 +399,8 @@ def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, fo
         return
     if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
         _watch_contact(params, state, inputs.now_ns, force_N, tip_m)
+    if state.phase == PHASE_JOG:
+        _end_jog(params, state, inputs, tip_m)
     if params.law == LAW_PREDICTIVE:
         _control_predictive(params, state, inputs, force_N)
     else:

@@ -21,7 +21,7 @@ REMEMBERED = 2000
 _SENDERS = 200
 # In this time at most one refusal is logged, with the number of the others.
 _LOG_EVERY_NS = 500_000_000
-_NEEDS_NO_LEASE = ("clock", "take", "hold", "stop")
+_NEEDS_NO_LEASE = ("clock", "take", "hold", "mark", "stop")
 
 
 @dataclass

@@ -41,6 +41,8 @@ class Intake:
         self._tracker_rotation = rotation(self._tracker_turn)
         self._tracker_shift_m = np.array(rig.tracker.base_from_tracker_m)
         self._sensor_rotation = rotation(rig.force_sensor.base_from_sensor_wxyz)
+        # Load of the sensor at no force (sensor frame, N), as `force_zero` measured it; subtracted from every reading.
+        self.zero_N = np.zeros(3)
 
     def pose(
         self, record: np.record, stamp_ns: int, arrival_ns: int, position_m: np.ndarray, quaternion_wxyz: np.ndarray
@@ -55,7 +57,7 @@ class Intake:
         """A force reading (sensor frame, (3,) N) into a FORCE record (base frame, force on the tissue)."""
         record.count += 1
         record.stamp_ns, record.arrival_ns = stamp_ns, arrival_ns
-        record.force_N[:] = self._sensor_rotation @ np.asarray(force_N)
+        record.force_N[:] = self._sensor_rotation @ (np.asarray(force_N) - self.zero_N)
 
     @staticmethod
     def estimate(record: np.record, stamp_ns: int, arrival_ns: int, force_N: np.ndarray, covariance_N2: np.ndarray) -> None:

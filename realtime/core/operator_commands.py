@@ -6,22 +6,36 @@ Whether a command may be given at all, by whom and how fresh, was checked before
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from protocol.enums import CommandKind, ForceSource, Phase
-from protocol.messages import Vector
+from protocol.enums import CommandKind, ForceSource, JogAxis, Phase
+from protocol.jog_limits import LONGEST_JOG, fastest_jog, unit_of
 from protocol.rig_file import Rig
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
-from realtime.control import inverse_kinematics
-from realtime.control.configure import tick_parameters
+from realtime.core.reach import TargetReach
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
-# A target may be out of reach by no more than this: the calibration is not better known.
-REACH_m = 0.001
 FORCE_BOX = "net_ft"  # as the driver names it in its events
 _KINDS = {kind.label: kind for kind in CommandKind}
+_JOG_PHASES = (Phase.HOLD, Phase.POSITION, Phase.JOG)
+_ZERO_PHASES = (Phase.DISARMED, Phase.HOLD, Phase.STOPPED)
+
+
+class RigPosition(NamedTuple):
+    """Where the rig is after the newest tick.
+
+    phase; tip_m and goal_m (3,), predicted tip and moving goal; stage_unit (3,), the set-point; force_N (3,), on the tissue.
+    """
+
+    phase: Phase = Phase.DISARMED
+    tip_m: npt.NDArray[np.float64] = np.zeros(3)
+    goal_m: npt.NDArray[np.float64] = np.zeros(3)
+    stage_unit: npt.NDArray[np.float64] = np.zeros(3)
+    force_N: npt.NDArray[np.float64] = np.zeros(3)
 
 
 class OperatorCommands:
@@ -32,14 +46,23 @@ class OperatorCommands:
         record: the COMMAND record that the tick reads; its `count` rises with each command that the tick has to act on.
         link: the link to the board.
         silent_sensors: names the sensors that send nothing, empty when all do; asked before arming.
+        standing: where the rig stands; asked before a jog and before the force sensor is zeroed.
+        zero_force: makes the sensor's present load its zero; returns why it cannot, empty when it did.
     """
 
     def __init__(
-        self, rig: Rig, record: np.record, link: StepperBoardLink, silent_sensors: Callable[[], str] = lambda: ""
+        self,
+        rig: Rig,
+        record: np.record,
+        link: StepperBoardLink,
+        silent_sensors: Callable[[], str] = lambda: "",
+        standing: Callable[[], RigPosition] = RigPosition,
+        zero_force: Callable[[], str] = lambda: "",
     ) -> None:
         self._rig, self._record, self._link, self._silent_sensors = rig, record, link, silent_sensors
+        self._standing, self._zero_force = standing, zero_force
         self._frames: list[bytes] = []
-        self._kinematics = tick_parameters(rig)[0].kinematics
+        self._reach = TargetReach(rig)
         record.normal[:] = (0.0, 0.0, -1.0)
 
     @property
@@ -66,6 +89,9 @@ class OperatorCommands:
             "target": self._target,
             "hold": self._hold,
             "force": self._force,
+            "jog": self._jog,
+            "zero": self._zero,
+            "mark": lambda command: "",  # it is in the log; nothing else happens
         }
         problem = actions[command.action](command)
         return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
@@ -143,7 +169,7 @@ class OperatorCommands:
     def _target(self, command: Command) -> str:
         if not self._record.armed:
             return "target: found the rig disarmed, wanted armed"
-        problem = self._too_much(command) or ("" if command.target_m is None else self._outside(command.target_m))
+        problem = self._too_much(command) or ("" if command.target_m is None else self._reach.problem(command.target_m))
         if problem:
             return problem
         if command.target_m is not None:
@@ -155,30 +181,75 @@ class OperatorCommands:
         self._set(_KINDS[command.target])
         return ""
 
+    def _jog(self, command: Command) -> str:
+        """Start or extend a jog, or say which limit binds."""
+        if not self._record.armed:
+            return "jog: found the rig disarmed, wanted armed"
+        axis, travel, speed = JogAxis[command.axis.upper()], command.travel_unit or 0.0, command.speed_unit_per_s or 0.0
+        here = self._standing()
+        if here.phase not in _JOG_PHASES:
+            return f"jog: found the loop in phase {here.phase.label}, wanted hold, position or jog; hold or retract first"
+        direction = np.array(command.direction if command.direction is not None else (0.0, 0.0, 0.0))
+        problem = (
+            self._too_far(axis, travel, speed)
+            or self._pressing(axis, travel, direction, here)
+            or self._beyond(axis, travel, direction, here)
+        )
+        if problem:
+            return problem
+        record = self._record
+        record.jog_axis, record.jog_travel, record.jog_speed = axis, travel, speed
+        record.jog_direction[:] = direction
+        self._set(CommandKind.JOG)
+        return ""
+
+    def _too_far(self, axis: JogAxis, travel: float, speed: float) -> str:
+        unit, fastest = unit_of(axis), fastest_jog(self._rig, axis)
+        if not abs(travel) <= LONGEST_JOG[axis]:
+            return f"travel_unit: found {travel:g} {unit}, wanted at most {LONGEST_JOG[axis]:g} {unit} in one jog"
+        if not 0.0 < speed <= fastest * (1.0 + 1e-9):
+            return f"speed_unit_per_s: found {speed:g} {unit}/s, wanted above 0 and at most {fastest:g} {unit}/s"
+        return ""
+
+    def _pressing(self, axis: JogAxis, travel: float, direction: npt.NDArray[np.float64], here: RigPosition) -> str:
+        """Say that the tip presses on something and that this jog does not lead away from it."""
+        force_N = float(np.linalg.norm(here.force_N))
+        if force_N <= self._rig.control.contact_force_N:
+            return ""
+        backwards = axis is JogAxis.INSERTION and travel < 0.0
+        away = axis is JogAxis.TIP and travel * float(direction @ here.force_N) < 0.0
+        if backwards or away:
+            return ""
+        return (
+            f"jog: found a force of {force_N:.3f} N on the tip, wanted a jog away from it, or less than "
+            f"control.contact_force_N {self._rig.control.contact_force_N}; zero the sensor if the tip hangs free"
+        )
+
+    def _beyond(self, axis: JogAxis, travel: float, direction: npt.NDArray[np.float64], here: RigPosition) -> str:
+        """Say which limit the jog would pass: workspace and reach for the tip, travel for an axis."""
+        if axis is JogAxis.TIP:
+            start_m = here.goal_m if here.phase is Phase.JOG else here.tip_m
+            return self._reach.problem(tuple(float(value) for value in start_m + travel * direction))
+        slopes = (self._rig.transmission.insertion_slope, self._rig.transmission.roll_slope, 1.0)
+        stage, end = self._rig.stage(int(axis)), float(here.stage_unit[axis]) + travel / slopes[axis]
+        if stage.min_unit <= end <= stage.max_unit:
+            return ""
+        unit = unit_of(axis)
+        return (
+            f"jog: found {axis.label} {end:.4f} {unit} at the end of the jog, "
+            f"wanted {stage.min_unit:g} to {stage.max_unit:g} {unit} (the stage's travel)"
+        )
+
+    def _zero(self, command: Command) -> str:
+        phase = self._standing().phase
+        if phase not in _ZERO_PHASES:
+            return (
+                f"zero: found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
+            )
+        return self._zero_force()
+
     def _too_much(self, command: Command) -> str:
         limit_N = self._rig.safety.over_force_N
         if command.force_N is not None and command.force_N >= limit_N:
             return f"force_N: found {command.force_N}, wanted below safety.over_force_N {limit_N}"
-        return ""
-
-    def _outside(self, target_m: Vector) -> str:
-        low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
-        for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
-            if not least <= value <= most:
-                return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
-        insertion, transmission = self._rig.stages.insertion, self._rig.transmission
-        # Half the backlash on either side: the body may stand anywhere in it.
-        half_m = 0.5 * transmission.insertion_backlash_m
-        least_m, most_m = (
-            transmission.insertion_at_home_m + transmission.insertion_slope * unit + side * half_m
-            for unit, side in ((insertion.min_unit, -1.0), (insertion.max_unit, 1.0))
-        )
-        off_m = inverse_kinematics.out_of_reach_m(
-            self._kinematics, np.asarray(target_m, float), least_m, most_m, self._rig.stages.knob.max_unit
-        )
-        if not off_m <= REACH_m:
-            return (
-                f"target_m: found {tuple(target_m)}, wanted a point that the unloaded tip can reach: "
-                f"it comes no nearer than {off_m * 1e3:.1f} mm"
-            )
         return ""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from protocol.enums import ForceSource, Phase, SafetyAction
+from protocol.errors import InputError
 from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply
 from realtime.control import safety
@@ -23,8 +24,9 @@ from realtime.control.configure import tick_parameters
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
 from realtime.core.command_gate import CommandGate, without_secrets
+from realtime.core.force_zero import ForceZero
 from realtime.core.intake import Intake
-from realtime.core.operator_commands import OperatorCommands
+from realtime.core.operator_commands import OperatorCommands, RigPosition
 from realtime.core.supervision import Supervision, SupervisionFinding
 from realtime.drivers.aurora import PoseSample
 from realtime.drivers.device_events import DeviceEvent
@@ -128,13 +130,17 @@ class RigCore:
         self.phase, self.force_source = Phase.DISARMED, ForceSource(int(self.params[0].force_source))
         self.board_errors: list[str] = []
         self.link = StepperBoardLink(axis_limits(rig))
-        self.commands = OperatorCommands(rig, records["command"], self.link, self._silent_sensors)
+        self.commands = OperatorCommands(
+            rig, records["command"], self.link, self._silent_sensors, self._standing, self._zero_force
+        )
         self.gate = CommandGate(
             lambda: self.now_ns, self._execute, roles=rig.access.roles if rig.access else {}, new_lease=new_lease
         )
         ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
         self.supervision = Supervision((ratios[0], ratios[1], ratios[2]))
         self._records, self._timing, self._intake = records, timing, Intake(rig)
+        self._force_zero = ForceZero(rig.force_sensor.noise_N, rig.force_sensor.range_N)
+        self._outputs: np.record | None = None  # of the newest tick
         self._leaving, self._loop_runs = Leaving(), True
         self._first = True
         self._tick_ns = 0
@@ -185,6 +191,7 @@ class RigCore:
 
     def _take_tick(self, tick: Tick) -> None:
         outputs, number = tick.outputs, tick.number
+        self._outputs = outputs
         self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
@@ -257,6 +264,7 @@ class RigCore:
     def _take_forces(self, samples: Sequence[ForceSample]) -> None:
         record = self._records["sensor"]
         for sample in samples:
+            self._force_zero.take(sample.force_N, sample.arrival_ns)
             self._intake.force(record, sample.stamp_ns, sample.arrival_ns, sample.force_N)
             self._leaving.changed.add("sensor")
             if record.count % telemetry.FORCE_EVERY == 0:
@@ -273,6 +281,30 @@ class RigCore:
         if text:
             self._command_changed()
             self._log("warning", device, text)
+
+    def _standing(self) -> RigPosition:
+        """Return where the rig stands after the newest tick."""
+        y = self._outputs
+        if y is None:
+            return RigPosition()
+        vectors = (np.array(values, float) for values in (y.tip_m, y.goal_m, y.stage_unit, y.force_N))
+        return RigPosition(self.phase, *vectors)
+
+    def _zero_force(self) -> str:
+        """Make the force sensor's present load its zero, and log it. Return why it cannot be done, empty when it was."""
+        try:
+            zero_N = self._force_zero.measure(self.now_ns)
+        except InputError as error:
+            return str(error)
+        before_N, self._intake.zero_N = self._intake.zero_N, zero_N
+        x, y, z = zero_N
+        self._log(
+            "info",
+            "force_zero",
+            f"force sensor zeroed: {x:.4f}, {y:.4f}, {z:.4f} N (sensor frame) are subtracted from every reading; "
+            f"before {before_N[0]:.4f}, {before_N[1]:.4f}, {before_N[2]:.4f} N",
+        )
+        return ""
 
     def _silent_sensors(self) -> str:
         """Return the sensors that the loop needs and that have sent nothing for longer than the failsafe allows."""
@@ -326,7 +358,9 @@ class RigCore:
             text = f"{command.action}: found the loop not running yet, wanted it to: it is being compiled"
             return Reply(stamp_ns=now_ns, id=command.id, result="refused", text=text)
         reply = self.commands.execute(command, now_ns)
-        if reply.result == "accepted":
+        if command.action == "mark" and reply.result == "accepted":
+            self._log("info", "mark", command.note)
+        elif reply.result == "accepted":
             if command.action in ("arm", "clear_fault"):
                 self.supervision.restart()
                 self.commands.set_watched_causes(self.supervision.causes)

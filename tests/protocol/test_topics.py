@@ -69,6 +69,7 @@ def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
             "expires_ns": values["stamp_ns"],
             "action": "arm",
             "target": "none",
+            "axis": "none",
         }
     return values
 
@@ -249,6 +250,12 @@ def test_long_texts_are_cut_when_sent_and_refused_when_received() -> None:
         ({"commander": "Console"}, "commander: found"),
         ({"commander": "a/b"}, "commander: found"),
         ({"id": ""}, "Command.id"),
+        ({"axis": "tip"}, "Command.axis"),
+        ({"action": "jog"}, "Command.axis"),
+        ({"action": "jog", "axis": "knob"}, "travel_unit"),
+        ({"action": "jog", "axis": "tip", "travel_unit": 0.001, "speed_unit_per_s": 0.01}, "Command.direction"),
+        ({"action": "jog", "axis": "elbow", "travel_unit": 0.001, "speed_unit_per_s": 0.01}, "Command.axis"),
+        ({"action": "mark"}, "Command.note"),
         ({"id": "x" * 65}, "Command.id"),
     ],
 )

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.enums import CommandKind, Phase, SafetyAction
+from protocol.enums import CommandKind, JogAxis, Phase, SafetyAction
 from protocol.rig_file import Rig, parse_rig
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
@@ -180,3 +180,46 @@ def test_the_tick_is_pure(bench: Bench) -> None:
     assert first.tobytes() == second.tobytes() and state.tobytes() == again.tobytes()
     assert inputs.tobytes() == bench.inputs.tobytes()
     assert STATE.itemsize and INPUTS.itemsize
+
+
+@pytest.mark.parametrize("law", ["predictive", "thesis"])
+def test_a_jog_moves_one_axis_by_its_travel_at_its_speed_and_then_rests(rig: Rig, law: str) -> None:
+    bench = armed(Bench(with_law(rig, law)))
+    before = np.array(bench.outputs[0].joint)
+    bench.command(CommandKind.JOG, jog_axis=JogAxis.KNOB, jog_travel=0.1, jog_speed=0.5)
+    bench.run(0.1)
+    half = float(bench.outputs[0].joint[2] - before[2])
+    assert bench.outputs[0].phase == Phase.JOG and 0.02 < half < 0.055
+    bench.run(0.4)
+    change = np.array(bench.outputs[0].joint) - before
+    assert change[2] == pytest.approx(0.1, abs=0.002) and change[1] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("law", ["predictive", "thesis"])
+def test_a_jog_that_meets_a_force_holds(rig: Rig, law: str) -> None:
+    bench = armed(Bench(with_law(rig, law)))
+    bench.command(CommandKind.JOG, jog_axis=JogAxis.TIP, jog_travel=0.01, jog_speed=0.005, jog_direction=(0.0, 0.0, 1.0))
+    bench.run(0.2)
+    assert bench.outputs[0].phase == Phase.JOG
+    bench.force[:] = (0.0, 0.0, 0.05)
+    bench.run(0.01)
+    assert bench.outputs[0].phase == Phase.HOLD
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"jog_axis": 7},
+        {"jog_axis": -1},
+        {"jog_travel": np.nan},
+        {"jog_speed": np.inf},
+        {"jog_speed": -0.01},
+        {"jog_axis": 3, "jog_direction": (0.0, 0.0, 0.0)},
+        {"jog_axis": 3, "jog_direction": (0.0, 0.0, 1.0), "jog_travel": 5.0},
+    ],
+)
+def test_a_jog_that_makes_no_sense_holds(bench: Bench, wrong: dict) -> None:
+    armed(bench)
+    bench.command(CommandKind.JOG, **{"jog_axis": 0, "jog_travel": 0.001, "jog_speed": 0.005} | wrong)
+    bench.run(0.05)
+    assert bench.outputs[0].phase == Phase.HOLD and np.all(np.isfinite(bench.outputs[0].stage_unit))

@@ -125,6 +125,14 @@ def eventful(run: Recorded) -> None:
     run.command("target", "position", target_m=TARGET_M)
     run.command("target", "position", target_m=(0.0, 0.0, 0.5))
     run.run(0.5)
+    run.command("jog", axis="insertion", travel_unit=-0.001, speed_unit_per_s=0.005)
+    run.run(0.1)
+    run.command("jog", axis="tip", direction=(0.0, 1.0, 0.0), travel_unit=0.001, speed_unit_per_s=0.005)
+    run.run(0.1)
+    run.command("hold")
+    run.run(0.1)
+    run.command("zero")
+    run.command("mark", note="before the tracker is silent")
     now_ns = run.world.now_ns
     run.world.tracker.faults.append(SensorFault("silent", now_ns, now_ns + 1_500_000_000))
     run.run(1.0)
@@ -166,5 +174,13 @@ def test_the_wall_clock_shell_says_and_does_what_the_lock_step_says_and_does(she
     wanted = [message for turn in run.turns for message in turn.leaving.messages if message[0] != "loop"]
     assert [message for message in network.messages if message[0] != "loop"] == wanted
     texts = [message.text for topic, message in wanted if topic == "log"]  # type: ignore[attr-defined]
-    for words in ("arm: accepted", "wanted fresh readings", "stop: no pose", "is back: disarmed"):
+    for words in (
+        "arm: accepted",
+        "jog: accepted",
+        "force sensor zeroed",
+        "before the tracker",
+        "wanted fresh readings",
+        "stop: no pose",
+        "is back: disarmed",
+    ):
         assert any(words in text for text in texts), words

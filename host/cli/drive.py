@@ -1,0 +1,341 @@
+"""Commands to a running rig: arm, jog, goto, touch, ... Each takes the lease, asks, and prints the rig's answer."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from host.cli.contract_io import write_json
+from host.cli.options import Json, RigFile
+from host.cli.quantities import direction, point, quantity
+from protocol.enums import JogAxis
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG
+
+if TYPE_CHECKING:
+    from host.run.connection import RigConnection
+    from protocol.topics import Message
+
+Name = Annotated[str, typer.Option("--name", help="Name under which the command is given.")]
+Endpoint = Annotated[str | None, typer.Option(help="Where a rig on another machine listens: tls/HOST:PORT.")]
+Keys = Annotated[Path | None, typer.Option(help="Folder of the certificate for --endpoint.")]
+Force = Annotated[str, typer.Option(help="Contact force, such as 0.2, 200mN or 20g.")]
+# Of jogs along a direction of the base frame.
+TIP_DIRECTIONS = {
+    "e1": (1.0, 0.0, 0.0),
+    "e2": (0.0, 1.0, 0.0),
+    "e3": (0.0, 0.0, 1.0),
+}
+LOOK_S = 0.02
+# A goal is reached when the tip has been near it for so long.
+THERE_S = 0.3
+ANSWERS_WITHIN_S = 3.0
+
+
+class Driver:
+    """One command to a rig: what was asked, what the rig answered, and how it went on."""
+
+    def __init__(self, connection: RigConnection, command: str, json: bool) -> None:
+        self.rig, self._command, self._json = connection, command, json
+        self.result: dict[str, Any] = {"command": command, "accepted": True}
+
+    @property
+    def state(self) -> Any:
+        """The newest state of the loop."""
+        return self.rig.latest("state")
+
+    def say(self, text: str) -> None:
+        """Print a line for people."""
+        print(f"{self._command}: {text}", file=sys.stderr, flush=True)
+
+    def wait(self, seconds: float, done: Callable[[Message], bool]) -> bool:
+        """Wait until the rig's state fulfils `done`; false after `seconds`, or where the rig stops."""
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            state = self.state
+            if state is not None and done(state):
+                return True
+            time.sleep(LOOK_S)
+        return False
+
+    def failed(self, text: str) -> typer.Exit:
+        """Note that the command was accepted but did not come to its end; exit status 1."""
+        state = self.state
+        why = f"; safety: {state.cause}" if state is not None and state.cause else ""
+        self.result |= {"done": False, "text": text + why}
+        self.say(text + why)
+        return typer.Exit(1)
+
+    def finish(self) -> None:
+        """Print the JSON object."""
+        state = self.state
+        if state is not None:
+            self.result |= {"phase": state.mode, "tip_m": state.tip_m, "force_N": state.force_N}
+        if self._json:
+            write_json(self.result)
+
+
+@contextlib.contextmanager
+def driving(
+    command: str, rig: Path, json: bool, name: str, endpoint: str | None, keys: Path | None, lease: bool = True
+) -> Iterator[Driver]:
+    """Connect, take the lease where it is needed, and give it back at the end. A refusal ends with exit status 1."""
+    from host.run.connection import CommandRefused, connect
+
+    with connect(rig, name, endpoint=endpoint, keys=keys) as connection:
+        driver = Driver(connection, command, json)
+        try:
+            if not driver.wait(ANSWERS_WITHIN_S, lambda state: True) and lease:
+                where = endpoint or str(connection.rig.local.folder)
+                driver.result |= {"accepted": False, "text": f"no message from rig {connection.rig.name} at {where}"}
+                driver.say(
+                    f"no message from rig {connection.rig.name} at {where} within {ANSWERS_WITHIN_S:g} s; nothing was "
+                    "commanded. Check that it runs, and that --rig is its rig file"
+                )
+                raise typer.Exit(1)
+            if lease:
+                connection.take()
+            yield driver
+        except CommandRefused as refused:
+            driver.result |= {"accepted": False, "text": refused.acknowledgement.reason}
+            print(f"seldinger: {refused}", file=sys.stderr)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            connection.hold()
+            driver.say("interrupted: the rig holds")
+            driver.result |= {"done": False, "text": "interrupted; the rig holds"}
+            raise typer.Exit(130) from None
+        finally:
+            driver.finish()
+
+
+def _plain(command: str, words: str, lease: bool = True) -> Callable[..., None]:
+    """Make the command that gives the rig one word and prints its answer."""
+
+    def run(
+        rig: RigFile = SIMULATED_RIG,
+        json: Json = False,
+        name: Name = "console",
+        endpoint: Endpoint = None,
+        keys: Keys = None,
+    ) -> None:
+        with driving(command, rig, json, name, endpoint, keys, lease) as driver:
+            getattr(driver.rig, "clear_fault" if command == "clear" else command)()
+            driver.say(words)
+
+    run.__doc__ = words
+    return run
+
+
+disarm = _plain("disarm", "accepted; the stages come to rest, the board is disarmed")
+hold = _plain("hold", "accepted; the rig holds where it is", lease=False)
+clear = _plain("clear", "accepted; latched causes and faults are cleared, the rig is disarmed")
+zero = _plain("zero", "accepted; the present load of the force sensor is its zero now")
+
+
+def arm(
+    rig: RigFile = SIMULATED_RIG, json: Json = False, name: Name = "console", endpoint: Endpoint = None, keys: Keys = None
+) -> None:
+    """Power the stages; they hold their position."""
+    with driving("arm", rig, json, name, endpoint, keys) as driver:
+        driver.rig.arm()
+        if not driver.wait(ANSWERS_WITHIN_S, lambda state: state.mode == "hold"):  # type: ignore[attr-defined]
+            raise driver.failed("accepted, but the loop does not hold")
+        driver.say("accepted; the rig holds")
+
+
+def jog(
+    axis: Annotated[str, typer.Argument(help="insertion, roll, knob; or the tip along e1, e2, e3 or a direction X,Y,Z.")],
+    travel: Annotated[str, typer.Argument(help="How far, such as 2mm, -0.002, 5deg; the sign is the direction.")],
+    speed: Annotated[
+        str | None, typer.Option(help="Speed, such as 5mm (per second). Default: half of the greatest.")
+    ] = None,
+    rig: RigFile = SIMULATED_RIG,
+    json: Json = False,
+    name: Name = "console",
+    endpoint: Endpoint = None,
+    keys: Keys = None,
+) -> None:
+    """Move one axis, or the tip along a direction, a short way. It ends where the tip touches something."""
+    along: tuple[float, float, float] | None = None
+    if axis in ("insertion", "roll", "knob"):
+        what = JogAxis[axis.upper()]
+    else:
+        what, along = JogAxis.TIP, TIP_DIRECTIONS.get(axis)
+        if along is None:
+            if axis.count(",") != 2:
+                raise InputError("axis", axis, "insertion, roll, knob, e1, e2, e3, or a direction X,Y,Z")
+            along = direction("axis", axis)
+    from protocol.jog_limits import unit_of
+
+    way = quantity("travel", travel, unit_of(what))
+    pace = None if speed is None else quantity("--speed", speed, unit_of(what))
+    with driving("jog", rig, json, name, endpoint, keys) as driver:
+        driver.rig.jog(what.label, way, pace, along)
+        driver.wait(0.5, lambda state: state.mode == "jog")  # type: ignore[attr-defined]
+        if not driver.wait(60.0, lambda state: state.mode != "jog"):  # type: ignore[attr-defined]
+            raise driver.failed("the jog has not ended within 60 s")
+        state = driver.state
+        if state.mode != "hold":
+            raise driver.failed(f"ended in phase {state.mode}")
+        driver.say(f"done; tip at {_mm(state.tip_m)}, force {state.force_N:.3f} N")
+
+
+def goto(
+    place: Annotated[str, typer.Argument(help="Point X,Y,Z of the base frame, such as 0,-10.7mm,21mm.")],
+    tolerance: Annotated[str, typer.Option(help="How near is near enough.")] = "1mm",
+    within: Annotated[str, typer.Option(help="Longest time to get there.")] = "20s",
+    rig: RigFile = SIMULATED_RIG,
+    json: Json = False,
+    name: Name = "console",
+    endpoint: Endpoint = None,
+    keys: Keys = None,
+) -> None:
+    """Bring the tip to a point in free space and stay there. Ctrl-C holds."""
+    goal_m, near_m, seconds = (
+        point("place", place),
+        quantity("--tolerance", tolerance, "m"),
+        quantity("--within", within, "s"),
+    )
+    with driving("goto", rig, json, name, endpoint, keys) as driver:
+        driver.rig.goto(goal_m)
+        since_s: float | None = None
+
+        def there(state: Any) -> bool:
+            nonlocal since_s
+            if state.mode not in ("position", "hold"):
+                return True
+            near = state.tip_m is not None and math.dist(state.tip_m, goal_m) <= near_m
+            since_s = (since_s or time.monotonic()) if near else None
+            return since_s is not None and time.monotonic() - since_s >= THERE_S
+
+        reached = driver.wait(seconds, there)
+        state = driver.state
+        off_m = math.dist(state.tip_m, goal_m) if state.tip_m is not None else math.nan
+        driver.result |= {"done": reached and state.mode == "position", "error_m": off_m}
+        if not driver.result["done"]:
+            raise driver.failed(f"not reached: {1e3 * off_m:.1f} mm off, phase {state.mode}")
+        driver.say(f"reached: {1e3 * off_m:.1f} mm off")
+
+
+def touch(
+    place: Annotated[str, typer.Argument(help="Point X,Y,Z on the tissue, base frame, such as 0,-10.7mm,25mm.")],
+    normal: Annotated[str, typer.Option(help="Direction X,Y,Z into the tissue.")] = "0,0,1",
+    force: Force = "0.2",
+    seconds: Annotated[str | None, typer.Option("--for", help="Retract after so long. Default: press until told.")] = None,
+    within: Annotated[str, typer.Option(help="Longest time until contact.")] = "20s",
+    rig: RigFile = SIMULATED_RIG,
+    json: Json = False,
+    name: Name = "console",
+    endpoint: Endpoint = None,
+    keys: Keys = None,
+) -> None:
+    """Approach the tissue along a normal and hold a force on it. Ctrl-C holds."""
+    goal_m, into, force_N = point("place", place), direction("--normal", normal), quantity("--force", force, "N")
+    hold_s = None if seconds is None else quantity("--for", seconds, "s")
+    patience_s = quantity("--within", within, "s")
+    with driving("touch", rig, json, name, endpoint, keys) as driver:
+        driver.rig.touch(goal_m, into, force_N)
+        ended = ("contact", "stopped", "retract", "disarmed")
+        if not driver.wait(patience_s, lambda state: state.mode in ended) or driver.state.mode != "contact":  # type: ignore[attr-defined]
+            driver.rig.hold()
+            raise driver.failed(f"no contact within {patience_s:g} s; the rig holds")
+        driver.say(f"in contact, {force_N:g} N wanted")
+        if hold_s is None:
+            driver.say("the force stays until hold, retract or stop")
+            return
+        forces = _pressed(driver, hold_s)
+        driver.result |= {"mean_force_N": sum(forces) / max(len(forces), 1), "seconds": hold_s}
+        if driver.state.mode in ("stopped", "disarmed", "retract"):
+            raise driver.failed(f"the touch ended early, phase {driver.state.mode}")
+        driver.rig.retract()
+        driver.wait(5.0, lambda state: state.mode == "stopped")  # type: ignore[attr-defined]
+        driver.say(f"mean force {driver.result['mean_force_N']:.3f} N; retracted")
+
+
+def _pressed(driver: Driver, seconds: float) -> list[float]:
+    """Return the forces (N) of the states in so many seconds of a touch, or until it ends."""
+    forces: list[float] = []
+    seen = -1
+
+    def ended(state: Any) -> bool:
+        nonlocal seen
+        if state.stamp_ns != seen and state.force_N is not None:
+            seen = state.stamp_ns
+            forces.append(state.force_N)
+        return state.mode in ("stopped", "disarmed", "retract")
+
+    driver.wait(seconds, ended)
+    return forces
+
+
+def force(
+    newton: Annotated[str, typer.Argument(help="Contact force, such as 0.15, 150mN or 15g.")],
+    rig: RigFile = SIMULATED_RIG,
+    json: Json = False,
+    name: Name = "console",
+    endpoint: Endpoint = None,
+    keys: Keys = None,
+) -> None:
+    """Change the force of the touch that goes on."""
+    force_N = quantity("newton", newton, "N")
+    with driving("force", rig, json, name, endpoint, keys) as driver:
+        driver.rig.force(force_N)
+        driver.say(f"accepted; {force_N:g} N wanted")
+
+
+def retract(
+    rig: RigFile = SIMULATED_RIG, json: Json = False, name: Name = "console", endpoint: Endpoint = None, keys: Keys = None
+) -> None:
+    """Withdraw the tip from the tissue, then stop."""
+    with driving("retract", rig, json, name, endpoint, keys) as driver:
+        driver.rig.retract()
+        if not driver.wait(10.0, lambda state: state.mode == "stopped"):  # type: ignore[attr-defined]
+            raise driver.failed("accepted, but not retracted within 10 s")
+        driver.say("done; the rig has stopped. Disarm and arm to go on")
+
+
+def mark(
+    note: Annotated[str, typer.Argument(help="What to note, at most 500 characters.")],
+    rig: RigFile = SIMULATED_RIG,
+    json: Json = False,
+    name: Name = "console",
+    endpoint: Endpoint = None,
+    keys: Keys = None,
+) -> None:
+    """Put a note with the rig's time into log and recording."""
+    if not 0 < len(note.strip()) <= 500:
+        raise InputError("note", note, "1 to 500 characters")
+    with driving("mark", rig, json, name, endpoint, keys, lease=False) as driver:
+        driver.rig.mark(note)
+        driver.say("noted")
+
+
+def status(rig: RigFile = SIMULATED_RIG, json: Json = False, endpoint: Endpoint = None, keys: Keys = None) -> None:
+    """Show a running rig on one screen, the first cause of what holds it back first. Commands nothing."""
+    from host.run.connection import open_session
+    from host.run.rig_status import read_status
+    from protocol.rig_file import load_rig
+
+    read = load_rig(rig)
+    with open_session(read, endpoint, keys) as session:
+        found = read_status(session, read.name)
+    if json:
+        write_json(found.as_json())
+    else:
+        print("\n".join(found.lines()))
+    if not found.connected:
+        where = endpoint or str(read.local.folder)
+        print(f"seldinger: no message from rig {read.name} at {where}; check that it runs", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def _mm(point_m: Any) -> str:
+    return "an unknown place" if point_m is None else ", ".join(f"{1e3 * value:.1f}" for value in point_m) + " mm"

@@ -1,0 +1,202 @@
+"""`seldinger arm`, `jog`, `goto`, `touch` ... as they are called, on a simulated rig in lock step; and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import host.cli.drive as drive
+import host.run.connection as connection
+from host.cli.main import build
+from host.cli.quantities import direction, point, quantity
+from host.run.rig_status import RigStatus
+from protocol.commander import CommandSender
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
+from protocol.topics import Command, Message, Reply, RigState
+from sim.board import SimulatedBoard
+from sim.scenario import Scenario
+from sim.world import World, simulated_plant
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("2mm", "m", 0.002),
+        ("-0.002", "m", -0.002),
+        ("+1e-3 m", "m", 0.001),
+        ("5deg", "rad", math.radians(5)),
+        ("150mN", "N", 0.15),
+        ("20g", "N", 0.196133),
+        ("2min", "s", 120.0),
+    ],
+)
+def test_a_quantity_is_read_in_its_unit(text: str, unit: str, value: float) -> None:
+    assert quantity("key", text, unit) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["", "mm", "two", "1,5mm", "nan", "inf", "1e999", "0x2", "2 apples", "5deg", "2mm2"])
+def test_what_is_no_length_is_refused_and_named(text: str) -> None:
+    with pytest.raises(InputError, match=r"^travel: found .*, wanted a number in m"):
+        quantity("travel", text, "m")
+
+
+@pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1;2;3"])
+def test_what_is_no_point_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"^place: "):
+        point("place", text)
+
+
+@pytest.mark.parametrize("text", ["", "0,0,0", "1,2", "nan,0,1", "inf,0,0", "x,y,z"])
+def test_what_is_no_direction_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--normal: "):
+        direction("--normal", text)
+    assert direction("--normal", "0,0,2") == (0.0, 0.0, 1.0)
+
+
+def called(*words: str) -> Result:
+    return CliRunner().invoke(build(list(words)), list(words))
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (("goto", "0,0"), "place"),
+        (("goto", "-1,b,0"), "place"),
+        (("jog", "elbow", "2mm"), "axis"),
+        (("jog", "knob", "2mm"), "travel"),
+        (("jog", "insertion", "-5deg"), "travel"),
+        (("jog", "0,0,0", "2mm"), "axis"),
+        (("jog", "e1", "1mm", "--speed", "fast"), "--speed"),
+        (("touch", "0,0,25mm", "--normal", "up"), "--normal"),
+        (("touch", "0,0,25mm", "--force", "2mm"), "--force"),
+        (("touch", "0,0,25mm", "--for", "long"), "--for"),
+        (("force", "-"), "newton"),
+        (("mark", "  "), "note"),
+        (("arm", "--rig", "nowhere.toml"), "nowhere.toml"),
+        (("status", "--endpoint", "tls/1.2.3.4:5"), "keys"),
+    ],
+)
+def test_bad_input_is_named_before_anything_is_sent(
+    words: tuple[str, ...], key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*arguments: object) -> None:
+        raise AssertionError("a session was opened")
+
+    monkeypatch.setattr(connection, "Session", forbidden)
+    error = called(*words).exception
+    assert isinstance(error, InputError) and key in str(error) and "\n" not in str(error)
+
+
+class VirtualRig:
+    """A simulated rig in lock step that passes for zenoh session, clock and `time` of the commands."""
+
+    def __init__(self, board: SimulatedBoard) -> None:
+        rig = load_rig(SIMULATED_RIG)
+        self.newest: dict[str, Message] = {}
+        self.scenario = Scenario(rig, World(rig, simulated_plant(rig, 1), board, 1), self._keep)
+        assert self.scenario.run(10.0, self.scenario.ready)
+
+    def _keep(self, topic: str, message: Message) -> None:
+        self.newest[topic] = message
+
+    # `time`
+    def monotonic(self) -> float:
+        return self.scenario.now_ns * 1e-9
+
+    def sleep(self, seconds: float) -> None:
+        self.scenario.run(seconds)
+
+    # the session
+    def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
+        return self.scenario.ask(command)
+
+    def latest(self, topic: str) -> Any:
+        rig = self
+
+        class Latest:
+            def take(self) -> Message | None:
+                return rig.newest.pop(topic, None)
+
+        return Latest()
+
+    def close(self) -> None:
+        """The scenario goes on."""
+
+
+@pytest.fixture(scope="module")
+def virtual() -> Iterator[VirtualRig]:
+    with SimulatedBoard("native") as board:
+        yield VirtualRig(board)
+
+
+class VirtualCommander(CommandSender):
+    """A commander on the rig's clock, which needs no thread."""
+
+    lost = ""
+
+    def __init__(self, session: Any, name: str) -> None:
+        super().__init__(session, name, clock_ns=lambda: int(session.scenario.now_ns))
+
+    def close(self) -> None:
+        self.release()
+
+
+@pytest.fixture
+def rig(virtual: VirtualRig, monkeypatch: pytest.MonkeyPatch) -> VirtualRig:
+    monkeypatch.setattr(connection, "open_session", lambda *arguments: virtual)
+    monkeypatch.setattr(connection, "Commander", VirtualCommander)
+    monkeypatch.setattr(drive, "time", virtual)
+    return virtual
+
+
+def said(*words: str) -> dict[str, Any]:
+    result = called(*words, "--json")
+    told: dict[str, Any] = json.loads(result.stdout)
+    told["status"] = result.exit_code
+    return told
+
+
+@pytest.mark.slow
+def test_a_session_from_arm_to_disarm(rig: VirtualRig, tmp_path: Path) -> None:
+    refused = said("jog", "e3", "2mm")
+    assert refused["status"] == 1 and not refused["accepted"] and "wanted armed" in refused["text"]
+    assert said("arm")["phase"] == "hold"
+    there = said("goto", "0,-10.7mm,20mm")
+    assert there["status"] == 0 and there["error_m"] < 1e-3 and there["phase"] == "position"
+    beyond = said("goto", "0,0,500mm")
+    assert beyond["status"] == 1 and "safety.workspace" in beyond["text"]
+    jogged = said("jog", "0,0,-1", "2mm")
+    assert jogged["status"] == 0 and jogged["phase"] == "hold" and abs(jogged["tip_m"][2] - 0.018) < 1e-3
+    assert said("zero")["status"] == 0 and said("mark", "before the touch")["status"] == 0
+    touched = said("touch", "0,-10.7mm,25mm", "--force", "150mN", "--for", "3s")
+    assert touched["status"] == 0 and abs(touched["mean_force_N"] - 0.15) < 0.05 and touched["phase"] == "stopped"
+    assert said("disarm")["status"] == 0 and said("arm")["phase"] == "hold"
+    assert said("hold")["accepted"] and said("clear")["accepted"]
+
+
+def test_the_status_puts_the_first_cause_first() -> None:
+    state = RigState(
+        stamp_ns=1,
+        mode="stopped",
+        safety_action="stop",
+        cause="no status from the stepper board",
+        tip_m=(0.0, -0.01, 0.02),
+        force_N=0.01,
+        pose_age_ns=20_000_000,
+        poses_rejected=0,
+        forces_rejected=0,
+    )
+    status = RigStatus(
+        rig="lab", newest={"state": state}, cause="The loop was late.", remedy="Close other programs.", followed=("Then.",)
+    )
+    lines = status.lines()
+    assert lines[0].startswith("lab: stopped") and lines[1].endswith("The loop was late.") and "Close" in lines[2]
+    assert any("sends nothing" in line for line in lines) and json.dumps(status.as_json())
+    assert RigStatus(rig="lab", newest={}).lines() == ["lab: no message from the control loop"]
