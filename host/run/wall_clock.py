@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -44,7 +45,7 @@ class Fleet:
         self._folder = tempfile.TemporaryDirectory(prefix="seldinger-")
         self.rig_file = Path(self._folder.name) / "rig.toml"
         own = load_rig(settings.rig_file).local
-        self._sockets = own if own_folder and not own.stop_socket.exists() else LocalPaths(Path(self._folder.name))
+        self._sockets = own if own_folder and not _in_use(own) else LocalPaths(Path(self._folder.name))
         self.endpoint = self._sockets.endpoint
         self.processes: dict[str, subprocess.Popen[str]] = {}
         self.rig_summary: dict[str, Any] = {}
@@ -303,6 +304,16 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     operator.commander.retract()
     operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))
     operator.commander.disarm()
+
+
+def _in_use(paths: LocalPaths) -> bool:
+    """Whether a rig's realtime process listens in this folder; the socket of one that was killed does not count."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(paths.stop_socket))
+        except OSError:
+            return False
+        return True
 
 
 def with_folder(text: str, folder: Path) -> str:
