@@ -146,6 +146,8 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
         noises.append(found)
         for segment in segments:
             segment.y[row, readings.wild(segment.y[row], found.sigma)] = np.nan
+    for segment in segments:
+        segment.resolution = np.array([readings.resolution(y, switched=False) for y in segment.y]) / np.sqrt(12.0)
     return Problem(model, segments, noises, np.ones(len(model.outputs)), columns)
 
 

@@ -65,7 +65,7 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
     is divided by
     the correlation time of what the better model leaves. `noise_sd` (outputs,): standard deviations below which nothing is
-    gained.
+    gained; nor below the scatter that the steps of a reading make.
     """
     independent, log_ratio, excess, excess_after = (np.zeros(noise_sd.size) for _ in range(4))
     by_output: list[list[float]] = []
@@ -73,7 +73,9 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
         b2, a2, n_eff, times = _pooled(segments, which, before, after, row)
         if n_eff < 3.0:
             continue
-        level_b, level_a = b2 + 1e-6 * noise_sd[row] ** 2, a2 + 1e-6 * noise_sd[row] ** 2
+        steps = max((float(s.resolution[row]) for s in segments if s.resolution is not None), default=0.0)
+        least = 1e-6 * noise_sd[row] ** 2
+        level_b, level_a = max(b2, steps**2) + least, max(a2, steps**2) + least
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
         excess[row] = max(0.0, 1.0 - noise_sd[row] ** 2 / level_b)
         excess_after[row] = max(0.0, 1.0 - 1.5 * noise_sd[row] ** 2 / level_a)

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill, quantum, smooth_derivatives, smoothing_window, white_level
-from host.diagnosis.model.readings import Finding, coarse, counts, without_outliers
+from host.diagnosis.model.operators import fill, smooth_derivatives, smoothing_window, white_level
+from host.diagnosis.model.readings import Finding, coarse, counts, resolution, without_outliers
 
 Array = npt.NDArray[np.float64]
 
@@ -461,7 +461,7 @@ def _saturated(recordings: list[Recording], paths: list[Pair], columns: dict[str
 def _clipped(recording: Recording, name: str, driver: str, side: float) -> float:
     """Share of samples in runs at the extreme reading, in which the driver goes on the same way and comes back."""
     y, x = side * fill(recording.channels[name]), fill(recording.channels[driver])
-    if quantum(recording.channels[name]) > 0.0 or np.ptp(x) == 0.0:
+    if resolution(recording.channels[name], switched=False) > 0.0 or np.ptp(x) == 0.0:
         return 0.0
     x = side * x * (1.0 if float(np.corrcoef(x, side * y)[0, 1]) * side >= 0.0 else -1.0)
     at = (y >= np.max(y)).astype(np.int8)

@@ -18,7 +18,7 @@ LOCAL = 8.0  # local spreads, from which a sample stands alone
 MOVES = 5.0  # deviations of the other samples over noise, from which a channel carries a motion and no single blows
 CODES = 3  # returns to the same value, from which that is a code for a lost reading
 LONGEST_CODE = 50  # samples in a row of such a code
-COARSEST = 500.0  # steps in the range of a channel, below which its resolution is said
+COARSEST = 1000.0  # steps in the range of a channel, below which its resolution is said
 FEW_LEVELS = 20  # levels up to which a channel may be a switched signal
 
 
@@ -39,7 +39,7 @@ def wild(values: Array, sigma: float) -> Mask:
     middle = np.median(windows, axis=1)
     spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
     away = np.abs(fill(values) - middle)
-    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * quantum(values)) & np.isfinite(values))
+    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * resolution(values, switched=False)) & np.isfinite(values))
 
 
 def scatter(values: Array) -> float:

@@ -300,6 +300,12 @@ case(
     findings=("quantized", "quantization", "saturated"),
 )
 case(
+    "reading is very coarse",
+    lambda: ([_changed(make.gear(k), load=lambda v: np.round(v / 0.2) * 0.2) for k in (1, 2)], make.gear_nominal()),
+    truth=("quantization",),
+    findings=("quantized",),
+)
+case(
     "wild samples",
     lambda: (
         [
