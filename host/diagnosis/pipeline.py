@@ -135,11 +135,12 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
         noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed)
         for p in segments
     ]
+    repeats = noise_module.repeated([[p.inputs[name] for name in model.quiet_inputs] for p in segments])
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
         # single wild samples would raise the noise by which they are found
         tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
-        found = noise_module.estimate(tame, still)
+        found = noise_module.estimate(tame, still, repeats)
         own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
         if own:
             found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]

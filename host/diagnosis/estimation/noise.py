@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,10 @@ Mask = npt.NDArray[np.bool_]
 ORDER = 3
 SHORTEST = 30  # samples of a stretch that counts
 SETTLING = 3.0  # first halves' variance against that of the second ones, from which on an output is still settling
+SAME = 2e-3  # deviation of two inputs over their own, below which the one repeats the other
+ALIKE = 0.8  # correlation of a channel with itself, from which a period is looked for
+FEWEST_REPEATED = 200  # samples
+REPEATS = "differences between repeats"
 QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
 
@@ -72,8 +77,57 @@ def runs(mask: Mask, shortest: int) -> list[slice]:
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= shortest]
 
 
-def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
-    """Noise of one channel from several recordings. `outputs[i]` (n_i,), `still[i]` its quiescent samples."""
+def repeated(inputs: list[list[Array]]) -> list[tuple[int, slice, int, slice]]:
+    """Stretches in which all inputs of one recording repeat those of another, or its own of a period before.
+
+    inputs: of each recording, its channels (n_i,). Returns (recording, samples, recording, samples) of each pair.
+    """
+    found = []
+    for a in range(len(inputs)):
+        for b in range(a, len(inputs)):
+            lag = _lag(inputs[a][0], inputs[b][0], own=a == b)
+            if lag is None:
+                continue
+            first = slice(max(lag, 0), min(inputs[a][0].size, inputs[b][0].size + lag))
+            second = slice(first.start - lag, first.stop - lag)
+            alike = first.stop - first.start >= FEWEST_REPEATED and all(
+                _same(x[first], y[second]) for x, y in zip(inputs[a], inputs[b], strict=True)
+            )
+            if alike:
+                found.append((a, first, b, second))
+    return found
+
+
+def _lag(x: Array, y: Array, own: bool) -> int | None:
+    """Samples by which `x` (n,) comes after `y` (m,) where both run alike best; of one channel with itself, its period."""
+    x, y = fill(x) - np.mean(fill(x)), fill(y) - np.mean(fill(y))
+    if not np.any(x) or not np.any(y):
+        return None
+    size = 1 << int(np.ceil(np.log2(x.size + y.size)))
+    across = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
+    most = min(x.size, y.size) // 2
+    if not own:
+        order = np.concatenate((np.arange(most), np.arange(-most, 0)))
+        return int(order[np.argmax(across[order])])
+    below = np.flatnonzero(across[:most] < 0.5 * across[0])
+    if not below.size:
+        return None
+    mean = across[:most] / (x.size - np.arange(most)) * x.size / across[0]
+    peaks = np.flatnonzero((mean[1:-1] >= mean[:-2]) & (mean[1:-1] >= mean[2:]) & (mean[1:-1] > ALIKE)) + 1
+    near = [lag for peak in peaks[peaks > below[0]] for lag in range(peak - 2, peak + 3)]
+    return next((int(lag) for lag in near if _same(x[lag:], x[:-lag])), None)
+
+
+def _same(x: Array, y: Array) -> bool:
+    x, y = fill(x), fill(y)
+    return float(np.std(x - y)) <= SAME * float(np.std(x)) and float(np.std(x)) > 0.0
+
+
+def estimate(outputs: list[Array], still: list[Mask], repeats: Sequence[tuple[int, slice, int, slice]] = ()) -> Noise:
+    """Noise of one channel from several recordings: of its quiescent parts, else of what does not repeat.
+
+    outputs: (n_i,) of each recording; still: its quiescent samples; repeats: stretches that repeat others (`repeated`).
+    """
     stretches = [
         values[part]
         for values, mask in zip(outputs, still, strict=True)
@@ -85,7 +139,12 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
         segments.append(segment - np.polynomial.polynomial.polyval(np.arange(segment.size), line))
     step = max((quantum(values) for values in outputs), default=0.0)
     noise_sd = step / np.sqrt(12.0)
+    source = "quiescent parts"
     if sum(segment.size for segment in segments) < 100:
+        differences = [(outputs[a][p] - outputs[b][q]) / np.sqrt(2.0) for a, p, b, q in repeats]
+        segments = [d[part] - np.mean(d[part]) for d in differences for part in runs(np.isfinite(d), FEWEST_REPEATED)]
+        source = REPEATS
+    if not segments:
         return Noise(
             max(_high_frequency(outputs), noise_sd, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
         )
@@ -98,7 +157,7 @@ def estimate(outputs: list[Array], still: list[Mask]) -> Noise:
     sigma = float(np.sqrt(max(lags[0], 0.0)))
     if sigma <= noise_sd:
         return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")
-    return Noise(sigma, autoregression(lags), "quiescent parts")
+    return Noise(sigma, autoregression(lags), source)
 
 
 def _settled(stretches: list[Array]) -> list[Array]:

@@ -29,8 +29,8 @@ class SelectionRules:
     least_excess_reduction: float = 0.10  # and share of what is above noise
     further_error_reduction: float = 0.05  # of a further effect: a residual of idealized formulas is not an effect
     further_likelihood_ratio: float = 0.2  # and least gain over that of the effects before it,
-    large_error_reduction: float = 0.3  # but for one that takes this share of the residual
-    large_significance: float = 1e-6  # with blocks that agree so well
+    large_error_reduction: float = 0.3  # but for one that takes this share of the residual, in either part,
+    large_log_likelihood: float = 25.0  # and gains so much in either: its own evidence is enough
     refinement_error_reduction: float = 0.15  # a finer form has to take this share to be preferred to a simpler one
     refinement_tolerance: float = 0.02  # part of the gain that a simpler form may lack
 
@@ -48,6 +48,7 @@ class SelectionRules:
     exchange_fits: int = 4  # rivals fitted in each place
     exchange_promise: float = 0.4  # least part of the best projected gain
     swap_fits: int = 3
+    joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 
     # Indistinguishable: rivals in an effect's place.
     most_equals: int = 4

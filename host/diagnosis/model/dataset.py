@@ -210,13 +210,32 @@ def _split(segments: list[Recording], patterns: list[str] | None) -> list[Record
         if len(segments) == 1:
             patterns = None
     if patterns is None and len(segments) >= 3:
-        out = [index % 3 == 1 for index in range(len(segments))]
+        places = np.argsort(np.argsort([_excitation(p, segments) for p in segments], kind="stable"), kind="stable")
+        out = [int(place) % 3 == 1 for place in places]
     elif patterns is None:
         return [replace(p, fit=u & ~b, heldout=u & b) for p, u in zip(segments, used, strict=True) for b in [_blocks(p.n)]]
     nothing = [np.zeros(p.n, dtype=bool) for p in segments]
     return [
         replace(p, fit=z if o else u, heldout=u if o else z) for p, u, z, o in zip(segments, used, nothing, out, strict=True)
     ]
+
+
+def _excitation(recording: Recording, beside: list[Recording]) -> float:
+    """How much the channels of a recording move: their deviations over the median one of all recordings, on average.
+
+    The recordings in between are held out: what only the strongest show has to be fitted, and can be seen in the next.
+    """
+    shares = []
+    for name in recording.channels:
+        spread = [float(np.nanstd(r.channels[name])) for r in beside if name in r.channels and _measured(r, name)]
+        typical = float(np.median(spread)) if spread else 0.0
+        if typical > 0.0 and _measured(recording, name):
+            shares.append(float(np.nanstd(recording.channels[name])) / typical)
+    return round(float(np.mean(shares)), 2) if shares else 0.0
+
+
+def _measured(recording: Recording, name: str) -> bool:
+    return bool(np.isfinite(recording.channels[name]).any())
 
 
 def _blocks(n: int) -> Mask:

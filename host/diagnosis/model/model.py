@@ -54,7 +54,7 @@ class Segment:
     tolerances: dict[str, float] = field(default_factory=dict)  # port -> movement below which nothing has moved
     start: dict[str, float] = field(default_factory=dict)  # port -> displacement needed at the first sample
     begin: Begin | None = None
-    resolution: Array | None = None  # (outputs,) standard deviation that the steps of each reading make: nothing is gained below
+    resolution: Array | None = None  # (outputs,) standard deviation that the steps of each reading make
     weight: Array | None = None  # (outputs,) scale of each output's residual
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
 

@@ -39,7 +39,8 @@ def wild(values: Array, sigma: float) -> Mask:
     middle = np.median(windows, axis=1)
     spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
     away = np.abs(fill(values) - middle)
-    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * resolution(values, switched=False)) & np.isfinite(values))
+    step = resolution(values, switched=False)
+    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * step) & np.isfinite(values))
 
 
 def scatter(values: Array) -> float:

@@ -24,6 +24,7 @@ from host.diagnosis.estimation.initial_state import estimate_state
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Segment
+from host.diagnosis.selection.joint import best_pair
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, enough, screen, without
 from host.diagnosis.selection.trial import Trial, at_bound, good_enough, rank, related, weighty
@@ -191,6 +192,7 @@ def search(problem: Problem, candidate_effects: list[Candidate], progress: Progr
     noise_sd = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
     _grow(problem, found, candidate_effects, noise_sd, 0.0, progress)
+    _join(problem, found, candidate_effects, noise_sd, progress)
     found = _detour(problem, found, candidate_effects, noise_sd, progress)
     _exchange(problem, found, candidate_effects, noise_sd, progress)
     if found.best.terms:
@@ -230,6 +232,26 @@ def _grow(
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
     found.best = best
+
+
+def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress) -> None:
+    """Two effects at once where none passed alone, then further ones."""
+    refused = found.steps[-1].trials if found.steps else []
+    if found.best.terms or len(refused) < 2 or problem.budget.spent():
+        return
+    begun = get_starts(problem)
+    pair = best_pair(problem, found.nominal, refused, noise_sd, progress)
+    if pair is None:
+        set_starts(problem, begun)
+        return
+    fit, gain, starts = pair
+    set_starts(problem, starts)
+    fit = refined(problem, fit)
+    reweigh(problem, fit)
+    found.best = fit
+    found.steps.append(Step("joint", fit.terms[0].candidate.key, gain, refused))
+    found.steps.append(Step("joint", fit.terms[1].candidate.key, gain, refused))
+    _grow(problem, found, candidate_effects, noise_sd, gain.log_likelihood, progress)
 
 
 def _taken(problem: Problem, trial: Trial) -> Fit:

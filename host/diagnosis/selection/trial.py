@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from host.diagnosis.estimation.evidence import Gain
-from host.diagnosis.estimation.fit import Fit
+from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate
 
@@ -31,8 +31,15 @@ class Trial:
 
 def at_bound(fit: Fit) -> bool:
     """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
-    term = fit.terms[-1]
-    values = fit.values[-len(term.parameters) :]
+    return bound_by(fit, fit.terms[-1])
+
+
+def bound_by(fit: Fit, term: Term) -> bool:
+    """As `at_bound`, of any of its terms."""
+    place = next(index for index, other in enumerate(fit.terms) if other is term)
+    after = sum(len(other.parameters) for other in fit.terms[place:])
+    first = len(fit.values) - after
+    values = fit.values[first : first + len(term.parameters)]
     return (
         any(
             p.high > p.low
@@ -144,7 +151,10 @@ def _plainly(trial: Trial, more: int) -> bool:
 def weighty(trial: Trial, earned: float) -> bool:
     """Whether a trial earns enough relative to the likelihood of what is named already; a finer shape is judged alone."""
     rules = trial.rules
-    large = trial.both.share > rules.large_error_reduction and trial.heldout.p_value < rules.large_significance
+    parts = (trial.heldout, trial.trained)
+    large = all(
+        part.share > rules.large_error_reduction and part.log_likelihood > rules.large_log_likelihood for part in parts
+    )
     enough = trial.both.share > rules.further_error_reduction and (
         large or trial.both.log_likelihood > rules.further_likelihood_ratio * earned
     )

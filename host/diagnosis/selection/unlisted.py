@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
+from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
@@ -61,7 +62,10 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
     return any(
         _power(problem, found.best.residuals, row)
-        > ((measured if noise.source == "quiescent parts" else problem.rules.residual_over_guessed_noise) * noise_sd[row])
+        > (
+            (measured if noise.source in ("quiescent parts", REPEATS) else problem.rules.residual_over_guessed_noise)
+            * noise_sd[row]
+        )
         ** 2
         for row, noise in enumerate(problem.noise)
     )

@@ -49,16 +49,18 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
 
 
 @pytest.mark.parametrize(
-    ("likelihood", "share", "held", "enough"),
+    ("likelihood", "share", "part", "enough"),
     [
-        (150.0, 0.4, 1e-3, False),  # less than a fifth of what is named
-        (150.0, 0.4, 1e-9, True),  # but a third of what is left, to be seen all along
-        (250.0, 0.2, 1e-3, True),
-        (250.0, 0.03, 1e-9, False),  # hardly anything of any output
+        (150.0, 0.2, 75.0, False),  # less than a fifth of what is named
+        (150.0, 0.4, 75.0, True),  # but a third of what is left, fitted and held out alike: its own evidence
+        (150.0, 0.4, 20.0, False),  # in one of the two parts dimly
+        (250.0, 0.2, 75.0, True),
+        (250.0, 0.03, 75.0, False),  # hardly anything of any output
     ],
 )
-def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, held: float, enough: bool) -> None:
-    tried = replace(trial(likelihood, share), heldout=Gain(0.5 * likelihood, held, share))
+def test_a_further_effect_outdoes_what_modules_lack(likelihood: float, share: float, part: float, enough: bool) -> None:
+    held, trained = Gain(part, 1e-3, share), Gain(75.0, 1e-3, share)
+    tried = replace(trial(likelihood, share), heldout=held, trained=trained)
     assert weighty(tried, 1000.0) is enough
     assert weighty(tried, 0.0)
 

@@ -134,3 +134,33 @@ def test_the_jackknife_knows_when_few_blocks_carry_a_parameter(seed: int) -> Non
     assert np.sqrt(np.mean(np.square(spread), axis=0))[0] == pytest.approx(true[0], rel=0.1)
     assert np.all(np.sqrt(np.mean(np.square(spread), axis=0)) > 0.95 * true)
     assert np.mean(freedom, axis=0)[1] < 5.0 < 40.0 < np.mean(freedom, axis=0)[0]
+
+
+def test_noise_is_what_does_not_repeat() -> None:
+    rng = np.random.default_rng(3)
+    t = np.arange(2000) * 0.01
+    x = np.sin(2 * np.pi * 0.5 * t) + 0.3 * np.sin(2 * np.pi * 1.5 * t)
+    structure = np.sign(np.gradient(x))  # a residual that comes back with every period
+    outputs = [structure + 0.02 * rng.standard_normal(t.size) for _ in range(2)]
+    nowhere = [np.zeros(t.size, dtype=bool)] * 2
+    repeats = noise.repeated([[x], [np.roll(x, 37)]])
+    assert {(a, b) for a, _, b, _ in repeats} == {(0, 0), (1, 1), (0, 1)}
+    found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]]))
+    assert found.source == noise.REPEATS and found.sigma == pytest.approx(0.02, rel=0.05)
+    assert noise.estimate(outputs, nowhere).sigma > 0.05  # the spectrum alone takes the structure for noise
+    assert noise.repeated([[x], [rng.standard_normal(t.size)]])[0][2] == 0
+
+
+def test_readings_that_are_none_are_found() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(2000) * 0.01
+    y = np.sin(2 * np.pi * 0.4 * t) + 0.002 * rng.standard_normal(t.size)
+    codes = y.copy()
+    for first in (100, 700, 1500):
+        codes[first : first + 8] = -5.0
+    assert np.flatnonzero(readings.lost(codes)).size == 24 and not readings.lost(y).any()
+    assert readings.resolution(np.round(y / 0.2) * 0.2, switched=False) == pytest.approx(0.2)
+    assert readings.resolution(np.sign(y), switched=True) == 0.0
+    last = y.copy()
+    last[-1] = 9.0
+    assert np.flatnonzero(readings.wild(last, 0.002)).tolist() == [t.size - 1]
