@@ -26,7 +26,6 @@ def install_services(
     take_away: Annotated[bool, typer.Option("--undo", help="Stop the services and remove what was installed.")] = False,
 ) -> None:
     """Write unit files and the service user, and reload systemd. Nothing is started; the command for that is printed."""
-    import host
     from host.run.installation_check import check_installation
     from host.run.service_units import UnitSettings, install, unit_texts
 
@@ -41,7 +40,7 @@ def install_services(
         raise InputError("--cpu", cpu, f"-1 to {count - 1}")
     settings = UnitSettings(rig.resolve(), count - 1 if cpu < 0 else cpu, simulated)
     try:
-        check_installation(settings.python, Path(host.__file__).parent.parent, rig)
+        check_installation(settings.python, Path(__file__).parents[2], rig)
     except InputError as error:
         if system:
             raise
