@@ -60,8 +60,8 @@ def design(problem: Problem, found: Found, standing: list[Standing], progress: C
     recorded signals is involved, since a motion that was not recorded has no such signals.
     """
     out = []
-    for stands in standing if all(term.candidate.effect.id != "unlisted" for term in found.best.terms) else ():
-        for other in (other for other in stands.alike if other.effect.id != "unlisted"):
+    for stands in standing if all(term.candidate.effect.listed for term in found.best.terms) else ():
+        for other in (other for other in stands.alike if other.effect.listed):
             progress(f"how to tell {stands.candidate.key} from {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)

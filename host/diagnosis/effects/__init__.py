@@ -29,9 +29,8 @@ def candidates(ports: tuple[Port, ...], timed: bool, left_out: frozenset[str] = 
     for port in ports:
         for effect in library():
             if (
-                effect.id in left_out
+                left_out.intersection((effect.id, *effect.spans))
                 or effect.port not in port.kind.split("+")
-                or effect.id in left_out
                 or (effect.timed and not timed)
             ):
                 continue

@@ -27,5 +27,6 @@ EFFECTS = (
         "The tip drags on the tissue: tangential force up to {coefficient} of the normal force.",
         "|F_t| <= coefficient*F_n",
         apply,
+        dissipates=True,
     ),
 )

@@ -44,6 +44,7 @@ EFFECTS = (
         apply,
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
     Effect(
         "coulomb_friction",
@@ -56,5 +57,6 @@ EFFECTS = (
         forms=("", "bristles"),
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
 )

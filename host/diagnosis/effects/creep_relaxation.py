@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.model.operators import lag
+from host.diagnosis.model.operators import lag, lagged_rows
 
 
 def taus(s: Scale) -> Parameter:
@@ -46,7 +46,7 @@ def apply_motion(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 def apply_load(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Slow deflection under load."""
-    return np.asarray(signal + p[0] * lag(c.load, c.dt_s, p[1]))
+    return np.asarray(signal + p[0] * lag(c.load, c.dt_s, p[1], c.start / p[0] if p[0] != 0.0 else 0.0))
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -63,14 +63,14 @@ def share(s: Scale, form: str) -> tuple[Parameter, ...]:
 def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
     """Under force the shaft goes on giving way (`force`); or the bend goes on following the knob (`bend`)."""
     if form == "bend":
-        return {**state, "kappa": state["kappa"] + p[0] * (lag(state["kappa"], c.dt_s, p[1]) - state["kappa"])}
-    slow = np.vstack([lag(np.ascontiguousarray(row), c.dt_s, p[1]) for row in state["push"]])
+        return {**state, "kappa": state["kappa"] + p[0] * (lagged_rows(state["kappa"], c.dt_s, p[1]) - state["kappa"])}
+    slow = lagged_rows(state["push"], c.dt_s, p[1])
     return {**state, "push": state["push"] + p[0] * slow}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     """The reading goes on changing after the force has."""
-    return np.asarray(signal + p[0] * np.vstack([lag(np.ascontiguousarray(row), c.dt_s, p[1]) - row for row in signal]))
+    return np.asarray(signal + p[0] * (lagged_rows(signal, c.dt_s, p[1]) - signal))
 
 
 EFFECTS = (
@@ -121,6 +121,7 @@ EFFECTS = (
         side="output",
         source="load",
         timed=True,
+        remembers=True,
         several=True,
     ),
     Effect(
@@ -132,6 +133,7 @@ EFFECTS = (
         "F = stiffness*(x - lag(x, time_constant))",
         slots=slots,
         timed=True,
+        remembers=True,
         several=True,
     ),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.model.operators import shift
+from host.diagnosis.model.operators import shift, shifted_rows
 
 LONGEST = 0.25  # of the recording
 
@@ -35,8 +35,7 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 def rows(values: Array, c: Context, late: Array) -> Array:
     """All rows of `values` (..., n) shifted by `late` (n,)."""
-    flat = values.reshape(-1, values.shape[-1])
-    return np.vstack([shift(np.ascontiguousarray(row), c.dt_s, late) for row in flat]).reshape(values.shape)
+    return shifted_rows(values, c.dt_s, late)
 
 
 SAYS = "The channel is {delay} late, at every frequency alike."

@@ -59,6 +59,7 @@ EFFECTS = (
         contains=("backlash", "coulomb_friction"),
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
     Effect(
         "load_dependent_friction",
@@ -70,6 +71,7 @@ EFFECTS = (
         apply,
         source="drag",
         remembers=True,
+        dissipates=True,
     ),
     Effect(
         "load_dependent_friction",
@@ -81,5 +83,6 @@ EFFECTS = (
         slots=slots,
         source="drag",
         remembers=True,
+        dissipates=True,
     ),
 )

@@ -1,43 +1,148 @@
-"""Missed steps: a jump between command and encoder that stays."""
+"""Missed steps: jumps between command and encoder that stay, one or several."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numba import njit
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale
 
-EDGE = 0.01  # of the recording
+EDGE = 0.01  # of the recording: a jump closer to its ends has no plateau that bears it out
+COARSE = 400  # blocks in which the instants are looked for first
+COUNT = {"": 1, "two": 2, "three": 3, "four": 4}
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Size of the jump and its instant: neither at the first nor at the last samples, which no plateau bears out."""
-    return (
-        Parameter("jump", s.unit, (s.need,), linear=True),
-        Parameter(
-            "instant",
-            "s",
-            tuple(np.linspace(0.02, 0.98, 49) * s.duration_s),
-            EDGE * s.duration_s,
-            (1.0 - EDGE) * s.duration_s,
-            step=0.005 * s.duration_s,
-        ),
-    )
+    """Size and instant of each jump."""
+    found: list[Parameter] = []
+    for k in range(COUNT[form]):
+        number = f"_{k + 1}" if form else ""
+        instants = tuple(np.linspace(0.02, 0.98, 49) * s.duration_s)
+        edge = EDGE * s.duration_s
+        found.append(Parameter(f"jump{number}", s.unit, (s.need,), linear=True))
+        found.append(Parameter(f"instant{number}", "s", instants, edge, s.duration_s - edge, step=0.005 * s.duration_s))
+    return tuple(found)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """A step at the instant, one sample wide."""
-    return np.asarray(signal + p[0] * np.clip((c.time_s - p[1]) / c.dt_s + 0.5, 0.0, 1.0))
+    """Steps at the instants, each one sample wide."""
+    out = signal
+    for jump, instant in zip(p[::2], p[1::2], strict=True):
+        out = out + jump * np.clip((c.time_s - instant) / c.dt_s + 0.5, 0.0, 1.0)
+    return np.asarray(out)
 
 
-EFFECTS = (
+def seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
+    """Instants at which a piecewise constant curve fits the residual best.
+
+    Several jumps need recordings on one clock: an axis that is homed before each recording forgets them.
+    """
+    count = COUNT[form]
+    if not evidence.one_clock:
+        return parameters if count == 1 else ()
+    time_s, need = np.concatenate(evidence.time_s), np.concatenate(evidence.need)
+    good = np.isfinite(need)
+    order = np.argsort(time_s[good], kind="stable")
+    time_s, need = time_s[good][order], need[good][order]
+    if time_s.size < 20 * (count + 1):
+        return () if count > 1 else parameters
+    found = []
+    for k, p in enumerate(parameters):
+        if p.linear:
+            found.append(p)
+            continue
+        at = change_points(need, count)[k // 2]
+        instant = 0.5 * (time_s[at - 1] + time_s[at])
+        found.append(replace(p, grid=(float(min(max(instant, p.low), p.high)),)))
+    return tuple(found)
+
+
+def change_points(values: Array, count: int) -> list[int]:
+    """First samples of the second and later parts of the piecewise constant fit of `values` (n,) with `count` jumps.
+
+    Exact on block means (dynamic programming, Bellman 1961), then each moved to the best sample between its neighbours.
+    """
+    edges = np.linspace(0, values.size, min(COARSE, values.size) + 1).astype(int)
+    weights = np.diff(edges).astype(np.float64)
+    means = np.add.reduceat(values, edges[:-1]) / weights
+    places = [int(edges[k]) for k in _segmented(means, weights, count)]
+    for _ in range(2):
+        for k in range(count):
+            low = places[k - 1] if k > 0 else 0
+            high = places[k + 1] if k + 1 < count else values.size
+            places[k] = low + _split(values[low:high])
+    return places
+
+
+@njit(cache=True)
+def _segmented(means: Array, weights: Array, count: int) -> list[int]:
+    """Blocks at which the parts begin that leave the least squared error."""
+    n = means.size
+    w, s, q = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1)
+    for i in range(n):
+        w[i + 1] = w[i] + weights[i]
+        s[i + 1] = s[i] + weights[i] * means[i]
+        q[i + 1] = q[i] + weights[i] * means[i] ** 2
+    cost = np.full((count + 1, n + 1), np.inf)
+    origin = np.zeros((count + 1, n + 1), np.int64)
+    for j in range(1, n + 1):
+        cost[0, j] = q[j] - s[j] ** 2 / w[j]
+    for k in range(1, count + 1):
+        for j in range(k + 1, n + 1):
+            for i in range(k, j):
+                here = cost[k - 1, i] + q[j] - q[i] - (s[j] - s[i]) ** 2 / (w[j] - w[i])
+                if here < cost[k, j]:
+                    cost[k, j], origin[k, j] = here, i
+    places, j = [0], n
+    for k in range(count, 0, -1):
+        j = origin[k, j]
+        places.append(j)
+    return places[:0:-1]
+
+
+def _split(values: Array) -> int:
+    """Sample at which two constants fit `values` (n,) best."""
+    n = values.size
+    if n < 3:
+        return max(n // 2, 1)
+    first = np.arange(1, n)
+    total = np.cumsum(values)
+    gain = total[:-1] ** 2 / first + (total[-1] - total[:-1]) ** 2 / (n - first)
+    return int(np.argmax(gain)) + 1
+
+
+EFFECTS = tuple(
     Effect(
         "missed_steps",
         "motion",
         10,
         parameters,
-        "At {instant} the axis lost {jump} and never got it back.",
-        "y = x + jump*(t > instant)",
+        says,
+        equation,
         apply,
         timed=True,
-    ),
+        forms=forms,
+        seeds=seeds,
+    )
+    for forms, says, equation in (
+        (("",), "At {instant} the axis lost {jump} and never got it back.", "y = x + jump*(t > instant)"),
+        (
+            ("two",),
+            "The axis lost {jump_1} at {instant_1} and {jump_2} at {instant_2}, and never got it back.",
+            "y = x + sum_k jump_k*(t > instant_k)",
+        ),
+        (
+            ("three",),
+            "The axis lost {jump_1} at {instant_1}, {jump_2} at {instant_2} and {jump_3} at {instant_3}, for good.",
+            "y = x + sum_k jump_k*(t > instant_k)",
+        ),
+        (
+            ("four",),
+            "The axis lost {jump_1} at {instant_1}, {jump_2} at {instant_2}, {jump_3} at {instant_3} and {jump_4} at "
+            "{instant_4}, for good.",
+            "y = x + sum_k jump_k*(t > instant_k)",
+        ),
+    )
 )

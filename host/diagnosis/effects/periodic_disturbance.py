@@ -31,7 +31,10 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
         )
     top = min(0.2 / s.dt_s, 8.0)
     lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
-    return (*pair, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    return (
+        *pair,
+        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+    )
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -55,7 +58,7 @@ def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (
         Parameter("sine", "m", (3e-4,), linear=True),
         Parameter("cosine", "m", (3e-4,), linear=True),
-        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s),
+        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
     )
 
 
@@ -70,7 +73,10 @@ def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
     pairs = tuple(Parameter(f"{part}_{a}", s.unit, (s.need,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
     top = min(0.2 / s.dt_s, 5.0)
     lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
-    return (*pairs, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    return (
+        *pairs,
+        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+    )
 
 
 def _wave(c: Context, p: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Presliding friction: friction builds up over a distance after each reversal (Dahl; Maxwell slip as second form)."""
+"""Presliding friction: friction builds up over a distance after each reversal (Dahl; Maxwell slip; no memory but one)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 
 from host.diagnosis.effects.coulomb_friction import BRISTLES
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.model.operators import dahl, maxwell_slip
+from host.diagnosis.model.operators import SLIP_ELEMENTS, dahl, maxwell_slip, wiped_at_reversal
+
+RATIO = {"maxwell": 2.0, "general": 3.0}  # of the distances of neighbouring elements: all alike, or over a decade and more
 
 
 def build_up(s: Scale, longest: float, count: int) -> Parameter:
@@ -24,15 +26,25 @@ def yielding(s: Scale, count: int, first: float = 3e-3, least: float = 3e-4) -> 
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Lost motion when fully built up, and the distance over which that happens."""
+    """Lost motion when fully built up, and the distance over which that happens; of four elements in form `general`."""
+    if form == "general":
+        return (*levels("lost_motion", s), build_up(s, 0.6, 4))
     return (
         Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
         build_up(s, 0.6, 5),
     )
 
 
+def levels(name: str, s: Scale) -> tuple[Parameter, ...]:
+    """Levels of the elements of generalized Maxwell slip, by growing distance; passive, so none is negative."""
+    sizes = (Parameter(f"{name}_{k + 1}", s.unit, (s.need / SLIP_ELEMENTS,), 0.0, np.inf, linear=True) for k in range(4))
+    return tuple(sizes)
+
+
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Friction force when fully built up, and the distance over which that happens."""
+    """Friction force when fully built up, and the distance over which that happens; of four elements in form `general`."""
+    if form == "general":
+        return (*levels("force", s), yielding(s, 5, 2.0 * BRISTLES, BRISTLES))
     return (
         Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
         yielding(s, 6, 2.0 * BRISTLES, BRISTLES),
@@ -40,15 +52,23 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Lost motion p[0] times a friction state that builds up over p[1]."""
+    """Lost motion times a friction state that builds up over the last parameter."""
+    if form in ("maxwell", "general"):
+        each = p[:SLIP_ELEMENTS] if form == "general" else np.full(SLIP_ELEMENTS, p[0] / SLIP_ELEMENTS)
+        return np.asarray(signal - maxwell_slip(c.motion, p[-1], RATIO[form], np.ascontiguousarray(each), -c.start))
     start = -c.start / p[0] if p[0] > 0.0 else 0.0
-    state = maxwell_slip if form == "maxwell" else dahl
-    return np.asarray(signal - p[0] * state(c.motion, p[1], start))
+    if form == "reversal":
+        return np.asarray(signal - p[0] * wiped_at_reversal(c.motion, p[1], c.tolerance, start))
+    return np.asarray(signal - p[0] * dahl(c.motion, p[1], start))
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Level and distance of the hysteretic force."""
-    return {"presliding": p[0], "presliding_distance": p[1], "presliding_maxwell": float(form == "maxwell")}
+    """Level and distance of the hysteretic force, and the levels of its elements."""
+    if form == "dahl":
+        return {"presliding": p[0], "presliding_distance": p[1]}
+    each = p[:SLIP_ELEMENTS] if form == "general" else np.full(SLIP_ELEMENTS, p[0] / SLIP_ELEMENTS)
+    elements = {f"slip_{k + 1}": float(level) for k, level in enumerate(each)}
+    return {"presliding": float(np.sum(each)), "presliding_distance": p[-1], "slip_ratio": RATIO[form], **elements}
 
 
 EFFECTS = (
@@ -58,12 +78,14 @@ EFFECTS = (
         46,
         lost,
         "The output stays behind by up to {lost_motion}, built up over {distance} after each reversal.",
-        "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance",
+        "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance; maxwell: four elements; reversal: "
+        "z = sign(dx)*(1 - 2*exp(-s/distance)), s since the last reversal",
         apply,
-        forms=("dahl", "maxwell"),
+        forms=("dahl", "maxwell", "reversal"),
         contains=("backlash", "coulomb_friction"),
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
     Effect(
         "presliding_friction",
@@ -77,5 +99,35 @@ EFFECTS = (
         contains=("coulomb_friction",),
         family="dry",
         remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "presliding_friction",
+        "motion",
+        46,
+        lost,
+        "The output stays behind by up to the sum of four elements that slide one after the other after each reversal; "
+        "the third after {distance}.",
+        "y = x - sum_k z_k,  z_k = clip(z_k + lost_motion_k*dx/d_k, -lost_motion_k, lost_motion_k),  d_k = 3^(k-3)*distance",
+        apply,
+        forms=("general",),
+        contains=("backlash", "coulomb_friction"),
+        family="dry",
+        remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "presliding_friction",
+        "force",
+        11,
+        force,
+        "Friction builds up in four elements that slide one after another after each reversal; the third after {distance}.",
+        "F = sum_k z_k,  z_k = clip(z_k + force_k*dx/d_k, -force_k, force_k),  d_k = 3^(k-3)*distance",
+        slots=slots,
+        forms=("general",),
+        contains=("coulomb_friction",),
+        family="dry",
+        remembers=True,
+        dissipates=True,
     ),
 )

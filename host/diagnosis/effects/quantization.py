@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale
 
+SAMPLES = 150  # of each output and recording, to look for steps in
 HARMONICS = 4  # of the saw tooth: a smooth approximation, so that a fit can follow it
 
 
@@ -20,6 +23,37 @@ def of_a_force(s: Scale, form: str) -> tuple[Parameter, ...]:
     if not grid:
         return ()
     return (Parameter("step", s.unit, grid, 0.5 * s.need, min(30.0 * s.need, 0.25 * s.span), step=0.01 * s.need),)
+
+
+def from_saw_tooth(evidence: Evidence, parameters: tuple[Parameter, ...], unit: str) -> tuple[Parameter, ...]:
+    """The steps at which the residual follows the saw tooth of the readings as simulated; none that the range does not
+    hold several times.
+    """
+    rows = [reading for reading in evidence.readings if reading.unit == unit]
+    if not rows:
+        return parameters
+    every = [max(1, reading.residual.size // SAMPLES) for reading in rows]
+    place = np.concatenate([reading.simulated[::k] for reading, k in zip(rows, every, strict=True)])
+    rest = np.concatenate([reading.residual[::k] / reading.scale for reading, k in zip(rows, every, strict=True)])
+    low, high = 1.2 * min(reading.scale for reading in rows), 12.0 * max(reading.scale for reading in rows)
+    span = float(np.max(np.abs(place))) if place.size else 0.0
+    if not span > high:
+        return tuple(replace(p, grid=()) for p in parameters)
+    turns = np.arange(1.0 / high, 1.0 / low, 0.2 / span)
+    follows = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
+    best = turns[np.argsort(follows)[:3]]
+    grid = tuple(float(1.0 / k) for k in best)
+    return (replace(parameters[0], grid=grid, low=0.5 * low, high=2.0 * high, step=0.01 * low),)
+
+
+def of_positions(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
+    """Step of readings in metres."""
+    return from_saw_tooth(evidence, parameters, "m")
+
+
+def of_forces(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
+    """Step of readings in newtons."""
+    return from_saw_tooth(evidence, parameters, "N")
 
 
 def stepped(x: Array, step: float) -> Array:
@@ -50,6 +84,7 @@ EFFECTS = (
         "The tracker's positions move in steps of {step}.",
         "y = step*round(x/step)",
         apply_pose,
+        seeds=of_positions,
     ),
     Effect(
         "quantization",
@@ -59,5 +94,6 @@ EFFECTS = (
         "The force sensor's readings move in steps of {step}.",
         "y = step*round(x/step)",
         apply_force,
+        seeds=of_forces,
     ),
 )

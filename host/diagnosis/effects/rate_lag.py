@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
-from host.diagnosis.model.operators import lag
+from host.diagnosis.model.operators import lag, lagged_rows
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -32,8 +30,7 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 def rows(values: Array, c: Context, time_constant_s: float) -> Array:
     """All rows of `values` (..., n) through the low pass."""
-    flat = values.reshape(-1, values.shape[-1])
-    return np.vstack([lag(np.ascontiguousarray(row), c.dt_s, time_constant_s) for row in flat]).reshape(values.shape)
+    return lagged_rows(values, c.dt_s, time_constant_s)
 
 
 SAYS = "The output follows with a first-order lag of {time_constant}."

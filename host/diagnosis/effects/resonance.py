@@ -14,7 +14,13 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (
         *share,
         Parameter(
-            "frequency", "Hz", spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True
+            "frequency",
+            "Hz",
+            spread(3.0 / s.duration_s, 0.3 / s.dt_s, 8),
+            1.0 / s.duration_s,
+            0.45 / s.dt_s,
+            log=True,
+            spectral=True,
         ),
         Parameter("damping_ratio", "", (0.03, 0.2), 1e-3, 2.0, log=True),
     )
@@ -25,7 +31,13 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (
         Parameter("mass_share", "", (0.1,), 1e-3, 5.0, log=True),
         Parameter(
-            "frequency", "Hz", spread(5.0 / s.duration_s, 0.25 / s.dt_s, 6), 1.0 / s.duration_s, 0.45 / s.dt_s, log=True
+            "frequency",
+            "Hz",
+            spread(5.0 / s.duration_s, 0.25 / s.dt_s, 6),
+            1.0 / s.duration_s,
+            0.45 / s.dt_s,
+            log=True,
+            spectral=True,
         ),
         Parameter("damping_ratio", "", (0.05,), 1e-3, 2.0, log=True),
     )
@@ -34,9 +46,15 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Second-order low pass with a peak, of all of the motion or of a share."""
     if form == "share":
-        moved = second_order(signal, c.dt_s, 2.0 * np.pi * p[1], p[2], c.start / p[0] if abs(p[0]) > 1e-3 else 0.0)
+        moved = of_mode(signal, c, p[1], p[2], *(s / p[0] if abs(p[0]) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
         return np.asarray(signal + p[0] * (moved - signal))
-    return second_order(signal, c.dt_s, 2.0 * np.pi * p[0], p[1], c.start)
+    return of_mode(signal, c, p[0], p[1], c.start, c.start_rate)
+
+
+def of_mode(signal: Array, c: Context, frequency_Hz: float, damping_ratio: float, start: float, rate: float) -> Array:
+    """Motion behind a mode of unit gain."""
+    omega = 2.0 * np.pi * frequency_Hz
+    return second_order(signal, c.dt_s, 2.0 * damping_ratio / omega, 1.0 / omega**2, start, rate)
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -44,6 +62,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"second_mass": p[0], "second_omega": 2.0 * np.pi * p[1], "second_damping": p[2]}
 
 
+EQUATION = "m'' + 2 z w m' + w^2 m = w^2 x,  y = m; of a share: y = x + share*(m - x)"
 EFFECTS = (
     Effect(
         "resonance",
@@ -51,12 +70,13 @@ EFFECTS = (
         63,
         parameters,
         "The output rings at {frequency}, damping ratio {damping_ratio}.",
-        "y'' + 2 z w y' + w^2 y = w^2 x",
+        EQUATION,
         apply,
         timed=True,
         forms=("", "share"),
         contains=("rate_lag",),
         remembers=True,
+        begins_with_speed=True,
     ),
     Effect(
         "resonance",
@@ -64,12 +84,13 @@ EFFECTS = (
         63,
         parameters,
         "What drives reaches what is read through a spring, and rings at {frequency}, damping ratio {damping_ratio}.",
-        "y'' + 2 z w y' + w^2 y = w^2 x",
+        EQUATION,
         apply,
         timed=True,
         forms=("", "share"),
         contains=("rate_lag",),
         remembers=True,
+        begins_with_speed=True,
     ),
     Effect(
         "resonance",

@@ -1,10 +1,11 @@
-"""Saturation: a limit beyond which nothing follows."""
+"""Saturation: a limit beyond which nothing follows; of a signal, of a speed, or of a drive inside a loop."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.operators import servo
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -42,9 +43,63 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(np.clip(signal, -p[0], p[0]))
 
 
+def of_loop(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Fastest motion, and the time constant with which it is approached."""
+    speeds = tuple(f * s.speed for f in (0.4, 0.8, 1.2, 1.7, 2.4))
+    longest = 0.1 * s.duration_s
+    taus = spread(s.dt_s, max(0.3 * longest, 4.0 * s.dt_s), 4)
+    return (
+        Parameter("limit", f"{s.unit}/s", speeds, 0.02 * s.speed, 20.0 * s.speed, log=True),
+        Parameter("time_constant", "s", taus, 0.1 * s.dt_s, max(longest, 5.0 * s.dt_s), log=True),
+    )
+
+
+def apply_loop(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Output of a position loop whose speed is limited."""
+    return servo(signal, c.dt_s, p[1], 0.0, p[0], c.start)
+
+
+def of_drive(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Largest drive."""
+    top = max(abs(s.low), abs(s.high))
+    return (
+        Parameter("limit", s.unit, tuple(f * top for f in (0.97, 0.9, 0.75, 0.6, 0.4)), 0.05 * top, top, step=0.05 * top),
+    )
+
+
+def slots(p: Array, form: str) -> dict[str, float]:
+    """Limit of the controller's output."""
+    return {"drive_limit": p[0]}
+
+
 SAYS = "Beyond {limit} nothing follows."
 EFFECTS = (
-    tuple(
+    (
+        Effect(
+            "saturation",
+            "motion",
+            65,
+            of_loop,
+            "A position loop moves no faster than {limit}; below that it follows with a time constant of {time_constant}.",
+            "dy/dt = clip((x - y)/time_constant, -limit, limit)",
+            apply_loop,
+            timed=True,
+            forms=("loop",),
+            contains=("rate_lag",),
+            remembers=True,
+        ),
+        Effect(
+            "saturation",
+            "loop",
+            34,
+            of_drive,
+            "The drive gives no more than {limit}, whatever the controller asks for.",
+            "u = clip(c, -limit, limit)  inside the loop",
+            slots=slots,
+            natural_bounds=True,
+        ),
+    )
+    + tuple(
         Effect(
             "saturation",
             port,

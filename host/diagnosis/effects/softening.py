@@ -1,14 +1,24 @@
-"""Softening: gain or stiffness changes with time."""
+"""Softening: gain or stiffness changes with time or with the distance travelled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Relative change of gain per second."""
+    """Relative change of gain per second, per distance (`travel`), or in all and its time constant (`run_in`)."""
+    if form == "run_in":
+        slowest = 0.6 * s.duration_s
+        taus = spread(0.05 * s.duration_s, 0.4 * s.duration_s, 4)
+        return (
+            Parameter("change", "", (s.need / s.span,), -0.95, 10.0, linear=True),
+            Parameter("time_constant", "s", taus, 0.01 * s.duration_s, slowest, log=True),
+        )
+    if form == "travel":
+        path = max(s.speed * s.duration_s, s.span)
+        return (Parameter("rate", f"1/{s.unit}", (s.need / (s.span * path),), -10.0 / path, 10.0 / path, linear=True),)
     return (
         Parameter(
             "rate", "1/s", (s.need / (s.span * s.duration_s),), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True
@@ -17,7 +27,12 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Gain that grows in proportion to time, about the middle of the motion."""
+    """Gain that changes in proportion to time, to the distance travelled so far, or towards another one."""
+    if form == "run_in":
+        return np.asarray(signal * (1.0 + p[0] * (1.0 - np.exp(-c.time_s / p[1]))))
+    if form == "travel":
+        path = np.concatenate((np.zeros(1), np.cumsum(np.abs(np.diff(c.motion)))))
+        return np.asarray(signal * (1.0 + p[0] * path))
     return np.asarray(signal + p[0] * c.time_s * signal)
 
 
@@ -71,6 +86,27 @@ EFFECTS = (
         "y = x*(1 + rate*t)",
         apply,
         timed=True,
+    ),
+    Effect(
+        "softening",
+        "motion",
+        20,
+        parameters,
+        "The gain changes by {rate} of itself for the distance travelled: it wears.",
+        "y = x*(1 + rate*s),  ds = |dx|",
+        apply,
+        forms=("travel",),
+    ),
+    Effect(
+        "softening",
+        "motion",
+        20,
+        parameters,
+        "The gain changes by {change} of itself, with a time constant of {time_constant}: it runs in.",
+        "y = x*(1 + change*(1 - exp(-t/time_constant)))",
+        apply,
+        timed=True,
+        forms=("run_in",),
     ),
     Effect(
         "softening",

@@ -60,6 +60,7 @@ EFFECTS = (
         contains=("coulomb_friction",),
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
     Effect(
         "stribeck_friction",
@@ -73,5 +74,6 @@ EFFECTS = (
         contains=("coulomb_friction", "presliding_friction"),
         family="dry",
         remembers=True,
+        dissipates=True,
     ),
 )

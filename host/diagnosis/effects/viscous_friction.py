@@ -40,6 +40,7 @@ EFFECTS = (
         "y = x - lost_motion_per_speed*v",
         apply,
         timed=True,
+        dissipates=True,
     ),
     Effect(
         "viscous_friction",
@@ -51,5 +52,6 @@ EFFECTS = (
         slots=slots,
         timed=True,
         forms=("", "quadratic"),
+        dissipates=True,
     ),
 )

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
-from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.model.effect import Candidate, Parameter, cornered
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
@@ -205,7 +205,12 @@ def reweigh(problem: Problem, fit: Fit) -> None:
 
 
 def finish(problem: Problem, fit: Fit) -> Fit:
-    """`fit` with its residuals on every sample."""
+    """`fit` with its residuals on every sample, each effect under the id that its values stand for."""
+    _, active = problem.parted(fit.terms, fit.values)
+    fit.terms = tuple(
+        replace(term, candidate=cornered(candidate, values))
+        for term, (candidate, values) in zip(fit.terms, active, strict=True)
+    )
     found = problem.simulate_all(problem.segments, fit.terms, fit.values)
     fit.residuals = [segment.y - out for segment, out in zip(problem.segments, found, strict=True)]
     return fit
@@ -245,7 +250,7 @@ def tuned(term: Term, lines: Array) -> tuple[Parameter, ...]:
     """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual."""
     return tuple(
         replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3])
-        if p.name == "frequency" and p.unit == "Hz" and any(q.linear for q in term.parameters)
+        if p.spectral and any(q.linear for q in term.parameters)
         else p
         for p in term.parameters
     )

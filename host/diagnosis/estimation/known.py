@@ -121,7 +121,11 @@ class Known(Model):
 def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
     """The candidate that `spec` names. Raises InputError with those there are."""
     candidate_effects = candidates(model.ports, timed)
-    at = [c for c in candidate_effects if c.effect.id == spec.id and spec.at in (c.port.name, c.port.subsystem)]
+    at = [
+        c
+        for c in candidate_effects
+        if spec.id in (c.effect.id, *c.effect.spans) and spec.at in (c.port.name, c.port.subsystem)
+    ]
     if not at:
         raise InputError(
             "effect",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ class Parameter:
     log: bool = False
     linear: bool = False
     step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
+    spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
     @property
     def key(self) -> str:
@@ -69,6 +70,7 @@ class Context:
     start: float = 0.0  # displacement needed at the first sample: start of memory
     source: Array | None = None
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
+    start_rate: float = 0.0  # speed at the first sample beyond that of the motion: start of memory of second order
     _cache: dict[str, Array] = field(default_factory=dict)
 
     def moving(self, signal: Array) -> Array:
@@ -87,8 +89,30 @@ class Context:
         return self.source
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What the residual shows at a port before an effect is fitted: one array (n,) a recording, samples to fit alone."""
+
+    time_s: tuple[Array, ...]
+    need: tuple[Array, ...]  # displacement or force that the port would need, NaN where nothing was measured
+    readings: tuple[Reading, ...]
+    one_clock: bool  # the recordings lie one after the other on one clock
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One output in one recording, samples to fit alone: what was simulated, the residual, and the weight of both."""
+
+    unit: str
+    simulated: Array
+    residual: Array
+    scale: float
+
+
 Apply = Callable[[Any, Context, Array, str], Any]
 Parameters = Callable[[Scale, str], tuple[Parameter, ...]]
+Seeds = Callable[[Evidence, tuple[Parameter, ...], str], tuple[Parameter, ...]]
+Corner = Callable[[Array], tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -117,8 +141,14 @@ class Effect:
     timed: bool = False
     forms: tuple[str, ...] = ("",)
     contains: tuple[str, ...] = ()
+    seeds: Seeds | None = None  # start values out of the residual, where no grid is fine enough
+    corner: Corner | None = None  # of a form that spans several ids: the id that values stand for, and what it then says
+    spans: tuple[str, ...] = ()  # those ids
+    listed: bool = True  # of the vocabulary; else an equation that was found by search
+    dissipates: bool = False  # its linear parameters are friction: none is negative, whichever way an output counts
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first
     remembers: bool = False  # its state at a recording's first sample is not known: it is estimated
+    begins_with_speed: bool = False  # so is its speed there
     natural_bounds: bool = False  # a parameter may end at its bound: the bound is physics
     at_rest: bool = False  # seen without any motion of its port
     several: bool = False  # more than one may act at a port
@@ -160,6 +190,20 @@ class Candidate:
     def name(self) -> str:
         """Effect and subsystem: what a verdict names."""
         return f"{self.effect.id}@{self.port.subsystem}"
+
+
+def rate_key(port: str) -> str:
+    """Key of the speed with which memory at `port` begins, among the starts of a recording."""
+    return f"{port}/rate"
+
+
+def cornered(candidate: Candidate, values: Array) -> Candidate:
+    """`candidate` under the id that its fitted `values` stand for, if its effect spans several."""
+    corner = candidate.effect.corner
+    if corner is None:
+        return candidate
+    effect_id, says = corner(values)
+    return replace(candidate, effect=replace(candidate.effect, id=effect_id, says=says))
 
 
 def spread(low: float, high: float, count: int) -> tuple[float, ...]:

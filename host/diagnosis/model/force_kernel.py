@@ -15,7 +15,6 @@ SLOTS = (
     "stribeck_speed",
     "presliding",
     "presliding_distance",
-    "presliding_maxwell",
     "load_friction",
     "load_friction_distance",
     "viscous",
@@ -43,6 +42,13 @@ SLOTS = (
     "stribeck_distance",
     "moment_sine",
     "moment_cosine",
+    "slip_1",
+    "slip_2",
+    "slip_3",
+    "slip_4",
+    "slip_ratio",
+    "drive_dead_band",
+    "drive_limit",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -51,7 +57,6 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     STRIBECK,
     PRESLIDING,
     PRE_DISTANCE,
-    PRE_MAXWELL,
     LOAD,
     LOAD_DISTANCE,
     VISCOUS,
@@ -79,6 +84,13 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     STRIBECK_D,
     MOMENT_S,
     MOMENT_C,
+    SLIP_1,
+    SLIP_2,
+    SLIP_3,
+    SLIP_4,
+    SLIP_RATIO,
+    DRIVE_DEAD,
+    DRIVE_LIMIT,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -119,12 +131,12 @@ def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
     force = 0.0
     side = 1.0 if dx > 0.0 else -1.0
     if p[PRESLIDING] != 0.0:
-        if p[PRE_MAXWELL] > 0.5:
-            distance = 0.25 * p[PRE_DISTANCE]
+        if p[SLIP_1] != 0.0 or p[SLIP_2] != 0.0 or p[SLIP_3] != 0.0 or p[SLIP_4] != 0.0:
+            distance = p[PRE_DISTANCE] / p[SLIP_RATIO] ** 2
             for j in range(4):
                 z[j] = min(max(z[j] + dx / distance, -1.0), 1.0)
-                force += 0.25 * p[PRESLIDING] * z[j]
-                distance *= 2.0
+                force += p[SLIP_1 + j] * z[j]
+                distance *= p[SLIP_RATIO]
         else:
             z[0] = side + (z[0] - side) * math.exp(-abs(dx) / p[PRE_DISTANCE])
             force += p[PRESLIDING] * z[0]
@@ -140,7 +152,7 @@ def hysteresis(z: Array, dx: float, v: float, load: float, p: Array) -> float:
 @njit(cache=True)
 def start_state(z: Array, start: float, load: float, p: Array) -> float:
     """Friction states such that together they hold `start` at the first sample, as far as they can; returns Coulomb's
-    share.
+    share. A branch that relaxes holds what friction cannot (`relaxed_by`).
     """
     level = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD] * abs(load)
     share = min(max(start / level, -1.0), 1.0) if level != 0.0 else 0.0
@@ -161,6 +173,13 @@ def _foot(x: Array, top: int, near: int, i: int, tolerance: float) -> int:
         if abs(bend) > SHARP * tolerance:
             return top - 1 if (x[top - 1] - x[top + 1]) / bend < 0.0 else top
     return near - int(FOOT * (i - near) + 0.5)
+
+
+@njit(cache=True)
+def relaxed_by(start: float, p: Array) -> float:
+    """Extension of the Maxwell branch at the first sample: it holds the force `start` where there is no dry friction."""
+    dry = p[COULOMB] + p[EXCESS] + p[PRESLIDING] + p[LOAD]
+    return start / p[MAXWELL_K] if p[MAXWELL_K] != 0.0 and dry == 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -199,9 +218,9 @@ def along(
     rest = start_state(z, start, load[0], p)
     dry = p[COULOMB] != 0.0 or p[EXCESS] != 0.0
     side = sides(x, tolerance) if dry and p[STRIBECK_D] <= 0.0 else z
-    slow = x[0]
+    slow = x[0] - relaxed_by(start, p)
     decay = math.exp(-dt_s / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
-    x2, v2 = x[0], 0.0
+    x2, v2 = x[0], v[0]
     steps = max(1, math.ceil(p[OMEGA2] * dt_s / 0.2))
     h = dt_s / steps
     for i in range(x.size):
@@ -343,7 +362,7 @@ def run_axis(
     s = (begin[0], begin[1], begin[0], begin[1])
     z = np.zeros(6)
     start_state(z, start, load[0], p)
-    held, slow = hysteresis(z, 0.0, begin[1], load[0], p), begin[0]
+    held, slow = hysteresis(z, 0.0, begin[1], load[0], p), begin[0] - relaxed_by(start, p)
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
     short = polynomial(p)
@@ -359,6 +378,10 @@ def run_axis(
             previous = s[0]
         out[0, i], out[1, i] = s[0], s[1]
         out[3, i] = drive if control.size else u[i, 0, 0]
+        # What the controller asks for is recorded; what a weak or sticky drive gives of it is not.
+        drive -= min(max(drive, -p[DRIVE_DEAD]), p[DRIVE_DEAD])
+        if p[DRIVE_LIMIT] > 0.0:
+            drive = min(max(drive, -p[DRIVE_LIMIT]), p[DRIVE_LIMIT])
         for j in range(substeps):
             more = offset - held
             push = (

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale
+from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, rate_key
 from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
@@ -204,6 +204,7 @@ def apply_effects(
             segment.start.get(port, 0.0),
             source,
             segment.equations,
+            segment.start.get(rate_key(port), 0.0),
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal

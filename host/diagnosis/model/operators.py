@@ -9,6 +9,8 @@ import numpy.typing as npt
 from numba import njit
 
 Array = npt.NDArray[np.float64]
+FIRST_SAMPLES = 10  # that show the speed with which a recording begins
+LEAST_INERTIA = 1e-9  # in sample periods: below this a lag is of first order, or none
 
 
 @njit(cache=True)
@@ -65,14 +67,22 @@ def dahl(x: Array, distance: float, start: float) -> Array:
     return out
 
 
+SLIP_ELEMENTS = 4
+
+
 @njit(cache=True)
-def maxwell_slip(x: Array, distance: float, start: float) -> Array:
-    """Mean of four Jenkin elements whose slip distances are spread 1/4, 1/2, 1, 2 times `distance`: non-local memory."""
+def maxwell_slip(x: Array, distance: float, ratio: float, levels: Array, start: float) -> Array:
+    """Sum of Jenkin elements of levels (4,) that slide after `distance` times ratio^-2, ratio^-1, 1 and ratio.
+
+    Memory is non-local. start: sum at the first sample, shared by all in proportion to their levels. Rate-independent
+    part of the generalized Maxwell slip model (Lampaert, Al-Bender and Swevers 2003; Iwan 1966).
+    """
     out = np.zeros(x.size)
-    step = 0.25 * distance
-    for _ in range(4):
-        out += 0.25 * jenkins(x, step, start)
-        step *= 2.0
+    total = np.sum(np.abs(levels))
+    share = start / total if total > 0.0 else 0.0
+    for k in range(levels.size):
+        if levels[k] != 0.0:
+            out += levels[k] * jenkins(x, distance * ratio ** (k - 2.0), share)
     return out
 
 
@@ -90,29 +100,106 @@ def lag(x: Array, dt_s: float, time_constant_s: float, start: float = 0.0) -> Ar
     return out
 
 
-@njit(cache=True)
-def second_order(x: Array, dt_s: float, omega_rad_s: float, damping: float, start: float = 0.0) -> Array:
-    """Unit-gain second-order low pass by Runge-Kutta sub-steps, input linear between samples.
+def lagged_rows(values: Array, dt_s: float, time_constant_s: float) -> Array:
+    """First-order low pass of every row of `values` (..., n), begun as in a steady motion."""
+    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
+    rows = [lag(row, dt_s, time_constant_s, -held_back(row, dt_s, time_constant_s)) for row in flat]
+    return np.vstack(rows).reshape(values.shape)
 
-    start: first output minus input; with one the output begins at the input's speed, as in motion; without at rest.
+
+def shifted_rows(values: Array, dt_s: float, delay_s: Array) -> Array:
+    """Every row of `values` (..., n) `delay_s` (n,) late, begun as in a steady motion."""
+    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
+    rows = [shift(row, dt_s, delay_s, -held_back(row, dt_s, max(float(delay_s[0]), 0.0))) for row in flat]
+    return np.vstack(rows).reshape(values.shape)
+
+
+def held_back(x: Array, dt_s: float, time_s: float) -> float:
+    """Distance by which an output that is `time_s` late is behind the first sample of `x` (n,), if the motion was steady.
+
+    Recordings are cut from motion. The speed is that of the first samples; one that is late by more than three times
+    these has a beginning that they do not show.
+    """
+    first = int(min(x.size - 1, max(2, min(round(time_s / dt_s), FIRST_SAMPLES))))
+    return float((x[first] - x[0]) * min(time_s / (first * dt_s), 3.0))
+
+
+@njit(cache=True)
+def second_order(x: Array, dt_s: float, lag_s: float, inertia_s2: float, start: float = 0.0, rate: float = 0.0) -> Array:
+    """Low pass inertia y'' + lag y' + y = x, exact for an input that is linear between samples.
+
+    Arguments:
+        x: (n,) input. lag_s, inertia_s2: coefficients, 0 and more; without inertia this is a first-order lag.
+        start: first output minus input. The output begins at the input's speed, as it does in a steady motion; without
+            a start (0.0) it begins at rest. rate: what its speed (per second) is beyond that.
+    Returns:
+        (n,) output.
+    Source: first-order hold of a linear system, Franklin, Powell and Workman, Digital Control, 1998, section 4.3.
+    """
+    a, b = lag_s / dt_s, inertia_s2 / dt_s**2
+    if b <= LEAST_INERTIA * max(a, LEAST_INERTIA):
+        return lag(x, dt_s, max(a, LEAST_INERTIA) * dt_s, start)
+    # In units of one sample. On a ramp the output runs `a` samples behind; the deviation from that dies out freely, by
+    # the exponential of [[0, 1], [-1/b, -a/b]]: (cosh s +- d/s sinh s, sinh s / s) exp(-d), s complex where it rings.
+    d, w2 = 0.5 * a / b, 1.0 / b
+    if d * d > w2:
+        root = math.sqrt(d * d - w2)
+        slow, fast = math.exp(-w2 / (d + root)), math.exp(-(d + root))
+        even, odd = 0.5 * (slow + fast), 0.5 * (slow - fast) / root
+    elif d * d < w2:
+        root = math.sqrt(w2 - d * d)
+        even, odd = math.cos(root) * math.exp(-d), math.sin(root) / root * math.exp(-d)
+    else:
+        even, odd = math.exp(-d), math.exp(-d)
+    out = np.empty(x.size)
+    y, v = x[0] + start, (x[1] - x[0] if start != 0.0 else 0.0) + rate * dt_s
+    out[0] = y
+    for i in range(1, x.size):
+        rise = x[i] - x[i - 1]
+        off, slip = y - x[i - 1] + a * rise, v - rise
+        y = x[i] - a * rise + (even + d * odd) * off + odd * slip
+        v = rise - w2 * odd * off + (even - d * odd) * slip
+        out[i] = y
+    return out
+
+
+@njit(cache=True)
+def delayed_second_order(
+    x: Array, dt_s: float, delay_s: float, lag_s: float, inertia_s2: float, start: float = 0.0, rate: float = 0.0
+) -> Array:
+    """`x` after a dead time and a second-order low pass: inertia y'' + lag y' + y = x(t - delay).
+
+    start: first output minus input. In a steady motion dead time and lag each hold back their share of it, and so they
+    share it here. rate: what the output's first speed (per second) is beyond that of the input.
+    """
+    total = delay_s + lag_s
+    waiting = start * delay_s / total if total > 0.0 else 0.0
+    late = shift(x, dt_s, np.full(x.size, delay_s), waiting)
+    return second_order(late, dt_s, lag_s, inertia_s2, start - waiting, rate)
+
+
+@njit(cache=True)
+def servo(x: Array, dt_s: float, time_constant_s: float, dead_band: float, fastest: float, start: float) -> Array:
+    """Position loop around an integrator with a dead band and a limit of speed in it.
+
+    dy/dt = clip(e - clip(e, -dead_band, dead_band), -fastest T, fastest T) / T with e = x - y and T the time constant.
+    On each side of a corner the equation is linear, and short steps keep the error of a corner small.
+
+    Arguments: x (n,); fastest: speed limit, in units of x per second; start: first output minus input.
     """
     out = np.empty(x.size)
-    steps = max(1, math.ceil(omega_rad_s * dt_s / 0.3))
+    steps = max(4, math.ceil(4.0 * dt_s / time_constant_s))
     h = dt_s / steps
-    w2, c = omega_rad_s * omega_rad_s, 2.0 * damping * omega_rad_s
-    y, v = x[0] + start, ((x[1] - x[0]) / dt_s if start != 0.0 else 0.0)
+    keep = math.exp(-h / time_constant_s)
+    y = x[0] + start
     out[0] = y
     for i in range(1, x.size):
         for j in range(steps):
-            u0 = x[i - 1] + (x[i] - x[i - 1]) * j / steps
-            u1 = x[i - 1] + (x[i] - x[i - 1]) * (j + 0.5) / steps
-            u2 = x[i - 1] + (x[i] - x[i - 1]) * (j + 1.0) / steps
-            k1y, k1v = v, w2 * (u0 - y) - c * v
-            k2y, k2v = v + 0.5 * h * k1v, w2 * (u1 - y - 0.5 * h * k1y) - c * (v + 0.5 * h * k1v)
-            k3y, k3v = v + 0.5 * h * k2v, w2 * (u1 - y - 0.5 * h * k2y) - c * (v + 0.5 * h * k2v)
-            k4y, k4v = v + h * k3v, w2 * (u2 - y - h * k3y) - c * (v + h * k3v)
-            y += h * (k1y + 2.0 * k2y + 2.0 * k3y + k4y) / 6.0
-            v += h * (k1v + 2.0 * k2v + 2.0 * k3v + k4v) / 6.0
+            u = x[i - 1] + (x[i] - x[i - 1]) * (j + 0.5) / steps
+            error = u - y
+            if abs(error) > dead_band:
+                side = 1.0 if error > 0.0 else -1.0
+                y += side * min((abs(error) - dead_band) * (1.0 - keep), fastest * h)
         out[i] = y
     return out
 
@@ -186,6 +273,28 @@ def since_reversal(x: Array, tolerance: float) -> Array:
         elif side != 0.0 and abs(x[i] - extreme) > tolerance:
             turn, extreme, side = extreme, x[i], -side
         out[i] = abs(x[i] - turn)
+    return out
+
+
+@njit(cache=True)
+def wiped_at_reversal(x: Array, distance: float, tolerance: float, start: float) -> Array:
+    """Friction state in [-1, 1] that knows nothing but the last reversal: side (1 - 2 exp(-s / distance)), s since there.
+
+    A reversal is larger than `tolerance`. Unlike Dahl's state it forgets how far the motion before it went: nested loops
+    do not close. Until the first reversal it builds up from `start`.
+    """
+    out = np.empty(x.size)
+    extreme, turn, side = x[0], x[0], 0.0
+    left = 1.0
+    for i in range(x.size):
+        if (side >= 0.0 and x[i] > extreme) or (side <= 0.0 and x[i] < extreme):
+            if side == 0.0:
+                side = 1.0 if x[i] > extreme else -1.0
+                left = 1.0 - side * min(max(start, -1.0), 1.0)
+            extreme = x[i]
+        elif side != 0.0 and abs(x[i] - extreme) > tolerance:
+            turn, extreme, side, left = extreme, x[i], -side, 2.0
+        out[i] = side * (1.0 - left * math.exp(-abs(x[i] - turn) / distance)) if side != 0.0 else start
     return out
 
 

@@ -68,7 +68,13 @@ class AxisModel(Model):
         self.outputs = tuple(outputs)
         self.ports = (
             Port(name, "force", name, tuple(o.channel for o in outputs)),
-            Port(f"{name}_drive", "timing+limit+mode", name, (self.spec.output,), held=True),
+            Port(
+                f"{name}_drive",
+                "timing+limit+mode" if spec.axis.controller is None else "loop",
+                name,
+                (self.spec.output,),
+                held=True,
+            ),
             Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
         )
         defaults = {

@@ -86,6 +86,31 @@ class TransmissionModel(Model):
         """Start values of the TOML; linear parameters find their place from anywhere."""
         return np.array([p.grid[0] for p in self.parameters])
 
+    def restarts(self, segments: list[Segment]) -> list[Array]:
+        """Nominal parameters that give each output its measured RMS, for readings that lead a linear fit astray.
+
+        With lags, for a range of time constants, all of one link alike. Parameters that the TOML holds keep their values.
+        """
+        used = [segment for segment in segments if segment.fit.any()]
+        if not used:
+            return []
+        order = max(link.lag_order for link in self.links)
+        slowest_s = max(float(segment.recording.time_s[-1]) for segment in used) / 8.0
+        times_s = np.geomspace(used[0].recording.dt_s, slowest_s, 9) if order else (1.0,)
+        found = []
+        for time_s in times_s:
+            theta = np.array([float(time_s) if "time_constant" in p.name else p.grid[0] for p in self.parameters])
+            at = 0
+            for row, link in enumerate(self.links):
+                theta[at], theta[at + 1] = 1.0, 0.0
+                run = np.concatenate([self.simulate(segment, theta, [])[row][segment.fit] for segment in used])
+                measured = np.concatenate([segment.y[row][segment.fit] for segment in used])
+                theta[at] = float(np.sqrt(np.nanmean(measured**2)) / max(np.sqrt(np.mean(run**2)), 1e-300))
+                at += 2 + link.lag_order
+            held = [p.grid[0] if p.high <= p.low else t for p, t in zip(self.parameters, theta, strict=True)]
+            found.append(np.array(held))
+        return found
+
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Every link's output, free run. Shape (outputs, n)."""
         out = np.empty_like(segment.y)

@@ -131,7 +131,7 @@ def probability_none(result: Diagnosis) -> float:
     if result.verdict == "missing_physics":
         strongest = max(result.standings, key=lambda standing: standing.gain.log_likelihood)
         found = posterior_of(result, strongest)
-        return found.nothing + found.none + sum(p for rival, p in found.rivals if rival.effect.id == "unlisted")
+        return found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)
     last = next((step.trials for step in reversed(result.found.steps) if step.trials), [])
     if not result.standings:
         return 1.0 - of_refused(last)
@@ -234,7 +234,7 @@ def _effect(
 
 def sentence(candidate: Candidate, parameters: tuple[Parameter, ...], values: Any) -> str:
     """The effect's own words with its values put in."""
-    against = candidate.effect.id.endswith("friction") and all(
+    against = candidate.effect.dissipates and all(
         float(v) <= 0.0 for p, v in zip(parameters, values, strict=True) if p.linear
     )
     text = {

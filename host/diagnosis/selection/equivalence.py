@@ -57,7 +57,7 @@ def with_unlisted_rival(standing: list[Standing], rest: Rest) -> list[Standing]:
     first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
     named = standing[first]
     forms = rest.predicted.forms if rest.predicted is not None else ()
-    if not forms or any(other.effect.id == "unlisted" for other in named.alike):
+    if not forms or any(not other.effect.listed for other in named.alike):
         return standing
     unknown = equation_at(named.candidate.port, *forms[0])
     return [*standing[:first], replace(named, alike=(*named.alike, unknown)), *standing[first + 1 :]]
@@ -69,7 +69,7 @@ def _better_said(
     """An equation of no listed effect that does plainly better in the place of `candidate`: then `candidate` may be the
     wrong name.
     """
-    if candidate.effect.id == "unlisted":
+    if not candidate.effect.listed:
         return ()
     for trial in equations_for(problem, less, candidate.port, noise_sd):
         behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd)

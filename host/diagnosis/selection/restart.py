@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from host.diagnosis.estimation.fit import Fit, Problem, robust, starts
@@ -29,6 +27,7 @@ def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -
         begin = starts(term, {}, {})
         tried = [np.concatenate((theta, begin)) for theta in begins]
         tried.sort(key=lambda values: robust(few.stacked((term,), values))[0])
-        item = Screened(candidate, term, (), 0.0, [begin] * KEPT)
-        found.append(replace(item, nominal=[values[: -begin.size] for values in tried[:KEPT]]))
+        nominals = [values[: -begin.size] for values in tried[:KEPT]]
+        if nominals:
+            found.append(Screened(candidate, term, (), 0.0, [begin] * len(nominals), nominals))
     return found

@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, Term, grid_points, jacobian, lines_of, size_of, starts, tuned
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.dataset import one_clock
+from host.diagnosis.model.effect import Candidate, Evidence, Reading
 from host.diagnosis.model.model import scale_of
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
-STEPPED_SAMPLES = 150  # of each output and recording, to look for steps in
 
 
 def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
@@ -58,8 +58,12 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
         other = term.candidate
         if other.port.name != candidate.port.name:
             continue
+        if other.effect.spans and other.effect.spans == candidate.effect.spans:
+            return None
         if other.effect.id == candidate.effect.id and other.source == candidate.source:
             if other.form == candidate.form and other.effect.order == candidate.effect.order:
+                return None
+            if candidate.effect.id in other.effect.contains:
                 return None
             if not other.effect.several:
                 drop.append(other.key)
@@ -128,7 +132,7 @@ def screen(
             Q = np.linalg.qr(J)[0] if J.shape[1] else J
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
-        term = _stepped(problem, fit, term_of(problem, candidate, fit))
+        term = _seeded(problem, fit, term_of(problem, candidate, fit))
         quick = candidate.port.name in slopes
         if not term.parameters:
             continue
@@ -216,33 +220,24 @@ def _independent(problem: Problem, left: Array) -> float:
     return total
 
 
-def _stepped(problem: Problem, fit: Fit, term: Term) -> Term:
-    """A quantization with the steps at which the residual goes with the saw tooth of its readings as simulated."""
-    if term.candidate.effect.id != "quantization":
+def _seeded(problem: Problem, fit: Fit, term: Term) -> Term:
+    """`term` with the start values that its effect reads from the residual, if it does."""
+    seeds = term.candidate.effect.seeds
+    if seeds is None or not term.parameters:
         return term
-    unit = "N" if term.candidate.port.kind == "forces" else "m"
-    rows = [row for row, output in enumerate(problem.model.outputs) if output.unit == unit]
-    if not rows:
-        return term
-    x, r = [], []
-    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
-        for row in rows:
+    n = len(problem.model.parameters)
+    used = [pair for pair in zip(problem.segments, fit.residuals, strict=True) if pair[0].fit.any()]
+    readings = []
+    for segment, residual in used:
+        for row, output in enumerate(problem.model.outputs):
             good = segment.fit & np.isfinite(residual[row])
-            every = max(1, int(good.sum()) // STEPPED_SAMPLES)
-            x.append((segment.y[row] - residual[row])[good][::every])
-            r.append(residual[row][good][::every] / problem.scale[row])
-    place, rest = np.concatenate(x), np.concatenate(r)
-    low, high = 1.2 * min(problem.scale[row] for row in rows), 12.0 * max(problem.scale[row] for row in rows)
-    span = float(np.max(np.abs(place))) if place.size else 0.0
-    if not span > high:
-        return replace(term, parameters=tuple(replace(p, grid=()) for p in term.parameters))
-    turns = np.arange(1.0 / high, 1.0 / low, 0.2 / span)
-    goes = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
-    best = turns[np.argsort(goes)[:3]]
-    p = term.parameters[0]
-    return replace(
-        term, parameters=(replace(p, grid=tuple(1.0 / k for k in best), low=0.5 * low, high=2.0 * high, step=0.01 * low),)
-    )
+            simulated = (segment.y[row] - residual[row])[good]
+            readings.append(Reading(output.unit, simulated, residual[row][good], float(problem.scale[row])))
+    needs = [problem.model.needs(segment, term.candidate.port, fit.values[:n], r)[segment.fit] for segment, r in used]
+    times = [segment.recording.time_s[segment.fit] for segment, _ in used]
+    shared = len(used) == 1 or one_clock([segment.recording for segment, _ in used])
+    evidence = Evidence(tuple(times), tuple(needs), tuple(readings), shared)
+    return replace(term, parameters=seeds(evidence, term.parameters, term.candidate.form))
 
 
 def _scan(

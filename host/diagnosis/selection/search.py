@@ -22,7 +22,7 @@ from host.diagnosis.estimation.fit import (
 )
 from host.diagnosis.estimation.initial_state import estimate_state
 from host.diagnosis.estimation.rules import SelectionRules
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.joint import best_pair
 from host.diagnosis.selection.restart import hidden
@@ -112,14 +112,14 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
     fit = finish(problem, fit)
     begun = get_starts(problem)
-    fit = _restart(problem, fit, item.candidate)
+    fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
     set_starts(problem, begun)
     heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
     trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)
     return Trial(
-        item.candidate,
+        fit.terms[-1].candidate,
         fit,
         heldout,
         trained,
@@ -143,6 +143,11 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
         reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
         for segment in problem.segments:
             _best_start(problem, fit, segment, port, reach)
+            if candidate.effect.begins_with_speed:
+                x = problem.model.motion(segment, candidate.port)
+                hurry = float(np.std(np.gradient(x, segment.recording.dt_s))) / max(float(np.std(x)), 1e-300)
+                for key, most in ((rate_key(port), reach * hurry), (port, reach)):
+                    _best_start(problem, fit, segment, key, most)
         trial = minimize(problem, fit.terms, fit.values, rounds=6, tolerance=1e-4)
         if not trial.cost < fit.cost:
             set_starts(problem, before)
@@ -349,7 +354,7 @@ def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
     """Frequencies (Hz) that were fitted for `term`: no rival should miss them for lack of a start."""
     at = len(fit.values) - sum(len(t.parameters) for t in fit.terms[fit.terms.index(term) :])
     pairs = zip(term.parameters, fit.values[at : at + len(term.parameters)], strict=True)
-    return tuple(float(value) for p, value in pairs if p.name == "frequency" and p.unit == "Hz")
+    return tuple(float(value) for p, value in pairs if p.spectral)
 
 
 def _in_place_of(

@@ -92,8 +92,10 @@ def of_sampling(trial: Trial) -> bool:
     if not shift or not trial.candidate.port.held:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
-    times = longest_s if shift == "rate" else 1.0
-    return abs(float(trial.fit.values[-1])) * times < 1.05 * trial.period_s
+    term = trial.fit.terms[-1]
+    own = zip(term.parameters, trial.fit.values[-len(term.parameters) :], strict=True)
+    late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
+    return late_s < 1.05 * trial.period_s
 
 
 def related(simple: Candidate, general: Candidate) -> bool:

@@ -173,6 +173,7 @@ def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
         form.text,
         apply,
         side="input",
+        listed=False,
     )
     return Candidate(effect, port, "", "search")
 

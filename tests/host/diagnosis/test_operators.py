@@ -47,8 +47,15 @@ def test_dahl_solves_its_differential_equation() -> None:
 @settings(max_examples=30, deadline=None)
 @given(signals, st.floats(0.05, 3.0))
 def test_friction_states_stay_within_one(x: np.ndarray, distance: float) -> None:
-    for operator in (op.dahl, op.maxwell_slip, op.jenkins):
-        assert np.all(np.abs(operator(x, distance, 0.0)) <= 1.0 + 1e-12)
+    quarters = np.full(op.SLIP_ELEMENTS, 1.0 / op.SLIP_ELEMENTS)
+    states = (
+        op.dahl(x, distance, 0.0),
+        op.jenkins(x, distance, 0.0),
+        op.maxwell_slip(x, distance, 2.0, quarters, 0.0),
+        op.wiped_at_reversal(x, distance, 1e-3, 0.0),
+    )
+    for state in states:
+        assert np.all(np.abs(state) <= 1.0 + 1e-12)
 
 
 def test_lag_follows_a_step_and_a_ramp_exactly() -> None:
@@ -63,7 +70,7 @@ def test_second_order_rings_at_its_frequency() -> None:
     x = np.where(t > 0, 1.0, 0.0)
     wd = w * np.sqrt(1 - z**2)
     wanted = 1 - np.exp(-z * w * t) * (np.cos(wd * t) + z / np.sqrt(1 - z**2) * np.sin(wd * t))
-    assert np.max(np.abs(op.second_order(x, 0.005, w, z) - wanted)) < 0.04
+    assert np.max(np.abs(op.second_order(x, 0.005, 2 * z / w, w**-2) - wanted)) < 0.04
 
 
 def test_shift_delays_a_sine_but_for_the_chords_between_samples() -> None:

@@ -1,0 +1,163 @@
+"""Forms of the vocabulary that are planted by another formula or integrator, in recordings that are cut from motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from host.diagnosis import diagnose
+
+pytestmark = pytest.mark.slow
+Array = np.ndarray
+Motion = Callable[[Any], Array]
+GEAR: dict[str, Any] = {
+    "name": "gear",
+    "kind": "transmission",
+    "data": {"time": "t"},
+    "channels": {"motor": {"column": "m", "unit": "rad"}, "tip": {"column": "y", "unit": "rad"}},
+    "link": [{"subsystem": "gear", "input": "motor", "output": "tip"}],
+}
+DT, SECONDS, NOISE = 0.02, 30.0, 4e-3
+T = np.arange(0.0, SECONDS, DT)
+
+
+def motion(seed: int, hertz: tuple[float, ...] = (0.11, 0.23, 0.53, 1.1, 2.1)) -> Motion:
+    """A sum of sines that has been running for ever."""
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(hertz))
+    return lambda t: np.asarray(
+        sum(0.5 / (1.0 + f) * np.sin(2.0 * np.pi * f * t + p) for f, p in zip(hertz, phases, strict=True))
+    )
+
+
+def integrated(rates: Callable[[float, Array], list[float]], states: int) -> Array:
+    """First state at the samples, begun long before the first one."""
+    run = solve_ivp(rates, (-10.0, T[-1]), np.zeros(states), "LSODA", t_eval=T, rtol=1e-7, atol=1e-9, max_step=0.05)
+    return np.asarray(run.y[0])
+
+
+def second_order(x: Motion, delay: float, lag: float, inertia: float) -> Array:
+    return integrated(lambda t, y: [y[1], (float(x(t - delay)) - y[0] - lag * y[1]) / inertia], 2)
+
+
+def recorded(seed: int, change: Callable[[Motion], Array], noise: float = NOISE) -> dict[str, Array]:
+    """One recording: motor, and 1.3 times what becomes of its motion, with white noise."""
+    x, rng = motion(seed), np.random.default_rng(100 + seed)
+    return {"t": T, "m": x(T), "y": 1.3 * change(x) + 0.02 + noise * rng.normal(size=T.size)}
+
+
+def found(change: Callable[[Motion], Array], recordings: int = 3) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Verdict, and its first effect."""
+    verdict = diagnose([recorded(seed, change) for seed in range(1, 1 + recordings)], GEAR).as_dict()
+    assert verdict["effects"], verdict["verdict"]
+    return verdict, verdict["effects"][0]
+
+
+def at_noise(verdict: dict[str, Any]) -> bool:
+    return bool(verdict["fit"]["rmse_after"] < 1.3 * NOISE)
+
+
+def test_dead_time_and_overdamped_lag() -> None:
+    verdict, effect = found(lambda x: second_order(x, 0.07, 0.25, 0.01))
+    assert len(verdict["effects"]) == 1 and effect["id"] == "rate_lag" and at_noise(verdict)
+    p = effect["parameters"]
+    assert p["delay_s"]["value"] == pytest.approx(0.07, abs=0.01)
+    assert p["lag_s"]["value"] == pytest.approx(0.25, rel=0.05)
+    assert "0.2 s and 0.05" in effect["says"] or p["inertia_s2"]["value"] == pytest.approx(0.01, rel=0.15)
+
+
+def test_dead_time_and_resonance() -> None:
+    verdict, effect = found(lambda x: second_order(x, 0.05, 0.03, 0.006))
+    assert len(verdict["effects"]) == 1 and effect["id"] == "resonance"
+    assert verdict["fit"]["rmse_after"] < 0.02 * verdict["fit"]["rmse_before"]
+    p = effect["parameters"]
+    assert p["delay_s"]["value"] == pytest.approx(0.05, abs=0.004)
+    assert p["inertia_s2"]["value"] == pytest.approx(0.006, rel=0.05)
+
+
+def test_a_pure_delay_stays_a_delay() -> None:
+    verdict, effect = found(lambda x: x(T - 0.13))
+    assert [e["id"] for e in verdict["effects"]] == ["latency"] and at_noise(verdict)
+    assert effect["parameters"]["delay_s"]["value"] == pytest.approx(0.13, rel=0.02)
+
+
+def test_a_mode_with_partial_participation() -> None:
+    def part(x: Motion) -> Array:
+        return 0.7 * x(T) + 0.3 * second_order(x, 0.0, 0.02, 0.005)
+
+    verdict, effect = found(part)
+    assert len(verdict["effects"]) == 1 and effect["id"] == "resonance" and at_noise(verdict)
+    assert effect["parameters"]["mode_share"]["value"] == pytest.approx(0.3, rel=0.05)
+
+
+def test_several_jumps() -> None:
+    def lost(x: Motion) -> Array:
+        y = x(T).copy()
+        for instant, jump in ((6.3, -0.03), (14.9, -0.05), (24.1, 0.02)):
+            y[instant <= T] += jump
+        return y
+
+    verdict, effect = found(lost, 1)
+    assert len(verdict["effects"]) == 1 and effect["id"] == "missed_steps" and at_noise(verdict)
+    instants = sorted(v["value"] for key, v in effect["parameters"].items() if key.startswith("instant"))
+    assert instants == pytest.approx([6.3, 14.9, 24.1], abs=0.05)
+
+
+def test_wear_with_the_distance_travelled() -> None:
+    def worn(x: Motion) -> Array:
+        fine = np.arange(0.0, SECONDS, DT / 10)
+        path = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(x(fine))))))
+        return x(T) * np.exp(-0.006 * path[::10])
+
+    _, effect = found(worn)
+    assert effect["id"] == "softening" and "travelled" in effect["says"]
+
+
+def test_generalized_maxwell_slip() -> None:
+    def slip(x: Motion) -> Array:
+        fine = np.arange(-5.0, SECONDS, DT / 10)
+        reach, level = np.array([0.01, 0.03, 0.08, 0.2, 0.5]), np.array([0.02, 0.0, 0.03, 0.02, 0.05])
+        sliders, out = np.full(5, float(x(fine[0]))), []
+        for place in x(fine):
+            sliders = place - np.clip(place - sliders, -reach, reach)
+            out.append(place - float(np.sum(level * (place - sliders) / reach)))
+        return np.asarray(out)[round(5.0 / DT) * 10 :: 10][: T.size]
+
+    verdict, effect = found(slip)
+    assert effect["id"] == "presliding_friction" and verdict["fit"]["rmse_after"] < 0.15 * verdict["fit"]["rmse_before"]
+
+
+def servo(x: Motion, band: float, fastest: float, tau: float = 0.15) -> Array:
+    def rates(t: float, y: Array) -> list[float]:
+        error = float(x(t)) - y[0]
+        return [float(np.clip((error - np.clip(error, -band, band)) / tau, -fastest, fastest))]
+
+    return integrated(rates, 1)
+
+
+def test_a_dead_band_inside_a_position_loop() -> None:
+    verdict, effect = found(lambda x: servo(x, 0.08, np.inf))
+    assert [e["id"] for e in verdict["effects"]] == ["dead_zone"] and at_noise(verdict)
+    assert effect["parameters"]["half_width_rad"]["value"] == pytest.approx(0.08, rel=0.05)
+
+
+def test_a_limit_of_speed_inside_a_position_loop() -> None:
+    verdict, effect = found(lambda x: servo(x, 0.0, 1.0))
+    assert [e["id"] for e in verdict["effects"]] == ["saturation"] and at_noise(verdict)
+    assert effect["parameters"]["limit_rad_per_s"]["value"] == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_lost_sign_behind_two_lags() -> None:
+    nominal = {**GEAR, "link": [{**GEAR["link"][0], "lag_order": 2}]}
+    runs = []
+    for seed in (1, 2, 3):
+        x, rng = motion(seed), np.random.default_rng(seed)
+        y = 1.3 * second_order(x, 0.0, 0.4, 0.03)
+        runs.append({"t": T, "m": x(T), "y": np.abs(y) + NOISE * rng.normal(size=T.size)})
+    verdict = diagnose(runs, nominal).as_dict()
+    assert [effect["id"] for effect in verdict["effects"]] == ["rectified_sensor"]
+    assert verdict["fit"]["rmse_after"] < 1.3 * NOISE
