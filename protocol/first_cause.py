@@ -98,6 +98,27 @@ RULES: dict[str, Rule] = {
         "Zero the force sensor in free space; if it still differs, check its mounting and the catheter's stiffness.",
         ("force_rejected", "force_stale", "steps_lost"),
     ),
+    "force_undecided": Rule(
+        "Force sensor and estimate began to disagree.",
+        "Wait; if they stay apart, the catheter retracts. Zero the force sensor in free space.",
+        ("force_rejected", "force_stale", "steps_lost"),
+    ),
+    "host_silent": Rule(
+        "The model process does not answer.",
+        "Look whether it runs: `systemctl status seldinger-host`, or start it again.",
+        ("loop_late",),
+    ),
+    "host_lost": Rule(
+        "The model process did not come back in time.", "Start the model process, then clear.", ("loop_late", "host_silent")
+    ),
+    "force_unreached": Rule(
+        "The requested force is not reached: the catheter gives way.", "Request less force, or expose less of the catheter."
+    ),
+    "still_pressed": Rule(
+        "A force remains on the stopped tip.",
+        "Pull the catheter back by hand until the force is gone.",
+        ("over_force", "force_disagrees", "board_silent", "board_fault", "operator_stop"),
+    ),
     "over_force": Rule(
         "The contact force went above the limit.",
         "Take the catheter off the tissue, then clear.",

@@ -233,6 +233,8 @@ class Safety(_Section):
     force_timeout_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
     retract_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)]
     retract_distance_m: Annotated[float, Field(gt=0, le=0.05)]
+    retract_stopped: bool = True
+    host_lost_after_s: Annotated[float, Field(gt=0, le=10)] = 2.0
     max_tip_speed_m_per_s: Annotated[float, Field(gt=0, le=1)]
     workspace_min_m: Vector3
     workspace_max_m: Vector3

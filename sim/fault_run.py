@@ -55,14 +55,27 @@ class FaultyScenario(Scenario):
     delay of every answer.
     """
 
-    def __init__(self, rig: Rig, world: World, publish: Publish, seed: int, estimator: Estimator | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        world: World,
+        publish: Publish,
+        seed: int,
+        estimator: Estimator | None = None,
+        force_source: str = "sensor",
+    ) -> None:
         self.noise = LineNoise(seed)
         self.pause_ns = self.clock_shift_ns = self.host_late_ns = 0
         self.host = "well"
+        self.wrong: Callable[[ForceEstimate], ForceEstimate] = lambda estimate: estimate
         self.watchers: list[Watcher] = []
         self.out = publish
         super().__init__(
-            rig, world, self._publish_to_watchers, estimator=None if estimator is None else self._estimate_unless_failed
+            rig,
+            world,
+            self._publish_to_watchers,
+            estimator=None if estimator is None else self._estimate_unless_failed,
+            force_source=force_source,
         )
         self.clock_shift_ns = CLOCK_START_NS
         self._model = estimator
@@ -75,7 +88,8 @@ class FaultyScenario(Scenario):
     def _estimate_unless_failed(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
         if self.host != "well" or self._model is None:
             return None
-        return self._model(tip, shaft, stage)
+        estimate = self._model(tip, shaft, stage)
+        return estimate if estimate is None else self.wrong(estimate)
 
     def step(self) -> None:
         """One period of the loop, after the pause that is due."""
@@ -201,7 +215,7 @@ class Watcher:
         if status is not None and status.state == BoardState.FAULT:
             self.outcome.board_fault = str(status.fault)
         phase = int(outputs.phase)
-        if self._stopped and phase not in (Phase.STOPPED, Phase.DISARMED):
+        if self._stopped and phase not in (Phase.STOPPED, Phase.DISARMED, Phase.RETRACT):
             self.outcome.rearmed = True
         self._stopped = self._stopped or (phase == Phase.STOPPED and int(outputs.action) == SafetyAction.STOP)
 

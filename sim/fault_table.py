@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
+from protocol.topics import ForceEstimate
 from sim.fault_run import MS, FaultyScenario
 from sim.sensor_faults import SensorFault
 
@@ -19,9 +21,6 @@ PEAK_N, LINK_REST_S = 0.55, 0.050
 # Steps of a rotor behind its field that have to be noticed: 0.5 mm of insertion, 4.5 degrees of handle or knob.
 STEPS_TO_FIND = 160
 KNOB = 2
-# What turns a rotor back is its load, and a stepper is chosen for twice the load's torque or more: against the same
-# friction that leaves half of the speed to which the motor takes the stage.
-SLIP_SHARE = 0.5
 PHASES = ("approach", "contact", "hold")
 
 
@@ -99,17 +98,33 @@ def _jam(run: FaultyScenario, size: float, seconds: float) -> None:
 
 
 def _slip(run: FaultyScenario, size: float, seconds: float) -> None:
-    """The load turns a rotor at `SLIP_SHARE` of the stage's full speed; the bent catheter its knob until it is straight."""
+    """The load turns a rotor at the stage's full speed; the bent catheter its knob until it is straight."""
     axis, stages = _axis(size), run.world.stages
     stage = run.loop.rig.stage(axis)
     if axis == KNOB:
         bent_steps = stages.position[KNOB] * stage.steps_per_unit
         size = math.copysign(min(abs(size), abs(bent_steps)), bent_steps)
-    stages.slip(axis, size, seconds, SLIP_SHARE * stage.max_speed_unit_per_s)
+    stages.slip(axis, size, seconds, stage.max_speed_unit_per_s)
 
 
 def _steps_apart(run: FaultyScenario) -> bool:
     return bool(np.abs(run.world.stages.lost_steps).max() > STEPS_TO_FIND)
+
+
+def _sensor_off(run: FaultyScenario) -> bool:
+    """Whether the sensor is wrong by more than three standard deviations that the estimate states."""
+    truth_N, witness = float(np.linalg.norm(run.world.plant.contact_force_N)), run.loop.state[0].witness
+    return abs(truth_N - witness.sensor_N) > max(3.0 * witness.estimate_sd_N, 0.15)
+
+
+def _estimate_scaled(run: FaultyScenario, size: float, seconds: float) -> None:
+    def wrong(estimate: ForceEstimate) -> ForceEstimate:
+        if estimate.force_N is None:
+            return estimate
+        x, y, z = estimate.force_N
+        return msgspec.structs.replace(estimate, force_N=(size * x, size * y, size * z))
+
+    run.wrong = wrong
 
 
 def _host(state: str) -> Inject:
@@ -230,7 +245,7 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "slipped_steps",
-        "motor too weak or its supply sags: the load turns one rotor, at half its full speed",
+        "motor too weak or its supply sags: the load turns one rotor, at its full speed",
         _slip,
         (-2000.0, 2000.0),
         "steps at most",
@@ -285,6 +300,37 @@ FAULTS: tuple[FaultKind, ...] = (
         seconds=(2.0, 5.0),
         must_detect=lambda size, seconds: abs(size) * seconds > 0.5,
         within_s=5.0,
+    ),
+    FaultKind(
+        "force_scaled",
+        "the force sensor reads this times the true force: dead, too little, or reversed",
+        _on_force("scale"),
+        (-1.0, 0.6),
+        "times",
+        seconds=(1.5, 1.5),
+        within_s=0.6,
+        must_detect=_never,
+        large=_sensor_off,
+    ),
+    FaultKind(
+        "force_offset",
+        "the force sensor reads so much more along its axis",
+        _on_force("offset"),
+        (-0.3, 0.3),
+        "N",
+        seconds=(1.5, 1.5),
+        within_s=0.6,
+        must_detect=lambda size, seconds: abs(size) > 0.2,
+    ),
+    FaultKind(
+        "estimate_scaled",
+        "the model process answers this times its estimate: zero, or the wrong sign",
+        _estimate_scaled,
+        (-1.0, 0.3),
+        "times",
+        seconds=(1.5, 1.5),
+        within_s=0.6,
+        must_detect=_never,
     ),
     FaultKind("force_saturated", "the gauges at their limit", _on_force("saturated")),
     FaultKind("force_unplugged", "no record of the force sensor", _on_force("silent")),

@@ -21,7 +21,19 @@ _SATURATED, _ERROR, _BRIDGE = 0x00020000, 0x80000000, 0x00000100
 # drop, duplicate, reorder: `value` is the chance per record; silent: nothing leaves (unplugged); saturated: load beyond
 # the gauges; broken: gauge excitation failed; drift: `value` N/s on every force axis; frozen: the same counts under new
 # sequence numbers; bit_errors: `value` is the rate per bit (as if the UDP checksum were off).
-FAULT_KINDS = ("drop", "duplicate", "reorder", "silent", "saturated", "broken", "drift", "frozen", "bit_errors")
+FAULT_KINDS = (
+    "drop",
+    "duplicate",
+    "reorder",
+    "silent",
+    "saturated",
+    "broken",
+    "drift",
+    "frozen",
+    "bit_errors",
+    "scale",
+    "offset",
+)
 
 
 @dataclass(frozen=True)
@@ -123,6 +135,10 @@ class NetFtEmulator:
         self._samples += 1
         self._ft_sequence = (self._ft_sequence + self._ft_step) & 0xFFFFFFFF
         self._load = np.concatenate((np.asarray(force_N, float) + c.zero_offset_N, np.asarray(torque_Nm, float)))
+        for fault in active(self.faults, time_ns, "scale"):
+            self._load[:3] *= fault.value
+        for fault in active(self.faults, time_ns, "offset"):
+            self._load[2] += fault.value
         for fault in active(self.faults, time_ns, "drift"):
             self._load[:3] += fault.value * (time_ns - fault.start_ns) * 1e-9
         self._load += noise

@@ -143,5 +143,6 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
         board_timeout_ns=round(BOARD_TIMEOUT_S * 1e9),
         retract_speed_m_per_s=limits.retract_speed_m_per_s,
         retract_distance_m=limits.retract_distance_m,
+        retract_stopped=int(limits.retract_stopped),
     )
     return params

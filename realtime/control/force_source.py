@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from numba import njit
 
 from realtime.control.codes import SOURCE_ESTIMATE, SOURCE_SENSOR
@@ -88,8 +90,10 @@ def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats,
     normal_N = compression(estimate.force_N, normal)
     state.arrival_ns[SOURCE_ESTIMATE], state.normal_N[SOURCE_ESTIMATE] = estimate.arrival_ns, normal_N
     state.noise_N2 = max(noise_N2, 1e-6)
-    place = _sensor_at(state, estimate.stamp_ns) if touching else -1
-    if place >= 0:
+    place = _sensor_at(state, estimate.stamp_ns)
+    state.estimate_stamp_ns = estimate.stamp_ns
+    state.sensor_then = state.ring_N[place] if place >= 0 else math.nan
+    if touching and place >= 0:
         _compare(state, normal_N - state.ring_N[place])
     return True
 
@@ -152,6 +156,7 @@ def apply(
         Number of readings that were rejected.
     """
     rejected, new = 0, -1
+    state.new[SOURCE_SENSOR] = state.new[SOURCE_ESTIMATE] = 0
     if inputs.sensor.count != state.seen[SOURCE_SENSOR]:
         state.seen[SOURCE_SENSOR] = inputs.sensor.count
         for i in range(3):
@@ -160,12 +165,14 @@ def apply(
             to_base(frame_wxyz, inputs.sensor.force_N, state.reading_N)
         if _take_sensor(state, inputs.sensor, normal):
             new = SOURCE_SENSOR
+            state.new[SOURCE_SENSOR] = 1
         else:
             rejected += 1
     estimated = False
     if inputs.estimate.count != state.seen[SOURCE_ESTIMATE]:
         state.seen[SOURCE_ESTIMATE] = inputs.estimate.count
         estimated = _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching)
+        state.new[SOURCE_ESTIMATE] = 1 if estimated else 0
         if not estimated and params.force_source == SOURCE_ESTIMATE:
             rejected += 1
     state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0

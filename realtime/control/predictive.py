@@ -152,6 +152,7 @@ def follow(state: PredictiveState, hybrid: HybridState, axis: int, speed: float,
 def touch(state: PredictiveState, force_N: float, depth_m: float) -> None:
     """Begin contact: the force set-point starts from the present force (N), with the free tip at `depth_m` (m)."""
     state.force_setpoint_N, state.away_s, state.goal_speed_m_per_s = max(force_N, 0.0), 0.0, 0.0
+    state.short_s = 0.0
     state.touch_depth_m = depth_m
 
 
@@ -228,6 +229,7 @@ def press(
     most_m = min(contact.depth_m, state.touch_depth_m) + _REACH_m
     press_m = spring_m + stiffer * wall_state.mean_depth_m
     depth_m = min(max((target_predictor.at(wall, contact.execute_ns) + press_m) / (1.0 + stiffer), least_m), most_m)
+    state.short_s = max(state.short_s + (move.period_s if depth_m == most_m else -move.period_s), 0.0)
     state.reversal_depth_m = max(config.reversal_depth_m, _DEPTH_SIGMA * sd_m)
     joint = _contact_joint(hybrid, kinematics, contact, depth_m)
     for axis in range(N_AXES):

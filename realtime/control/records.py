@@ -328,6 +328,7 @@ class PredictiveState:
     reversal_depth_m: float = real("m", "shortest motion back for which a reversal is planned now")
     force_setpoint_N: float = real("N", "force to press with now")
     away_s: float = real("s", "how long the contact has been lost")
+    short_s: float = real("s", "how long the free tip has been as deep as it may be, with too little force")
     speed: Floats = real("m/s, rad/s", "speed of the joint command", N_AXES)
     joint_at_crossing: Floats = real("m, rad, rad", "joint command one planned crossing from now", N_AXES)
     joint_after_crossing: Floats = real("m, rad, rad", "joint command a little later", N_AXES)
@@ -359,6 +360,27 @@ class ForceSourceState:
     age_from_ns: int = whole("ns", "when it arrived")
     force_N: Floats = real("N", "its force, base frame", 3)
     reading_N: Floats = real("N", "the sensor's newest reading, base frame", 3)
+    estimate_stamp_ns: int = whole("ns", "when the newest estimate's pose was measured")
+    sensor_then: float = real("N", "the sensor's compression at that time, NaN where it is not known")
+    new: Ints = whole("", "1 where the sensor, the estimate has a plausible new reading in this tick", 2)
+
+
+class WitnessState:
+    """Sensor, estimate and geometry compared (`witnesses`)."""
+
+    sensor_N: float = real("N", "compression by the sensor, averaged over 10 ms")
+    estimate_N: float = real("N", "compression by the estimate, averaged over 60 ms")
+    estimate_sd_N: float = real("N", "standard deviation that the newest estimate states")
+    estimate_ns: int = whole("ns", "stamp of the newest estimate")
+    difference_N: float = real("N", "estimate minus sensor at the same times, averaged")
+    pairs: int = whole("", "pairs that were compared since arming")
+    geometry_N: float = real("N", "compression by the tip's deflection; 0 where that is not known")
+    reference_m: float = real("m", "measured tip minus free tip, along the outward normal, in free space")
+    reference_s: float = real("s", "time that this was learned from")
+    deflection_m: float = real("m", "how much further it is now")
+    pose_ns: int = whole("ns", "stamp of the newest pose")
+    differ_s: float = real("s", "how long sensor and estimate have disagreed")
+    pressed_s: float = real("s", "how long a stopped catheter has been pressed")
 
 
 class History:
@@ -380,7 +402,8 @@ class SafetyParams:
     force_timeout_ns: int = whole("ns", "age of a force that makes the loop hold in contact")
     board_timeout_ns: int = whole("ns", "age of a board's status that stops")
     retract_speed_m_per_s: float = real("m/s", "speed of a retraction")
-    retract_distance_m: float = real("m", "length of a retraction")
+    retract_distance_m: float = real("m", "least length of a retraction")
+    retract_stopped: int = whole("", "1: a stopped catheter that is pressed is retracted")
 
 
 class Params:
@@ -425,6 +448,9 @@ class State:
     home_m: float = real("m", "distal insertion of the body at home, as located at rest")
     predicted_joint: Floats = real("m, rad, rad", "joints when the stages are where they were sent", N_AXES)
     normal: Floats = real("", "outward normal of the wall, as learned", 3)
+    witness: WitnessState = part(WitnessState, "sensor, estimate and geometry compared")
+    free_s: float = real("s", "how long nothing has pressed on a tip that is being retracted")
+    retract_knob_rad: float = real("rad", "knob where the retraction began")
     history: History = part(History, "predicted joints of the last 0.2 s")
     tip_offset: TipOffsetState = part(TipOffsetState, "offset of the tip")
     wall: WallState = part(WallState, "motion of the wall")
@@ -462,6 +488,7 @@ class Outputs:
     breath_Hz: float = real("Hz", "breath rate found, 0 for none")
     stiffness_N_per_m: float = real("N/m", "stiffness learned, catheter and tissue in series")
     play_m: float = real("m", "width of the backlash learned")
+    witness_N: Floats = real("N", "compression by force sensor, estimate and geometry", 3)
 
 
 POSE, FORCE, BOARD, COMMAND, INPUTS = map(dtype_of, (PoseRecord, Force, BoardRecord, CommandRecord, Inputs))

@@ -32,6 +32,16 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         False,
         "the force sensor sends nothing, is frozen or disagrees with the estimate: the estimate closes the loop",
     ),
+    ("force_undecided", ACTION_HOLD, False, "force sensor and estimate disagree: holding until it is clear which is wrong"),
+    ("host_silent", ACTION_HOLD, False, "the model process does not answer: holding; see that it runs"),
+    ("host_lost", ACTION_RETRACT, True, "the model process did not come back in time: retracting; start it, then clear"),
+    (
+        "force_unreached",
+        ACTION_WARN,
+        False,
+        "the requested force is not reached, because the catheter gives way: request less, or expose less of the catheter",
+    ),
+    ("still_pressed", ACTION_WARN, False, "a force remains on the stopped tip: pull the catheter back by hand"),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 (
@@ -49,11 +59,20 @@ CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
     STEPS_LOST,
     FORCE_DISAGREES,
     FORCE_HANDOVER,
+    FORCE_UNDECIDED,
+    HOST_SILENT,
+    HOST_LOST,
+    FORCE_UNREACHED,
+    STILL_PRESSED,
 ) = (1 << index for index in range(len(CAUSES)))
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 
-_HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE
-_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST
+_HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE | FORCE_UNDECIDED | HOST_SILENT
+_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST | HOST_LOST
+# With these the board does not move the stages, whatever is sent.
+BOARD_BITS = BOARD_SILENT | BOARD_FAULT
+# These may be followed by a force within milliseconds: the catheter is taken away at full speed.
+URGENT_BITS = OVER_FORCE | STEPS_LOST
 _STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
 
 

@@ -22,11 +22,11 @@ from realtime.control import (
     target_predictor,
     tip_offset,
     wall_observer,
+    witnesses,
 )
 from realtime.control.codes import (
     ACTION_HOLD,
     ACTION_RETRACT,
-    ACTION_STOP,
     BOARD_FAULT,
     COMMAND_CONTACT,
     COMMAND_HOLD,
@@ -60,6 +60,12 @@ _NOISY_FACTOR = 2.0
 _NORMAL_S = 2.0
 # How far beyond the given target the approach goes on looking for the wall.
 _SEARCH_m = 0.010
+# The requested force counts as not reached after the free tip has been as deep as it may be for this long.
+_SHORT_S = 1.0
+# A retraction ends when nothing has pressed for this long; if something still does, it goes on for this much further.
+_FREE_S, _RETRACT_MORE_m = 0.1, 0.030
+# An urgent retraction turns the knob by at most this, if that takes the tip away by more than this per radian.
+_BEND_rad, _BENDS_AWAY_m, _NUDGE_rad = 0.5, 0.003, 1e-3
 # This many poses rejected in a row make the loop hold.
 _WILD_POSES = 3
 
@@ -70,6 +76,7 @@ def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> 
     joint, flank = free_tip.joint_at(state.history, inputs.tip.stamp_ns)
     if flank == 0.0:
         return
+    witnesses.take_pose(params, state.witness, inputs, joint, state.normal, state.phase)
     moving = state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH or state.phase == PHASE_JOG
     free = (moving or state.phase == PHASE_HOLD) and state.force.smooth_N < params.hybrid.contact_force_N
     tip_offset.apply(params.tip_offset, params.kinematics, state.tip_offset, joint, inputs.tip, state.normal, touching, free)
@@ -86,6 +93,9 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
         params, force, inputs, state.predictor.quaternion_wxyz, state.normal, touching
     )
     state.force_seen = force.seen[force.source]
+    witnesses.take_forces(
+        state.witness, force, force.new[SOURCE_SENSOR] != 0, force.new[SOURCE_ESTIMATE] != 0, params.period_s
+    )
     if force.fresh == 0 or state.phase != PHASE_CONTACT or params.law != LAW_PREDICTIVE:
         return
     if force.source == SOURCE_SENSOR and force.value_N > params.hybrid.contact_force_N:
@@ -102,7 +112,7 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
 @njit(cache=True)
 def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, forces_rejected: int) -> int:
     """Return the bit set of all that is wrong at this tick."""
-    limits, now_ns, armed = params.safety, inputs.now_ns, state.phase != PHASE_DISARMED
+    armed = state.phase != PHASE_DISARMED
     flags = 0
     if pose_result == predictor.REJECTED:
         flags |= safety.POSE_REJECTED
@@ -111,7 +121,14 @@ def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, force
     if state.predictor.rejected_in_row >= _WILD_POSES:
         flags |= safety.POSES_WILD
     if armed:
-        flags |= _armed_flags(params, state, inputs)
+        flags |= _armed_flags(params, state, inputs) | _witness_flags(params, state, inputs)
+    return flags | _force_flags(params, state, inputs.now_ns, armed)
+
+
+@njit(cache=True)
+def _force_flags(params: Params, state: State, now_ns: int, armed: bool) -> int:
+    """Return what is wrong with the force that closes the loop."""
+    flags, limits = 0, params.safety
     force_age_ns = now_ns - state.force.age_from_ns
     force_timeout_ns = limits.force_timeout_ns
     if state.force.source == SOURCE_ESTIMATE:
@@ -131,10 +148,31 @@ def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, force
 
 
 @njit(cache=True)
+def _witness_flags(params: Params, state: State, inputs: Inputs) -> int:
+    """Return what sensor, estimate and geometry of an armed loop say together, whichever of them closes the loop."""
+    flags, witness = 0, state.witness
+    if witnesses.over(params, witness, state.force, inputs):
+        flags |= safety.OVER_FORCE
+    differ = witnesses.disagree(witness, inputs, params.period_s)
+    if differ == 2:
+        flags |= safety.FORCE_DISAGREES
+    elif differ == 1:
+        flags |= safety.FORCE_UNDECIDED
+    if state.phase == PHASE_CONTACT and state.predictive.short_s > _SHORT_S:
+        flags |= safety.FORCE_UNREACHED
+    if state.phase == PHASE_STOPPED and witnesses.pressed(witness, inputs):
+        flags |= safety.STILL_PRESSED
+    return flags
+
+
+@njit(cache=True)
 def _armed_flags(params: Params, state: State, inputs: Inputs) -> int:
     """Return what is wrong for an armed loop with poses, board and operator; and what the supervision found."""
     limits, now_ns = params.safety, inputs.now_ns
     flags = inputs.command.watch
+    in_contact = state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT
+    if not (in_contact or witnesses.pressed(state.witness, inputs)):
+        flags &= ~safety.HOST_LOST
     pose_age_ns = now_ns - state.predictor.accepted_ns
     if pose_age_ns > limits.hold_after_ns:
         flags |= safety.POSE_STALE
@@ -180,6 +218,7 @@ def _arm(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> Non
     """Start from where the stages are, at rest, with nothing learned."""
     _locate(params, state, inputs, tip_m)
     force_source.start(params, state.force)
+    witnesses.start(state.witness)
     hybrid.forget(state.hybrid)
     state.history.count = 0
     tip_offset.start(state.tip_offset)
@@ -200,7 +239,8 @@ def _enter(params: Params, state: State, phase: int, tip_m: ReadFloats) -> None:
     if params.law == LAW_PREDICTIVE:
         predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
     state.hybrid.above_ns = 0
-    state.retract_from_m = state.hybrid.joint[0]
+    state.retract_from_m, state.retract_knob_rad = state.predicted_joint[0], state.hybrid.joint[2]
+    state.free_s = 0.0
     for i in range(3):
         state.hybrid.goal_m[i] = tip_m[i]
 
@@ -217,22 +257,43 @@ def _sensible(params: Params, command: CommandRecord) -> bool:
 
 
 @njit(cache=True)
-def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, tip_m: ReadFloats) -> None:
+def _retracts_stopped(params: Params, state: State, inputs: Inputs, causes: int) -> bool:
+    """Whether a stop takes the catheter off the tissue first, or a stopped catheter is retracted again.
+
+    A catheter that is stopped in contact stays pressed, and a wall that comes nearer presses harder. So a stop in contact
+    is followed by a retraction, and a stopped catheter retracts when it is pressed with half the greatest force. The
+    rig file can forbid it (`safety.retract_stopped`); a board that does not move the stages makes it impossible.
+    """
+    if params.safety.retract_stopped == 0 or causes & safety.BOARD_BITS or inputs.board.ready == 0:
+        return False
+    if state.phase == PHASE_STOPPED:
+        return witnesses.standing(params, state.witness, inputs, params.period_s)
+    if state.phase == PHASE_RETRACT:
+        return not _retracted(params, state)
+    return state.phase == PHASE_CONTACT or witnesses.pressed(state.witness, inputs)
+
+
+@njit(cache=True)
+def _follow_failsafe(params: Params, state: State, inputs: Inputs, action: int, causes: int, tip_m: ReadFloats) -> None:
+    """Set the phase of an armed loop that retracts, stops or is stopped."""
+    away = action == ACTION_RETRACT and state.phase != PHASE_STOPPED
+    if away or _retracts_stopped(params, state, inputs, causes):
+        _enter(params, state, PHASE_RETRACT, tip_m)
+    else:
+        _enter(params, state, PHASE_STOPPED, tip_m)
+
+
+@njit(cache=True)
+def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, causes: int, tip_m: ReadFloats) -> None:
     """Set the phase that the command and the failsafe action lead to. Only disarming leads out of a stop."""
     command = inputs.command
     ready = inputs.board.ready != 0 and state.predictor.started != 0
     if command.armed == 0:
         state.phase = PHASE_DISARMED
         return
-    if action == ACTION_STOP:
+    if action >= ACTION_RETRACT or state.phase == PHASE_STOPPED:
         if state.phase != PHASE_DISARMED:
-            _enter(params, state, PHASE_STOPPED, tip_m)
-        return
-    if action == ACTION_RETRACT:
-        if state.phase != PHASE_DISARMED and state.phase != PHASE_STOPPED:
-            _enter(params, state, PHASE_RETRACT, tip_m)
-        return
-    if state.phase == PHASE_STOPPED:
+            _follow_failsafe(params, state, inputs, action, causes, tip_m)
         return
     if state.phase == PHASE_DISARMED:
         if ready and command.count != state.command_seen:
@@ -302,12 +363,32 @@ def _watch_contact(params: Params, state: State, now_ns: int, force_N: float, ti
 
 
 @njit(cache=True)
-def _retract(params: Params, state: State, tip_m: ReadFloats) -> None:
-    hy = state.hybrid
-    if state.retract_from_m - hy.joint[0] < params.safety.retract_distance_m:
-        hy.joint[0] -= params.safety.retract_speed_m_per_s * params.period_s
-    else:
+def _retracted(params: Params, state: State) -> bool:
+    """Whether a retraction is over: far enough with no witness that presses, or as far as it may go."""
+    least_m = params.safety.retract_distance_m
+    far_m, asked_m = state.retract_from_m - state.predicted_joint[0], state.retract_from_m - state.hybrid.joint[0]
+    return (far_m >= least_m and state.free_s > _FREE_S) or asked_m >= least_m + _RETRACT_MORE_m
+
+
+@njit(cache=True)
+def _retract(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
+    """Pull back until nothing presses; after an urgent cause at full speed, with the knob bending away from the wall."""
+    hy, period_s = state.hybrid, params.period_s
+    state.free_s = 0.0 if witnesses.pressed(state.witness, inputs) else state.free_s + period_s
+    if _retracted(params, state):
         _enter(params, state, PHASE_STOPPED, tip_m)
+        return
+    if state.latched & safety.URGENT_BITS == 0:
+        hy.joint[0] -= params.safety.retract_speed_m_per_s * period_s
+        return
+    hy.joint[0] -= params.stage.max_speed[0] * params.backlash.slope * period_s
+    # The insertion has to cross its backlash first; the knob has none to speak of.
+    here_m = dot(free_tip.apply(params.kinematics, hy.joint), state.normal)
+    nudged = (hy.joint[0], hy.joint[1], hy.joint[2] + _NUDGE_rad)
+    outward_m = (dot(free_tip.apply(params.kinematics, nudged), state.normal) - here_m) / _NUDGE_rad
+    bent_rad = hy.joint[2] + math.copysign(params.stage.max_speed[2] * period_s, outward_m)
+    if abs(outward_m) > _BENDS_AWAY_m and abs(bent_rad - state.retract_knob_rad) < _BEND_rad:
+        hy.joint[2] = min(max(bent_rad, params.stage.min_unit[2]), params.stage.max_unit[2])
 
 
 @njit(cache=True)
@@ -395,7 +476,7 @@ def _end_jog(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) ->
 def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, force_N: float) -> None:
     """Advance the joint command by one tick according to the phase."""
     if state.phase == PHASE_RETRACT:
-        _retract(params, state, tip_m)
+        _retract(params, state, inputs, tip_m)
         return
     if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
         _watch_contact(params, state, inputs.now_ns, force_N, tip_m)
@@ -460,6 +541,12 @@ def _report(params: Params, state: State, inputs: Inputs, outputs: Outputs, forc
     outputs.normal_force_N = force_N
     outputs.force_source, outputs.play_m = state.force.source, state.backlash.width_m
     outputs.wanted_force_N = inputs.command.force_N
+    witness = state.witness
+    outputs.witness_N[0], outputs.witness_N[1], outputs.witness_N[2] = (
+        witness.sensor_N,
+        witness.estimate_N,
+        witness.geometry_N,
+    )
     outputs.phase, outputs.action, outputs.cause = state.phase, state.action, flags | state.latched
     outputs.poses_rejected, outputs.forces_rejected = state.predictor.rejected, state.force_rejected
     outputs.pose_age_ns = inputs.now_ns - state.predictor.accepted_ns
@@ -538,7 +625,7 @@ def tick(params: Any, state: Any, inputs: Any, outputs: Any) -> None:
     action, latched = safety.decide(flags, s.latched, clear)
     s.action, s.latched = action, latched
     # 4. Phase, joint command, stages.
-    _follow_operator(p, s, u, action, tip_m)
+    _follow_operator(p, s, u, action, flags | latched, tip_m)
     if s.phase == PHASE_DISARMED and s.predictor.started != 0:
         _locate(p, s, u, tip_m)
     if action < ACTION_HOLD or s.phase == PHASE_RETRACT:

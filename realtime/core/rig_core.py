@@ -38,6 +38,10 @@ from realtime.drivers.stepper_board import BoardEventKind, StepperBoardLink
 LONGEST_GAP_NS = 10_000_000
 # A cause that comes and goes, as a stale pose may at every frame, is logged again after this time without it.
 CAUSE_QUIET_NS = 1_000_000_000
+# Warnings that are logged: the loop goes on, and the operator has to know.
+_LOGGED_WARNINGS = safety.STILL_PRESSED | safety.FORCE_UNREACHED
+# Causes whose log line carries what sensor, estimate and geometry say.
+_FORCE_CAUSES = safety.OVER_FORCE | safety.FORCE_UNDECIDED | safety.FORCE_DISAGREES | _LOGGED_WARNINGS
 _BOARD_ERRORS = (BoardEventKind.FAULT, BoardEventKind.RESET, BoardEventKind.MISMATCH)
 _DEVICE_LEVELS = {DeviceEventKind.LOST: "warning", DeviceEventKind.WARNING: "warning", DeviceEventKind.ERROR: "error"}
 
@@ -137,7 +141,8 @@ class RigCore:
             lambda: self.now_ns, self._execute, roles=rig.access.roles if rig.access else {}, new_lease=new_lease
         )
         ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
-        self.supervision = Supervision((ratios[0], ratios[1], ratios[2]))
+        self.supervision = Supervision((ratios[0], ratios[1], ratios[2]), round(rig.safety.host_lost_after_s * 1e9))
+        self._watched = 0
         self._records, self._timing, self._intake = records, timing, Intake(rig)
         self._force_zero = ForceZero(rig.force_sensor.noise_N, rig.force_sensor.range_N)
         self._outputs: np.record | None = None  # of the newest tick
@@ -167,6 +172,7 @@ class RigCore:
         for estimate in arrived.estimates:
             self._take_estimate(estimate)
         self._report(self.supervision.host_overdue(now_ns))
+        self._hand_over_causes()
         for request in arrived.requests:
             self._take_request(request)
         bring_up = self.link.advance(now_ns)
@@ -195,7 +201,7 @@ class RigCore:
         self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
-        self._log_new_causes(int(outputs.cause), int(outputs.action), tick_ns)
+        self._log_new_causes(outputs, tick_ns)
         if number % telemetry.STAGE_EVERY == 0:
             self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs))
         if number % telemetry.STATE_EVERY == 0:
@@ -216,9 +222,9 @@ class RigCore:
             self._leaving.log(tick_ns, "warning", "realtime", text)
         self._tick_ns = tick_ns
 
-    def _log_new_causes(self, causes: int, action: int, tick_ns: int) -> None:
-        """Log a cause that makes the loop hold, retract or stop, when it appears."""
-        new = 0
+    def _log_new_causes(self, outputs: np.record, tick_ns: int) -> None:
+        """Log a cause that makes the loop hold, retract or stop, when it appears, and a force that remains."""
+        new, causes, action = 0, int(outputs.cause), int(outputs.action)
         while causes:
             bit = causes & -causes
             causes ^= bit
@@ -226,8 +232,10 @@ class RigCore:
             self._cause_seen_ns[bit] = tick_ns
             if seen_ns is None or not 0 <= tick_ns - seen_ns <= CAUSE_QUIET_NS:
                 new |= bit
-        if new and safety.action_of(new) >= SafetyAction.HOLD:
+        if new and (safety.action_of(new) >= SafetyAction.HOLD or new & _LOGGED_WARNINGS):
             text = "; ".join(safety.messages(new))
+            if new & _FORCE_CAUSES:
+                text += f" ({telemetry.witness_text(outputs.witness_N)})"
             self._leaving.log(tick_ns, "warning", "safety", f"{SafetyAction(action).label}: {text}")
 
     # --- devices ---
@@ -239,7 +247,7 @@ class RigCore:
                 take_status(board, self.link, self.now_ns)
                 self._leaving.changed.add("board")
                 if self.phase is not Phase.DISARMED and board.ready:
-                    self._report(self.supervision.status(board.position_steps, board.encoder_counts, self.now_ns))
+                    self._report(self.supervision.status(board.position_steps, board.encoder_counts))
                 continue
             if event.kind in _BOARD_ERRORS:
                 self.board_errors.append(event.message)
@@ -328,18 +336,18 @@ class RigCore:
         covariance_N2 = np.array(estimate.covariance_N2).reshape(3, 3)
         self._intake.estimate(record, estimate.stamp_ns, self.now_ns, np.array(estimate.force_N), covariance_N2)
         self._leaving.changed.add("estimate")
-        if self.phase is Phase.CONTACT:
-            forces_N = {"force sensor": self._records["sensor"].force_N, "model": record.force_N}
-            self._report(self.supervision.forces(forces_N, self.now_ns))
 
     def _report(self, finding: SupervisionFinding | None) -> None:
-        """Hand a finding of the supervision to the tick, and log it."""
-        if finding is None:
-            return
-        if finding.cause:
-            self.commands.set_watched_causes(self.supervision.causes)
+        """Log a finding of the supervision."""
+        if finding is not None:
+            self._log("warning", "supervision", finding.text)
+
+    def _hand_over_causes(self) -> None:
+        """Hand the causes that the supervision has found, and those that are over, to the tick."""
+        if self.supervision.causes != self._watched:
+            self._watched = self.supervision.causes
+            self.commands.set_watched_causes(self._watched)
             self._leaving.changed.add("command")
-        self._log("warning", "supervision", finding.text)
 
     # --- commanders ---
 
@@ -363,7 +371,7 @@ class RigCore:
         elif reply.result == "accepted":
             if command.action in ("arm", "clear_fault"):
                 self.supervision.restart()
-                self.commands.set_watched_causes(self.supervision.causes)
+                self._hand_over_causes()
             self._command_changed()
         return reply
 

@@ -87,6 +87,16 @@ def state_message(command: np.record, outputs: np.record) -> RigState:
     )
 
 
+def witness_text(witness_N: np.ndarray) -> str:
+    """Return what force sensor, estimate and geometry (3,) N say, and which of the first two is the odd one out."""
+    sensor_N, estimate_N, geometry_N = (float(force_N) for force_N in witness_N)
+    says = f"force sensor {sensor_N:.2f} N, estimate {estimate_N:.2f} N, deflection of the tip {geometry_N:.2f} N"
+    off_sensor, off_estimate = abs(sensor_N - geometry_N), abs(estimate_N - geometry_N)
+    if abs(sensor_N - estimate_N) < max(2.0 * min(off_sensor, off_estimate), 0.05):
+        return says
+    return f"{says}: the {'force sensor' if off_sensor > off_estimate else 'estimate'} disagrees with both others"
+
+
 def tick_buckets(work: np.ndarray) -> tuple[int, ...]:
     """Convert the loop's histogram of tick times (`native_loop.count_in`) into that of the message."""
     work = work.copy()  # the loop's thread counts on meanwhile; np.flatnonzero needs an array that does not change

@@ -87,10 +87,47 @@ def test_no_fresh_pose_holds_then_stops(bench: Bench) -> None:
     joint = bench.run(0.030).joint[0]
     assert bench.run(0.020).joint[0] == joint
     bench.run(0.050)
-    assert bench.outputs[0].action == SafetyAction.STOP and bench.outputs[0].phase == Phase.STOPPED
+    assert bench.outputs[0].action == SafetyAction.STOP and bench.outputs[0].phase == Phase.RETRACT
+    bench.force[:] = 0.0
+    bench.run(1.0)
+    assert bench.outputs[0].joint[0] <= joint - 0.009 and bench.outputs[0].phase == Phase.STOPPED
     bench.with_pose = True
     bench.run(0.5)
     assert bench.outputs[0].phase == Phase.STOPPED, "a stop must not end by itself"
+
+
+def test_where_the_rig_file_forbids_it_a_stop_in_contact_does_not_retract(rig: Rig) -> None:
+    still = rig.model_copy(update={"safety": rig.safety.model_copy(update={"retract_stopped": False})})
+    bench = in_contact(Bench(still))
+    bench.with_pose = False
+    bench.run(0.2)
+    assert bench.outputs[0].phase == Phase.STOPPED
+
+
+def test_a_stopped_catheter_that_the_wall_presses_is_retracted_again(bench: Bench) -> None:
+    in_contact(bench)
+    bench.force[:] = (0.0, 0.0, 0.55)
+    bench.run(0.02)
+    bench.force[:] = 0.0
+    assert bench.run(1.0).phase == Phase.STOPPED
+    before = bench.outputs[0].joint[0]
+    bench.force[:] = (0.0, 0.0, 0.2)
+    assert bench.run(0.2).phase == Phase.STOPPED and "still_pressed" in safety.names(int(bench.outputs[0].cause))
+    bench.force[:] = (0.0, 0.0, 0.31)
+    assert bench.run(0.2).phase == Phase.RETRACT
+    bench.force[:] = 0.0
+    assert bench.run(1.0).phase == Phase.STOPPED and bench.outputs[0].joint[0] <= before - 0.009
+
+
+def test_a_retraction_goes_on_while_something_presses(bench: Bench) -> None:
+    in_contact(bench)
+    bench.force[:] = (0.0, 0.0, 0.55)
+    bench.run(0.02)
+    before = bench.outputs[0].joint[0]
+    bench.force[:] = (0.0, 0.0, 0.1)
+    bench.run(2.0)
+    assert bench.outputs[0].joint[0] < before - 0.03 and bench.outputs[0].phase == Phase.STOPPED
+    assert "still_pressed" in safety.names(int(bench.outputs[0].cause))
 
 
 def test_over_force_retracts_and_stays_stopped(bench: Bench) -> None:

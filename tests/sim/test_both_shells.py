@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from protocol.enums import Phase
-from protocol.rig_file import load_rig
+from protocol.rig_file import Rig, load_rig
 from protocol.topics import Message, Reply
 from realtime.control.tick import tick
 from realtime.core import process as wall_clock
@@ -82,6 +82,10 @@ class Network:
 
     def __init__(self, *_: object) -> None:
         self.messages: list[tuple[str, Message]] = []
+
+    @classmethod
+    def of_rig(cls, rig: Rig) -> Network:
+        return cls()
 
     def publisher(self, topic: str) -> Any:
         network = self

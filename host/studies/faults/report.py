@@ -7,7 +7,6 @@ from collections import Counter
 from host.studies.faults.campaign import DELAYS_S, HOLD_AFTER_S, RunResult, summary_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control.stage_limiter import crossing_time_s
-from realtime.core.supervision import FORCE_DIFFERENCE_N
 from sim.fault_table import BY_NAME, FAULTS, LINK_REST_S, PEAK_N, STEPS_TO_FIND, FaultKind
 
 MOST_EXAMPLES = 12
@@ -41,12 +40,10 @@ Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {li
 
 Loss of the zenoh router, processes killed with SIGKILL and real disks need the wall clock and are tested elsewhere
 (`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that fails while its axis is at rest is
-detected when the axis moves. A force sensor that drifts is detected by its difference from the model, so only after it was
-wrong by {apart_N} N for about a second.
+detected when the axis moves. A force sensor that is wrong is detected by its difference from the estimate, once that is
+larger than 1.5 standard deviations of the estimate (`realtime/control/witnesses.py`).
 
-**A knob that slips at the stage's full speed exceeds the force limit**; `slipped_steps` therefore draws half of it. At
-full speed, towards straight, 3 of 48 runs exceeded the limit when the loop stopped on lost steps, and 1 of 48 when it
-retracted, as it does now. Single runs reached 0.68 N: the catheter straightens before the insertion stage has crossed its
+**A knob that slips at the stage's full speed straightens the catheter** before the insertion stage has crossed its
 backlash ({crossing_ms:.0f} ms). A motor with a torque reserve slips more slowly; use one.
 """
 
@@ -74,7 +71,6 @@ def page_section(results: list[RunResult], seed: int, board: str) -> str:
         rest_ms=1e3 * LINK_REST_S,
         longest_ms=_longest_rest_ms(results),
         violations="\n".join(_violations(bad)),
-        apart_N=FORCE_DIFFERENCE_N,
         steps_to_find=STEPS_TO_FIND,
         lost_s=BY_NAME["missed_steps"].within_s,
         crossing_ms=_crossing_ms(),

@@ -1,0 +1,85 @@
+"""Sensor, estimate and geometry compared: what agrees raises nothing, one that is wrong is named, none presses unseen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from protocol.rig_file import SIMULATED_RIG, load_rig
+from realtime.control import witnesses
+from realtime.control.codes import SOURCE_ESTIMATE, SOURCE_SENSOR
+from realtime.control.configure import tick_parameters
+from realtime.control.records import INPUTS, STATE, new
+from realtime.core.telemetry import witness_text
+
+MS = 1_000_000
+SD_N = 0.05
+
+
+class Witnesses:
+    """The block with a reading of the sensor each millisecond and an estimate each 25 ms."""
+
+    def __init__(self) -> None:
+        self.params, self.state, self.inputs = tick_parameters(load_rig(SIMULATED_RIG))[0], new(STATE)[0], new(INPUTS)[0]
+        witnesses.start(self.state.witness)
+        self.rng = np.random.default_rng(4)
+
+    def run(self, seconds: float, sensor_N: float, estimate_N: float) -> int:
+        """Return the greatest answer of `disagree` over a time with these forces, in noise."""
+        worst, force, inputs = 0, self.state.force, self.inputs
+        for _ in range(round(seconds * 1000)):
+            inputs.now_ns += MS
+            inputs.sensor.arrival_ns = inputs.now_ns
+            force.normal_N[SOURCE_SENSOR] = sensor_N + 0.003 * self.rng.normal()
+            force.reading_N[:] = (0.0, 0.0, sensor_N)
+            force.arrival_ns[SOURCE_SENSOR] = inputs.now_ns
+            new_estimate = inputs.now_ns % (25 * MS) == 0
+            if new_estimate:
+                force.normal_N[SOURCE_ESTIMATE] = estimate_N + SD_N * self.rng.normal()
+                force.noise_N2, force.estimate_stamp_ns = SD_N**2, inputs.now_ns - 30 * MS
+                force.sensor_then = sensor_N
+                force.arrival_ns[SOURCE_ESTIMATE] = inputs.estimate.arrival_ns = inputs.now_ns
+            witnesses.take_forces(self.state.witness, force, True, new_estimate, 1e-3)
+            worst = max(worst, witnesses.disagree(self.state.witness, inputs, 1e-3))
+        return worst
+
+
+def test_readings_that_agree_within_noise_never_differ() -> None:
+    assert Witnesses().run(15.0, 0.2, 0.22) == 0
+
+
+@pytest.mark.parametrize(
+    ("sensor_N", "estimate_N"), [(0.0, 0.2), (0.2, 0.0), (0.2, -0.2), (0.2, 0.5), (0.25, 0.0), (-0.2, 0.2)]
+)
+def test_one_that_is_wrong_makes_the_loop_hold_and_then_retract(sensor_N: float, estimate_N: float) -> None:
+    rig = Witnesses()
+    rig.run(1.0, 0.0, 0.0)
+    assert rig.run(0.25, sensor_N, estimate_N) == 1
+    assert rig.run(0.5, sensor_N, estimate_N) == 2
+
+
+def test_without_one_of_them_nothing_is_compared() -> None:
+    rig = Witnesses()
+    rig.run(0.5, 0.0, 0.3)
+    rig.inputs.now_ns += 300 * MS
+    assert witnesses.disagree(rig.state.witness, rig.inputs, 1e-3) == 0
+
+
+@pytest.mark.parametrize(("sensor_N", "estimate_N", "geometry_N"), [(0.51, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 2.6)])
+def test_each_witness_alone_proves_too_much_force(sensor_N: float, estimate_N: float, geometry_N: float) -> None:
+    rig = Witnesses()
+    rig.run(1.0, sensor_N, estimate_N)
+    rig.state.witness.geometry_N = geometry_N
+    assert witnesses.over(rig.params, rig.state.witness, rig.state.force, rig.inputs)
+
+
+def test_what_is_below_the_limit_is_not_too_much() -> None:
+    rig = Witnesses()
+    rig.run(5.0, 0.45, 0.45)
+    assert not witnesses.over(rig.params, rig.state.witness, rig.state.force, rig.inputs)
+
+
+def test_the_text_names_the_witness_that_is_wrong() -> None:
+    assert witness_text(np.array([0.0, 0.21, 0.18])).endswith("the force sensor disagrees with both others")
+    assert witness_text(np.array([0.2, 0.0, 0.22])).endswith("the estimate disagrees with both others")
+    assert "disagrees" not in witness_text(np.array([0.2, 0.21, 0.1]))
