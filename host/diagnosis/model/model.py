@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, rate_key
-from host.diagnosis.model.operators import fill
+from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -174,8 +174,6 @@ class Model(ABC):
 
 def tolerance_of(values: Array, span: float) -> float:
     """Movements below this are not movements: three steps of resolution, or 0.1 % of the span."""
-    from host.diagnosis.model.operators import quantum
-
     return max(3.0 * quantum(values), 1e-3 * span, 1e-12)
 
 

@@ -186,15 +186,17 @@ Coefficient = float | str  # a number, or an expression of parameters
 
 
 class FeedbackSpec(Request):
-    """A loop around a linear model: its first input is the controller's output plus what `input` recorded.
+    """A loop around a linear model: its input is what the controller makes of `reference` minus `output`.
 
-    controller: transfer function from reference minus output to input (of s, or of z with `period_s`).
+    numerator, denominator: of the controller, in falling powers of s (of z with `period_s`). `actuation`: the output that
+    recorded the plant's input.
     """
 
     reference: str
     output: str
     numerator: list[Coefficient] = Field(min_length=1)
     denominator: list[Coefficient] = Field(default=[1.0], min_length=1)
+    actuation: str = ""
 
 
 class LinearSpec(SimulatorSpec):
@@ -238,6 +240,13 @@ class MujocoSpec(SimulatorSpec):
     actuators: dict[str, str] = {}
     sensors: dict[str, str] = {}
     offers: Literal["all", "none"] = "all"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _channels(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        return {"inputs": list(given.get("actuators", {})), "outputs": list(given.get("sensors", {})), **given}
 
 
 class FmuSpec(SimulatorSpec):

@@ -25,6 +25,14 @@ def build(spec: NominalSpec) -> Model:
         from host.diagnosis.models.rig import RigModel
 
         return RigModel(spec)
+    if spec.kind == "linear":
+        from host.diagnosis.models.linear import LinearModel
+
+        return LinearModel(spec)
+    if spec.kind == "mujoco":
+        from host.diagnosis.models.mjcf import MujocoModel
+
+        return MujocoModel(spec)
     from host.diagnosis.models.external import ExternalModel
 
     return ExternalModel(spec)

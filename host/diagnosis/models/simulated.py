@@ -75,11 +75,18 @@ class SimulatorRun:
     parameters: dict[str, float]
     time_s: Array
     initial: dict[str, float]
+    inside: tuple[Segment, list[ActiveEffect]] | None = None  # effects at ports inside the simulator
+    rate: float = 1.0  # typical rate of the outputs (1/s): scale of time of initial derivatives
 
     @cached_property
     def key(self) -> Hashable:
         """Equal for runs that give the same outputs."""
         digest = hashlib.blake2b(repr((self.parameters, self.initial)).encode(), digest_size=16)
+        if self.inside is not None:
+            segment, active = self.inside
+            digest.update(repr(([(c.key, tuple(values)) for c, values in active], segment.start)).encode())
+            for _, values in sorted(segment.equations.items()):
+                digest.update(values.tobytes())
         for signal in (self.time_s, *self.inputs.values()):
             digest.update(np.ascontiguousarray(signal).tobytes())
         return digest.digest()
@@ -89,6 +96,7 @@ class SimulatedModel(Model):
     """Base of the kinds `callable`, `linear`, `mujoco` and `fmu`."""
 
     scan_points = 24
+    inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
 
     def __init__(self, spec: NominalSpec, section: SimulatorSpec, offers: list[OfferSpec]) -> None:
         self.section, self.specified = section, spec
@@ -167,7 +175,7 @@ class SimulatedModel(Model):
         for port in self.ports:
             if port.offers:
                 segment.units[port.name] = ""
-            elif port.name.endswith("_reading"):
+            elif port.name not in self.inside and port.name.endswith("_reading"):
                 segment.units[port.name] = self.units[port.channels[0]]
         segment.begin = self._begin(segment)
         return segment
@@ -241,7 +249,13 @@ class SimulatedModel(Model):
         initial = {
             name: value - begin.get(f"offset:{name}", 0.0) for name, value in begin.items() if not name.startswith("offset:")
         }
-        return SimulatorRun(given, values, segment.recording.time_s, initial)
+        within = [effect for effect in active if effect[0].port.name in self.inside]
+        inside = (segment, within) if within else None
+        return SimulatorRun(given, values, segment.recording.time_s, initial, inside, self.rate_of(segment))
+
+    def rate_of(self, segment: Segment) -> float:
+        """Scale of time (1/s) of the derivatives among the initial state."""
+        return 1.0
 
     def _checked(self, run: SimulatorRun, found: Mapping[str, Array]) -> Array:
         rows = []

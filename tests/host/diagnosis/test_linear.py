@@ -1,0 +1,217 @@
+"""Linear models of any order: exact sampling, unknown first states, loops with effects inside, and verdicts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import seldinger as sd
+from host.diagnosis.effects import candidates
+from host.diagnosis.model.effect import Array
+from host.diagnosis.model.expressions import names_in, value_of
+from host.diagnosis.model.model import Model
+from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.selection.search import fit_nominal, refined
+from protocol.errors import InputError
+
+DT_S = 0.01
+CHANNELS = {"u": {"column": "u", "unit": "N"}, "y": {"column": "y", "unit": "m"}}
+THIRD: dict[str, Any] = {  # an oscillator behind a lag: k w^2 / ((tau s + 1)(s^2 + 2 d w s + w^2))
+    "name": "third order",
+    "kind": "linear",
+    "data": {"time": "t"},
+    "channels": CHANNELS,
+    "linear": {
+        "inputs": ["u"],
+        "outputs": ["y"],
+        "numerator": ["k * w**2"],
+        "denominator": ["tau", "1 + 2 * d * w * tau", "2 * d * w + tau * w**2", "w**2"],
+        "subsystem": "stage",
+    },
+    "parameters": {
+        "k": 1.0,
+        "w": {"value": 6.0, "low": 1.0, "high": 50.0, "unit": "rad/s"},
+        "d": {"value": 0.5, "low": 0.01, "high": 2.0},
+        "tau": {"value": 0.1, "low": 0.01, "high": 1.0, "unit": "s"},
+    },
+}
+K, W, D, TAU = 0.02, 9.0, 0.3, 0.08
+TRUE = signal.TransferFunction([K * W**2], np.convolve([TAU, 1.0], [1.0, 2 * D * W, W**2]))
+
+
+def tones(seed: int, n: int) -> Array:
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) * DT_S
+    return np.asarray(
+        sum(a * np.sin(2 * np.pi * f * t + rng.uniform(0, 6.28)) for a, f in ((1, 0.23), (0.7, 0.71), (0.5, 1.9)))
+    )
+
+
+def recorded(
+    seed: int, u_of: Any = lambda u: u, y_of: Any = lambda y: y, n: int = 2000, noise: float = 2e-5
+) -> dict[str, Array]:
+    """The true third order, its input held, cut from motion after three seconds."""
+    u = tones(seed, n + 300)
+    ad, bd, c, d, _ = signal.cont2discrete((TRUE.to_ss().A, TRUE.to_ss().B, TRUE.to_ss().C, TRUE.to_ss().D), DT_S)
+    _, y, _ = signal.dlsim((ad, bd, c, d, DT_S), u_of(u))
+    y = y[:, 0] + noise * np.random.default_rng(seed + 100).standard_normal(u.size)
+    return {"t": np.arange(n) * DT_S, "u": u[300:], "y": y[300:]}
+
+
+def model_of(nominal: dict[str, Any], *recordings: dict[str, Array]) -> tuple[Model, Any]:
+    model, problem, _ = prepare(nominal_of(nominal), [Table(f"r{k}", columns) for k, columns in enumerate(recordings)])
+    return model, problem
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_sampling_is_exact(hold: str) -> None:
+    nominal = {**THIRD, "linear": {**THIRD["linear"], "hold": hold}}
+    columns = recorded(1, n=400)
+    model, problem = model_of(nominal, columns)
+    segment = problem.segments[0]
+    segment.begin.values = np.zeros(3)
+    fine = 50
+    t = np.arange(400 * fine) * DT_S / fine
+    u = np.repeat(columns["u"], fine) if hold == "zero" else np.interp(t, columns["t"], columns["u"])
+    _, y, _ = signal.lsim(TRUE, u, t, interp=hold == "linear")
+    out = model.simulate(segment, np.array([K, W, D, TAU]), [])
+    last = -fine if hold == "linear" else None  # beyond the last sample a straight input is not known
+    assert np.max(np.abs(out[0] - y[::fine])[: -1 if last else None]) < 1e-6 * np.max(np.abs(y))
+
+
+def test_the_first_state_and_the_parameters_are_found_together() -> None:
+    _, problem = model_of(THIRD, recorded(1), recorded(2))
+    fit = refined(problem, fit_nominal(problem))
+    assert fit.values == pytest.approx([K, W, D, TAU], rel=0.02)
+    r = np.concatenate([r[0] for r in fit.residuals])
+    assert np.nanstd(r) < 1.1 * 2e-5
+
+
+def test_state_space_discrete_and_transfer_function_agree() -> None:
+    columns = recorded(3, n=300)
+    space = TRUE.to_ss()
+    ad, bd, c, d, _ = signal.cont2discrete((space.A, space.B, space.C, space.D), DT_S)
+    matrices = {"A": ad.tolist(), "B": bd.tolist(), "C": c.tolist(), "D": d.tolist()}
+    section = {"inputs": ["u"], "outputs": ["y"], "period_s": DT_S, **matrices}
+    discrete, problem_d = model_of({**THIRD, "linear": section, "parameters": {}}, columns)
+    plain, problem = model_of(THIRD, columns)
+    for p in (problem, problem_d):
+        p.segments[0].begin.values = np.zeros(3)
+    one = discrete.simulate(problem_d.segments[0], np.zeros(0), [])
+    assert np.allclose(one, plain.simulate(problem.segments[0], np.array([K, W, D, TAU]), []), atol=1e-12)
+
+
+LOOP: dict[str, Any] = {
+    "name": "loop",
+    "kind": "linear",
+    "data": {"time": "t"},
+    "channels": {"r": {"column": "r", "unit": "m"}, "y": {"column": "y", "unit": "m"}, "f": {"column": "f", "unit": "N"}},
+    "linear": {
+        "inputs": ["r"],
+        "outputs": ["y", "f"],
+        "A": [[0.0, 1.0], [0.0, "-c / m"]],
+        "B": [[0.0], ["1 / m"]],
+        "C": [[1.0, 0.0]],
+        "subsystem": "slide",
+        "feedback": {
+            "reference": "r",
+            "output": "y",
+            "numerator": [12.0, 60.0],
+            "denominator": [0.02, 1.0],
+            "actuation": "f",
+        },
+    },
+    "parameters": {"m": {"value": 1.0, "low": 0.05, "high": 20.0}, "c": {"value": 2.0, "low": 0.0, "high": 50.0}},
+}
+
+
+def loop_recorded(seed: int, limit: float = np.inf, n: int = 2000) -> dict[str, Array]:
+    """Slide of 0.5 kg and 3 N s/m under its controller, whose force is limited; sample by sample."""
+    rng = np.random.default_rng(seed)
+    r = 0.02 * tones(seed, n)
+    ad, bd, *_ = signal.cont2discrete(
+        (np.array([[0, 1], [0, -6.0]]), np.array([[0], [2.0]]), np.eye(2), np.zeros((2, 1))), DT_S
+    )
+    ak, bk, ck, dk = signal.tf2ss([12.0, 60.0], [0.02, 1.0])
+    akd, bkd, *_ = signal.cont2discrete((ak, bk, ck, dk), DT_S)
+    x, z = np.zeros(2), np.zeros(1)
+    y, f = np.empty(n), np.empty(n)
+    for k in range(n):
+        y[k] = x[0]
+        error = r[k] - y[k]
+        f[k] = np.clip(ck[0] @ z + dk[0, 0] * error, -limit, limit)
+        z = akd @ z + bkd[:, 0] * error
+        x = ad @ x + bd[:, 0] * f[k]
+    noise = 1e-5 * rng.standard_normal(n)
+    return {"t": np.arange(n) * DT_S, "r": r, "y": y + noise, "f": f + 1e-3 * rng.standard_normal(n)}
+
+
+def test_an_effect_inside_the_loop_is_solved_with_it() -> None:
+    columns = loop_recorded(1, limit=0.6)
+    model, problem = model_of(LOOP, columns)
+    segment = problem.segments[0]
+    segment.begin.values = np.zeros(2)
+    clips = {c.key: c for c in candidates(model.ports, True)}
+    sides = {"upper": 0.6, "lower": -0.6}
+    limits = [(clips[f"saturation@slide_actuation({side})"], np.array([value])) for side, value in sides.items()]
+    out = model.simulate(segment, np.array([0.5, 3.0]), limits)
+    assert np.max(np.abs(out[0] - columns["y"])) < 6e-5 and np.max(np.abs(out[1] - columns["f"])) < 6e-3
+
+
+def test_the_loop_without_effects_is_the_recorded_one() -> None:
+    columns = loop_recorded(2)
+    model, problem = model_of(LOOP, columns)
+    problem.segments[0].begin.values = np.zeros(2)
+    out = model.simulate(problem.segments[0], np.array([0.5, 3.0]), [])
+    assert np.max(np.abs(out[0] - columns["y"])) < 6e-5
+
+
+def backlash(u: Array, width: float = 0.3) -> Array:
+    y = u.copy()
+    for k in range(1, u.size):
+        y[k] = min(max(y[k - 1], u[k] - 0.5 * width), u[k] + 0.5 * width)
+    return y
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("what", "expected"),
+    [
+        ("nothing", []),
+        ("backlash", [("backlash", "u")]),
+        ("latency", [("latency", "u")]),
+    ],
+)
+def test_verdicts_about_a_third_order(what: str, expected: list[tuple[str, str]]) -> None:
+    u_of = {"nothing": lambda u: u, "backlash": backlash, "latency": lambda u: np.concatenate([np.full(7, u[0]), u[:-7]])}[
+        what
+    ]
+    verdict = sd.diagnose([recorded(k, u_of) for k in range(3)], THIRD)
+    assert [(e["id"], e["port"]) for e in verdict.effects] == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        ({"numerator": ["k * q"]}, "q"),
+        ({"numerator": ["k[0]"]}, "arithmetic"),
+        ({"denominator": None}, "either numerator"),
+        ({"A": [[1.0]], "B": [[1.0]], "C": [[1.0]]}, "either numerator"),
+        ({"numerator": None, "denominator": None, "A": [[1.0, 0.0]], "B": [[1.0]], "C": [[1.0]]}, "linear.A"),
+        ({"period_s": 0.5}, "period"),
+    ],
+)
+def test_a_section_that_cannot_be_is_bad_input(change: dict[str, Any], wanted: str) -> None:
+    with pytest.raises(InputError, match=wanted):
+        model, problem = model_of({**THIRD, "linear": {**THIRD["linear"], **change}}, recorded(1, n=100))
+        model.simulate(problem.segments[0], np.array([K, W, D, TAU]), [])
+
+
+def test_coefficients_are_arithmetic_of_parameters() -> None:
+    assert names_in("-k / m + sqrt(c)", "A") == {"k", "m", "c"}
+    assert value_of("-(k / m) ** 2", {"k": 6.0, "m": 2.0}) == -9.0 and np.isnan(value_of("1 / m", {"m": 0.0}))
