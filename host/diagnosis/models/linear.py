@@ -12,7 +12,7 @@ signals cause.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,15 @@ WIDE = 2.0  # standard deviation of a state that is not measured, in spans of wh
 MOST_ROUNDS = 80  # of the loop with effects inside
 SETTLED = 1e-7  # change of the loop's signals in a round, relative
 MEMORY = 6  # rounds that the next one is made of (Anderson acceleration)
+
+
+class StateSpace(NamedTuple):
+    """x[k + 1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
 
 
 class LinearModel(SimulatedModel):
@@ -180,11 +189,11 @@ class LinearModel(SimulatedModel):
         Akd, Bk0, _ = (Ak, Bk, Bk) if self.spec.period_s is not None else sampled(Ak, Bk, dt_s, "zero")
         fed = names.index(loop.output)
         reference = run.inputs[loop.reference]
-        closed = (Ad, B0 + B1, C, D, Akd, Bk0, Ck, Dk)
+        plant, controller = StateSpace(Ad, B0 + B1, C, D), StateSpace(Akd, Bk0, Ck, Dk)
 
         def solve(changes: Array) -> tuple[Array, Array]:
             """Outputs and the controller's command with `changes` (2, n) of the plant's input and the fed-back output."""
-            return closed_loop(*closed, fed, reference, changes, begin)
+            return closed_loop(plant, controller, fed, reference, changes, begin)
 
         changes = np.zeros((2, run.time_s.size))
         y, command = solve(changes)
@@ -296,23 +305,15 @@ def response(A: Array, B0: Array, B1: Array, C: Array, D: Array, u: Array, begin
 
 @njit(cache=True)
 def closed_loop(
-    A: Array,
-    B: Array,
-    C: Array,
-    D: Array,
-    Ak: Array,
-    Bk: Array,
-    Ck: Array,
-    Dk: Array,
-    fed: int,
-    reference: Array,
-    changes: Array,
-    begin: Array,
+    plant: StateSpace, controller: StateSpace, fed: int, reference: Array, changes: Array, begin: Array
 ) -> tuple[Array, Array]:
-    """Outputs (outputs, n) and command (n,) of plant and controller, the plant's input held between samples.
+    """Outputs (outputs, n) and command (n,) of plant and controller, both sampled, the plant's input held between samples.
 
-    A plant that answers at once (D not zero) answers the command of the sample before.
+    fed: row of the output that is fed back. changes: (2, n) of the plant's input and of that output, by effects.
+    A plant that answers at once (D not zero) answers the input of the sample before.
     """
+    A, B, C, D = plant
+    Ak, Bk, Ck, Dk = controller
     n = reference.size
     y, command = np.empty((C.shape[0], n)), np.empty(n)
     x, z = begin.copy(), np.zeros(Ak.shape[0])
