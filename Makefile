@@ -19,7 +19,7 @@ DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsima
 # Prints, on standard error, which step of the set-up begins.
 step = echo "seldinger: set-up, step $(1)" >&2
 
-.PHONY: demo test quick setup board-tools packages warm format-check lint types lock lock-check audit nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof soak clean
+.PHONY: demo test quick setup board-tools packages warm format-check lint types lock lock-check audit nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof chaos soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -109,6 +109,11 @@ fuzz-files: setup
 # The firmware's arithmetic for all inputs (firmware/proof/prove.c); needs Debian's frama-c-base.
 proof:
 	@$(MAKE) -s -C firmware proof
+
+# Random kills, stalls, unplugged ports and full disks in contact, over all processes on the wall clock; some 40 s a run.
+RUNS ?= 100
+chaos: setup
+	@$(BIN)/python -m host.studies.chaos --runs $(RUNS) --seed $(SEED) --docs docs/reliability.md
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md

@@ -217,7 +217,7 @@ class RecordingFile:
                 f"chunks that unpack to more than {self._limit_bytes / 2**20:.0f} MiB",
                 "less; a recording that is trusted and really so large is read with a higher unpack limit",
             )
-        content = _unpack(chunk)
+        content = unpack_chunk(chunk)
         if len(content) != chunk.uncompressed_size or (
             chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc
         ):
@@ -323,7 +323,7 @@ class RecordingFile:
         if self._held[0] != number:
             place, length = self._chunk_places[number]
             stream.seek(place)
-            self._held = (number, _unpack(Chunk.read(ReadDataStream(io.BytesIO(stream.read(length))))))
+            self._held = (number, unpack_chunk(Chunk.read(ReadDataStream(io.BytesIO(stream.read(length))))))
         return self._held[1]
 
     def message(self, topic: str, index: int) -> dict[str, Any] | None:
@@ -386,7 +386,7 @@ def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, start, place
 
 
-def _unpack(chunk: Chunk) -> bytes:
+def unpack_chunk(chunk: Chunk) -> bytes:
     """Return a chunk's content, never more than it declares. Raises ValueError, ZstdError, RuntimeError."""
     if chunk.compression == "":
         return chunk.data

@@ -50,7 +50,7 @@ STALL_S = (0.02, 3.0)
 WATCHED_S, STOPPED_S = 3.0, 3.0
 # Without a step edge for so long before the end of an interval the stages are at rest.
 QUIET_S = 0.5
-_TOUCH_S = 240.0
+_TOUCH_S = 120.0
 _ROOM_BYTES = 20_000
 
 
@@ -70,6 +70,7 @@ class ChaosRun:
     number: int
     troubles: list[Trouble]
     contact: bool = False
+    note: str = ""
     peak_N: float | None = None
     rest_s: float | None = None
     confirmed: bool = False
@@ -105,7 +106,9 @@ def run_once(number: int, seed: int, settings: DemoSettings) -> ChaosRun:
         operator = Operator(fleet)
         with contextlib.closing(operator.session):
             result.contact = operator.touch(ContactJob(TARGET_M, force_N=settings.force_N, approach_s=120.0), _TOUCH_S)
-            if result.contact:
+            if not result.contact:
+                result.note = f"phase {operator.mode() or 'unknown'}, {'; '.join(operator.causes[-2:]) or 'no cause'}"
+            else:
                 operator.wait(wait_s, lambda: False)
                 _break(fleet, path, result.troubles)
                 _stop(fleet, operator, result)
@@ -293,7 +296,7 @@ def _finished(results: Path | None) -> list[ChaosRun]:
 
 
 def _progress(run: ChaosRun) -> str:
-    said = "; ".join(run.broken) if run.broken else "in order" if run.contact else "no contact"
+    said = "; ".join(run.broken) if run.broken else "in order" if run.contact else f"no contact: {run.note}"
     peak = "" if run.peak_N is None else f", {run.peak_N:.3f} N"
     return f"seldinger: run {run.number}: {', '.join(trouble.what for trouble in run.troubles)}{peak}: {said}"
 

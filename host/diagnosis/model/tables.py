@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from host.recordings.recording import CHUNK_LIMIT_BYTES, unpack_chunk
 from protocol.errors import Description, InputError, reason
 
 Array = npt.NDArray[np.float64]
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
+# A packed table may unpack to so much, or to so many times its own size where that is more.
+UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED = 256 * 2**20, 64
+_PIECE_BYTES = 2**20
+_MAT_COMPRESSED, _MAT_HEAD_BYTES = 15, 128
 
 
 @dataclass(frozen=True)
@@ -61,47 +68,104 @@ def is_table(path: Path) -> bool:
     return path.name.lower().endswith(SUFFIXES)
 
 
-def read_table(path: Path) -> dict[str, Array]:
+class _TooLarge(ValueError):
+    """The table unpacks to more than its limit."""
+
+
+def read_table(path: Path, unpacked_limit_bytes: int | None = None) -> dict[str, Array]:
     """The columns of the table at `path`, each (n,) float64, NaN where a field is empty.
 
+    unpacked_limit_bytes: what a packed file may unpack to; by default UNPACKED_LIMIT_BYTES, or UNPACKED_PER_PACKED times its
+    size where that is more. The size is known before anything is kept.
+
     Raises:
-        InputError: no such file, an unknown kind, or nothing numeric in it.
+        InputError: no such file, an unknown kind, nothing numeric in it, a damaged file, or one that unpacks to more.
     """
     if not path.is_file():
         raise InputError("recording", str(path), "a file that exists")
-    name = path.name.lower()
+    if not is_table(path):
+        raise InputError("recording", path.name, "a table ending in " + ", ".join(SUFFIXES))
+    limit = unpacked_limit_bytes or max(UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED * path.stat().st_size)
     try:
-        if name.endswith((".csv", ".csv.gz")):
-            columns = _from_arrow(_read_csv(path))
-        elif name.endswith(".parquet"):
-            import pyarrow.parquet
-
-            columns = _from_arrow(pyarrow.parquet.read_table(path))
-        elif name.endswith(".mat"):
-            columns = _read_mat(path)
-        elif name.endswith(".npz"):
-            with np.load(path, allow_pickle=False) as archive:
-                columns = _columns({key: archive[key] for key in archive.files})
-        elif name.endswith(".mcap"):
-            columns = _read_mcap(path)
-        else:
-            raise InputError("recording", path.name, "a table ending in " + ", ".join(SUFFIXES))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError("recording", Description(f"{path.name}: {reason(error)}"), "a readable table") from None
+        columns = _read(path, limit)
+    except _TooLarge:
+        found = Description(f"{path.name}, which unpacks to more than {limit / 2**20:.3g} MiB")
+        raise InputError("recording", found, "less; unpack or split a table that is trusted and really so large") from None
+    except InputError:
+        raise
+    # Readers of damaged files raise whatever the damage leads to (RecursionError, SyntaxError, struct.error, ...).
+    except Exception as error:
+        said = str(reason(error)).partition("\n")[0][:200]
+        raise InputError("recording", Description(f"{path.name}: {said}"), "a readable table") from None
     if not columns:
         raise InputError("recording", path.name, "at least one numeric column")
     return columns
 
 
-def _read_csv(path: Path) -> Any:
+def _read(path: Path, limit: int) -> dict[str, Array]:
+    name = path.name.lower()
+    if name.endswith((".csv", ".csv.gz")):
+        return _from_arrow(_read_csv(path, limit))
+    if name.endswith(".parquet"):
+        return _from_arrow(_read_parquet(path, limit))
+    if name.endswith(".mat"):
+        return _read_mat(path, limit)
+    if name.endswith(".npz"):
+        return _read_npz(path, limit)
+    return _read_mcap(path, limit)
+
+
+def _read_csv(path: Path, limit: int) -> Any:
     import pyarrow
     import pyarrow.csv
 
     options = pyarrow.csv.ConvertOptions(null_values=["", "nan", "NaN", "NA", "null"], strings_can_be_null=True)
-    try:
-        return pyarrow.csv.read_csv(path, convert_options=options)
-    except pyarrow.ArrowInvalid as error:
-        raise ValueError(str(error)) from None
+    source: Any = path
+    if path.name.lower().endswith(".gz"):
+        with gzip.open(path) as stream:
+            content = stream.read(limit + 1)
+        if len(content) > limit:
+            raise _TooLarge
+        source = pyarrow.BufferReader(content)
+    return pyarrow.csv.read_csv(source, convert_options=options)
+
+
+def _read_parquet(path: Path, limit: int) -> Any:
+    import pyarrow.parquet
+
+    with pyarrow.parquet.ParquetFile(path) as file:
+        head = file.metadata
+        packed = sum(head.row_group(index).total_byte_size for index in range(head.num_row_groups))
+        # A column of one repeated value takes no room in the file, and 8 bytes a row here.
+        if max(packed, 8 * head.num_rows * head.num_columns) > limit:
+            raise _TooLarge
+        return file.read()
+
+
+def _read_npz(path: Path, limit: int) -> dict[str, Array]:
+    with zipfile.ZipFile(path) as archive:
+        if sum(info.file_size for info in archive.infolist()) > limit:
+            raise _TooLarge
+        arrays = {}
+        for info in archive.infolist():
+            with archive.open(info) as stream:
+                content = stream.read(limit + 1)
+            arrays[info.filename.removesuffix(".npy")] = _array_of(content)
+    return _columns(arrays)
+
+
+def _array_of(content: bytes) -> Any:
+    """The array in an .npy file. Raises ValueError where its head announces more than there is: numpy allocates first."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    read_head = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_head(stream)
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if dtype.hasobject or not 0 <= size <= len(content):
+        raise ValueError("an array with objects, or larger than its file")
+    return np.load(io.BytesIO(content), allow_pickle=False)
 
 
 def _from_arrow(table: Any) -> dict[str, Array]:
@@ -133,10 +197,12 @@ def _columns(arrays: dict[str, Any]) -> dict[str, Array]:
     return columns
 
 
-def _read_mat(path: Path) -> dict[str, Array]:
+def _read_mat(path: Path, limit: int) -> dict[str, Array]:
     import scipy.io
 
-    content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
+    packed = path.read_bytes()
+    _check_mat(packed, limit)
+    content = scipy.io.loadmat(io.BytesIO(packed), squeeze_me=True, struct_as_record=False)
     flat: dict[str, Any] = {}
     for key, value in content.items():
         fields = getattr(value, "_fieldnames", None)
@@ -147,21 +213,59 @@ def _read_mat(path: Path) -> dict[str, Array]:
     return _columns(flat)
 
 
-def _read_mcap(path: Path) -> dict[str, Array]:
+def _check_mat(content: bytes, limit: int) -> None:
+    """Unpack the compressed variables of a MATLAB 5 file piece by piece, and keep none. Raises _TooLarge."""
+    if content[_MAT_HEAD_BYTES - 2 : _MAT_HEAD_BYTES] not in (b"IM", b"MI"):
+        return
+    order: Any = "little" if content[_MAT_HEAD_BYTES - 2 : _MAT_HEAD_BYTES] == b"IM" else "big"
+    place, total = _MAT_HEAD_BYTES, 0
+    while place + 8 <= len(content):
+        kind, length = (int.from_bytes(content[place + at : place + at + 4], order) for at in (0, 4))
+        body, place = content[place + 8 : place + 8 + length], place + 8 + length
+        if kind == _MAT_COMPRESSED:
+            unpacker, waiting = zlib.decompressobj(), body
+            while waiting and not unpacker.eof:
+                total += len(unpacker.decompress(waiting, _PIECE_BYTES))
+                waiting = unpacker.unconsumed_tail
+                if total > limit:
+                    raise _TooLarge
+
+
+def _mcap_messages(path: Path, limit: int) -> Iterator[tuple[Any, Any]]:
+    """Channel and message of every message, chunk by chunk; no chunk unpacks to more than it declares."""
+    from mcap.records import Channel, Chunk, Message
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    channels: dict[int, Channel] = {}
+    total = 0
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True, record_size_limit=CHUNK_LIMIT_BYTES).records:
+            inner: Any = [record]
+            if isinstance(record, Chunk):
+                total += record.uncompressed_size
+                if record.uncompressed_size > CHUNK_LIMIT_BYTES or total > limit:
+                    raise _TooLarge
+                inner = breakup_chunk(replace(record, compression="", data=unpack_chunk(record)))
+            for one in inner:
+                if isinstance(one, Channel):
+                    channels[one.id] = one
+                elif isinstance(one, Message):
+                    yield channels[one.channel_id], one
+
+
+def _read_mcap(path: Path, limit: int) -> dict[str, Array]:
     """Every numeric field of every topic on the time line of the topic with most messages; column `topic.field`."""
     import json
 
     import msgpack
-    from mcap.reader import make_reader
 
     topics: dict[str, list[tuple[float, dict[str, float]]]] = {}
-    with path.open("rb") as stream:
-        for _, channel, message in make_reader(io.BytesIO(stream.read())).iter_messages():
-            is_json = channel.message_encoding == "json"
-            body = json.loads(message.data) if is_json else msgpack.unpackb(message.data)
-            if isinstance(body, dict):
-                stamp = float(body.get("stamp_ns", message.log_time)) * 1e-9
-                topics.setdefault(channel.topic, []).append((stamp, _numbers(body)))
+    for channel, message in _mcap_messages(path, limit):
+        is_json = channel.message_encoding == "json"
+        body = json.loads(message.data) if is_json else msgpack.unpackb(message.data)
+        if isinstance(body, dict):
+            stamp = float(body.get("stamp_ns", message.log_time)) * 1e-9
+            topics.setdefault(channel.topic, []).append((stamp, _numbers(body)))
     if not topics:
         return {}
     base = max(topics, key=lambda topic: len(topics[topic]))
