@@ -102,9 +102,10 @@ fuzz: setup
 	@$(MAKE) -s -C firmware/fuzz frames SEQUENCES=$(INPUTS)
 	@$(BIN)/python -m host.studies.reliability_page docs/reliability.md <build/fuzz.json
 
-# Crafted recordings read by every reader of them; those that broke one stay in build/crafted_recordings and are read again.
+# Crafted recordings and tables read by every reader of them; those that broke one stay in build/crafted_*.
 fuzz-files: setup
 	@$(BIN)/python -m tests.host.crafted_recordings $(FILES) $(SEED)
+	@$(BIN)/python -m tests.host.diagnosis.crafted_tables $(FILES) $(SEED)
 
 # The firmware's arithmetic for all inputs (firmware/proof/prove.c); needs Debian's frama-c-base.
 proof:

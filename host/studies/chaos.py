@@ -50,7 +50,7 @@ STALL_S = (0.02, 3.0)
 WATCHED_S, STOPPED_S = 3.0, 3.0
 # Without a step edge for so long before the end of an interval the stages are at rest.
 QUIET_S = 0.5
-_TOUCH_S = 120.0
+_TOUCH_S = 90.0
 _ROOM_BYTES = 20_000
 
 
