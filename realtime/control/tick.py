@@ -103,9 +103,7 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
     result, dt_s = wall_observer.take_force(
         params.wall, params.kinematics, state.wall, state.history, force, state.normal, params.hybrid.contact_force_N
     )
-    if result == target_predictor.REJECTED:
-        state.force_rejected += 1
-    elif result == target_predictor.ACCEPTED:
+    if result == target_predictor.ACCEPTED:
         wall_observer.correct_backlash(params.backlash, state.backlash, state.wall, dt_s)
 
 
