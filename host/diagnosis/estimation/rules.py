@@ -83,6 +83,12 @@ class SelectionRules:
     prior_equal: float = 0.12  # of all rivals together that are indistinguishable, at least: formulas are idealized
     exact_share: float = 0.06  # share of the mismatch that an idealized formula leaves where it is the right one
     coarsening_none: float = 8.0  # independent samples for the comparison with physics that would leave no more than that
+    # Calibration: p' = 1 / (1 + exp(-(slope log(p / (1 - p)) + shift))), Platt 1999, of effects and of "none of these".
+    # Slope 1 and shift 0 leave the probabilities as they are: see docs/diagnosis.md for what they were compared with.
+    effect_slope: float = 1.0
+    effect_shift: float = 0.0
+    none_slope: float = 1.0
+    none_shift: float = 0.0
     confident: float = 0.9  # probability from which a verdict counts as confident
 
     def as_dict(self) -> dict[str, float]:

@@ -44,11 +44,13 @@ def wild(values: Array, sigma: float) -> Mask:
 
 
 def scatter(values: Array) -> float:
-    """Robust standard deviation of the samples about the median of their neighbours: noise that single samples do not
-    raise.
+    """Standard deviation of noise that single samples do not raise: the larger of two robust ones, about the median of the
+    neighbours, which in a steep motion is the sample itself, and of the second differences.
     """
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(fill(values), 3, mode="reflect"), 7)
-    return float(1.4826 * np.median(np.abs(fill(values) - np.median(windows, axis=1))))
+    about = np.median(np.abs(fill(values) - np.median(windows, axis=1)))
+    bends = np.median(np.abs(np.diff(fill(values), 2))) / np.sqrt(6.0)
+    return float(1.4826 * max(about, bends))
 
 
 def lost(values: Array) -> Mask:

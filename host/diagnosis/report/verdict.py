@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from host.diagnosis.model.findings import Finding
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.locate import joined
-from host.diagnosis.selection.posterior import Posterior, of_refused, posterior
+from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused, posterior
 
 REMARKS = ("excitation", "outliers", "quantized", "hold")  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
@@ -42,7 +43,8 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         "verdict": result.verdict,
         "located": [_located(location, result) for location in result.located],
         "data_findings": [finding_json(finding) for finding in result.findings],
-        "probability_none": probability_none(result),
+        "probability_none": _none_stated(result),
+        "probability_none_raw": probability_none(result),
         "rules": result.problem.rules.as_dict(),
         "effects": effects(result),
         "fit": {
@@ -120,22 +122,30 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
     }
 
 
-def posterior_of(result: Diagnosis, standing: Standing) -> Posterior:
-    """Probabilities at the place of one effect."""
+def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Posterior:
+    """Probabilities at the place of one effect; raw: before calibration."""
     rules = result.problem.rules
+    rules = replace(rules, effect_slope=1.0, effect_shift=0.0) if raw else rules
     return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), result.rest.left, rules)
 
 
+def _none_stated(result: Diagnosis) -> float:
+    rules = result.problem.rules
+    return calibrated(probability_none(result), rules.none_slope, rules.none_shift)
+
+
 def probability_none(result: Diagnosis) -> float:
-    """Probability that no effect that was considered is what is missing: nothing is, or physics that is in no list."""
+    """Probability, before calibration, that no effect that was considered is what is missing: nothing is, or physics that
+    is in no list.
+    """
     if result.verdict == "missing_physics":
         strongest = max(result.standings, key=lambda standing: standing.gain.log_likelihood)
-        found = posterior_of(result, strongest)
+        found = posterior_of(result, strongest, raw=True)
         return found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)
     last = next((step.trials for step in reversed(result.found.steps) if step.trials), [])
     if not result.standings:
         return 1.0 - of_refused(last)
-    return 1.0 - max(posterior_of(result, standing).effect for standing in result.standings)
+    return 1.0 - max(posterior_of(result, standing).raw for standing in result.standings)
 
 
 def finding_json(finding: Finding) -> dict[str, str]:
@@ -222,6 +232,7 @@ def _effect(
         "subsystem": candidate.port.subsystem,
         "port": candidate.port.name,
         "probability": probable.effect,
+        "probability_raw": probable.raw,
         "alternatives": [{"name": name, "probability": p} for name, p in sorted(by_name.items(), key=lambda item: -item[1])],
         "says": sentence(candidate, parameters, values),
         "equation": equation(candidate),

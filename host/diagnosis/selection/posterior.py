@@ -16,6 +16,9 @@ rivals that are indistinguishable (`equivalence`) have at least the weight `prio
 The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
 independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
 is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.
+
+What is stated is calibrated: slope and shift of the log-odds, frozen in `SelectionRules`, fitted on suites apart from those
+that judge (host.studies.proof.calibrate). The probabilities before that are kept as raw.
 """
 
 from __future__ import annotations
@@ -30,16 +33,21 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.trial import Trial
 
 FARTHEST = 700.0  # of a logarithm that is taken to its exponential
+EDGE = 1e-4  # probabilities are kept this far from 0 and 1 before they are calibrated
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probability of an effect, of its rivals by name, of nothing in its place, and of physics that is in no list."""
+    """Probability of an effect, of its rivals by name, of nothing in its place, and of physics that is in no list.
+
+    raw: of the effect, before calibration.
+    """
 
     effect: float
     rivals: tuple[tuple[Candidate, float], ...]
     nothing: float
     none: float
+    raw: float
 
 
 def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
@@ -62,7 +70,19 @@ def posterior(
     odds = rules.prior_none / (1.0 - rules.prior_none)
     none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
     total = 1.0 + sum(weight for _, weight in weights) + nothing + none
-    return Posterior(1.0 / total, tuple((rival, weight / total) for rival, weight in weights), nothing / total, none / total)
+    raw = 1.0 / total
+    stated = calibrated(raw, rules.effect_slope, rules.effect_shift)
+    share = (1.0 - stated) / (1.0 - raw) if raw < 1.0 else 0.0  # of what is not the effect, every part alike
+    others = tuple((rival, share * weight / total) for rival, weight in weights)
+    return Posterior(stated, others, share * nothing / total, share * none / total, raw)
+
+
+def calibrated(p: float, slope: float, shift: float) -> float:
+    """Return the probability that `p` states truly, by slope and shift of its log-odds."""
+    if (slope, shift) == (1.0, 0.0):
+        return p
+    q = min(max(p, EDGE), 1.0 - EDGE)
+    return 1.0 / (1.0 + float(np.exp(-(slope * np.log(q / (1.0 - q)) + shift))))
 
 
 def of_refused(trials: list[Trial]) -> float:

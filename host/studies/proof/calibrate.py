@@ -35,7 +35,7 @@ def statements(judged: Judged, kind: str) -> list[tuple[float, bool]]:
     for label, verdict in judged:
         if kind == "none":
             p = verdict.get("probability_none_raw", verdict.get("probability_none"))
-            true = not label["planted"]
+            true = all(name == "unlisted" for names in label["names"] for name in names)  # none of the vocabulary
         else:
             first = (verdict.get("effects") or [{}])[0]
             p = first.get("probability_raw", first.get("probability"))

@@ -11,8 +11,10 @@ from host.diagnosis.effects import library
 from host.diagnosis.effects.quantization import stepped
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Parameter, Port
 from host.diagnosis.selection.equivalence import Standing, with_unlisted_rival
+from host.diagnosis.selection.posterior import calibrated, posterior
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
 from host.diagnosis.selection.unlisted import Rest
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart
@@ -69,3 +71,13 @@ def test_steps_by_their_saw_tooth() -> None:
     x = np.linspace(-0.02, 0.03, 5000)
     step = 1.7e-3
     assert np.corrcoef(stepped(x, step) - x, step * np.round(x / step) - x)[0, 1] > 0.92
+
+
+def test_a_calibrated_probability_takes_its_share_from_all_others() -> None:
+    gain = Gain(40.0, 1e-6, 0.9, independent=np.array([400.0]), log_ratio=np.array([0.2]), excesses=np.array([0.1]))
+    asis = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, RULES)
+    lower = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, replace(RULES, effect_slope=0.5, effect_shift=-0.3))
+    assert asis.raw == asis.effect == lower.raw and lower.effect < asis.effect
+    for each in (asis, lower):
+        assert each.effect + each.rivals[0][1] + each.nothing + each.none == pytest.approx(1.0)
+    assert calibrated(0.8, 0.5, -0.3) == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * np.log(4.0) - 0.3))))

@@ -318,6 +318,87 @@ case(
     findings=("outlier", "outliers", "missing"),
 )
 case(
+    "wild samples of the input",
+    lambda: (
+        [
+            _changed(make.gear(k), motor=lambda v: _marred(v, lambda a, r: a.__setitem__(r.integers(0, a.size, 15), 40.0)))
+            for k in (1, 2)
+        ],
+        make.gear_nominal(),
+    ),
+    findings=("outliers",),
+    parameters=(("gain", 0.4),),
+)
+case(
+    "a code for lost readings",
+    lambda: (
+        [_changed(make.gear(k), load=lambda v: _marred(v, lambda a, r: _lost(a, r.integers(0, 1900, 8)))) for k in (1, 2)],
+        make.gear_nominal(),
+    ),
+    findings=("outliers",),
+    parameters=(("gain", 0.4),),
+)
+
+
+def _lost(values: Any, starts: Any) -> None:
+    for first in starts:
+        values[first : first + 8] = -5.0
+
+
+case(
+    "wild samples and play",
+    lambda: (
+        [
+            _changed(
+                make.with_play(make.gear(k), 0.05),
+                load=lambda v: _marred(v, lambda a, r: a.__setitem__(r.integers(0, a.size, 15), 7.0)),
+            )
+            for k in (1, 2)
+        ],
+        make.gear_nominal(),
+    ),
+    truth=("backlash",),
+    findings=("outliers",),
+)
+case(
+    "counts called radians",
+    lambda: ([_changed(make.gear(k), load=lambda v: np.round(v / 1.5e-3)) for k in (1, 2)], make.gear_nominal(gain=0.4)),
+    findings=("unit",),
+)
+case(
+    "milliseconds called seconds",
+    lambda: (
+        [_changed(make.free_mass(k), t=lambda v: 1e3 * v) for k in (5, 6)],
+        {**make.free_nominal(), "parameters": {"mass": 0.5, "damping": 3.0}},
+    ),
+    findings=("unit",),
+    parameters=MASS,
+)
+case(
+    "columns of the spring swapped",
+    lambda: ([{"t": c["t"], "x": c["f"], "f": c["x"]} for c in (make.spring(5), make.spring(6))], make.spring_nominal()),
+    findings=("swapped",),
+    parameters=(("stiffness", 200.0),),
+)
+case(
+    "noisy output is the input, late by 5.3 samples",
+    lambda: ([_noisy_copy(k) for k in (1, 2)], make.gear_nominal()),
+    findings=("alias",),
+)
+
+
+def _noisy_copy(number: int) -> dict[str, Any]:
+    columns = make.gear(number)
+    motor = columns["motor"] + 0.01 * make.stream(number).standard_normal(columns["t"].size)
+    return {**columns, "motor": motor, "load": np.interp(columns["t"] - 0.053, columns["t"], motor)}
+
+
+case(
+    "force held by a computer, called straight",
+    lambda: ([make.sprung(k, "zero") for k in (1, 2)], make.axis_nominal("linear")),
+    parameters=SPRUNG,
+)
+case(
     "two clocks",
     lambda: ([_changed_by(make.gear(k, fastest_Hz=4.0), _drifted) for k in (1, 2)], make.gear_nominal()),
     truth=("clock_drift",),
@@ -338,7 +419,20 @@ case(
 
 # What the finder says where it must not, one line a case.
 FAILS: dict[str, str] = {}
-SLOW = {"a million rows"}
+SLOW = {  # over 3 s of processor time
+    "a million rows",
+    "sprung mass with dry friction, zero",
+    "sprung mass with dry friction, linear",
+    "free mass with dry friction",
+    "gear with a delay of a second",
+    "gear with a lag",
+    "delay or lag, one slow tone",
+    "no second term in the nominal model",
+    "reading clips",
+    "sprung zero acceleration",
+    "sprung linear acceleration",
+    "sprung band_limited acceleration",
+}
 
 
 def _parameter(name: str) -> Any:
