@@ -90,16 +90,18 @@ class Job:
 
 
 @pytest.mark.parametrize("phase", PHASES)
-def test_without_poses_it_holds_then_stops_and_stays(phase: str) -> None:
+def test_without_poses_it_holds_then_leaves_the_wall_and_stops(phase: str) -> None:
     job = Job(phase)
-    job.fail("tracker", "silent", 3.0)
-    job.go(0.3)
+    job.fail("tracker", "silent", 4.0)
+    before_N = job.go(0.3)
     assert {"pose_stale", "pose_lost"} <= job.causes
+    assert job.phase == Phase.STOPPED or (job.phase == Phase.RETRACT and phase != "approach")
+    leaving_N = job.go(1.2)
     assert job.phase == Phase.STOPPED
     steps = job.world.steps.copy()
     force_N = job.go(1.0)
     assert np.array_equal(job.world.steps, steps), "stages moved after the stop"
-    assert np.max(force_N) < PEAK_N
+    assert np.max([*before_N, *leaving_N]) < PEAK_N and np.max(force_N) == 0.0
 
 
 @pytest.mark.parametrize("phase", PHASES)
