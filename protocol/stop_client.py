@@ -42,6 +42,14 @@ class PathAnswer:
     text: str
 
 
+def shows_stop(mode: str, safety_action: str) -> bool:
+    """Whether a rig in phase `mode` has obeyed a stop: at rest, or on its way out of contact because of the stop.
+
+    A retraction that the failsafe demands by itself has the action `retract`, not `stop`.
+    """
+    return mode in ("stopped", "disarmed") or (mode == "retract" and safety_action == "stop")
+
+
 def peer_credentials(connection: socket.socket) -> tuple[int, int, int]:
     """Return process, user and group id of the program at the other end, as the kernel knows them (SO_PEERCRED)."""
     pid, uid, gid = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))

@@ -7,13 +7,11 @@ import time
 from typing import Any
 
 from protocol.commander import Acknowledgement, CommandSender
-from protocol.stop_client import CONFIRM_S, PathAnswer, stop_by_socket, stop_over
+from protocol.stop_client import CONFIRM_S, PathAnswer, shows_stop, stop_by_socket, stop_over
 from protocol.topics import RigState
 from protocol.zenoh_session import Session
 
 RENEW_S = 1.0
-# Phases in which the loop moves nothing.
-STOPPED_MODES = ("stopped", "disarmed")
 _POLL_S = 0.002
 
 
@@ -75,13 +73,13 @@ class Commander(CommandSender):
             )
         if not answer.accepted:
             return PathAnswer("zenoh", True, False, answer.reason)
-        begin_s, mode = time.monotonic(), "no state"
+        begin_s, mode, action = time.monotonic(), "no state", ""
         while True:
             state = self._states.take()
             if isinstance(state, RigState):
-                mode = state.mode
+                mode, action = state.mode, state.safety_action
             after_s = time.monotonic() - begin_s
-            if mode in STOPPED_MODES:
+            if shows_stop(mode, action):
                 return PathAnswer("zenoh", True, True, f"{mode}, seen {after_s * 1e3:.0f} ms after the answer")
             if after_s > self._confirm_s:
                 return PathAnswer(

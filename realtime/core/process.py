@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from protocol.enums import Phase
 from protocol.reply_seal import ReplySeal
 from protocol.rig_file import Rig
-from protocol.stop_client import CONFIRM_S
+from protocol.stop_client import CONFIRM_S, shows_stop
 from protocol.topics import Command, CommandCounts, Log, LoopTiming, Message, Reply, encode
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
@@ -33,7 +32,6 @@ _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command r
 _POLL_S = 0.005
 # A stop over the socket waits so long for the core; then it ends the loop, and the board stops the stages by itself.
 _CORE_BUSY_S = 0.05
-_STOPPED = (Phase.STOPPED, Phase.DISARMED)
 logger = logging.getLogger("seldinger.realtime")
 
 
@@ -171,7 +169,7 @@ class RealtimeProcess:
             request = CommandRequest(peer.commander, encode(stop))
             line = Log(stamp_ns=now_ns, level="warning", source="stop socket", text=f"stop from {peer}")
             self._take(Arrived(requests=[request], log_lines=[line]), _CORE_BUSY_S)
-            while self.core.phase not in _STOPPED and time.monotonic_ns() - begin_ns < CONFIRM_S * 1e9:
+            while not self._shows_stop() and time.monotonic_ns() - begin_ns < CONFIRM_S * 1e9:
                 time.sleep(0.001)
                 self._take(Arrived(), _CORE_BUSY_S)
         except Exception as failure:  # whatever fails in the core, a stop is not lost
@@ -182,9 +180,12 @@ class RealtimeProcess:
             logger.error("stop socket: %s", text)
             return {**self.status(), "confirmed": False, "text": text}
         after_ms = (time.monotonic_ns() - begin_ns) * 1e-6
-        confirmed = self.core.phase in _STOPPED
+        confirmed = self._shows_stop()
         text = f"{before.label}, {self.core.phase.label} after {after_ms:.1f} ms"
         return {**self.status(), "confirmed": confirmed, "after_ms": round(after_ms, 3), "text": text}
+
+    def _shows_stop(self) -> bool:
+        return shows_stop(self.core.phase.label, self.core.action.label)
 
     def counts(self) -> CommandCounts:
         """Return who holds the lease, and what became of the commands so far."""

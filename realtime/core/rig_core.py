@@ -132,6 +132,7 @@ class RigCore:
         self.now_ns = 0
         # Of the newest tick.
         self.phase, self.force_source = Phase.DISARMED, ForceSource(int(self.params[0].force_source))
+        self.action = SafetyAction.NONE
         self.board_errors: list[str] = []
         self.link = StepperBoardLink(axis_limits(rig))
         self.commands = OperatorCommands(
@@ -199,6 +200,7 @@ class RigCore:
         outputs, number = tick.outputs, tick.number
         self._outputs = outputs
         self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
+        self.action = SafetyAction(int(outputs.action))
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
         self._log_new_causes(outputs, tick_ns)

@@ -25,7 +25,7 @@ from protocol.commander import CommandSender
 from protocol.errors import InputError
 from protocol.local_paths import LocalPaths
 from protocol.rig_file import SIMULATED_RIG, Rig, parse_rig, read_rig_data
-from protocol.stop_client import PathAnswer, ask_socket, stop_by_socket, stop_over
+from protocol.stop_client import PathAnswer, ask_socket, shows_stop, stop_by_socket, stop_over
 from protocol.topics import Command, Reply, RigState, decode, encode, request_key
 from protocol.zenoh_session import Session
 from realtime.core.process import RealtimeProcess
@@ -172,6 +172,21 @@ def test_a_stop_that_the_rigs_state_does_not_show_is_not_confirmed(tmp_path: Pat
         ending.set()
         publishing.join()
         del server
+
+
+@pytest.mark.parametrize(
+    ("mode", "action", "shown"),
+    [
+        ("stopped", "stop", True),
+        ("disarmed", "none", True),
+        ("retract", "stop", True),
+        ("retract", "retract", False),
+        ("contact", "stop", False),
+        ("no state", "", False),
+    ],
+)
+def test_what_shows_a_stop(mode: str, action: str, shown: bool) -> None:
+    assert shows_stop(mode, action) == shown
 
 
 def _accepted(payload: bytes) -> Reply:
