@@ -224,6 +224,23 @@ class ControlSection(_Section):
         return self
 
 
+class EstimationSection(_Section):
+    """The force estimator of the model process, and how surely it knows the joints and the stiffness.
+
+    `*_sd_*`: standard deviations of what lasts; `*_walk_*`: growth of the joints' errors in one second at rest.
+    """
+
+    model: Literal["planar", "spatial"] = "spatial"
+    insertion_sd_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0003
+    curvature_sd_per_m: Annotated[float, Field(gt=0, le=20)] = 0.5
+    roll_sd_rad: Annotated[float, Field(gt=0, le=1)] = 0.02
+    stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    tangential_force_sd_N: Annotated[float, Field(gt=0, le=1)] = 0.02
+    insertion_walk_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0001
+    curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.1
+    roll_walk_rad: Annotated[float, Field(gt=0, le=1)] = 0.005
+
+
 class Safety(_Section):
     """Limits of force, silence, speed and place. `HARD_*` bound them: no rig file can widen those."""
 
@@ -301,6 +318,7 @@ class Rig(_Section):
     force_sensor: ForceSensorSection
     board: BoardSection
     control: ControlSection
+    estimation: EstimationSection = EstimationSection()
     safety: Safety
     zenoh: Zenoh = Zenoh()
     network: NetworkAccess = NetworkAccess()

@@ -19,17 +19,23 @@ class PoseReading(NamedTuple):
 
 
 class Actuation(NamedTuple):
-    """The distal end's joints when the pose was measured, as the controller has them through the transmission."""
+    """The distal end's joints when the pose was measured, as the controller has them through the transmission.
+
+    force_direction (3,): unit vector in the base frame along which the controller presses; None where it does not.
+    """
 
     insertion_m: float
     roll_rad: float
     curvature_per_m: float
     stamp_ns: int
+    force_direction: Array | None = None
 
 
 class TipForce(NamedTuple):
     """force_N (3,) of the tip on the tissue and covariance_N2 (3, 3), base frame; stamp_ns is the pose's.
 
+    `lasting_covariance_N2` (3, 3) is the part of the covariance that poses shortly after each other share: errors of
+    insertion, curvature, roll and stiffness. What remains of `covariance_N2` is noise, new in each pose.
     A pose that no force explains is not an error: `converged` is false, and `residual` says how far off it is.
     """
 
@@ -38,6 +44,7 @@ class TipForce(NamedTuple):
     converged: bool
     residual: float
     stamp_ns: int
+    lasting_covariance_N2: Array | None = None
 
 
 class Estimator(Protocol):

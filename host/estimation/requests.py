@@ -8,16 +8,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from host.estimation.reach import check_reach
 from host.mechanics.requests import PICTURE_POINTS, Actuated, Coordinate, ShapePicture, Station, catheter_for
-from protocol.errors import InputError
 from protocol.requests import Request
 
 Vector2 = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
 Vector3 = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 QUATERNION_TOLERANCE = 1e-3
 SENSORS_OF_CASE = {1: 1, 2: 1, 3: 2, 4: 2, 5: 2, 6: 3}
-# How much further than the exposed length a pose may lie from the sheath's exit: noise and registration, not a wrong unit.
-REACH_MARGIN_M = 0.020
 
 
 class PlanarPose(Request):
@@ -62,21 +60,6 @@ class CosseratEstimate(Actuated):
         if len(self.sensors) < SENSORS_OF_CASE[self.case]:
             raise ValueError(f"{SENSORS_OF_CASE[self.case]} sensors for case {self.case}, not {len(self.sensors)}")
         return self
-
-
-def check_reach(key: str, position_m: list[float], exposed_m: float) -> None:
-    """Raise InputError where the catheter cannot reach a position.
-
-    Arguments: `position_m`, from the sheath's exit; `exposed_m`, length of catheter outside the sheath.
-    """
-    distance_m = math.hypot(*position_m)
-    if distance_m > exposed_m + REACH_MARGIN_M:
-        raise InputError(
-            key,
-            position_m,
-            f"a position at most {1e3 * (exposed_m + REACH_MARGIN_M):.1f} mm from the sheath's exit "
-            f"(exposed length {1e3 * exposed_m:.1f} mm and {1e3 * REACH_MARGIN_M:.0f} mm), not {1e3 * distance_m:.1f} mm",
-        )
 
 
 def estimate_request(

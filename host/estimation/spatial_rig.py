@@ -1,0 +1,169 @@
+"""The running rig's spatial estimator: the rod of chapter 3, both tracked poses, with the actuation's errors followed.
+
+With a sensor at the tip alone the poses are those of case 2, with a second one those of case 4 and the tip's absolute
+position; a third (case 6) is a further row. The absolute positions determine the errors of insertion and roll,
+which cases 4 and 6 leave out. Source: chapter 5, weighted, with the errors of the actuation as further unknowns.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
+from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
+from host.estimation.reach import check_reach
+from host.estimation.sensor_noise import chi_square_limit
+from host.estimation.spatial import start_grid
+from host.estimation.spatial_rig_kernels import Found, Frame, fit
+from host.mechanics.rod import finite, rod_record
+from protocol.catheter import Catheter, load_catheter
+from protocol.rig_file import Rig
+
+Array = NDArray[np.float64]
+
+LARGEST_FORCE_N = 1.0
+WEAK_FORCE_N = 1.0  # standard deviation of the force before the poses are seen: keeps an unseen direction finite
+ODD_DEVIATIONS = 5.0  # of the chi square that no force explains
+RESTARTS = slice(0, 26)
+CONFUSED_FRAMES = 8  # so many in a row that no force explains: what was learned of the actuation is wrong
+UNSEEN_STD_N = 10.0
+
+
+class SpatialRigEstimator:
+    """Implements `host.estimation.interface.Estimator` with the rod. Keeps the force's branch and the actuation's errors."""
+
+    def __init__(
+        self,
+        catheter: Catheter,
+        shaft_offset_m: float,
+        position_std_m: float,
+        angle_std_rad: float,
+        knowledge: ActuationKnowledge,
+        stiffness_sd: float = 0.0,
+        tangential_sd_N: float = WEAK_FORCE_N,
+    ) -> None:
+        self._catheter, self._shaft_offset_m = catheter, shaft_offset_m
+        self._position_std_m, self._angle_std_rad = position_std_m, angle_std_rad
+        self._stiffness_sd, self._tangential_sd_N = stiffness_sd, tangential_sd_N
+        self.errors = ActuationErrors(knowledge)
+        self._force = np.zeros(3)
+        self._unexplained = 0
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> SpatialRigEstimator:
+        """For the catheter and the tracker of a rig file. Raises InputError where the rod's stiffness is not known."""
+        catheter = load_catheter(rig.catheter.name)
+        rod_record(catheter, 0.0, 0.0)
+        tracker = rig.tracker
+        return cls(
+            catheter,
+            tracker.shaft_sensor_offset_m,
+            tracker.position_noise_m,
+            tracker.orientation_noise_rad,
+            ActuationKnowledge.from_rig(rig),
+            rig.estimation.stiffness_sd,
+            rig.estimation.tangential_force_sd_N,
+        )
+
+    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
+        """The force of the tip on the tissue, base frame, that explains the poses. Raises: InputError (bad input)."""
+        rod = rod_record(self._catheter, actuation.insertion_m, actuation.curvature_per_m)
+        exposed_m = self._catheter.distal_length_m + actuation.insertion_m
+        finite("pose_tip", [*pose_tip.position_m, *pose_tip.quaternion_wxyz], (7,), "three finite numbers in m and four")
+        check_reach("pose_tip.position_m", pose_tip.position_m, exposed_m)
+        offsets, poses = [0.0], [[*pose_tip.position_m, *pose_tip.quaternion_wxyz]]
+        if pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all():
+            offsets.append(self._shaft_offset_m)
+            poses.append([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz])
+        self.errors.move_to(actuation)
+        prior, information = np.zeros(6), np.zeros((6, 6))
+        prior[3:] = self.errors.mean
+        information[:3, :3] = np.eye(3) / WEAK_FORCE_N**2
+        information[3:, 3:] = np.linalg.inv(self.errors.covariance)
+        joints = np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad])
+        frame = Frame(
+            rod[:6].copy(),
+            self._catheter.distal_length_m,
+            joints,
+            np.array(offsets),
+            np.array(poses),
+            self._position_std_m,
+            self._angle_std_rad,
+            prior,
+            information,
+            self._tangential_rows(actuation),
+        )
+        settled, cost, found = self._search(frame)
+        converged = settled and cost <= chi_square_limit(6 * len(offsets), ODD_DEVIATIONS)
+        return self._answer(frame, found, converged, pose_tip.stamp_ns)
+
+    def _tangential_rows(self, actuation: Actuation) -> Array:
+        """Directions (2, 3) across the force that is commanded, over the standard deviation there; (0, 3) without one."""
+        if actuation.force_direction is None:
+            return np.zeros((0, 3))
+        along = np.asarray(actuation.force_direction, dtype=float)
+        across = np.linalg.svd(along[None, :])[2][1:]
+        return np.ascontiguousarray(across / self._tangential_sd_N)
+
+    def _search(self, frame: Frame) -> tuple[bool, float, Found]:
+        """From the last force; where that explains nothing, from none, then from a grid of forces."""
+        limit = chi_square_limit(6 * len(frame.offsets), ODD_DEVIATIONS)
+        best: tuple[bool, float, Found] | None = None
+        starts = [self._force]
+        if self._force.any():
+            starts.append(np.zeros(3))
+        if self._unexplained <= 1:  # a pose that stays odd is not searched for again at every frame
+            starts += list(start_grid(0.5)[RESTARTS])
+        for start in starts:
+            found = _new_found(len(frame.offsets))
+            found.x[:3], found.x[3:] = start, frame.prior[3:]
+            settled, cost = fit(frame, LARGEST_FORCE_N, found)
+            if best is None or (settled, -cost) > (best[0], -best[1]):
+                best = (settled, cost, found)
+            if best[0] and best[1] <= limit:
+                break
+        assert best is not None
+        return best
+
+    def _answer(self, frame: Frame, found: Found, converged: bool, stamp_ns: int) -> TipForce:
+        covariance = np.linalg.inv(found.information)
+        force_N = -found.force_N
+        total = found.by_x @ covariance @ found.by_x.T
+        # With the actuation's errors held at their estimates, the rest is the tracker's noise of this pose.
+        by_noise = found.by_x[:, :3] @ np.linalg.inv(found.information[:3, :3]) @ found.by_x[:, :3].T
+        # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
+        stiffness = self._stiffness_sd**2 * np.outer(force_N, force_N)
+        lasting = total - by_noise + stiffness
+        total = total + stiffness
+        total *= min(1.0, UNSEEN_STD_N**2 / max(float(np.diag(total).max()), 1e-300))
+        residual = _residual(frame, found)
+        if converged:
+            self._force, self._unexplained = found.x[:3].copy(), 0
+            self.errors.learn(found.x[3:], covariance[3:, 3:])
+        else:
+            self._force = np.zeros(3)
+            self._unexplained += 1
+            if self._unexplained >= CONFUSED_FRAMES:
+                self.errors.forget()
+                self._unexplained = 0
+        return TipForce(
+            force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T)
+        )
+
+
+def _new_found(sensors: int) -> Found:
+    return Found(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((sensors, 6)))
+
+
+def _residual(frame: Frame, found: Found) -> float:
+    """Largest of the sensors' residuals, dimensionless: |position error| over the exposed length, and the turn."""
+    outside = frame.distal_length_m + frame.actuation[0]
+    return max(math.hypot(np.linalg.norm(row[:3]) / outside, np.linalg.norm(row[3:])) for row in found.residual)
+
+
+def make_estimator(rig: Rig) -> Estimator:
+    """The spatial estimator of the running rig."""
+    return SpatialRigEstimator.from_rig(rig)
