@@ -66,6 +66,7 @@ RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
 _XYZ_m = ("x_m", "y_m", "z_m")
 _FORCE = ("fx_N", "fy_N", "fz_N")
+_LASTING = tuple(f"lasting_c{row}{column}_N2" for row in "xyz" for column in "xyz")
 _COVARIANCE = tuple(f"c{row}{column}_N2" for row in "xyz" for column in "xyz")
 
 # Time histograms: bucket k holds times from 2^(k / 4) to 2^((k + 1) / 4) us; the first and the last are open.
@@ -177,6 +178,13 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
     converged: Annotated[bool, doc("a force explains the pose; if false, force and covariance may be nil")]
     force_N: Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue", _FORCE)] | None = None
     covariance_N2: Annotated[tuple[Covariance_N2, ...], columns_of("covariance, row by row", _COVARIANCE)] | None = None
+    lasting_covariance_N2: (
+        Annotated[
+            tuple[Covariance_N2, ...],
+            columns_of("part of the covariance that the poses of some seconds share, row by row", _LASTING),
+        ]
+        | None
+    ) = None
     residual: Annotated[Number | None, doc("residual of the best force")] = None
     published_ns: Annotated[Stamp_ns, doc("when the estimate left the estimator")]
     compute_us: Annotated[Duration_us, doc("time the estimator took")]

@@ -85,10 +85,12 @@ class FaultyScenario(Scenario):
         for watcher in self.watchers:
             watcher.receive(topic, message)
 
-    def _estimate_unless_failed(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
+    def _estimate_unless_failed(
+        self, tip: Message, shaft: Message | None, stage: Message, state: Message | None
+    ) -> ForceEstimate | None:
         if self.host != "well" or self._model is None:
             return None
-        estimate = self._model(tip, shaft, stage)
+        estimate = self._model(tip, shaft, stage, state)
         return estimate if estimate is None else self.wrong(estimate)
 
     def step(self) -> None:

@@ -21,7 +21,7 @@ from sim.world import World
 # Where the simulated wall stands and how the catheter is bent in front of it.
 TARGET_M = (0.0, -0.0107, 0.025)
 
-Estimator = Callable[[Message, Message | None, Message], ForceEstimate | None]
+Estimator = Callable[[Message, Message | None, Message, Message | None], ForceEstimate | None]
 
 SETTLE_S = 3.0
 START_TIMEOUT_S = 10.0
@@ -97,7 +97,8 @@ class Scenario:
         self._latest[topic] = message
         if topic != "pose/tip" or self._estimator is None or "stage" not in self._latest:
             return
-        estimate = self._estimator(message, self._latest.get("pose/shaft"), self._latest["stage"])
+        shaft, state = self._latest.get("pose/shaft"), self._latest.get("state")
+        estimate = self._estimator(message, shaft, self._latest["stage"], state)
         if estimate is not None:
             assert isinstance(message, Pose)
             self.loop.estimate_at(msgspec.structs.replace(estimate, published_ns=message.arrival_ns + self._delay_ns))

@@ -87,3 +87,8 @@ class ActuationErrors:
     def learn(self, mean: Array, covariance: Array) -> None:
         """Take over what a pose has told: mean (3,) and covariance (3, 3) after it."""
         self.mean, self.covariance = mean.copy(), 0.5 * (covariance + covariance.T)
+
+    def learn_part(self, which: list[int], mean: Array, covariance: Array) -> None:
+        """Take over what a pose has told about some of the errors, `which` (k) of them; the others keep theirs."""
+        self.mean[which] = mean
+        self.covariance[np.ix_(which, which)] = 0.5 * (covariance + covariance.T)

@@ -1,7 +1,8 @@
 """The running rig's planar estimator: both tracked poses, projected by roll, with play in insertion and curvature.
 
-An error of 1 mm in the insertion would read as 0.1 N, so insertion and curvature are estimated along with the force,
-held by how well the transmission is known; the second sensor separates them from the force.
+An error of 1 mm in the insertion would read as 0.1 N, so the errors of insertion and curvature are estimated along with
+the force and followed from pose to pose; the second sensor separates them from the force. The force out of the plane is
+not estimated: it is reported as zero with `out_of_plane_sd_N`.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
+from host.estimation.actuation_errors import CURVATURE, INSERTION, ROLL, ActuationErrors, ActuationKnowledge
+from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
+from host.estimation.reach import check_reach
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
+from host.mechanics.rod import finite
 from protocol.catheter import Catheter, load_catheter
 from protocol.rig_file import Rig
 
@@ -29,20 +33,25 @@ CHI_SQUARE_PER_FREEDOM = 12.0  # about 3.5 standard deviations throughout: beyon
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """How well the actuation and the contact are known before the poses are seen, standard deviations."""
+class ContactKnowledge:
+    """How surely the contact and the stiffness are known before the poses are seen, standard deviations."""
 
-    insertion_m: float = 0.4e-3
-    curvature_per_m: float = 1.0
-    roll_rad: float = 0.08
-    axial_force_N: float = 1.0  # weak: keeps an unseen direction finite
-    lateral_force_N: float = 1.0  # in the bending plane; less where the wall is known to face the sheath
-    out_of_plane_force_N: float = 0.05  # planar poses do not show it
+    force_sd_N: float = 1.0  # weak: keeps an unseen direction finite
+    tangential_sd_N: float = 1.0  # across the commanded direction of the force
+    out_of_plane_sd_N: float = 0.05
+    stiffness_sd: float = 0.0  # relative
+
+
+@dataclass(frozen=True)
+class _Prior:
+    mean: Array  # (4,) as the parameters of a fit
+    information: Array  # (4, 4)
 
 
 @dataclass(frozen=True)
 class _Fit:
     parameters: Array  # force x, y (N), insertion error (m), curvature error (1/m)
+    information: Array  # (4, 4)
     covariance: Array  # (4, 4)
     chi_square: float
     residual: float
@@ -70,59 +79,87 @@ class PlanarRigEstimator:
         shaft_offset_m: float,
         position_std_m: float,
         angle_std_rad: float,
-        knowledge: Knowledge | None = None,
+        knowledge: ActuationKnowledge,
+        contact: ContactKnowledge | None = None,
     ) -> None:
         self._catheter = catheter
         self._shaft_offset_m = shaft_offset_m
         self._position_std_m = position_std_m
         self._weight = np.linalg.inv(tip_covariance(position_std_m, angle_std_rad))
-        self._known = knowledge or Knowledge()
-        self._branch = np.zeros(4)
+        self._contact = contact or ContactKnowledge()
+        self._roll_sd_rad = knowledge.start[ROLL]
+        self.errors = ActuationErrors(knowledge)
+        self._branch = np.zeros(2)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
         """For the catheter and the tracker of a rig file. Raises InputError where the catheter is not known."""
-        tracker = rig.tracker
-        # the rig's wall faces the sheath: its force is along e3 but for friction and for the wall's tilt
+        tracker, known = rig.tracker, rig.estimation
         return cls(
             load_catheter(rig.catheter.name),
             tracker.shaft_sensor_offset_m,
             tracker.position_noise_m,
             tracker.orientation_noise_rad,
-            Knowledge(lateral_force_N=0.05),
+            ActuationKnowledge.from_rig(rig),
+            ContactKnowledge(tangential_sd_N=known.tangential_force_sd_N, stiffness_sd=known.stiffness_sd),
         )
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
-        values = [*pose_tip.position_m, *pose_tip.quaternion_wxyz, *actuation[:3]]
-        if not np.isfinite(values).all():
-            raise ValueError("pose_tip, actuation: found NaN or infinity, wanted finite numbers")
+        finite("pose_tip", [*pose_tip.position_m, *pose_tip.quaternion_wxyz], (7,), "finite position and quaternion")
+        finite("actuation", actuation[:3], (3,), "three finite numbers")
         arcs_of(self._catheter, actuation.insertion_m, actuation.curvature_per_m)  # refuses what is out of range
+        outside = self._catheter.distal_length_m + actuation.insertion_m
+        check_reach("pose_tip.position_m", pose_tip.position_m, outside)
         y_axis, normal = bending_plane(self._roll(pose_tip, actuation))
         poses = {0.0: self._planar(pose_tip, y_axis, actuation)}
         seen = pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all()
-        outside = self._catheter.distal_length_m + actuation.insertion_m
-        if pose_shaft is not None and seen and self._shaft_offset_m < outside - 3.0 * self._known.insertion_m:
+        if pose_shaft is not None and seen and self._shaft_offset_m < outside - 1e-3:
             poses[self._shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
-        fit = self._fit(poses, actuation, self._branch)
-        if not fit.ended and self._branch.any():
-            fit = self._fit(poses, actuation, np.zeros(4))
-        freedom = 3 * len(poses)
-        converged = fit.ended and fit.chi_square <= CHI_SQUARE_PER_FREEDOM * freedom
-        self._branch = fit.parameters if converged else np.zeros(4)
+        self.errors.move_to(actuation)
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
+        prior = self._prior(actuation, axes)
+        fit = self._fit(poses, actuation, prior, self._branch)
+        if not fit.ended and self._branch.any():
+            fit = self._fit(poses, actuation, prior, np.zeros(2))
+        converged = fit.ended and fit.chi_square <= CHI_SQUARE_PER_FREEDOM * 3 * len(poses)
+        self._branch = fit.parameters[:2] if converged else np.zeros(2)
+        if converged:
+            self.errors.learn_part([INSERTION, CURVATURE], fit.parameters[2:], fit.covariance[2:, 2:])
+        force_N = -axes @ fit.parameters[:2]
         covariance = axes @ fit.covariance[:2, :2] @ axes.T
-        covariance += self._known.out_of_plane_force_N**2 * np.outer(normal, normal)
+        by_noise = axes @ np.linalg.inv(fit.information[:2, :2]) @ axes.T
+        # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
+        lasting = covariance - by_noise + self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
+        unseen = self._contact.out_of_plane_sd_N**2 * np.outer(normal, normal)
+        total = by_noise + lasting + unseen
         return TipForce(
-            -axes @ fit.parameters[:2], 0.5 * (covariance + covariance.T), converged, fit.residual, pose_tip.stamp_ns
+            force_N,
+            0.5 * (total + total.T),
+            converged,
+            fit.residual,
+            pose_tip.stamp_ns,
+            0.5 * (lasting + lasting.T) + unseen,
         )
+
+    def _prior(self, actuation: Actuation, axes: Array) -> _Prior:
+        """What is known before the poses are seen: of the force (x, y in the plane) and of the actuation's errors."""
+        information = np.zeros((4, 4))
+        information[:2, :2] = np.eye(2) / self._contact.force_sd_N**2
+        if actuation.force_direction is not None:
+            along = axes.T @ np.asarray(actuation.force_direction, dtype=float)
+            across = np.array([-along[1], along[0]])
+            information[:2, :2] += np.outer(across, across) / self._contact.tangential_sd_N**2
+        two = [INSERTION, CURVATURE]
+        information[2:, 2:] = np.linalg.inv(self.errors.covariance[np.ix_(two, two)])
+        return _Prior(np.array([0.0, 0.0, *self.errors.mean[two]]), information)
 
     def _roll(self, tip: PoseReading, actuation: Actuation) -> float:
         """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
         y_axis, normal = bending_plane(actuation.roll_rad)
         lateral, across = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
         seen = lateral * lateral / self._position_std_m**2
-        held = 1.0 / self._known.roll_rad**2
+        held = 1.0 / self._roll_sd_rad**2
         return actuation.roll_rad - math.atan2(across * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
 
     @staticmethod
@@ -135,21 +172,19 @@ class PlanarRigEstimator:
             angle += math.copysign(2.0 * math.pi, actuation.curvature_per_m)
         return np.array([position[2], float(position @ y_axis), angle])
 
-    def _fit(self, poses: dict[float, Array], actuation: Actuation, start: Array) -> _Fit:
-        """Gauss-Newton on force, insertion error and curvature error, held by what is known of them."""
-        known = self._known
-        held = np.diag(
-            [known.axial_force_N**-2, known.lateral_force_N**-2, known.insertion_m**-2, known.curvature_per_m**-2]
-        )
-        parameters, ended, chi_square, residual = start.copy(), False, math.inf, math.inf
+    def _fit(self, poses: dict[float, Array], actuation: Actuation, prior: _Prior, start: Array) -> _Fit:
+        """Gauss-Newton on force, insertion error and curvature error from the force `start` (2,)."""
+        held, mean = prior.information, prior.mean
+        parameters, ended, chi_square, residual = np.array([*start, *mean[2:]]), False, math.inf, math.inf
         information = held
         for _ in range(STEPS):
             linear = self._linearize(poses, actuation, parameters)
             if linear is None:
-                parameters = 0.5 * parameters
+                parameters[:2] *= 0.5
                 continue
-            information, gradient = held.copy(), -held @ parameters
-            chi_square, residual = float(parameters @ held @ parameters), 0.0
+            off = mean - parameters
+            information, gradient = held.copy(), held @ off
+            chi_square, residual = float(off @ held @ off), 0.0
             for error, jacobian in linear:
                 information += jacobian.T @ self._weight @ jacobian
                 gradient += jacobian.T @ self._weight @ error
@@ -163,7 +198,7 @@ class PlanarRigEstimator:
             if np.hypot(*step[:2]) < END_N:
                 ended = True
                 break
-        return _Fit(parameters, _capped(information), chi_square, residual, ended)
+        return _Fit(parameters, information, _capped(information), chi_square, residual, ended)
 
     def _linearize(
         self, poses: dict[float, Array], actuation: Actuation, parameters: Array
@@ -191,8 +226,3 @@ def _capped(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(scale, scale)
     return np.asarray(inverse * min(1.0, UNSEEN_STD_N**2 / max(float(inverse[:2, :2].max()), 1e-300)))
-
-
-def make_estimator(rig: Rig) -> Estimator:
-    """The estimator of the running rig: both tracked poses, projected into the bending plane."""
-    return PlanarRigEstimator.from_rig(rig)

@@ -12,9 +12,9 @@ import numpy as np
 from host.estimation.interface import Actuation, Estimator, PoseReading
 from protocol.errors import InputError
 from protocol.rig_file import Rig
-from protocol.topics import ForceEstimate, Message, Pose, Stage
+from protocol.topics import ForceEstimate, Message, Pose, RigState, Stage
 
-DEFAULT_ESTIMATOR = "host.estimation.planar_rig:make_estimator"
+DEFAULT_ESTIMATOR = "host.estimation.rig_estimator:make_estimator"
 HISTORY_NS = 500_000_000
 PAIRED_WITHIN_NS = 5_000_000
 
@@ -50,6 +50,7 @@ class EstimationService:
         self._estimator, self._timer_ns = estimator, timer_ns
         self._stages: deque[Stage] = deque()
         self._shaft: Pose | None = None
+        self._force_direction: np.ndarray | None = None
         self._waiting: Pose | None = None
         self.answered = 0
         self.unanswered = 0
@@ -61,6 +62,9 @@ class EstimationService:
             self._stages.append(message)
             while message.stamp_ns - self._stages[0].stamp_ns > HISTORY_NS or message.stamp_ns < self._stages[0].stamp_ns:
                 self._stages.popleft()
+        elif isinstance(message, RigState):
+            direction = message.force_direction
+            self._force_direction = None if direction is None else np.array(direction)
         elif isinstance(message, Pose) and topic == "pose/shaft":
             self._shaft = message
         elif isinstance(message, Pose) and topic == "pose/tip" and not message.missing:
@@ -81,9 +85,11 @@ class EstimationService:
             return None
         return self._ask(tip, self._shaft_of(tip), actuation, now_ns)
 
-    def __call__(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
+    def __call__(
+        self, tip: Message, shaft: Message | None, stage: Message, state: Message | None = None
+    ) -> ForceEstimate | None:
         """Return the estimate for one pose at once, for lock step; the caller sets `published_ns`."""
-        for topic, message in (("stage", stage), ("pose/shaft", shaft), ("pose/tip", tip)):
+        for topic, message in (("stage", stage), ("state", state), ("pose/shaft", shaft), ("pose/tip", tip)):
             if message is not None:
                 self.receive(topic, message)
         return self.answer(tip.stamp_ns)
@@ -92,7 +98,10 @@ class EstimationService:
         if not self._stages:
             return None
         nearest = min(self._stages, key=lambda stage: abs(stage.stamp_ns - stamp_ns))
-        return _actuation(nearest) if abs(nearest.stamp_ns - stamp_ns) <= HISTORY_NS else None
+        if abs(nearest.stamp_ns - stamp_ns) > HISTORY_NS:
+            return None
+        actuation = _actuation(nearest)
+        return None if actuation is None else actuation._replace(force_direction=self._force_direction)
 
     def _shaft_of(self, tip: Pose) -> PoseReading | None:
         shaft = self._shaft
@@ -127,6 +136,9 @@ class EstimationService:
             published_ns=now_ns,
             force_N=tuple(map(float, answer.force_N)),
             covariance_N2=tuple(map(float, np.ravel(answer.covariance_N2))),
+            lasting_covariance_N2=(
+                None if answer.lasting_covariance_N2 is None else tuple(map(float, np.ravel(answer.lasting_covariance_N2)))
+            ),
             residual=answer.residual,
             compute_us=compute_us,
         )

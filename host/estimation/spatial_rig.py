@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
-from host.estimation.interface import Actuation, Estimator, PoseReading, TipForce
+from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import chi_square_limit
 from host.estimation.spatial import start_grid
-from host.estimation.spatial_rig_kernels import Found, Frame, fit
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit
 from host.mechanics.rod import finite, rod_record
 from protocol.catheter import Catheter, load_catheter
 from protocol.rig_file import Rig
@@ -84,7 +84,7 @@ class SpatialRigEstimator:
         information[:3, :3] = np.eye(3) / WEAK_FORCE_N**2
         information[3:, 3:] = np.linalg.inv(self.errors.covariance)
         joints = np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad])
-        frame = Frame(
+        frame = TrackedFrame(
             rod[:6].copy(),
             self._catheter.distal_length_m,
             joints,
@@ -108,17 +108,17 @@ class SpatialRigEstimator:
         across = np.linalg.svd(along[None, :])[2][1:]
         return np.ascontiguousarray(across / self._tangential_sd_N)
 
-    def _search(self, frame: Frame) -> tuple[bool, float, Found]:
+    def _search(self, frame: TrackedFrame) -> tuple[bool, float, FrameFit]:
         """From the last force; where that explains nothing, from none, then from a grid of forces."""
         limit = chi_square_limit(6 * len(frame.offsets), ODD_DEVIATIONS)
-        best: tuple[bool, float, Found] | None = None
+        best: tuple[bool, float, FrameFit] | None = None
         starts = [self._force]
         if self._force.any():
             starts.append(np.zeros(3))
         if self._unexplained <= 1:  # a pose that stays odd is not searched for again at every frame
             starts += list(start_grid(0.5)[RESTARTS])
         for start in starts:
-            found = _new_found(len(frame.offsets))
+            found = _new_fit(len(frame.offsets))
             found.x[:3], found.x[3:] = start, frame.prior[3:]
             settled, cost = fit(frame, LARGEST_FORCE_N, found)
             if best is None or (settled, -cost) > (best[0], -best[1]):
@@ -128,8 +128,8 @@ class SpatialRigEstimator:
         assert best is not None
         return best
 
-    def _answer(self, frame: Frame, found: Found, converged: bool, stamp_ns: int) -> TipForce:
-        covariance = np.linalg.inv(found.information)
+    def _answer(self, frame: TrackedFrame, found: FrameFit, converged: bool, stamp_ns: int) -> TipForce:
+        covariance: Array = np.linalg.inv(found.information).astype(np.float64)
         force_N = -found.force_N
         total = found.by_x @ covariance @ found.by_x.T
         # With the actuation's errors held at their estimates, the rest is the tracker's noise of this pose.
@@ -149,21 +149,14 @@ class SpatialRigEstimator:
             if self._unexplained >= CONFUSED_FRAMES:
                 self.errors.forget()
                 self._unexplained = 0
-        return TipForce(
-            force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T)
-        )
+        return TipForce(force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T))
 
 
-def _new_found(sensors: int) -> Found:
-    return Found(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((sensors, 6)))
+def _new_fit(sensors: int) -> FrameFit:
+    return FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((sensors, 6)))
 
 
-def _residual(frame: Frame, found: Found) -> float:
+def _residual(frame: TrackedFrame, found: FrameFit) -> float:
     """Largest of the sensors' residuals, dimensionless: |position error| over the exposed length, and the turn."""
     outside = frame.distal_length_m + frame.actuation[0]
     return max(math.hypot(np.linalg.norm(row[:3]) / outside, np.linalg.norm(row[3:])) for row in found.residual)
-
-
-def make_estimator(rig: Rig) -> Estimator:
-    """The spatial estimator of the running rig."""
-    return SpatialRigEstimator.from_rig(rig)

@@ -29,7 +29,7 @@ SHORTEST_m = 1e-3  # of the rod: nearer to the sheath a force has no lever
 LARGEST_DAMPING = 1e6
 
 
-class Frame(NamedTuple):
+class TrackedFrame(NamedTuple):
     """The poses of one frame of the tracker, the actuation at its time, and what is known before the poses are seen."""
 
     compliances: Array  # (6,) of shaft and body, 1/(N m2), as in a rod record
@@ -44,7 +44,7 @@ class Frame(NamedTuple):
     tangential: Array  # (2, 3) directions along the wall, base frame, over the force's standard deviation there, or (0, 3)
 
 
-class Found(NamedTuple):
+class FrameFit(NamedTuple):
     """What `fit` leaves, arrays written in place."""
 
     x: Array  # (6,) unknowns; on entry the start
@@ -55,8 +55,8 @@ class Found(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _base_rates(rod: Array, base: Array, inside: bool, u: Array) -> None:
-    """Set u (3,) = curvatures of the rod at the sheath, and the insertion's lane (3) of the base row's tangents in `base`."""
+def _base_curvatures(rod: Array, base: Array, inside: bool, u: Array) -> None:
+    """Set u (3,) = curvatures of the rod at the sheath, where `inside` says whether that is the distal shaft."""
     r1, r2, r3, n1, n2, n3 = base[0], base[1], base[2], base[3], base[4], base[5]
     first = SHAFT_1 if inside else BODY_1
     u[0] = rod[first] * (n2 * r3 - n3 * r2) + (rod[K0] if inside else 0.0)
@@ -65,7 +65,7 @@ def _base_rates(rod: Array, base: Array, inside: bool, u: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def model(f: Frame, x: Array, rows: Array, work: Array, found: Found, A: Array) -> None:
+def model(f: TrackedFrame, x: Array, rows: Array, work: Array, found: FrameFit, A: Array) -> None:
     """Residuals (found.residual), their sensitivity A (k, 6, 6) to x, and the force in the base frame, at the unknowns x.
 
     Arguments: rows (k + 1, 48) and work (672,), scratch.
@@ -81,7 +81,7 @@ def model(f: Frame, x: Array, rows: Array, work: Array, found: Found, A: Array) 
         stations[i] = min(f.offsets[i], total)
     sweep(rod, x[:3], stations, QUICK, ALL_TANGENTS, rows, work)
     base = rows[k]
-    _base_rates(rod, base, body <= 0.0, u)
+    _base_curvatures(rod, base, body <= 0.0, u)
     longer = np.empty((3, 3))  # by insertion: d rho, d n, d theta of the base
     for c in range(3):
         a, b = (c + 1) % 3, (c + 2) % 3
@@ -149,7 +149,7 @@ def _pose_tangents(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _normal_equations(f: Frame, found: Found, x: Array, A: Array, H: Array, g: Array) -> float:
+def _normal_equations(f: TrackedFrame, found: FrameFit, x: Array, A: Array, H: Array, g: Array) -> float:
     """Set H (6, 6) = information and g (6,) = slope of the weighted cost, prior included; returns the cost."""
     cost = 0.0
     for i in range(UNKNOWNS):
@@ -183,7 +183,7 @@ def _normal_equations(f: Frame, found: Found, x: Array, A: Array, H: Array, g: A
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit(f: Frame, largest_N: float, found: Found) -> tuple[bool, float]:
+def fit(f: TrackedFrame, largest_N: float, found: FrameFit) -> tuple[bool, float]:
     """Levenberg-Marquardt on the six unknowns from found.x, in place. Returns (settled, weighted cost at the answer)."""
     k = f.offsets.shape[0]
     rows, work, A = np.zeros((k + 1, ROW)), np.zeros(WORK), np.zeros((k, ROWS_OF_POSE, UNKNOWNS))

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from host.estimation.service import EstimationService, load_estimator
+from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -35,7 +35,7 @@ class DemoSettings:
     hold_s: float = 20.0
     pace: float = 1.0
     force_source: str = "sensor"
-    estimator: str = "host.estimation.planar_rig:make_estimator"
+    estimator: str = DEFAULT_ESTIMATOR
     rig_file: Path = SIMULATED_RIG
     directory: Path = Path("runs")
     effects: tuple[str, ...] = ()

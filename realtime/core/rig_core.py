@@ -205,9 +205,9 @@ class RigCore:
         self._watch_gap(tick_ns)
         self._log_new_causes(outputs, tick_ns)
         if number % telemetry.STAGE_EVERY == 0:
-            self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs))
+            self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs, self._located))
         if number % telemetry.STATE_EVERY == 0:
-            self._publish("state", telemetry.state_message(self._records["command"], outputs))
+            self._publish("state", telemetry.state_message(self._records["command"], outputs, self._located))
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self._publish("board", board_message(self.link, tick_ns))
         if number % telemetry.LOOP_EVERY == 0:
@@ -239,6 +239,11 @@ class RigCore:
             if new & _FORCE_CAUSES:
                 text += f" ({telemetry.witness_text(outputs.witness_N)})"
             self._leaving.log(tick_ns, "warning", "safety", f"{SafetyAction(action).label}: {text}")
+
+    @property
+    def _located(self) -> bool:
+        """Whether a pose of the tip has arrived."""
+        return bool(self._records["tip"].count > 0)
 
     # --- devices ---
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from protocol.enums import Phase, SafetyAction
+from protocol.enums import CommandKind, Phase, SafetyAction
 from protocol.topics import (
     HISTOGRAM_BUCKETS,
     ForceSensor,
@@ -25,8 +25,11 @@ from realtime.loop.native_loop import GAP_PLACES, LATENESS_BIN_NS, WORK_BIN_NS
 STAGE_EVERY, FORCE_EVERY, STATE_EVERY, BOARD_EVERY, LOOP_EVERY = 4, 2, 10, 50, 500
 
 
-def stage_message(params: np.record, board: np.record, outputs: np.record) -> Stage:
-    """Return handle commands, encoders (BOARD record), and the catheter's joints as the controller predicts them."""
+def stage_message(params: np.record, board: np.record, outputs: np.record, located: bool) -> Stage:
+    """Return handle commands, encoders (BOARD record), and the catheter's joints as the controller predicts them.
+
+    located: whether a pose has been accepted; without one the joints are not known.
+    """
     steps = params.stage.steps_per_unit
     encoder = np.asarray(board.encoder_counts) / steps
     known = board.count > 0
@@ -38,9 +41,9 @@ def stage_message(params: np.record, board: np.record, outputs: np.record) -> St
         encoder_insertion_m=float(encoder[0]) if known else None,
         encoder_roll_rad=float(encoder[1]) if known else None,
         encoder_knob_rad=float(encoder[2]) if known else None,
-        joint_insertion_m=float(outputs.joint[0]),
-        joint_roll_rad=float(outputs.joint[1]),
-        joint_curvature_per_m=curvature_of_knob(params.kinematics, float(outputs.joint[2])),
+        joint_insertion_m=float(outputs.joint[0]) if located else None,
+        joint_roll_rad=float(outputs.joint[1]) if located else None,
+        joint_curvature_per_m=curvature_of_knob(params.kinematics, float(outputs.joint[2])) if located else None,
     )
 
 
@@ -67,18 +70,24 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
     )
 
 
-def state_message(command: np.record, outputs: np.record) -> RigState:
-    """Return phase, safety action, messages of its causes, target (COMMAND record) and tip."""
+def state_message(command: np.record, outputs: np.record, located: bool) -> RigState:
+    """Return phase, safety action, messages of its causes, target (COMMAND record) and tip.
+
+    located: whether a pose has been accepted; without one the tip is not known.
+    """
     pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
+    # The wall of a contact stays where it is while the rig holds or retracts; a new position leaves it.
+    at_wall = command.kind in (CommandKind.CONTACT, CommandKind.HOLD, CommandKind.RETRACT) and bool(np.any(command.normal))
+    tip_m, velocity_m_per_s = outputs.tip_m, outputs.tip_velocity_m_per_s
     return RigState(
         stamp_ns=int(outputs.now_ns),
         mode=Phase(int(outputs.phase)).label,
         safety_action=SafetyAction(int(outputs.action)).label,
         cause="; ".join(safety.messages(int(outputs.cause)))[:500],
-        target_m=tuple(map(float, command.target_m)),
-        tip_m=tuple(map(float, outputs.tip_m)),
-        tip_velocity_m_per_s=tuple(map(float, outputs.tip_velocity_m_per_s)),
-        force_direction=tuple(-float(x) for x in command.normal),
+        target_m=tuple(map(float, command.target_m)) if command.kind != CommandKind.NONE else None,
+        tip_m=tuple(map(float, tip_m)) if located else None,
+        tip_velocity_m_per_s=tuple(map(float, velocity_m_per_s)) if located else None,
+        force_direction=tuple(-float(x) for x in command.normal) if at_wall else None,
         target_force_N=pressing,
         force_N=float(outputs.normal_force_N),
         pose_age_ns=max(int(outputs.pose_age_ns), 0),

@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from host.estimation import planar
+from host.estimation.actuation_errors import ActuationKnowledge
 from host.estimation.interface import Actuation, PoseReading
-from host.estimation.planar_rig import Knowledge, PlanarRigEstimator, bending_plane, make_estimator
+from host.estimation.planar_rig import ContactKnowledge, PlanarRigEstimator, bending_plane
 from host.mechanics import pcar
 from protocol.catheter import load_catheter
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 REFERENCES = json.loads((Path(__file__).parents[1] / "references" / "planar.json").read_text())
 THERMOCOOL, BLAZER = load_catheter("thermocool_sf"), load_catheter("blazer_prime_xp")
+SURE = ActuationKnowledge((1e-6, 1e-3, 0.08), (1e-6, 1e-3, 1e-3), (1e-6, 1e-3, 1e-3))
 
 
 def pose_of(arcs: pcar.Arcs, force: NDArray) -> NDArray | None:
@@ -217,7 +219,7 @@ def reading(arcs: pcar.Arcs, force: NDArray, back_m: float, roll_rad: float, noi
 
 
 def test_rig_estimator_gives_the_force_on_the_tissue_in_the_base_frame() -> None:
-    estimator = PlanarRigEstimator(BLAZER, 0.02, 0.29e-3, 0.0035, Knowledge(1e-6, 1e-3, 0.08, 10.0, 10.0, 0.05))
+    estimator = PlanarRigEstimator(BLAZER, 0.02, 0.29e-3, 0.0035, SURE, ContactKnowledge(10.0, 10.0, 0.05))
     for roll in (0.0, 1.2, -2.5):
         arcs, force = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056), np.array([-0.15, -0.02])
         tip, shaft = (reading(arcs, force, back, roll, np.zeros(3)) for back in (0.0, 0.02))
@@ -233,11 +235,10 @@ def test_rig_estimator_gives_the_force_on_the_tissue_in_the_base_frame() -> None
 def test_rig_estimator_stays_within_its_covariance_under_noise_and_play() -> None:
     rng = np.random.default_rng(11)
     rig = load_rig(SIMULATED_RIG)
-    estimator = make_estimator(rig)
-    assert isinstance(estimator, PlanarRigEstimator)
     offset = rig.tracker.shaft_sensor_offset_m
     normalized, converged = [], 0
     for _ in range(40):
+        estimator = PlanarRigEstimator.from_rig(rig)
         insertion, curvature, roll = rng.uniform(-0.075, -0.065), rng.uniform(10.0, 25.0), rng.uniform(-3.0, 3.0)
         force = np.array([-rng.uniform(0.05, 0.2), rng.normal() * 0.02])
         arcs = pcar.arcs_of(BLAZER, insertion + 0.3e-3 * rng.normal(), curvature + 0.5 * rng.normal(), 0.0028)
@@ -251,13 +252,15 @@ def test_rig_estimator_stays_within_its_covariance_under_noise_and_play() -> Non
 
 
 def test_rig_estimator_without_shaft_sensor_and_with_bad_input() -> None:
-    estimator = make_estimator(load_rig(SIMULATED_RIG))
+    estimator = PlanarRigEstimator.from_rig(load_rig(SIMULATED_RIG))
     arcs = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056)
     tip = reading(arcs, np.array([-0.1, 0.0]), 0.0, 0.3, np.zeros(3))
     alone = estimator.estimate(tip, None, Actuation(-0.07, 0.3, 18.0, 0))
     assert alone.converged and abs(alone.force_N[2] - 0.1) < 3.0 * math.sqrt(alone.covariance_N2[2, 2])
-    far = estimator.estimate(tip._replace(position_m=np.array([0.2, 0.2, 0.2])), None, Actuation(-0.07, 0.3, 18.0, 0))
-    assert not far.converged and np.isfinite(far.force_N).all() and np.isfinite(far.covariance_N2).all()
+    odd = estimator.estimate(tip._replace(position_m=np.array([0.02, 0.02, -0.02])), None, Actuation(-0.07, 0.3, 18.0, 0))
+    assert not odd.converged and np.isfinite(odd.force_N).all() and np.isfinite(odd.covariance_N2).all()
+    with pytest.raises(ValueError, match=r"pose_tip.position_m: found .*wanted a position at most 60.0 mm"):
+        estimator.estimate(tip._replace(position_m=np.array([0.2, 0.2, 5.0])), None, Actuation(-0.07, 0.3, 18.0, 0))
     for bad in (tip._replace(position_m=np.full(3, np.nan)), tip._replace(quaternion_wxyz=np.full(4, np.inf))):
         with pytest.raises(ValueError, match="found"):
             estimator.estimate(bad, None, Actuation(-0.07, 0.3, 18.0, 0))

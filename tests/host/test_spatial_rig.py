@@ -1,0 +1,172 @@
+"""The rig's spatial estimator: exact tangents, forces out of the bending plane, errors of the actuation, true covariance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
+from host.estimation.interface import Actuation, PoseReading
+from host.estimation.planar_rig import PlanarRigEstimator
+from host.estimation.rig_estimator import make_estimator
+from host.estimation.spatial_rig import SpatialRigEstimator, _new_fit
+from host.estimation.spatial_rig_kernels import TrackedFrame, model
+from host.mechanics.cosserat import solve_cosserat
+from host.mechanics.cosserat_kernels import ROW, WORK
+from host.mechanics.rod import rod_record
+from host.mechanics.rotations import quaternion_of_vector, quaternion_product
+from protocol.catheter import load_catheter
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig, parse_rig
+
+BLAZER = load_catheter("blazer_prime_xp")
+OFFSET_m, POSITION_STD_m, ANGLE_STD_rad = 0.020, 0.29e-3, 0.0035
+SURE = ActuationKnowledge((1e-6, 1e-4, 1e-5), (1e-6, 1e-4, 1e-5), (1e-6, 1e-4, 1e-5))
+UNSURE = ActuationKnowledge((0.8e-3, 0.5, 0.02), (5e-3, 0.1, 0.02), (1e-4, 0.1, 0.005))
+
+
+def poses(
+    force_N: np.ndarray, insertion_m: float, curvature_per_m: float, roll_rad: float, rng: np.random.Generator | None = None
+) -> list[PoseReading]:
+    """Poses of tip and shaft under a force (3,) on the tip in the base frame, by `solve_cosserat`; with noise if `rng`."""
+    c, s = math.cos(roll_rad), math.sin(roll_rad)
+    turned = np.array([c * force_N[0] + s * force_N[1], c * force_N[1] - s * force_N[0], force_N[2]])
+    found = solve_cosserat(BLAZER, insertion_m, curvature_per_m, turned, "base", stations_m=[0.0, OFFSET_m])
+    assert found.converged
+    about = quaternion_of_vector(np.array([0.0, 0.0, roll_rad]))
+    out = []
+    for p, q in zip(found.station_positions_m, found.station_quaternions_wxyz, strict=True):
+        position = np.array([c * p[0] - s * p[1], s * p[0] + c * p[1], p[2]])
+        quaternion = quaternion_product(about, q)
+        if rng is not None:
+            position = position + POSITION_STD_m * rng.standard_normal(3)
+            quaternion = quaternion_product(quaternion, quaternion_of_vector(ANGLE_STD_rad * rng.standard_normal(3)))
+        out.append(PoseReading(position, quaternion, 0))
+    return out
+
+
+def estimator(knowledge: ActuationKnowledge, **changes: float) -> SpatialRigEstimator:
+    return SpatialRigEstimator(BLAZER, OFFSET_m, POSITION_STD_m, ANGLE_STD_rad, knowledge, **changes)
+
+
+@pytest.mark.parametrize("insertion_m", [-0.07, 0.01])
+def test_tangents_are_those_of_difference_quotients(insertion_m: float) -> None:
+    actuation = np.array([insertion_m, 15.0, 0.7])
+    tip, shaft = poses(np.array([0.02, -0.01, -0.1]), insertion_m, 15.0, 0.7)
+    frame = TrackedFrame(
+        rod_record(BLAZER, insertion_m, 15.0)[:6].copy(),
+        BLAZER.distal_length_m,
+        actuation,
+        np.array([0.0, OFFSET_m]),
+        np.array([[*pose.position_m, *pose.quaternion_wxyz] for pose in (tip, shaft)]),
+        POSITION_STD_m,
+        ANGLE_STD_rad,
+        np.zeros(6),
+        np.eye(6),
+        np.zeros((0, 3)),
+    )
+    rows, work, A, unused = np.zeros((3, ROW)), np.zeros(WORK), np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
+    x = np.array([0.015, -0.03, -0.08, 0.4e-3, 0.6, 0.02])
+    here, steps = _new_fit(2), (1e-6, 1e-6, 1e-6, 1e-7, 1e-4, 1e-6)
+    model(frame, x, rows, work, here, A)
+    for c, step in enumerate(steps):
+        ahead, behind = _new_fit(2), _new_fit(2)
+        model(frame, x + step * np.eye(6)[c], rows, work, ahead, unused)
+        model(frame, x - step * np.eye(6)[c], rows, work, behind, unused)
+        slope = -(ahead.residual - behind.residual) / (2.0 * step)
+        if c == 5:  # the position's residual is in the frame turned by the roll: only its part at the answer is exact
+            slope, exact = slope[:, 3:], A[:, 3:, c]
+        else:
+            exact = A[:, :, c]
+        assert np.allclose(slope, exact, rtol=2e-3, atol=2e-4 * np.abs(A[:, :, c]).max())
+        by = (ahead.force_N - behind.force_N) / (2.0 * step)
+        assert np.allclose(by, here.by_x[:, c], rtol=1e-4, atol=1e-6 * np.abs(here.by_x).max())
+
+
+@pytest.mark.parametrize("roll_rad", [0.0, 1.2, -2.5])
+@pytest.mark.parametrize("force_N", [(0.0, 0.0, -0.15), (0.08, 0.0, -0.13), (-0.12, 0.05, -0.06)])
+def test_exact_poses_give_the_force_on_the_tissue_in_space(roll_rad: float, force_N: tuple[float, ...]) -> None:
+    on_tip = np.array(force_N)
+    tip, shaft = poses(on_tip, -0.07, 18.0, roll_rad)
+    for seen in (shaft, None):
+        found = estimator(SURE).estimate(tip, seen, Actuation(-0.07, roll_rad, 18.0, 0))
+        assert found.converged and found.residual < 1e-3
+        # without noise the prior of 1 N draws the weakest direction towards zero a little
+        assert np.linalg.norm(found.force_N + on_tip) < 0.08 * np.linalg.norm(on_tip)
+
+
+def test_errors_of_the_actuation_are_followed_and_stated() -> None:
+    rng, on_tip, normal = np.random.default_rng(3), np.array([0.05, 0.0, -0.12]), np.array([-0.05, 0.0, 0.12]) / 0.13
+    joints = Actuation(-0.07, 0.3, 18.0, 0, normal)
+    one = estimator(UNSURE, tangential_sd_N=0.02)
+    stated = []
+    for k in range(80):
+        tip, shaft = poses(on_tip, -0.07 + 0.6e-3, 18.0, 0.3, rng)
+        found = one.estimate(tip, shaft, joints._replace(stamp_ns=k * 25_000_000))
+        stated.append(math.sqrt(found.covariance_N2[2, 2]))
+    assert found.converged and found.lasting_covariance_N2 is not None
+    assert stated[-1] < stated[0]  # insertion is learned
+    assert one.errors.mean[0] == pytest.approx(0.6e-3, abs=3.0 * math.sqrt(one.errors.covariance[0, 0]))
+    assert one.errors.covariance[0, 0] < 0.1 * 0.8e-3**2
+    noise = found.covariance_N2 - found.lasting_covariance_N2
+    assert np.linalg.eigvalsh(noise).min() > -1e-12 and np.linalg.eigvalsh(found.lasting_covariance_N2).min() > -1e-12
+
+
+def test_the_covariance_is_true_when_the_world_is_drawn_from_what_it_states() -> None:
+    rng, sd_N, stiffness_sd, normalized, inside = np.random.default_rng(5), 0.02, 0.05, [], []
+    for _ in range(150):
+        insertion, curvature, roll = rng.uniform(-0.078, -0.065), rng.uniform(8.0, 25.0), rng.uniform(-3.0, 3.0)
+        normal = np.array([0.3 * rng.standard_normal(), 0.3 * rng.standard_normal(), 1.0])
+        normal /= np.linalg.norm(normal)
+        across = np.linalg.svd(normal[None, :])[2][1:]
+        on_tip = -rng.uniform(0.02, 0.2) * normal + sd_N * rng.standard_normal(2) @ across
+        off = rng.standard_normal(3) * UNSURE.start
+        scaled = on_tip / (1.0 + stiffness_sd * rng.standard_normal())
+        tip, shaft = poses(scaled, insertion + off[0], curvature + off[1], roll + off[2], rng)
+        one = estimator(UNSURE, stiffness_sd=stiffness_sd, tangential_sd_N=sd_N)
+        found = one.estimate(tip, shaft, Actuation(insertion, roll, curvature, 0, normal))
+        if found.converged:
+            error = found.force_N + on_tip
+            normalized.append(error @ np.linalg.solve(found.covariance_N2, error))
+            inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(found.covariance_N2)))
+    assert len(normalized) >= 145
+    assert 2.0 < np.mean(normalized) < 4.0
+    assert 0.90 <= np.mean(inside) <= 0.98
+
+
+def test_what_cannot_be_is_refused_by_both_models() -> None:
+    rig = load_rig(SIMULATED_RIG)
+    tip, shaft = poses(np.array([0.0, 0.0, -0.1]), -0.07, 18.0, 0.0)
+    joints = Actuation(-0.07, 0.0, 18.0, 0)
+    for made in (SpatialRigEstimator.from_rig(rig), PlanarRigEstimator.from_rig(rig)):
+        with pytest.raises(InputError, match=r"pose_tip.position_m: found .*, wanted a position at most"):
+            made.estimate(tip._replace(position_m=np.array([0.0, 0.0, 5.0])), shaft, joints)
+        with pytest.raises(InputError, match="pose_tip"):
+            made.estimate(tip._replace(position_m=np.full(3, np.nan)), shaft, joints)
+        with pytest.raises(InputError, match="insertion_m"):
+            made.estimate(tip, shaft, joints._replace(insertion_m=-0.2))
+        odd = made.estimate(tip._replace(position_m=np.array([0.02, 0.03, -0.01])), None, joints)
+        assert not odd.converged and np.isfinite(odd.force_N).all()
+
+
+def test_the_rig_file_chooses_the_model() -> None:
+    data = load_rig(SIMULATED_RIG).effective()
+    for name, kind in (("planar", PlanarRigEstimator), ("spatial", SpatialRigEstimator)):
+        rig = parse_rig({**data, "estimation": {**data["estimation"], "model": name}})
+        assert isinstance(make_estimator(rig), kind)
+
+
+def test_uncertainty_grows_with_travel_and_is_bounded_by_the_start() -> None:
+    errors = ActuationErrors(UNSURE)
+    errors.move_to(Actuation(-0.07, 0.0, 18.0, 0))
+    errors.learn(np.array([1e-4, 0.1, 0.0]), np.diag([1e-10, 1e-4, 1e-8]))
+    errors.move_to(Actuation(-0.06, 0.0, 18.0, 25_000_000))
+    assert errors.covariance[0, 0] == pytest.approx(1e-10 + 5e-3**2 * 0.01 + 1e-4**2 * 0.025)
+    assert errors.mean[0] == 1e-4
+    for k in range(2, 40):
+        errors.move_to(Actuation(-0.06 - 0.01 * (k % 2), 0.0, 18.0, k * 25_000_000))
+    assert math.sqrt(errors.covariance[0, 0]) == pytest.approx(0.8e-3)
+    errors.move_to(Actuation(-0.06, 0.0, 18.0, 10_000_000_000))
+    assert not errors.mean.any()  # after a gap nothing is remembered
