@@ -235,6 +235,8 @@ class EstimationSection(_Section):
     curvature_sd_per_m: Annotated[float, Field(gt=0, le=20)] = 0.5
     roll_sd_rad: Annotated[float, Field(gt=0, le=1)] = 0.02
     stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    free_force_sd_N: Annotated[float, Field(gt=0, le=10)] = 0.05
+    contact_force_sd_N: Annotated[float, Field(gt=0, le=10)] = 1.0
     tangential_force_sd_N: Annotated[float, Field(gt=0, le=1)] = 0.02
     insertion_walk_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0001
     curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.1

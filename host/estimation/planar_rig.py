@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.actuation_errors import CURVATURE, INSERTION, ROLL, ActuationErrors, ActuationKnowledge
+from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
 from host.estimation.reach import check_reach
@@ -30,16 +31,6 @@ END_N = 1e-6
 LARGEST_FORCE_STEP_N = 0.1
 FORCE_LIMIT_N = 2.0
 CHI_SQUARE_PER_FREEDOM = 12.0  # about 3.5 standard deviations throughout: beyond it no force explains the poses
-
-
-@dataclass(frozen=True)
-class ContactKnowledge:
-    """How surely the contact and the stiffness are known before the poses are seen, standard deviations."""
-
-    force_sd_N: float = 1.0  # weak: keeps an unseen direction finite
-    tangential_sd_N: float = 1.0  # across the commanded direction of the force
-    out_of_plane_sd_N: float = 0.05
-    stiffness_sd: float = 0.0  # relative
 
 
 @dataclass(frozen=True)
@@ -94,14 +85,14 @@ class PlanarRigEstimator:
     @classmethod
     def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
         """For the catheter and the tracker of a rig file. Raises InputError where the catheter is not known."""
-        tracker, known = rig.tracker, rig.estimation
+        tracker = rig.tracker
         return cls(
             load_catheter(rig.catheter.name),
             tracker.shaft_sensor_offset_m,
             tracker.position_noise_m,
             tracker.orientation_noise_rad,
             ActuationKnowledge.from_rig(rig),
-            ContactKnowledge(tangential_sd_N=known.tangential_force_sd_N, stiffness_sd=known.stiffness_sd),
+            ContactKnowledge.from_rig(rig),
         )
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
@@ -145,7 +136,7 @@ class PlanarRigEstimator:
     def _prior(self, actuation: Actuation, axes: Array) -> _Prior:
         """What is known before the poses are seen: of the force (x, y in the plane) and of the actuation's errors."""
         information = np.zeros((4, 4))
-        information[:2, :2] = np.eye(2) / self._contact.force_sd_N**2
+        information[:2, :2] = np.eye(2) / self._contact.force_sd(actuation) ** 2
         if actuation.force_direction is not None:
             along = axes.T @ np.asarray(actuation.force_direction, dtype=float)
             across = np.array([-along[1], along[0]])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
+from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import chi_square_limit
@@ -25,7 +26,6 @@ from protocol.rig_file import Rig
 Array = NDArray[np.float64]
 
 LARGEST_FORCE_N = 1.0
-WEAK_FORCE_N = 1.0  # standard deviation of the force before the poses are seen: keeps an unseen direction finite
 ODD_DEVIATIONS = 5.0  # of the chi square that no force explains
 RESTARTS = slice(0, 26)
 CONFUSED_FRAMES = 8  # so many in a row that no force explains: what was learned of the actuation is wrong
@@ -42,12 +42,11 @@ class SpatialRigEstimator:
         position_std_m: float,
         angle_std_rad: float,
         knowledge: ActuationKnowledge,
-        stiffness_sd: float = 0.0,
-        tangential_sd_N: float = WEAK_FORCE_N,
+        contact: ContactKnowledge | None = None,
     ) -> None:
         self._catheter, self._shaft_offset_m = catheter, shaft_offset_m
         self._position_std_m, self._angle_std_rad = position_std_m, angle_std_rad
-        self._stiffness_sd, self._tangential_sd_N = stiffness_sd, tangential_sd_N
+        self._contact = contact or ContactKnowledge()
         self.errors = ActuationErrors(knowledge)
         self._force = np.zeros(3)
         self._unexplained = 0
@@ -64,8 +63,7 @@ class SpatialRigEstimator:
             tracker.position_noise_m,
             tracker.orientation_noise_rad,
             ActuationKnowledge.from_rig(rig),
-            rig.estimation.stiffness_sd,
-            rig.estimation.tangential_force_sd_N,
+            ContactKnowledge.from_rig(rig),
         )
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
@@ -81,7 +79,7 @@ class SpatialRigEstimator:
         self.errors.move_to(actuation)
         prior, information = np.zeros(6), np.zeros((6, 6))
         prior[3:] = self.errors.mean
-        information[:3, :3] = np.eye(3) / WEAK_FORCE_N**2
+        information[:3, :3] = np.eye(3) / self._contact.force_sd(actuation) ** 2
         information[3:, 3:] = np.linalg.inv(self.errors.covariance)
         joints = np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad])
         frame = TrackedFrame(
@@ -106,7 +104,7 @@ class SpatialRigEstimator:
             return np.zeros((0, 3))
         along = np.asarray(actuation.force_direction, dtype=float)
         across = np.linalg.svd(along[None, :])[2][1:]
-        return np.ascontiguousarray(across / self._tangential_sd_N)
+        return np.ascontiguousarray(across / self._contact.tangential_sd_N)
 
     def _search(self, frame: TrackedFrame) -> tuple[bool, float, FrameFit]:
         """From the last force; where that explains nothing, from none, then from a grid of forces."""
@@ -135,7 +133,7 @@ class SpatialRigEstimator:
         # With the actuation's errors held at their estimates, the rest is the tracker's noise of this pose.
         by_noise = found.by_x[:, :3] @ np.linalg.inv(found.information[:3, :3]) @ found.by_x[:, :3].T
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
-        stiffness = self._stiffness_sd**2 * np.outer(force_N, force_N)
+        stiffness = self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
         lasting = total - by_noise + stiffness
         total = total + stiffness
         total *= min(1.0, UNSEEN_STD_N**2 / max(float(np.diag(total).max()), 1e-300))

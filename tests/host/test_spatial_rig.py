@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
+from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading
 from host.estimation.planar_rig import PlanarRigEstimator
 from host.estimation.rig_estimator import make_estimator
@@ -47,8 +48,8 @@ def poses(
     return out
 
 
-def estimator(knowledge: ActuationKnowledge, **changes: float) -> SpatialRigEstimator:
-    return SpatialRigEstimator(BLAZER, OFFSET_m, POSITION_STD_m, ANGLE_STD_rad, knowledge, **changes)
+def estimator(knowledge: ActuationKnowledge, **contact: float) -> SpatialRigEstimator:
+    return SpatialRigEstimator(BLAZER, OFFSET_m, POSITION_STD_m, ANGLE_STD_rad, knowledge, ContactKnowledge(**contact))
 
 
 @pytest.mark.parametrize("insertion_m", [-0.07, 0.01])

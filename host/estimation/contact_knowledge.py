@@ -1,0 +1,38 @@
+"""How surely the contact and the stiffness are known before the poses are seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from host.estimation.interface import Actuation
+from protocol.rig_file import Rig
+
+
+@dataclass(frozen=True)
+class ContactKnowledge:
+    """Standard deviations of the force and of the stiffness before the poses are seen.
+
+    Two poses hardly determine the force along the catheter while little of it is outside the sheath. There the estimate
+    stays near zero, within these standard deviations, instead of showing noise of 0.5 N.
+    """
+
+    free_sd_N: float = 1.0  # of the force while no contact is commanded
+    force_sd_N: float = 1.0  # while one is
+    tangential_sd_N: float = 1.0  # across the commanded direction of the force
+    out_of_plane_sd_N: float = 0.05  # of what the planar model does not estimate
+    stiffness_sd: float = 0.0  # relative
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> ContactKnowledge:
+        """Return what section [estimation] of the rig file states."""
+        known = rig.estimation
+        return cls(
+            free_sd_N=known.free_force_sd_N,
+            force_sd_N=known.contact_force_sd_N,
+            tangential_sd_N=known.tangential_force_sd_N,
+            stiffness_sd=known.stiffness_sd,
+        )
+
+    def force_sd(self, actuation: Actuation) -> float:
+        """Standard deviation of the force, N: whether a contact is commanded decides."""
+        return self.free_sd_N if actuation.force_direction is None else self.force_sd_N
