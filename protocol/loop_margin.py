@@ -1,13 +1,17 @@
 """Phase margins of the thesis' two loops (Figs. 6.12, 7.1), linear: gains, delays and the stiffness that is assumed.
 
-Both integrate (the actuators are moved by differences), so L(s) = (K_p + K_i/s) / s e^(-sT) for the position and
-(K_p + K_i/s) / s (K_f + K_if/s) k e^(-sT) for the force. Play and noise ask for more than a margin above zero:
-`seldinger tune` finds by simulation what rings.
+In the PI form the joints follow K_p e + K_i sum(e), so L(s) = (K_p + K_i/s) e^(-sT) for the position, times
+(K_f + K_if/s) k for the force (`pi_margin_deg`).
+
+In the incremental form both integrate (the actuators are moved by differences), so L(s) = (K_p + K_i/s) / s e^(-sT) for
+the position and (K_p + K_i/s) / s (K_f + K_if/s) k e^(-sT) for the force. Backlash and noise ask for more than a margin
+above zero: `seldinger tune` finds by simulation which gains oscillate.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 # A loop with less is taken for unstable.
 LEAST_MARGIN_deg = 20.0
@@ -49,3 +53,31 @@ def _corner(integral: float, gain: float) -> float:
     if integral <= 0.0:
         return 0.0
     return integral / gain if gain > 0.0 else math.inf
+
+
+class ProportionalIntegral(NamedTuple):
+    """One controller K_p + K_i / s: gain dimensionless, integral in 1/s."""
+
+    gain: float
+    integral_per_s: float
+
+
+def pi_margin_deg(parts: tuple[ProportionalIntegral, ...], delay_s: float) -> float:
+    """Phase margin (degrees) of the product of K_p + K_i/s with a delay (s), the PI form of the law.
+
+    The gain falls towards the product of the proportional parts. From 1 up there is no crossover: -90.
+    """
+    if math.prod(part.gain for part in parts) >= 1.0 or not all(math.isfinite(v) for part in parts for v in part):
+        return -90.0
+
+    def size(omega: float) -> float:
+        return math.prod(math.hypot(part.gain, part.integral_per_s / omega) for part in parts)
+
+    low, high = 1e-6, 1e6
+    if size(low) < 1.0:
+        return 90.0
+    for _ in range(100):
+        omega = math.sqrt(low * high)
+        low, high = (omega, high) if size(omega) > 1.0 else (low, omega)
+    lag = sum(math.atan2(part.integral_per_s, part.gain * low) for part in parts) + low * delay_s
+    return 180.0 - math.degrees(lag)

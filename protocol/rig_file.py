@@ -200,6 +200,11 @@ class ControlSection(_Section):
     reversal_threshold_m: Annotated[float, Field(ge=0, le=0.002)]
     acceleration_noise_m_per_s2: Positive
     law: Literal["thesis", "predictive"] = "predictive"
+    form: Literal["pi", "incremental"] = "pi"
+    pi_position_gain: Annotated[float, Field(ge=0, le=2)] = 0.083
+    pi_position_integral_per_s: Annotated[float, Field(ge=0, le=50)] = 0.24
+    pi_force_gain_m_per_N: Annotated[float, Field(ge=0, le=0.5)] = 0.1
+    pi_force_integral_m_per_N_s: Annotated[float, Field(ge=0, le=1)] = 0.12
     force_frame: Literal["base", "tip"] = "base"
     move_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)] = 0.03
     move_accel_m_per_s2: Annotated[float, Field(gt=0, le=2)] = 0.2
@@ -339,8 +344,10 @@ class Rig(_Section):
         c, turns_s = self.control, 1.5 / self.control.loop_hz + self.board.setpoint_lead_s
         if c.law != "thesis":
             return self
-        gains = (c.position_gain_per_s, c.position_integral_per_s2)
         late_s = self.tracker.latency_s + 0.5 / self.tracker.rate_hz + turns_s
+        if c.form == "pi":
+            return self._pi_gains_hold(late_s, turns_s)
+        gains = (c.position_gain_per_s, c.position_integral_per_s2)
         margins = {
             "position": (loop_margin.position_margin_deg(*gains, late_s), late_s),
             "force": (
@@ -356,6 +363,22 @@ class Rig(_Section):
                     f"control: found gains with a phase margin of {margin_deg:.0f} degrees in the {loop} loop "
                     f"(at {c.loop_hz} Hz, {delay_s * 1e3:.0f} ms late), wanted at least "
                     f"{loop_margin.LEAST_MARGIN_deg:.0f}: less gain, or less integral"
+                )
+        return self
+
+    def _pi_gains_hold(self, late_s: float, turns_s: float) -> Rig:
+        c = self.control
+        joint = loop_margin.ProportionalIntegral(c.pi_position_gain, c.pi_position_integral_per_s)
+        force = loop_margin.ProportionalIntegral(
+            c.pi_force_gain_m_per_N / c.tip_compliance_m_per_N, c.pi_force_integral_m_per_N_s / c.tip_compliance_m_per_N
+        )
+        for loop, parts, delay_s in (("position", (joint,), late_s), ("force", (joint, force), turns_s)):
+            margin_deg = loop_margin.pi_margin_deg(parts, delay_s)
+            if not margin_deg >= loop_margin.LEAST_MARGIN_deg:
+                raise ValueError(
+                    f"control: found gains of the PI form with a phase margin of {margin_deg:.0f} degrees in the "
+                    f"{loop} loop ({delay_s * 1e3:.0f} ms late), wanted at least {loop_margin.LEAST_MARGIN_deg:.0f}: "
+                    "less pi_* gain"
                 )
         return self
 

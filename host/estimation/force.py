@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, overload
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.estimation import planar
 from host.estimation.planar import PlanarEstimate, RecordingEstimate
+from host.estimation.reach import REACH_MARGIN_M, check_reach, out_of_reach
 from host.estimation.sensor_noise import PoseSensor, SurfacePrior
 from host.estimation.spatial import ONE_TO_ONE, SpatialEstimate, checked_case, estimate_cosserat, quieter_than_noise
 from host.estimation.spatial_batch import BatchEstimate, estimate_batch
@@ -97,10 +99,11 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
         `residual` (dimensionless), `chi_square`, `warnings`, `solutions_N` (k, 3), ...
         BatchEstimate for n samples: `force_N` (n, 3), `covariance_N2` (n, 3, 3), `converged` (n,), `residual` (n,).
         PlanarEstimate or RecordingEstimate for the planar model: `force_N` (2,) or (n, 2) in the base frame, ...
-        A pose that no force explains is no error: `converged` is False.
+        A pose that no force explains is no error: `converged` is False. So is, among n samples, a pose out of reach.
 
     Raises:
-        InputError: a value is not finite, out of its range or of a wrong shape; names the argument.
+        InputError: a value is not finite, out of its range or of a wrong shape, or a sensor is further from the sheath's
+            exit than the exposed length and 20 mm (one sample only); names the argument.
 
     Source:
         Thesis, (5.3) to (5.11) with (5.5) corrected, and chapter 4 for the planar model; weights and covariance are ours.
@@ -112,6 +115,7 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
         if case is None:
             raise InputError("case", "nothing", "1 to 6")
         if not _many(sensors):
+            _check_sensors(catheter.distal_length_m, insertion_m, sensors[: checked_case(case)])
             return estimate_cosserat(
                 catheter,
                 insertion_m,
@@ -131,12 +135,25 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
             _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
         )
         found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
+        found.converged[out_of_reach(poses.positions_m, catheter.distal_length_m + np.asarray(insertion_m))] = False
         if not ordered and case in ONE_TO_ONE:
             _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
         return found
     if model != "pcar":
         raise InputError("model", model, "cosserat or pcar")
     return _planar(catheter, insertion_m, curvature_per_m, sensors, prior, thorough, workers)
+
+
+def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[Any]) -> None:
+    """Raise InputError where the catheter cannot reach a sensor; what is no number is left to the estimator to name."""
+    for index, sensor in enumerate(sensors):
+        try:
+            exposed_m = distal_length_m + insertion_m
+            far = math.hypot(*sensor[1]) > exposed_m + REACH_MARGIN_M
+        except (TypeError, ValueError, IndexError):
+            return
+        if far and math.isfinite(exposed_m):
+            check_reach(f"sensors.{index}.position_m", sensor[1], exposed_m)
 
 
 class Poses(NamedTuple):
@@ -202,7 +219,10 @@ def _planar(
     _, position, angle = sensors[0]
     if not _many(sensors):
         arcs = arcs_of(catheter, insertion_m, curvature_per_m)
+        _check_sensors(catheter.distal_length_m, insertion_m, sensors)
         return planar.estimate(arcs, [*np.ravel(position), angle], prior=prior, thorough=thorough)
     _only_one(prior=prior, thorough=thorough or None)
     pose = np.column_stack([np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)])
-    return planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)
+    recorded = planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)
+    recorded.converged[out_of_reach(pose[:, :2], catheter.distal_length_m + np.asarray(insertion_m))] = False
+    return recorded

@@ -116,10 +116,15 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
     )
     _fill(
         p.hybrid,
+        pi_form=control.form == "pi",
         position_gain_per_s=control.position_gain_per_s,
         position_integral_per_s2=control.position_integral_per_s2,
-        force_gain_m_per_N=control.force_gain_m_per_N,
-        force_integral_m_per_N_s=control.force_integral_m_per_N_s,
+        joint_gain=control.pi_position_gain,
+        joint_integral_per_s=control.pi_position_integral_per_s,
+        force_gain_m_per_N=control.pi_force_gain_m_per_N if control.form == "pi" else control.force_gain_m_per_N,
+        force_integral_m_per_N_s=(
+            control.pi_force_integral_m_per_N_s if control.form == "pi" else control.force_integral_m_per_N_s
+        ),
         approach_speed_m_per_s=control.approach_speed_m_per_s,
         contact_force_N=control.contact_force_N,
     )

@@ -1,4 +1,11 @@
-"""External hybrid position/force control (thesis Fig. 7.1): PI loops in joint space around the inverse kinematics."""
+"""External hybrid position/force control (thesis Fig. 7.1): PI loops in joint space around the inverse kinematics.
+
+The thesis can be read in two ways, and both are here:
+- PI form (chapter 7): q = q_0 + K_p e + K_i sum(e). The force loop's displacement is added to the *desired* position,
+  as in Fig. 7.1. For the gains of the experiments, (7.6).
+- Incremental form (chapter 6 moves the joints by K_I e, 6.4.1): each tick adds K_p e + K_i sum(e) to the joints. The
+  force loop's displacement is added to the present tip. For the gains of the simulations, K_pp = 1.37.
+"""
 
 from __future__ import annotations
 
@@ -43,8 +50,9 @@ def tip_error(
 ) -> Point:
     """Return the requested displacement of the tip (m), from its position (3,) and the measured compression (N).
 
-    The selection matrix S = normal normal^T takes the normal direction from the force loop,
-    delta = K_pf e + K_if integral(e), and leaves the others to the position loop.
+    delta = K_pf e + K_if integral(e) along the normal comes from the force loop. PI form: it is added to the desired
+    position, whose distance from the tip along the normal remains (external hybrid control). Incremental form: the
+    selection matrix S = normal normal^T takes the normal direction from the position loop.
     """
     target_m, normal = aim.target_m, aim.normal
     error_m = (target_m[0] - tip_m[0], target_m[1] - tip_m[1], target_m[2] - tip_m[2])
@@ -57,7 +65,7 @@ def tip_error(
     integral = state.force_integral_N_s + error_N * period_s
     state.force_integral_N_s = min(max(integral, -_FORCE_INTEGRAL_LIMIT_N_s), _FORCE_INTEGRAL_LIMIT_N_s)
     delta_m = config.force_gain_m_per_N * error_N + config.force_integral_m_per_N_s * state.force_integral_N_s
-    change_m = -delta_m - along
+    change_m = -delta_m if config.pi_form != 0 else -delta_m - along
     return (
         error_m[0] + change_m * normal[0],
         error_m[1] + change_m * normal[1],
@@ -85,10 +93,17 @@ def apply(
     for axis in range(N_AXES):
         limit = _ERROR_LIMIT[axis]
         error = min(max(wanted[axis] - measured[axis], -limit), limit)
+        if config.pi_form != 0:
+            # K_p e + K_i sum(e) by its change from tick to tick, so that nothing winds up and no phase begins with a jump.
+            change = error - state.last_error[axis] if state.has_last != 0 else 0.0
+            state.joint[axis] += config.joint_gain * change + config.joint_integral_per_s * error * period_s
+            state.last_error[axis] = error
+            continue
         stored = limit / max(config.position_gain_per_s, 1e-9)
         state.integral[axis] = min(max(state.integral[axis] + error * period_s, -stored), stored)
         rate = config.position_gain_per_s * error + config.position_integral_per_s2 * state.integral[axis]
         state.joint[axis] += rate * period_s
+    state.has_last = 1
 
 
 @njit(cache=True)
@@ -96,4 +111,5 @@ def forget(state: HybridState) -> None:
     """Empty the integrators: the joint command stays where it is, so the change of phase has no bump."""
     for axis in range(N_AXES):
         state.integral[axis] = 0.0
+    state.has_last = 0
     state.force_integral_N_s = 0.0

@@ -248,6 +248,9 @@ class HybridParams:
     force_integral_m_per_N_s: float = real("m/(N s)", "integral gain of the force loop")
     approach_speed_m_per_s: float = real("m/s", "speed of the goal without contact")
     contact_force_N: float = real("N", "force that counts as contact")
+    pi_form: int = whole("", "1: joints follow K_p e + K_i sum(e); 0: they are moved by it (incremental form)")
+    joint_gain: float = real("", "K_p of the PI form")
+    joint_integral_per_s: float = real("1/s", "K_i of the PI form")
 
 
 class HybridState:
@@ -255,6 +258,8 @@ class HybridState:
 
     joint: Floats = real("m, rad, rad", "joint command: insertion, roll, knob", N_AXES)
     integral: Floats = real("m s, rad s", "integral of the joint error", N_AXES)
+    last_error: Floats = real("m, rad, rad", "joint error of the last tick, PI form", N_AXES)
+    has_last: int = whole("", "1 when last_error is that of the last tick")
     force_integral_N_s: float = real("N s", "integral of the force error")
     goal_m: Floats = real("m", "moving goal of the tip", 3)
     above_ns: int = whole("ns", "since when the force has been beyond its threshold; 0: it is not")

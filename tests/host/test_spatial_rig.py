@@ -9,9 +9,11 @@ import pytest
 
 from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
 from host.estimation.contact_knowledge import ContactKnowledge
+from host.estimation.force import estimate_force
 from host.estimation.interface import Actuation, PoseReading
 from host.estimation.planar_rig import PlanarRigEstimator
 from host.estimation.rig_estimator import make_estimator
+from host.estimation.spatial_batch import BatchEstimate
 from host.estimation.spatial_rig import SpatialRigEstimator, _new_fit
 from host.estimation.spatial_rig_kernels import TrackedFrame, model
 from host.mechanics.cosserat import solve_cosserat
@@ -171,3 +173,16 @@ def test_uncertainty_grows_with_travel_and_is_bounded_by_the_start() -> None:
     assert math.sqrt(errors.covariance[0, 0]) == pytest.approx(0.8e-3)
     errors.move_to(Actuation(-0.06, 0.0, 18.0, 10_000_000_000))
     assert not errors.mean.any()  # after a gap nothing is remembered
+
+
+def test_a_sensor_out_of_reach_is_bad_input_from_python_too() -> None:
+    far, q = np.array([0.0, 0.0, 5.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    wanted = r"sensors.0.position_m: found .*wanted a position at most"
+    with pytest.raises(InputError, match=wanted):
+        estimate_force(BLAZER, -0.07, 18.0, [(0.0, far, q)], case=2)
+    with pytest.raises(InputError, match=wanted):
+        estimate_force(BLAZER, -0.07, 18.0, [(0.0, far[1:], 0.0)], model="pcar")
+    tip, _ = poses(np.zeros(3), -0.07, 18.0, 0.0)
+    rows = np.array([tip.position_m, far]), np.array([tip.quaternion_wxyz, q])
+    many = estimate_force(BLAZER, -0.07, 18.0, [(0.0, *rows)], case=2)
+    assert isinstance(many, BatchEstimate) and many.converged.tolist() == [True, False]

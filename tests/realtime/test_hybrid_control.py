@@ -231,6 +231,25 @@ def test_the_selection_matrix_keeps_force_and_position_apart(
     )
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_the_pi_form_holds_the_force_with_the_gains_of_the_experiments(rig: Rig, factor: float) -> None:
+    """(7.6) at 25 ms, K_ip halved and doubled: Fig. 7.24's gains all hold 0.1 N."""
+    gains = {"law": "thesis", "form": "pi", "pi_position_integral_per_s": 0.24 * factor}
+    trace = bench(changed(rig, **gains), STILL).press(0.1, WALL_m, 14.0).since_contact()
+    late = trace.force_N[trace.time_s > 8.0]
+    assert abs(late.mean() - 0.1) < 3e-3 and late.std() < 7e-3
+
+
+def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_the_wall(rig: Rig) -> None:
+    """Fig. 7.12: the steady error falls with K_if. The desired position is 3 mm in front of the wall."""
+    error_N = []
+    for factor in (0.0, 1.0):
+        thesis = changed(rig, law="thesis", form="pi", pi_force_integral_m_per_N_s=0.12 * factor)
+        trace = bench(thesis, STILL).press(0.1, WALL_m - (0.0, 0.0, 0.003), 18.0).since_contact()
+        error_N.append(0.1 - float(trace.force_N[trace.time_s > 12.0].mean()))
+    assert error_N[0] > 0.02 and abs(error_N[1]) < 1e-3
+
+
 def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
     """Nothing of the simulator's stiffness is built in: a wall of 300 N/m instead of 1000."""
     run = bench(rig, HeartConfig())

@@ -61,14 +61,31 @@ def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, 
 )
 def test_gains_that_would_be_unstable_are_refused(gains: dict, loop: str) -> None:
     data = changed("control.law", "thesis")
+    data["control"]["form"] = "incremental"
     data["control"].update(gains)
     with pytest.raises(InputError, match=rf"^rig file: control: found gains .* in the {loop} loop .* wanted at least 20"):
         parse_rig(data)
 
 
+@pytest.mark.parametrize(
+    ("gains", "loop"),
+    [
+        ({"pi_position_gain": 1.1}, "position"),
+        ({"pi_position_integral_per_s": 50.0}, "position"),
+        ({"pi_force_gain_m_per_N": 0.5}, "force"),
+    ],
+)
+def test_gains_of_the_pi_form_that_would_be_unstable_are_refused(gains: dict, loop: str) -> None:
+    data = changed("control.law", "thesis")
+    assert parse_rig(data).control.form == "pi"
+    data["control"].update(gains)
+    with pytest.raises(InputError, match=rf"^rig file: control: found gains of the PI form .* in the {loop} loop"):
+        parse_rig(data)
+
+
 def test_gains_that_hold_at_one_rate_may_not_at_another() -> None:
     data = changed("control.law", "thesis")
-    data["control"].update(position_gain_per_s=22.0)
+    data["control"].update(form="incremental", position_gain_per_s=22.0)
     assert parse_rig(data).control.law == "thesis"
     data["control"]["loop_hz"] = 100
     with pytest.raises(InputError, match="at 100 Hz"):

@@ -58,7 +58,11 @@ def study(settings: StudySettings, progress: Progress = _quiet) -> dict[str, Any
     return result
 
 
-_LAWS: dict[str, dict[str, Any]] = {"thesis": {"law": "thesis"}, "retuned": {"law": "thesis", **RETUNED}}
+_LAWS: dict[str, dict[str, Any]] = {
+    "thesis": {"law": "thesis", "form": "pi"},
+    "incremental": {"law": "thesis", "form": "incremental"},
+    "retuned": {"law": "thesis", "form": "incremental", **RETUNED},
+}
 
 
 class _Runs:
@@ -144,7 +148,7 @@ def _prediction(runs: _Runs) -> dict[str, Any]:
 def _positions(runs: _Runs) -> dict[str, Any]:
     """The tip to random points, by the predictive law and by the thesis' integral controller."""
     noisy = with_control(runs.rig, "tracker", position_noise_m=TRACKER_NOISE_m)
-    thesis = with_control(noisy, law="thesis", position_integral_per_s2=0.0, approach_speed_m_per_s=0.02)
+    thesis = with_control(noisy, law="thesis", form="incremental", position_integral_per_s2=0.0, approach_speed_m_per_s=0.02)
     goals = control_runs.random_goals(runs.rig, runs.settings.goals, 5)
     table: dict[str, Any] = {"goals": len(goals), "tracker_noise_m": TRACKER_NOISE_m}
     for name, rig in (("predictive", noisy), ("thesis", thesis)):
