@@ -90,13 +90,17 @@ def drawn_world(rig: Rig, seed: int) -> dict[str, Any]:
     random, known, plain = np.random.default_rng([seed, 13]), rig.estimation, PlantConfig()
     stiffer = 1.0 + known.stiffness_sd * random.standard_normal()
     catheter = CATHETERS[rig.catheter.name]
-    scaled = [tuple(stiffer * value for value in values) for values in (catheter.distal_Nm2, catheter.body_Nm2)]
+    distal, body = catheter.distal_Nm2, catheter.body_Nm2
     # At the demo's 0.2 N the force along the wall has the stated standard deviation.
     tilt_rad = known.tangential_force_sd_N / 0.2 * random.standard_normal(2)
     normal = (float(tilt_rad[0]), float(tilt_rad[1]), -1.0)
     width_m = rig.transmission.insertion_backlash_m + 2.0 * rig.control.play_sd_m * random.standard_normal()
     return {
-        "catheter": replace(catheter, distal_Nm2=scaled[0], body_Nm2=scaled[1]),
+        "catheter": replace(
+            catheter,
+            distal_Nm2=(stiffer * distal[0], stiffer * distal[1], stiffer * distal[2]),
+            body_Nm2=(stiffer * body[0], stiffer * body[1], stiffer * body[2]),
+        ),
         "tissue": replace(plain.tissue, normal=normal),
         "vessel": replace(plain.vessel, play_width_m=max(width_m, 0.0)),
     }
