@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     ),
     "plan": ("host.cli.plan", "plan", "Plan a path of the tip past obstacles, from a JSON request."),
     "faults": ("host.cli.faults", "faults", "Inject faults in every phase on the simulated rig; report their detection."),
+    "run": ("host.cli.run", "run", "Run a protocol, a scripted experiment, with a report per point."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
     "stop": ("host.cli.stop", "stop", "Stop the rig over every path; say whether its own state confirms it."),
     "check-device": (

@@ -15,6 +15,8 @@ from host.recordings.rig_picture import Picture
 from host.run.commander import Acknowledgement, Commander
 from host.view.source import refusal
 from protocol.catheter import load_catheter
+from protocol.enums import JogAxis
+from protocol.jog_limits import fastest_jog
 from protocol.requests import Request, wanted_of
 from protocol.rig_file import Rig
 from protocol.topics import TOPICS, decode, key
@@ -34,11 +36,31 @@ DEPTHS = {
 }
 
 
-class ButtonPress(Request):
-    """A button pressed on the page. All but stop must have been confirmed there."""
+# Buttons that act without a second press: a jog is held, a note moves nothing.
+UNCONFIRMED = ("stop", "jog", "mark")
+# A page repeats a jog ten times a second while its button is held. One command moves for this long: without its page the
+# motion ends by itself.
+JOG_S = 0.3
 
-    button: Literal["arm", "hold", "stop", "disarm", "clear"]
+Vector3 = tuple[float, float, float]
+
+
+class ButtonPress(Request):
+    """A button pressed on the page. All but UNCONFIRMED must have been confirmed there.
+
+    axis, direction, forwards, share (of the greatest speed): of a jog. point_m, normal, force_N: of goto, touch, force.
+    """
+
+    button: Literal["arm", "hold", "stop", "disarm", "clear", "jog", "goto", "touch", "force", "retract", "zero", "mark"]
     confirmed: bool = Field(default=False)
+    axis: Literal["tip", "insertion", "roll", "knob"] = "tip"
+    direction: Vector3 | None = None
+    forwards: bool = True
+    share: float = Field(default=0.5, gt=0.0, le=1.0)
+    point_m: Vector3 | None = None
+    normal: Vector3 | None = None
+    force_N: float | None = None
+    note: str = Field(default="", max_length=500)
 
 
 class LiveRig:
@@ -92,9 +114,9 @@ class LiveRig:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "message"
             return refusal(f"{where}: found {str(first['input'])[:60]!r}, wanted {wanted_of(first)}")
-        if press.button != "stop" and not press.confirmed:
+        if press.button not in UNCONFIRMED and not press.confirmed:
             return {"action": press.button, "result": "refused", "text": "not confirmed"}
-        answer = self._command(press.button)
+        answer = self._command(press)
         text = answer.reason.removeprefix(f"{answer.result}: ")
         if press.button == "stop" and answer.accepted:
             text = "confirmed by " + ", ".join(f"{path.path} ({path.text})" for path in answer.paths if path.confirmed)
@@ -102,18 +124,50 @@ class LiveRig:
             text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}
 
-    def _command(self, button: str) -> Acknowledgement:
-        """Hold and stop need no lease. Arming takes and keeps it, until the rig is disarmed from here or the page ends."""
-        commander = self._commander
-        if button in ("hold", "stop"):
-            return commander.hold() if button == "hold" else commander.stop()
-        taken = commander.take()
-        if not taken.accepted:
-            return taken
-        answer = {"arm": commander.arm, "disarm": commander.disarm, "clear": commander.clear_fault}[button]()
-        if button != "arm" or not answer.accepted:
+    def _command(self, press: ButtonPress) -> Acknowledgement:
+        """Give the command of a button.
+
+        Hold, mark and stop need no lease. Arming and moving take and keep it, until the rig is disarmed from here or the
+        page's process ends; other commands give it back where it was not held before.
+        """
+        commander, button = self._commander, press.button
+        if button == "hold":
+            return commander.hold()
+        if button == "stop":
+            return commander.stop()
+        if button == "mark":
+            return commander.mark(press.note)
+        held = commander.lease_left_s > 0.0
+        if not held:
+            taken = commander.take()
+            if not taken.accepted:
+                return taken
+        answer = self._under_lease(press)
+        keeps = button not in ("disarm", "clear") and (held or (answer.accepted and button != "zero"))
+        if not keeps:
             commander.release()
         return answer
+
+    def _under_lease(self, press: ButtonPress) -> Acknowledgement:
+        commander = self._commander
+        if press.button == "jog":
+            speed = press.share * fastest_jog(self._rig, JogAxis[press.axis.upper()])
+            travel = speed * JOG_S * (1.0 if press.forwards else -1.0)
+            return commander.jog(press.axis, travel, speed, press.direction if press.axis == "tip" else None)
+        if press.button == "goto":
+            return commander.give("target", "position", target_m=press.point_m)
+        if press.button == "touch":
+            return commander.give("target", "contact", target_m=press.point_m, normal=press.normal, force_N=press.force_N)
+        if press.button == "force":
+            return commander.give("force", force_N=press.force_N)
+        simple = {
+            "arm": commander.arm,
+            "disarm": commander.disarm,
+            "clear": commander.clear_fault,
+            "retract": commander.retract,
+            "zero": commander.zero,
+        }
+        return simple[press.button]()
 
     def close(self) -> None:
         """Return the lease and close the commander."""

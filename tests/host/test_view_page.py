@@ -127,6 +127,7 @@ class Fake:
         self.asked: list[dict[str, Any]] = []
         self.silent_s: float | None = 0.01
         self.causes = ["contact force above the limit: retracting"]
+        self.result = "refused"
 
     def hello(self) -> dict[str, Any]:
         return {
@@ -169,7 +170,7 @@ class Fake:
 
     def act(self, text: str) -> dict[str, Any]:
         self.asked.append(json.loads(text))
-        return {"action": self.asked[-1]["button"], "result": "refused", "text": "no board"}
+        return {"action": self.asked[-1]["button"], "result": self.result, "text": "no board"}
 
 
 @pytest.mark.parametrize("size", WIDTHS, ids=lambda size: f"{size[0]}px")
@@ -192,6 +193,93 @@ def test_stop_acts_at_once_the_others_ask_and_the_answer_is_shown(browser: Any, 
         fake.silent_s = 3.0
         open_page.wait(lambda: open_page.text("#action") == "No data")
         assert "old" in open_page.text("#cause") and open_page.complaints == []
+
+
+@pytest.mark.parametrize("size", WIDTHS, ids=lambda size: f"{size[0]}px")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_jog_lasts_as_long_as_its_button_is_held(browser: Any, size: tuple[int, int], scheme: str, tmp_path: Path) -> None:
+    fake = Fake()
+    fake.causes = []
+    fake.result = "accepted"
+    with running(ViewServer(fake, port := free_port())), OpenPage(browser, port, size) as open_page:
+        page = open_page.page
+        page.emulate_media(color_scheme=scheme)
+        button = page.locator('[data-jog="-e2"]')
+        button.scroll_into_view_if_needed()
+        button.dispatch_event("pointerdown", {"button": 0, "pointerId": 1, "isPrimary": True})
+        open_page.wait(lambda: len(fake.asked) >= 3)
+        assert fake.asked[0] == {"button": "jog", "axis": "tip", "forwards": False, "share": 0.5, "direction": [0, 1, 0]}
+        page.screenshot(path=str(tmp_path / "jog.png"), full_page=True)
+        button.dispatch_event("pointerup", {"button": 0, "pointerId": 1})
+        open_page.wait(lambda: fake.asked[-1]["button"] == "hold")
+        count = len(fake.asked)
+        page.wait_for_timeout(400)
+        assert len(fake.asked) == count, "nothing is repeated after the button was let go"
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert contrast(page) >= 4.5
+
+
+def test_a_refused_jog_is_not_repeated_and_keys_jog_only_when_asked(browser: Any) -> None:
+    fake = Fake()
+    with running(ViewServer(fake, port := free_port())), OpenPage(browser, port, WIDTHS[0]) as open_page:
+        page = open_page.page
+        page.keyboard.press("ArrowUp")
+        page.check("#keys")
+        assert fake.asked == []
+        page.keyboard.down("ArrowUp")
+        open_page.wait(lambda: open_page.text("#answer") == "Jog: refused. no board")
+        count = len(fake.asked)
+        page.wait_for_timeout(400)
+        page.keyboard.up("ArrowUp")
+        assert len(fake.asked) <= count + 1 and all(item["button"] == "jog" for item in fake.asked)
+        page.keyboard.press("Escape")
+        open_page.wait(lambda: fake.asked[-1]["button"] == "stop")
+        assert open_page.complaints == []
+
+
+def test_a_typed_point_is_confirmed_and_sent_in_metres(browser: Any) -> None:
+    fake = Fake()
+    with running(ViewServer(fake, port := free_port())), OpenPage(browser, port, WIDTHS[0]) as open_page:
+        page = open_page.page
+        page.click('[data-do="goto"]')
+        assert fake.asked == [] and "number is missing" in open_page.text("#answer")
+        for field, value in (("x-mm", "0"), ("y-mm", "-10.7"), ("z-mm", "21")):
+            page.fill(f"#{field}", value)
+        page.evaluate("() => { const b = document.querySelector('[data-do=\"goto\"]'); b.click(); b.click(); }")
+        open_page.wait(lambda: len(fake.asked) == 1)
+        assert fake.asked[0]["button"] == "goto" and fake.asked[0]["point_m"] == pytest.approx([0, -0.0107, 0.021])
+        page.fill("#note", "sheath moved")
+        page.click("#mark button")
+        open_page.wait(lambda: len(fake.asked) == 2)
+        assert fake.asked[1] == {"button": "mark", "note": "sheath moved"}
+
+
+def contrast(page: Any) -> float:
+    """The least contrast (WCAG) of visible text against the card or page behind it."""
+    return float(
+        page.evaluate(
+            """() => {
+        const channel = c => { c /= 255; return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4; };
+        const parse = text => text.match(/[\\d.]+/g).map(Number);
+        const light = ([r, g, b]) => 0.2126 * channel(r) + 0.7152 * channel(g) + 0.0722 * channel(b);
+        const behind = node => {
+          for (; node; node = node.parentElement) {
+            const color = parse(getComputedStyle(node).backgroundColor);
+            if (color.length < 4 || color[3] === 1) return color;
+          }
+          return [255, 255, 255];
+        };
+        let least = 21;
+        for (const node of document.querySelectorAll("main *, header *")) {
+          const own = [...node.childNodes].some(child => child.nodeType === 3 && child.textContent.trim());
+          if (!own || !node.offsetParent || node.closest("#scene-card")) continue;
+          const front = light(parse(getComputedStyle(node).color)), back = light(behind(node));
+          least = Math.min(least, (Math.max(front, back) + 0.05) / (Math.min(front, back) + 0.05));
+        }
+        return least;
+      }"""
+        )
+    )
 
 
 def asked(open_page: OpenPage, button: str, name: str) -> str:

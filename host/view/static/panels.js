@@ -2,7 +2,7 @@
 
 const ACTIONS = {none: "No fault", warn: "Warning", hold: "Holding", retract: "Retracting", stop: "Stopped"};
 const MODES = {disarmed: "Disarmed", hold: "Holding", position: "Moving", approach: "Approach", contact: "Contact",
-  retract: "Retract", stopped: "Stopped"};
+  retract: "Retract", stopped: "Stopped", jog: "Jog"};
 const IDLE = {disarmed: "The stages do not move until the rig is armed.",
   hold: "Armed and holding."};
 

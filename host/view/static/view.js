@@ -1,6 +1,7 @@
 // The page: one web socket in, everything drawn from its frames; connects again when the server comes back.
 
 import {Controls} from "/static/controls.js";
+import {Drive} from "/static/drive.js";
 import {showBoard, showLog, showLoop, showSafety} from "/static/panels.js";
 import {Player} from "/static/player.js";
 import {Traces} from "/static/traces.js";
@@ -19,6 +20,7 @@ const send = message => {
   return true;
 };
 const controls = new Controls(element("controls"), send);
+const drive = new Drive(element("drive"), controls);
 
 function write(place, text) {
   if (place.textContent !== text) place.textContent = text;
@@ -41,7 +43,7 @@ async function begin(hello) {
   page.hello = hello;
   document.title = `seldinger ${hello.kind}: ${hello.rig}`;
   element("rig").textContent = [hello.rig, hello.catheter, hello.file].filter(Boolean).join(" · ");
-  element("controls").hidden = hello.kind !== "live";
+  element("controls").hidden = element("drive").hidden = hello.kind !== "live";
   force.lanes[0].limit = hello.over_force_N;
   if (hello.kind === "play" && !page.player) {
     page.player = new Player(hello, send);
@@ -117,13 +119,16 @@ function connect() {
   socket.addEventListener("message", event => {
     const message = JSON.parse(event.data);
     if (message.hello) ready = begin(message.hello);
-    else if (message.answer && message.answer.action !== "play") controls.answered(message.answer);
+    else if (message.answer && message.answer.action !== "play") {
+      if (!drive.answered(message.answer)) controls.answered(message.answer);
+    }
     else if (message.frame) ready.then(() => take(message.frame));
   });
   const present = () => socket.readyState === WebSocket.OPEN && socket.send('"present"');
   socket.addEventListener("open", present);
   const telling = setInterval(present, PRESENT_MS);
   socket.addEventListener("close", event => {
+    drive.release(false);
     clearInterval(telling);
     link(event.reason || "no server", "bad");
     if (event.code !== REPLACED) setTimeout(connect, RETRY_MS);

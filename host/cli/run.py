@@ -1,0 +1,119 @@
+"""`seldinger run PROTOCOL.toml`: a scripted experiment on the running rig or in the simulator, with a report."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from host.cli.contract_io import write_json
+from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, writable_folder
+from host.cli.progress import Progress
+from protocol.errors import Description, InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+
+if TYPE_CHECKING:
+    from host.run.protocol_file import DryRun, ScriptedProtocol
+    from host.run.protocol_run import Job, ProtocolResult
+
+
+def run(
+    protocol: Annotated[Path, typer.Argument(help="Protocol (TOML), see docs/protocols.md.")],
+    rig: RigFile = SIMULATED_RIG,
+    simulated: Annotated[bool, typer.Option("--simulated", help="Run it in virtual time on the simulated rig.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check it against the rig's limits; nothing moves.")] = False,
+    resume: Annotated[Path | None, typer.Option(help="Result (JSON) of an earlier run: do what is not done yet.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before it moves, nor at steps that wait.")] = False,
+    effect: Annotated[list[str] | None, typer.Option(help="With --simulated: plant an effect, as in `demo`.")] = None,
+    board: Board = "auto",
+    seed: Seed = 1,
+    directory: Folder = Path("runs"),
+    json: Json = False,
+) -> None:
+    """Run a protocol: go to points, touch, follow a line on the wall, wait. Exit status 1 if a step failed or is off."""
+    from host.report.protocol_report import write_protocol_report
+    from host.run import protocol_file, protocol_run
+
+    one_of("--board", board, BOARDS)
+    checked_seed(seed)
+    loaded = load_rig(rig)
+    steps = protocol_file.read_protocol(protocol, loaded)
+    checked = protocol_file.dry_run(steps, loaded)
+    _show(steps, checked, loaded)
+    if dry_run:
+        if json:
+            planned = {"actions": len(steps.actions), "seconds": checked.seconds}
+            write_json({"protocol": steps.file.name, "good": True, **planned})
+        return
+    earlier = () if resume is None else protocol_run.read_result(resume, steps)
+    writable_folder("--dir", directory)
+    target = resume or protocol_run.new_result_path(directory)
+    job = protocol_run.Job(steps, loaded, target, earlier)
+    try:
+        result = _carry_out(job, simulated, yes, directory, board, seed, tuple(effect or ()))
+    except RuntimeError as error:
+        print(f"seldinger: run: {error}", file=sys.stderr)
+        raise typer.Exit(1) from None
+    report = write_protocol_report(result.as_json(), target.with_suffix(".html"))
+    _tell(result, target, report)
+    if json:
+        write_json({**result.as_json(), "result": str(target), "report": str(report)})
+    if not result.good:
+        raise typer.Exit(1)
+
+
+def _carry_out(
+    job: Job, simulated: bool, yes: bool, directory: Path, board: str, seed: int, effects: tuple[str, ...]
+) -> ProtocolResult:
+    from host.run import protocol_run
+
+    with Progress() as bar:
+        if simulated:
+            from host.estimation.service import EstimationService, load_estimator
+            from host.run.demo import DemoSettings
+
+            estimator = EstimationService(load_estimator(DemoSettings().estimator, job.rig))
+            return protocol_run.run_simulated(job, directory, board, seed, effects, estimator, bar)
+        if not (yes or sys.stdin.isatty()):
+            raise InputError("--yes", Description("nothing"), "--yes without a terminal: the protocol moves the catheter")
+        if not yes:
+            typer.confirm("The catheter will move. Is a hand at the emergency stop?", abort=True, err=True)
+        return protocol_run.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Go on?", err=True), bar)
+
+
+def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
+    """Print what the protocol asks of the rig."""
+    ends = zip("xyz", 1e3 * checked.low_m, 1e3 * checked.high_m, strict=True)
+    rows = [
+        f"{steps.file.name}: {len(steps.file.steps)} steps, {len(steps.actions)} actions, about {checked.seconds:.0f} s",
+        "tip (mm): " + ", ".join(f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in ends),
+    ]
+    for axis, (name, (low, high)) in enumerate(checked.travel.items()):
+        rows.append(f"{name}: {low:.4g} to {high:.4g} of {rig.stage(axis).min_unit} to {rig.stage(axis).max_unit}")
+    if checked.forces_N:
+        rows.append(
+            f"force: {min(checked.forces_N):.3g} to {max(checked.forces_N):.3g} N, over-force at {rig.safety.over_force_N} N"
+        )
+    print("\n".join(rows), file=sys.stderr)
+
+
+def _tell(result: ProtocolResult, target: Path, report: Path) -> None:
+    """Print a line for each action, and where the files are."""
+    for item in result.results:
+        touch = item.touch
+        figures = ""
+        if touch is not None:
+            figures = (
+                f"  mean {touch.mean_force_N:.3f} N, integral {touch.force_time_integral_Ns:.2f} N s, "
+                f"loss {100 * touch.contact_loss_share:.0f} %, "
+                + ("no pose" if touch.tip_error_m is None else f"tip {1e3 * touch.tip_error_m:.2f} mm off")
+            )
+        print(f"{item.id:>6}  {item.kind:<6}{item.verdict:<17}{figures or '  ' + item.says}", file=sys.stderr)
+    if result.ended:
+        print(f"ended at {result.ended}", file=sys.stderr)
+        print(f"to go on: the same command with --resume {target}", file=sys.stderr)
+    if result.recording:
+        print(f"recording  {result.recording}", file=sys.stderr)
+    print(f"result     {target}\nreport     {report}", file=sys.stderr)
