@@ -24,6 +24,7 @@ from host.diagnosis.model.dataset import Recording, load, read_tables, thin
 from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
@@ -166,7 +167,8 @@ def diagnose(
         InputError: the recordings do not fit the nominal model's file.
         NothingToCompare: a channel that the comparison needs says nothing.
     """
-    progress("reading recordings", 0.0)
+    overall = Overall(progress)
+    overall.part(0.0, 0.02)("reading recordings", 0.0)
     budget = Budget(time_budget_s)
     data = inspected(spec, sources)
     if not data.recordings:
@@ -176,22 +178,21 @@ def diagnose(
     held = hold_between_samples(problem, [full] if full is not problem else [])
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
-        progress(cost, 0.0)
+        overall.part(0.02, 0.03)(cost, 0.0)
     candidate_effects = candidates(model.ports, problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
-    found = search(problem, candidate_effects, progress)
+    found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])
-    progress("examining the residual", 0.0)
-    rest = explain_rest(problem, found, noise_sd, progress)
-    progress("weighing what stands in their place", 0.0)
+    rest = explain_rest(problem, found, noise_sd, overall.part(0.7, 0.8))
+    overall.part(0.8, 0.85)("comparing rivals in the place of each effect", 0.0)
     standing = with_unlisted_rival(standings(problem, found, noise_sd), rest)
-    progress("intervals", 0.0)
+    overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.rest = rest
     result.findings = [*data.findings, *held, *uncertain(problem, found.best, spans)]
-    result.designs = [] if budget.spent() else design(problem, found, standing, progress)
+    result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
     piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects
     named = bool(found.best.terms) and not piled
@@ -200,6 +201,7 @@ def diagnose(
     )
     if not located and rest.sure and rest.predicted is not None:
         result.located = [_unexplained(full, found, rest.predicted.subsystem)]
+    overall.end()
     return result
 
 

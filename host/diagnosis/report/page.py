@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from host.diagnosis.model.effect import Parameter
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.pictures import pictures, shown
 from host.diagnosis.report.quantities import interval, quantity, short
-from host.diagnosis.report.verdict import words
+from host.diagnosis.report.verdict import remains, words
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
@@ -42,21 +43,22 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     segment, _, row = shown(result)
+    recordings = len(result.full.segments)
     samples = sum(p.n for p in result.full.segments)
     text = environment.get_template("diagnosis.html.j2").render(
         title=headline(result, verdict),
         eyebrow=f"Diagnosis of {result.spec.name}",
         lead=lead(result, verdict),
-        footer=f"{len(result.full.segments)} recordings, {samples} samples, {verdict['seconds']:.0f} s.",
+        footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
         lines=lines(result, verdict),
         pictures=pictures(result),
-        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
+        effects=[shown_effect(e, units_of(result), bounds_reached(result, e)) for e in verdict["effects"]],
         nominal=_nominal(result),
         candidates=candidates(result),
         located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
         scripts=[Path(path).name for path in verdict.get("scripts", ())],
         on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
-        partly=result.rest.left,
+        partly=remains(result.rest.left).replace("its power", "the power of the mismatch"),
         noises=_noises(result),
         output=result.model.outputs[row].channel.replace("_", " "),
         recording=segment.recording.name,
@@ -79,12 +81,18 @@ def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
     data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
     also = f"; data: {', '.join(data)}" if data else ""
-    also += f"; worse in {len(verdict['worse'])} held-out comparisons" if verdict["worse"] else ""
+    also += f"; {worse_words(verdict)}" if verdict["worse"] else ""
     if verdict["verdict"] == "nothing_missing":
         return "Nothing is missing: the nominal model explains these recordings" + also
     if verdict["verdict"] == "mismatch_not_identified":
         return "There is a mismatch, and no known effect accounts for it" + also
     return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]) + also
+
+
+def worse_words(verdict: dict[str, Any]) -> str:
+    """Where the held-out error grew: the first output and recording by name, and how many more."""
+    first, more = verdict["worse"][0].partition(":")[0], len(verdict["worse"]) - 1
+    return f"worse in {first.replace('_', ' ', 1)}" + (f" and {more} more" if more else "")
 
 
 def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
@@ -116,13 +124,32 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     if verdict["located"]:
         found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
     if result.found.best.terms:
-        found.append(Line("remaining mismatch", f"{100 * result.rest.left:.1f}{NBSP}%", "of the part above noise"))
+        left = 100.0 * result.rest.left
+        rms = f"of its RMS above noise ({left:.2g}{NBSP}% of its power)"
+        found.append(Line("remaining mismatch", f"{10.0 * max(left, 0.0) ** 0.5:.0f}{NBSP}%", rms))
     return found
 
 
 def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
     """Name and unit of every effect's parameters by their keys."""
     return {p.key: (p.name, p.unit) for term in result.found.best.terms for p in term.parameters}
+
+
+def bounds_reached(result: Diagnosis, effect: dict[str, Any]) -> frozenset[str]:
+    """Keys of those parameters of an effect that ended at a bound."""
+    named = (effect["id"], effect["port"])
+    terms = [t for t in result.found.best.terms if (t.candidate.effect.id, t.candidate.port.name) == named]
+    return frozenset(
+        p.key
+        for t in terms
+        for p in t.parameters
+        if p.key in effect["parameters"] and _at_bound(p, effect["parameters"][p.key]["value"])
+    )
+
+
+def _at_bound(p: Parameter, value: float) -> bool:
+    near = 1e-3 * max(abs(p.high - p.low), 1e-300) if abs(p.high - p.low) < float("inf") and not p.log else 1e-3 * abs(value)
+    return p.high > p.low and bool(value - p.low <= near or p.high - value <= near)
 
 
 def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
@@ -139,13 +166,13 @@ def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
     return "; ".join(shown[:most]) + (f"; and {len(shown) - most} more recordings" if len(shown) > most else "")
 
 
-def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
+def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]], at_bound: frozenset[str]) -> dict[str, Any]:
     """An effect with its numbers as text."""
     rows = []
     for key, p in effect["parameters"].items():
         name, unit = units.get(key, (key, ""))
         low, high = p["ci95"]
-        mark = " at its bound" if low == high or p["value"] in (low, high) else ""
+        mark = " at its bound" if key in at_bound else ""
         rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"]) + mark))
     return {
         **effect,
@@ -236,7 +263,13 @@ def candidates(result: Diagnosis) -> list[Row]:
 def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
     spans = result.intervals
     return [
-        (words(p.name), quantity(float(v), p.unit), interval(a, b, p.unit, float(v)) if p.high > p.low else "held")
+        (
+            words(p.name),
+            quantity(float(v), p.unit),
+            (interval(a, b, p.unit, float(v)) + (" at its bound" if _at_bound(p, float(v)) else ""))
+            if p.high > p.low
+            else "held",
+        )
         for p, v, (a, b) in zip(result.model.parameters, result.found.best.values, spans, strict=False)
     ]
 

@@ -207,12 +207,17 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
     white = result.figures.white_after[result.figures.primary] > NOT_WHITE
     if ranked and result.rest.sure and result.rest.left > PARTLY:
-        ranked[0]["says"] += f" This explains the mismatch only partly: {result.rest.left:.0%} of its power is left."
+        ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result.rest.left)}."
     elif ranked and not white:
         figures = result.figures
         share = figures.after[figures.primary] / max(figures.before[figures.primary], 1e-300)
         ranked[0]["says"] += f" The held-out RMS error is {share:.0%} of what it was, and not yet white noise."
     return ranked
+
+
+def remains(power: float) -> str:
+    """The mismatch above noise that remains, as power and as amplitude: 4 % of the power are 20 % of the RMS."""
+    return f"{power:.0%} of its power above noise remains, {np.sqrt(max(power, 0.0)):.0%} of its RMS"
 
 
 def _effect(
