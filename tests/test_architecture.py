@@ -50,6 +50,7 @@ DIAGNOSIS = [  # bottom up: each may import those above it in this list
     "host.diagnosis.live",
     "host.diagnosis.pipeline",
     "host.diagnosis.report",
+    "host.diagnosis.export",
     "host.diagnosis",
 ]
 for place, name in enumerate(DIAGNOSIS):

@@ -38,6 +38,10 @@ def diagnose(
         list[str] | None,
         typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as the report gives it."),
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(help="File for the extended model: .py (module) or .json (a simulator's parameters)."),
+    ] = None,
     trust: Annotated[
         bool,
         typer.Option("--trust", help="Run the code that the nominal TOML names even if another user may have written it."),
@@ -53,6 +57,10 @@ def diagnose(
         raise InputError("--nominal", "nothing", "a TOML file")
     if out is not None:
         writable_folder("--out", out)
+    if export is not None:
+        from host.diagnosis.export.write import check_target
+
+        check_target(export)
     _say_what_runs(nominal, trust)
     with Progress(quiet) as progress:
         verdict = run(
@@ -69,6 +77,8 @@ def diagnose(
         print(f"report: {report}", file=sys.stderr)
         for script in verdict.as_dict()["scripts"]:
             print(f"script: {script}", file=sys.stderr)
+    if export is not None:
+        print(f"model: {verdict.export(export)}", file=sys.stderr)
     if json:
         write_json(verdict.as_dict())
     else:

@@ -51,6 +51,24 @@ class Verdict:
 
         return dict(plain(self._content))
 
+    def export(self, path: Path | str) -> Path:
+        """Write the nominal model with the effects that were found.
+
+        Parameters:
+            path: `.py` (a module that runs without the diagnosis) or `.json` (names and values of a simulator's parameters).
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: a model that cannot be written so, or recordings in which there was nothing to compare.
+        """
+        from host.diagnosis.export.write import export
+
+        if self.diagnosis is None:
+            raise InputError("--export", "no model: there was nothing to compare", "recordings that can be compared")
+        return export(self.diagnosis, Path(path))
+
     def write(self, folder: Path | str) -> Path:
         """Write verdict.json and, if there was something to compare, report.html and the scripts of proposed experiments.
 

@@ -249,18 +249,6 @@ class MujocoSpec(SimulatorSpec):
         return {"inputs": list(given.get("actuators", {})), "outputs": list(given.get("sensors", {})), **given}
 
 
-class FmuSpec(SimulatorSpec):
-    """A functional mock-up unit for co-simulation (FMI 2.0 or 3.0). `variables`: channel -> variable where the names differ.
-
-    `initial`: state (an output, its `_rate`, or one of `states`) -> variable that is set to it before the run.
-    """
-
-    model: str
-    variables: dict[str, str] = {}
-    initial: dict[str, str] = {}
-    step_s: float | None = Field(default=None, gt=0)
-
-
 class RigSpec(Request):
     """Geometry of the catheter rig that is held; what may be refitted stands under `parameters`."""
 
@@ -288,7 +276,7 @@ class NominalSpec(Request):
     """A whole nominal TOML."""
 
     name: str
-    kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "fmu", "rig"]
+    kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "rig"]
     data: DataSpec = DataSpec()
     channels: dict[str, ChannelSpec] = {}
     parameters: dict[str, ParameterSpec] = {}
@@ -298,7 +286,6 @@ class NominalSpec(Request):
     callable: CallableSpec | None = None
     linear: LinearSpec | None = None
     mujoco: MujocoSpec | None = None
-    fmu: FmuSpec | None = None
     offer: list[OfferSpec] = []
     rig: RigSpec | None = None
     effect: list[EffectSpec] = []
@@ -328,7 +315,7 @@ class NominalSpec(Request):
     @property
     def simulator(self) -> SimulatorSpec | None:
         """The section of a kind that runs a simulator."""
-        sections = {"callable": self.callable, "linear": self.linear, "mujoco": self.mujoco, "fmu": self.fmu}
+        sections = {"callable": self.callable, "linear": self.linear, "mujoco": self.mujoco}
         return sections.get(self.kind)
 
     @property

@@ -15,13 +15,11 @@ def code_of(spec: NominalSpec) -> str:
     path = code_path(spec)
     if spec.callable is not None and isinstance(spec.callable.function, str):
         return f"the Python function {spec.callable.function} ({path or 'an installed module'})"
-    return f"the compiled code in {path}" if path is not None else ""
+    return ""
 
 
 def code_path(spec: NominalSpec) -> Path | None:
     """File of the code that `spec` runs; None for an installed module, or without code."""
-    if spec.kind == "fmu" and spec.fmu is not None:
-        return Path(spec.folder, spec.fmu.model)
     if spec.callable is not None and isinstance(spec.callable.function, str):
         path = Path(spec.folder, *spec.callable.function.partition(":")[0].split(".")).with_suffix(".py")
         return path if path.is_file() else None

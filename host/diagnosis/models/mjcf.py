@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.effect import spread
 from host.diagnosis.model.model import Segment
-from host.diagnosis.model.nominal import MujocoSpec, NominalSpec, OfferSpec
+from host.diagnosis.model.nominal import NominalSpec, OfferSpec
 from host.diagnosis.models.simulated import SimulatedModel, first_state
 from protocol.errors import Description, InputError
 
@@ -118,45 +118,71 @@ class MujocoModel(SimulatedModel):
         return names, means, sds
 
     def _joint_of(self, channel: str) -> tuple[str, int] | None:
-        import mujoco
-
-        sensor = self.readings[channel]
-        kinds = {mujoco.mjtSensor.mjSENS_JOINTPOS: "position", mujoco.mjtSensor.mjSENS_JOINTVEL: "speed"}
-        kind = kinds.get(mujoco.mjtSensor(int(self.mjcf.sensor_type[sensor])))
-        return None if kind is None else (kind, int(self.mjcf.sensor_objid[sensor]))
+        return read_joint(self.mjcf, self.readings[channel])
 
     def run(
         self, inputs: dict[str, Array], parameters: dict[str, float], time_s: Array, initial: dict[str, float]
     ) -> Mapping[str, Array]:
         """Simulate with the control held between samples; sensors are read where a step begins."""
-        import mujoco
-        from mujoco import rollout
+        put(self.mjcf, {**self.offs, **parameters})
+        return rolled(self.mjcf, (self.controls, self.readings), self.steps_s, inputs, time_s, initial)
 
-        model = self.mjcf
-        dt_s = float(np.median(np.diff(time_s)))
-        steps = max(1, int(np.ceil(dt_s / self.steps_s * (1.0 - WHOLE_STEPS))))
-        model.opt.timestep = dt_s / steps
-        data = mujoco.MjData(model)
-        for name, value in {**self.offs, **parameters}.items():
-            values, index = place(model, name)
-            values[index] = value
-        mujoco.mj_setConst(model, data)
-        mujoco.mj_resetData(model, data)
-        for name, value in initial.items():
-            channel, rate = (name, False) if name in self.readings else (name.removesuffix("_rate"), True)
-            joint = self._joint_of(channel)
-            if joint is not None:
-                speed = rate or joint[0] == "speed"
-                (data.qvel if speed else data.qpos)[(model.jnt_dofadr if speed else model.jnt_qposadr)[joint[1]]] = value
-        control = np.zeros((time_s.size, model.nu))
-        for name, signal in inputs.items():
-            control[:, self.controls[name]] = signal
-        full = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        begin = np.zeros(mujoco.mj_stateSize(model, full))
-        mujoco.mj_getState(model, data, begin, full)
-        _, read = rollout.rollout(model, data, begin[None], np.repeat(control, steps, axis=0)[None])
-        rows = read[0, ::steps]
-        return {name: np.array(rows[:, int(model.sensor_adr[at])]) for name, at in self.readings.items()}
+
+def put(model: Any, values: dict[str, float]) -> None:
+    """Set parameters of the compiled model, and what MuJoCo derives from them."""
+    import mujoco
+
+    for name, value in values.items():
+        array, index = place(model, name)
+        array[index] = value
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def read_joint(model: Any, sensor: int) -> tuple[str, int] | None:
+    """What a sensor reads of a joint (position or speed) and the joint; None for another sensor."""
+    import mujoco
+
+    kinds = {mujoco.mjtSensor.mjSENS_JOINTPOS: "position", mujoco.mjtSensor.mjSENS_JOINTVEL: "speed"}
+    kind = kinds.get(mujoco.mjtSensor(int(model.sensor_type[sensor])))
+    return None if kind is None else (kind, int(model.sensor_objid[sensor]))
+
+
+def rolled(
+    model: Any,
+    ids: tuple[dict[str, int], dict[str, int]],
+    longest_step_s: float,
+    inputs: dict[str, Array],
+    time_s: Array,
+    initial: dict[str, float],
+) -> dict[str, Array]:
+    """Sensors (n,) by channel of a run with the control held between samples.
+
+    ids: actuator of each input and sensor of each output. A sample is a whole number of steps, none longer than
+    `longest_step_s`. Sensors are read where a step begins, so that the first sample is the initial state.
+    """
+    import mujoco
+    from mujoco import rollout
+
+    controls, readings = ids
+    dt_s = float(np.median(np.diff(time_s)))
+    steps = max(1, int(np.ceil(dt_s / longest_step_s * (1.0 - WHOLE_STEPS))))
+    model.opt.timestep = dt_s / steps
+    data = mujoco.MjData(model)
+    for name, value in initial.items():
+        channel, rate = (name, False) if name in readings else (name.removesuffix("_rate"), True)
+        joint = read_joint(model, readings[channel])
+        if joint is not None:
+            speed = rate or joint[0] == "speed"
+            (data.qvel if speed else data.qpos)[(model.jnt_dofadr if speed else model.jnt_qposadr)[joint[1]]] = value
+    control = np.zeros((time_s.size, model.nu))
+    for name, signal in inputs.items():
+        control[:, controls[name]] = signal
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    begin = np.zeros(mujoco.mj_stateSize(model, full))
+    mujoco.mj_getState(model, data, begin, full)
+    _, read = rollout.rollout(model, data, begin[None], np.repeat(control, steps, axis=0)[None])
+    rows = read[0, ::steps]
+    return {name: np.array(rows[:, int(model.sensor_adr[at])]) for name, at in readings.items()}
 
 
 def offer(
@@ -188,16 +214,20 @@ def specified(path: Path, payloads: dict[str, float]) -> Any:
         model = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError) as error:
         raise InputError("mujoco.model", Description(f"{path}: {error}"), "a model file of MuJoCo (MJCF)") from None
-    plain: Any = model.copy().compile() if payloads else None
     for name, mass in payloads.items():
-        body, site = model.body(name), model.site(name)
-        if body is None and site is None:
-            raise InputError("mujoco", f"{name}.payload", f"a body or site of {path.name}")
-        parent = body if body is not None else site.parent
-        at = plain.body(name).ipos if body is not None else site.pos
-        added = parent.add_body(name=f"{name}_payload", pos=[float(x) for x in at])
+        parent, at = _carrier(path, model, name)
+        added = parent.add_body(name=f"{name}_payload", pos=at)
         added.mass, added.inertia, added.explicitinertial = mass, [PAYLOAD_INERTIA_KG_M2] * 3, True
     return model
+
+
+def _carrier(path: Path, model: Any, name: str) -> tuple[Any, list[float]]:
+    """Body that carries the payload at body or site `name`, and the place in it. Raises InputError."""
+    body, site = model.body(name), model.site(name)
+    if body is None and site is None:
+        raise InputError("mujoco", f"{name}.payload", f"a body or site of {path.name}")
+    at = model.copy().compile().body(name).ipos if body is not None else site.pos
+    return (body if body is not None else site.parent), [float(x) for x in at]
 
 
 def place(model: Any, name: str) -> tuple[Array, int]:
@@ -212,21 +242,3 @@ def place(model: Any, name: str) -> tuple[Array, int]:
             continue
         return found.reshape(-1), 0
     raise InputError("mujoco", name, "element.attribute of the model file, such as hinge.damping or forearm.mass")
-
-
-def patched(spec: MujocoSpec, folder: str, values: dict[str, float]) -> str:
-    """The model file (XML) of `spec` with the parameters `values` set, as `place` names them. Raises InputError."""
-    payloads = {name.rpartition(".")[0]: value for name, value in values.items() if name.endswith(".payload")}
-    model = specified(Path(folder, spec.model), payloads)
-    for name, value in values.items():
-        element, _, attribute = name.rpartition(".")
-        if attribute == "payload":
-            continue
-        found = next(one for one in (getattr(model, kind)(element) for kind in ELEMENTS) if hasattr(one, attribute))
-        given = getattr(found, attribute)
-        if isinstance(given, np.ndarray) and given.size:
-            given.reshape(-1)[0] = value
-        else:
-            setattr(found, attribute, value)
-    model.compile()
-    return str(model.to_xml())
