@@ -48,7 +48,7 @@ def module_of(result: Diagnosis) -> str:
     """Source text of a module that simulates the extended model of `result`. Raises InputError for a kind without one."""
     theta, active = extended(result)
     gathered = Gathered()
-    for one in (runtime.ExportedEffect, runtime.Run):
+    for one in (runtime.ExportedEffect, runtime.ExportedRun):
         gathered.add(one)
     model = result.model.inner
     law, initial = _law(model, theta, active, gathered)
@@ -84,7 +84,7 @@ SIMULATE = """
 
 def simulate(inputs, time_s, initial=None, start=None):
     \"\"\"Outputs by channel, each (n,), for inputs by channel; see the head of this file.\"\"\"
-    run = Run(inputs, time_s, start or {}, EFFECTS)
+    run = ExportedRun(inputs, time_s, start or {}, EFFECTS)
 """
 
 
@@ -110,11 +110,11 @@ def _array(values: Any) -> str:
 
 def _links(model: TransmissionModel, theta: Array, gathered: Gathered) -> str:
     gathered.add(runtime.run_links)
-    gathered.add(runtime.Link)
+    gathered.add(runtime.ExportedLink)
     rows, at = [], 0
     for name, link in zip(model.names, model.links, strict=True):
         lags = tuple(float(value) for value in theta[at + 2 : at + 2 + link.lag_order])
-        one = runtime.Link(name, link.input, link.output, float(theta[at]), float(theta[at + 1]), lags)
+        one = runtime.ExportedLink(name, link.input, link.output, float(theta[at]), float(theta[at + 1]), lags)
         rows.append(f"    {one!r},")
         at += 2 + link.lag_order
     listed = "\n".join(["LINKS = (", *rows, ")"])

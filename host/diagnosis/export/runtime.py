@@ -29,7 +29,7 @@ class ExportedEffect(NamedTuple):
     side: str
 
 
-class Run(NamedTuple):
+class ExportedRun(NamedTuple):
     """What one simulation has. inputs: channels (n,). start: port -> displacement of a memory at the first sample."""
 
     inputs: dict[str, Array]
@@ -38,7 +38,7 @@ class Run(NamedTuple):
     effects: tuple[ExportedEffect, ...]
 
 
-class Link(NamedTuple):
+class ExportedLink(NamedTuple):
     """output = gain input + offset, then lags of these time constants (s)."""
 
     port: str
@@ -54,7 +54,7 @@ def period_of(time_s: Array) -> float:
     return float(np.median(np.diff(time_s)))
 
 
-def affected(run: Run, signal: Array, port: str, side: str = "", moving: str = "") -> Array:
+def affected(run: ExportedRun, signal: Array, port: str, side: str = "", moving: str = "") -> Array:
     """`signal` (n,) after the effects at `port` (on one `side` of a gain). moving: channel whose resolution counts there."""
     here = [effect for effect in run.effects if effect.port == port and side in ("", effect.side)]
     motion = signal
@@ -71,7 +71,7 @@ def affected(run: Run, signal: Array, port: str, side: str = "", moving: str = "
     return signal
 
 
-def run_links(links: tuple[Link, ...], run: Run) -> dict[str, Array]:
+def run_links(links: tuple[ExportedLink, ...], run: ExportedRun) -> dict[str, Array]:
     """Outputs of a transmission."""
     found = {}
     for link in links:
@@ -85,7 +85,7 @@ def run_links(links: tuple[Link, ...], run: Run) -> dict[str, Array]:
 
 
 def run_axis_law(
-    names: dict[str, str], hold: str, substeps: int, linear: Array, slots: Array, begin: Array, run: Run
+    names: dict[str, str], hold: str, substeps: int, linear: Array, slots: Array, begin: Array, run: ExportedRun
 ) -> dict[str, Array]:
     """Output of an axis in free run. names: input, output, subsystem and reads. linear: mass, damping, stiffness, offset."""
     force = affected(run, run.inputs[names["input"]], f"{names['subsystem']}_drive")
@@ -99,7 +99,7 @@ def run_axis_law(
 
 
 def run_simulator(
-    simulator: Callable[[dict[str, Array]], Any], names: tuple[tuple[str, ...], ...], run: Run
+    simulator: Callable[[dict[str, Array]], Any], names: tuple[tuple[str, ...], ...], run: ExportedRun
 ) -> dict[str, Array]:
     """Outputs of a simulator with effects at its inputs and outputs. names: inputs, outputs."""
     given = {name: affected(run, run.inputs[name], name, "", name) for name in names[0]}

@@ -1,4 +1,4 @@
-"""Two effects at once, where no effect alone passes: each may show only beside the other (play and a bent curve)."""
+"""Two effects at once, where no effect alone passes: each may show only together with the other (play and a bent curve)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Progress = Callable[[str, float], None]
 def best_pair(
     problem: Problem, nominal: Fit, trials: list[Trial], noise_sd: Array, progress: Progress
 ) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
-    """The likeliest pair of refused effects of which each earns its place beside the other; None if there is none.
+    """The likeliest pair of refused effects of which each earns its place together with the other; None if there is none.
 
     trials: effects fitted alone over `nominal`, all refused. Returns the pair's fit, its gain on held-out samples and the
     starts of memory that it was found with.
