@@ -215,18 +215,20 @@ def test_a_learned_normal_is_unit_and_near_the_commanded_one(force: np.ndarray, 
     assert np.linalg.norm(normal) == pytest.approx(1.0) and normal @ commanded > 0.93
 
 
+@pytest.mark.parametrize("form", ["pi", "incremental"])
 @given(tip=vector, target=vector, force=st.floats(-1, 1))
-def test_the_selection_matrix_keeps_force_and_position_apart(
-    rig: Rig, tip: np.ndarray, target: np.ndarray, force: float
+def test_the_force_loop_acts_along_the_normal_and_the_position_loop_across(
+    rig: Rig, form: str, tip: np.ndarray, target: np.ndarray, force: float
 ) -> None:
-    """The thesis' law: across the normal only the position error, along it only the force error."""
-    config, normal = tick_parameters(rig)[0].hybrid, np.array([0.0, 0.6, -0.8])
+    """Across the normal only the position error. Along it the force loop: alone, or added to the desired position (PI)."""
+    config, normal = tick_parameters(changed(rig, law="thesis", form=form))[0].hybrid, np.array([0.0, 0.6, -0.8])
     across = np.eye(3) - np.outer(normal, normal)
     aim = hybrid.Aim(target, normal, WANTED_N, True)
     out = np.array(hybrid.tip_error(config, new(HYBRID_STATE)[0], tip, aim, force, 1e-3))
     assert across @ out == pytest.approx(across @ (target - tip), abs=1e-9)
     error = WANTED_N - force
-    assert -out @ normal == pytest.approx(
+    off_m = (target - tip) @ normal if form == "pi" else 0.0
+    assert off_m - out @ normal == pytest.approx(
         config.force_gain_m_per_N * error + config.force_integral_m_per_N_s * 1e-3 * error, abs=1e-9
     )
 
