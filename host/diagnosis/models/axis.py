@@ -29,6 +29,7 @@ from host.diagnosis.models import balance
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
+UNSEEN_S = 0.05  # scale of an initial position or speed that is not read
 
 
 @dataclass
@@ -117,9 +118,15 @@ class AxisModel(Model):
         }
         segment.inputs[f"motion:{name}"] = reads[spec.reads][0]
         begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
-        # Only a motion read as position is started again: its first speed is a derivative of noise, and its error rings on.
-        again = self.free_run and spec.controller is None and spec.reads == "position"
+        # Position and speed at the first sample are estimated: one is a derivative of noise, and its error rings on.
+        again = self.free_run and spec.controller is None
         spread = _begin_spread(motion, x, recording.dt_s, window)
+        # What is not read is found from the recording; it begins no larger than the largest reading makes it in UNSEEN_S.
+        largest = float(np.max(np.abs(x)))
+        if spec.reads == "velocity":
+            spread = np.array([largest * UNSEEN_S, spread[0]])
+        elif spec.reads == "acceleration":
+            spread = np.array([largest * UNSEEN_S**2, largest * UNSEEN_S])
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
