@@ -284,7 +284,8 @@ class SimulatedModel(Model):
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """What the diagnosis costs in simulations, from one simulation of each recording that is fitted."""
         used = [segment for segment in segments if segment.fit.any()]
-        before, spent = self.calls, self.call_s
+        self.simulate_all(used[:1], theta, [])  # compiles or loads what later runs have
+        before, spent = (self.calls, self.call_s) if len(used) > 1 else (0, 0.0)
         self.simulate_all(used, theta, [])
         each = (self.call_s - spent) / max(self.calls - before, 1)
         offers = sum(len(effect.parameters(UNSCALED, "")[0].grid) for port in self.ports for effect in port.offers)
