@@ -58,7 +58,7 @@ class Job:
         self.run.run(seconds, self._watch)
         return np.array(self.force_N[begin:])
 
-    def _estimate(self, tip: Message, shaft: Message | None, stage: Message) -> ForceEstimate | None:
+    def _estimate(self, tip: Message, shaft: Message | None, stage: Message, *_: object) -> ForceEstimate | None:
         """The force at the time of the pose, 15 mN off and 20 mN noisy."""
         near = [force for stamp_ns, force in self._past if abs(stamp_ns - tip.stamp_ns) <= 1_000_000]
         if not near:
