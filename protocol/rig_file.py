@@ -238,14 +238,14 @@ class EstimationSection(_Section):
     model: Literal["planar", "spatial"] = "spatial"
     insertion_sd_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0003
     curvature_sd_per_m: Annotated[float, Field(gt=0, le=20)] = 0.5
-    roll_sd_rad: Annotated[float, Field(gt=0, le=1)] = 0.02
+    roll_sd_rad: Annotated[float, Field(gt=0, le=1)] = 0.1
     stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
     free_force_sd_N: Annotated[float, Field(gt=0, le=10)] = 0.05
     contact_force_sd_N: Annotated[float, Field(gt=0, le=10)] = 1.0
     tangential_force_sd_N: Annotated[float, Field(gt=0, le=1)] = 0.02
     insertion_walk_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0001
     curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.1
-    roll_walk_rad: Annotated[float, Field(gt=0, le=1)] = 0.005
+    roll_walk_rad: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
 class Safety(_Section):

@@ -23,6 +23,10 @@ from host.mechanics.rotations import quaternion_of_vector, quaternion_product
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig, parse_rig
+from protocol.topics import Message
+from sim.forked_board import forkable_board
+from sim.scenario import Scenario
+from sim.world import World, simulated_plant
 
 BLAZER = load_catheter("blazer_prime_xp")
 OFFSET_m, POSITION_STD_m, ANGLE_STD_rad = 0.020, 0.29e-3, 0.0035
@@ -186,3 +190,15 @@ def test_a_sensor_out_of_reach_is_bad_input_from_python_too() -> None:
     rows = np.array([tip.position_m, far]), np.array([tip.quaternion_wxyz, q])
     many = estimate_force(BLAZER, -0.07, 18.0, [(0.0, *rows)], case=2)
     assert isinstance(many, BatchEstimate) and many.converged.tolist() == [True, False]
+
+
+def test_the_poses_of_one_frame_reach_the_estimator_together() -> None:
+    """In lock step the shaft's pose is published before the tip's, which is what asks for an estimate."""
+    rig, seen = load_rig(SIMULATED_RIG), []
+
+    def asked(tip: Message, shaft: Message | None, stage: Message, state: Message | None) -> None:
+        seen.append(None if shaft is None else tip.stamp_ns - shaft.stamp_ns)
+
+    world = World(rig, simulated_plant(rig, 1), forkable_board("native"), 1)
+    Scenario(rig, world, lambda topic, message: None, estimator=asked).run(2.0)
+    assert len(seen) > 5 and set(seen[1:]) == {0}
