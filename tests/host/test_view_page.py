@@ -296,7 +296,7 @@ def test_a_running_rig_is_armed_held_and_stopped_from_the_page(browser: Any, tmp
         fleet.wait_for_state()
         rig = load_rig(fleet.rig_file)
         with (
-            Session(rig.name, [], rig.zenoh.connect) as session,
+            Session.of_rig(rig) as session,
             closing(LiveRig(rig, session)) as live,
             running(ViewServer(live, port := free_port())),
             OpenPage(browser, port, WIDTHS[0]) as open_page,
