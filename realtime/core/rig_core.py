@@ -267,7 +267,7 @@ class RigCore:
     def _take_poses(self, samples: Sequence[PoseSample]) -> None:
         tracker = self.rig.tracker
         names = {tracker.tip_handle: "tip", tracker.shaft_handle: "shaft"}
-        # The tip's pose last in its frame: whoever answers it then has the shaft's pose of the same time.
+        # The tip's pose last in its frame: an estimator that answers it then has the shaft's pose of the same time.
         for sample in sorted(samples, key=lambda one: (one.stamp_ns, names.get(one.tool) == "tip")):
             name = names.get(sample.tool)
             if sample.missing or name is None:

@@ -72,6 +72,7 @@ def payloads(draw: st.DrawFn) -> tuple[str, bytes]:
         )
     if name == "command":
         values |= {"id": "c", "commander": "console", "action": "arm", "target": "none", "expires_ns": values["stamp_ns"]}
+        values["axis"] = "none"
     message = message_class(**values)
     try:
         return name, encode(message)

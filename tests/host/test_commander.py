@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -23,11 +23,13 @@ PATIENCE_S = 30.0
 class Gate:
     """A gate on a session of its own; what got past it."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, prove: Callable[[bytes], bytes] | None = None) -> None:
         self.done: list[Command] = []
         self.session = Session("simulated", [endpoint], [])
         self.gate = CommandGate(lambda: time.monotonic_ns() + AHEAD_NS, self.obey)
-        self.server: RequestServer = self.session.serve_requests(lambda name, payload: self.gate.answer(name, payload)[1])
+        self.server: RequestServer = self.session.serve_requests(
+            lambda name, payload: self.gate.answer(name, payload)[1], prove
+        )
 
     def obey(self, command: Command, now_ns: int) -> Reply:
         self.done.append(command)

@@ -18,6 +18,22 @@ ROOT = Path(__file__).resolve().parents[2]
 # Commands without kernels, or whose kernels are those of studies: they repeat what is warmed, or compile and say so.
 NOT_WARMED = {"bench", "check-device", "control-study", "export", "faults", "flash", "home", "install-services", "keys"}
 NOT_WARMED |= {"prove", "reproduce", "rig", "soak", "warm"}
+NOT_WARMED |= {
+    "arm",
+    "clear",
+    "disarm",
+    "force",
+    "goto",
+    "hold",
+    "jog",
+    "mark",
+    "retract",
+    "run",
+    "status",
+    "stop",
+    "touch",
+    "zero",
+}
 WARMED = {
     "solve": ("planar", "rod"),
     "estimate": ("planar", "estimates"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import seldinger as sd
+from protocol.reply_seal import ReplySeal
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import RigState
 from tests.host.test_commander import Gate
@@ -16,16 +17,17 @@ from tests.waiting import until
 
 
 @pytest.fixture
-def gate(tmp_path: Path) -> Iterator[Gate]:
-    made = Gate(f"unixsock-stream/{tmp_path}/rig.sock")
-    yield made
-    made.session.close()
+def rig_file(tmp_path: Path) -> Rig:
+    rig, endpoint = load_rig(SIMULATED_RIG), f"unixsock-stream/{tmp_path}/rig.sock"
+    return rig.model_copy(update={"zenoh": type(rig.zenoh)(folder=f"{tmp_path}/run", listen=[], connect=[endpoint])})
 
 
 @pytest.fixture
-def rig_file(tmp_path: Path) -> Rig:
-    rig = load_rig(SIMULATED_RIG)
-    return rig.model_copy(update={"zenoh": type(rig.zenoh)(listen=[], connect=[f"unixsock-stream/{tmp_path}/rig.sock"])})
+def gate(rig_file: Rig, tmp_path: Path) -> Iterator[Gate]:
+    seal = ReplySeal(rig_file.local.prepare().reply_key)
+    made = Gate(f"unixsock-stream/{tmp_path}/rig.sock", seal.prove)
+    yield made
+    made.session.close()
 
 
 def _answers(rig: sd.RigConnection) -> bool:
@@ -46,7 +48,8 @@ def test_commands_go_under_the_lease(gate: Gate, rig_file: Rig) -> None:
         rig.hold()
         rig.disarm()
         rig.clear_fault()
-        rig.stop()
+        with pytest.raises(sd.CommandRefused, match="not confirmed"):  # nothing publishes the rig's state here
+            rig.stop()
         with pytest.raises(sd.CommandRefused, match="arm: refused: arm: found no board, wanted one"):
             rig.arm()
         with pytest.raises(sd.CommandRefused, match=r"touch: .*normal"):
@@ -64,7 +67,8 @@ def test_without_the_lease_a_command_is_refused_and_stop_is_not(gate: Gate, rig_
             rig.goto([0.0, -0.02, 0.06])
         with pytest.raises(sd.CommandRefused, match="held by other"):
             rig.take()
-        rig.stop()
+        with pytest.raises(sd.CommandRefused, match="not confirmed"):  # nothing publishes the rig's state here
+            rig.stop()
     assert gate.done[-1].action == "stop"
 
 
