@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     manager.stopping()
     process.stop()
     if failed:
-        print(f"seldinger: realtime: {process.loop.error or process.failure}", file=sys.stderr)
+        print(f"seldinger: realtime: {process.error}", file=sys.stderr)
     return 1 if failed else 0
 
 

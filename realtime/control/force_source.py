@@ -17,7 +17,7 @@ _RANGE_N = 20.0
 _FROZEN = 25
 # Estimates are used no older than this on arrival, and for this long after (two frames of the tracker and a margin).
 _ESTIMATE_AGE_NS, _ESTIMATE_LIFE_NS = 150_000_000, 75_000_000
-# Sensor and estimate are compared over _DIFFERENCE estimates. They disagree when their mean square difference exceeds
+# Sensor and estimate are compared over _DIFFERENCE estimates. The difference is unusual when its mean square exceeds
 # _DISAGREE times its usual value, which is learned over _LEARN estimates, and _LEAST_N squared.
 _DIFFERENCE, _LEARN, _LEARNED, _DISAGREE, _LEAST_N = 10.0, 200.0, 30, 6.0, 0.03
 # The loop returns to the sensor when it has been good for this long.
@@ -102,7 +102,7 @@ def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats,
 def _compare(state: ForceSourceState, difference_N: float) -> None:
     off_N = difference_N - state.bias_N if state.pairs > 0 else 0.0
     state.difference_N2 += (off_N * off_N - state.difference_N2) / _DIFFERENCE
-    if disagree(state):
+    if unusual_difference(state):
         return
     state.pairs += 1
     state.bias_N += (difference_N - state.bias_N) / min(state.pairs, _LEARN)
@@ -110,8 +110,11 @@ def _compare(state: ForceSourceState, difference_N: float) -> None:
 
 
 @njit(cache=True)
-def disagree(state: ForceSourceState) -> bool:
-    """Whether sensor and estimate differ by more than usual."""
+def unusual_difference(state: ForceSourceState) -> bool:
+    """Whether sensor and estimate differ by more than usual in contact, so that the sensor is replaced.
+
+    It is relative to the learned offset and noise. `witnesses.disagree` asks whether the difference is harmful.
+    """
     return state.pairs > _LEARNED and state.difference_N2 > max(_DISAGREE * state.usual_difference_N2, _LEAST_N**2)
 
 
@@ -123,7 +126,7 @@ def _choose(params: Params, state: ForceSourceState, now_ns: int, touching: bool
         state.source = params.force_source
         return changed
     overdue = now_ns - state.arrival_ns[SOURCE_SENSOR] > params.safety.force_timeout_ns // 2
-    bad = overdue or state.equal >= _FROZEN or disagree(state)
+    bad = overdue or state.equal >= _FROZEN or unusual_difference(state)
     state.good_s = 0.0 if bad else state.good_s + params.period_s
     usable = now_ns - state.arrival_ns[SOURCE_ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
     if state.source == SOURCE_SENSOR and bad and usable:
@@ -155,7 +158,7 @@ def apply(
     Returns:
         Number of readings that were rejected.
     """
-    rejected, new = 0, -1
+    rejected = 0
     state.new[SOURCE_SENSOR] = state.new[SOURCE_ESTIMATE] = 0
     if inputs.sensor.count != state.seen[SOURCE_SENSOR]:
         state.seen[SOURCE_SENSOR] = inputs.sensor.count
@@ -164,23 +167,21 @@ def apply(
         if params.sensor_on_tip != 0:
             to_base(frame_wxyz, inputs.sensor.force_N, state.reading_N)
         if _take_sensor(state, inputs.sensor, normal):
-            new = SOURCE_SENSOR
             state.new[SOURCE_SENSOR] = 1
         else:
             rejected += 1
-    estimated = False
     if inputs.estimate.count != state.seen[SOURCE_ESTIMATE]:
         state.seen[SOURCE_ESTIMATE] = inputs.estimate.count
-        estimated = _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching)
-        state.new[SOURCE_ESTIMATE] = 1 if estimated else 0
-        if not estimated and params.force_source == SOURCE_ESTIMATE:
+        if _take_estimate(state, inputs.estimate, normal, inputs.now_ns, touching):
+            state.new[SOURCE_ESTIMATE] = 1
+        elif params.force_source == SOURCE_ESTIMATE:
             rejected += 1
     state.changed = 1 if _choose(params, state, inputs.now_ns, touching) else 0
     state.fresh = 0
-    if state.source == SOURCE_SENSOR and new == SOURCE_SENSOR:
+    if state.source == SOURCE_SENSOR and state.new[SOURCE_SENSOR] != 0:
         _set(state, inputs.sensor, state.reading_N, state.normal_N[SOURCE_SENSOR], params.force_noise_N**2)
         state.smooth_N = state.value_N
-    elif state.source == SOURCE_ESTIMATE and estimated:
+    elif state.source == SOURCE_ESTIMATE and state.new[SOURCE_ESTIMATE] != 0:
         before_ns = state.stamp_ns
         bias_N = 0.0 if params.force_source == SOURCE_ESTIMATE else state.bias_N
         _set(state, inputs.estimate, inputs.estimate.force_N, state.normal_N[SOURCE_ESTIMATE] - bias_N, state.noise_N2)

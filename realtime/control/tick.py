@@ -93,9 +93,7 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
         params, force, inputs, state.predictor.quaternion_wxyz, state.normal, touching
     )
     state.force_seen = force.seen[force.source]
-    witnesses.take_forces(
-        state.witness, force, force.new[SOURCE_SENSOR] != 0, force.new[SOURCE_ESTIMATE] != 0, params.period_s
-    )
+    witnesses.take_forces(state.witness, force, params.period_s)
     if force.fresh == 0 or state.phase != PHASE_CONTACT or params.law != LAW_PREDICTIVE:
         return
     if force.source == SOURCE_SENSOR and force.value_N > params.hybrid.contact_force_N:

@@ -60,19 +60,11 @@ def _share(dt_s: float, memory_s: float) -> float:
 
 
 @njit(cache=True)
-def take_forces(state: WitnessState, force: ForceSourceState, new_sensor: bool, new_estimate: bool, period_s: float) -> None:
-    """Take in what `force_source` has accepted in this tick.
-
-    Args:
-        state: the witnesses.
-        force: the newest readings, and the ring of the sensor's readings.
-        new_sensor: whether the sensor has a new reading.
-        new_estimate: whether there is a new estimate.
-        period_s: period of the loop (s).
-    """
-    if new_sensor:
+def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -> None:
+    """Take in what `force_source` has accepted in this tick: `force.new` says which of the readings are new."""
+    if force.new[SOURCE_SENSOR] != 0:
         state.sensor_N += _share(period_s, _SENSOR_S) * (force.normal_N[SOURCE_SENSOR] - state.sensor_N)
-    if not new_estimate:
+    if force.new[SOURCE_ESTIMATE] == 0:
         return
     dt_s = min(max((force.estimate_stamp_ns - state.estimate_ns) * 1e-9, 0.0), 0.1)
     state.estimate_ns = force.estimate_stamp_ns

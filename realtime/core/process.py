@@ -5,23 +5,23 @@ from __future__ import annotations
 import logging
 import threading
 import time
-import uuid
 from typing import Any
 
 import numpy as np
 
 from protocol.reply_seal import ReplySeal
 from protocol.rig_file import Rig
-from protocol.stop_client import CONFIRM_S, shows_stop
-from protocol.topics import Command, CommandCounts, Log, LoopTiming, Message, Reply, encode
+from protocol.topics import CommandCounts, Log, LoopTiming, Message, Reply
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import control_loop, telemetry
 from realtime.core.lines import force_config, tracker_config
 from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
-from realtime.core.stop_listener import Peer, StopListener
-from realtime.drivers.board_port import RETRY_S, BoardPort
+from realtime.core.stop_listener import StopListener
+from realtime.core.stop_path import StopPath
+from realtime.drivers.board_port import BoardPort
+from realtime.drivers.board_thread import BoardThread
 from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
 from realtime.drivers.transport import open_serial
 from realtime.loop.clock import Clock
@@ -29,9 +29,6 @@ from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.scheduling import RealtimeSettings
 
 _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command reply commander".split()
-_POLL_S = 0.005
-# A stop over the socket waits so long for the core; then it ends the loop, and the board stops the stages by itself.
-_CORE_BUSY_S = 0.05
 logger = logging.getLogger("seldinger.realtime")
 
 
@@ -56,8 +53,7 @@ class RealtimeProcess:
         open_timeout_s: float = 10.0,
     ) -> None:
         self.rig, self.clock = rig, Clock.monotonic()
-        self.failure: BaseException | None = None
-        self._stopping, self._lock, self._publish_lock = threading.Event(), threading.Lock(), threading.Lock()
+        self._lock, self._publish_lock = threading.Lock(), threading.Lock()
         self._mailboxes = input_mailboxes(INPUTS, numbered=False)
         records = {name: box.record[0] for name, box in self._mailboxes.items()}
         self.core = RigCore(rig, records, self._timing, force_source)
@@ -65,7 +61,6 @@ class RealtimeProcess:
         self._unpublished: list[tuple[str, Message]] = []
         self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s)
         self._session = Session.of_rig(rig)
-        self._stops = StopListener(paths.stop_socket, self.stop_by_socket, self.status)
         self._seal = ReplySeal(paths.reply_key)
         self._publishers = {name: self._session.publisher(name) for name in _TOPICS}
         self._estimates = self._session.latest("force/estimate")
@@ -95,7 +90,14 @@ class RealtimeProcess:
             lambda event: self._step(Arrived(device_events=[event])),
             force_port,
         )
-        self._board_thread = threading.Thread(target=self._serve_board, name="board", daemon=True)
+        self._board = BoardThread(
+            self._port,
+            self._read_board,
+            lambda why: self._step(Arrived(board_lost=why)),
+            lambda: self.log("warning", "the board's port is there again"),
+        )
+        self.stop_path = StopPath(self.core, self.loop, self._take, self.clock.now_ns)
+        self._stops = StopListener(paths.stop_socket, self.stop_path.stop, self.stop_path.status)
 
     def start(self) -> None:
         """Answer commands, compile, start the loop and all threads."""
@@ -107,7 +109,7 @@ class RealtimeProcess:
         self.loop.start()
         if self.loop.granted.warning:
             self.log("warning", self.loop.granted.warning)
-        for thread in (self._board_thread, self._tracker, self._force):
+        for thread in (self._board, self._tracker, self._force):
             thread.start()
         self.log("info", f"loop at {self.rig.control.loop_hz} Hz, disarmed")
 
@@ -121,8 +123,7 @@ class RealtimeProcess:
             finally:
                 self._lock.release()
         time.sleep(0.1)
-        self._stopping.set()
-        self._board_thread.join(1.0)
+        self._board.stop()
         self._tracker.stop()
         self._force.stop()
         self.loop.stop()
@@ -133,59 +134,16 @@ class RealtimeProcess:
     @property
     def alive(self) -> bool:
         """Whether the loop runs and no thread has failed."""
-        return self.loop.alive and self.failure is None
+        return self.loop.alive and self._board.failure is None
+
+    @property
+    def error(self) -> BaseException | None:
+        """What ended the loop or the board's thread."""
+        return self.loop.error or self._board.failure
 
     def request(self, name: str, payload: bytes) -> Reply | None:
         """Answer what commander `name` asks; called on a thread of zenoh's."""
         return self._step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
-
-    def status(self) -> dict[str, Any]:
-        """Return the rig's phase and whether the loop runs, for the stop socket."""
-        return {
-            "rig": self.rig.name,
-            "phase": self.core.phase.label,
-            "loop_runs": self.loop.alive,
-            "board_link": self.core.link.phase.value,
-        }
-
-    def stop_by_socket(self, peer: Peer) -> dict[str, Any]:
-        """Stop the rig for a program at the stop socket; return what was done and whether the rig's state shows it.
-
-        If the core does not take the command, because a thread that works in it hangs, the loop is ended: without
-        set-points the board stops the stages after its dead-man time.
-        """
-        begin_ns, before = time.monotonic_ns(), self.core.phase
-        now_ns = self.clock.now_ns()
-        try:
-            stop = Command(
-                stamp_ns=now_ns,
-                id=uuid.uuid4().hex,
-                commander=peer.commander,
-                lease="",
-                expires_ns=now_ns,
-                action="stop",
-                target="none",
-            )
-            request = CommandRequest(peer.commander, encode(stop))
-            line = Log(stamp_ns=now_ns, level="warning", source="stop socket", text=f"stop from {peer}")
-            self._take(Arrived(requests=[request], log_lines=[line]), _CORE_BUSY_S)
-            while not self._shows_stop() and time.monotonic_ns() - begin_ns < CONFIRM_S * 1e9:
-                time.sleep(0.001)
-                self._take(Arrived(), _CORE_BUSY_S)
-        except Exception as failure:  # whatever fails in the core, a stop is not lost
-            self.loop.stop()
-            busy = isinstance(failure, TimeoutError)
-            why = "the core does not answer" if busy else f"the core failed ({type(failure).__name__})"
-            text = f"{why}: the loop was ended, the board stops the stages by its dead man"
-            logger.error("stop socket: %s", text)
-            return {**self.status(), "confirmed": False, "text": text}
-        after_ms = (time.monotonic_ns() - begin_ns) * 1e-6
-        confirmed = self._shows_stop()
-        text = f"{before.label}, {self.core.phase.label} after {after_ms:.1f} ms"
-        return {**self.status(), "confirmed": confirmed, "after_ms": round(after_ms, 3), "text": text}
-
-    def _shows_stop(self) -> bool:
-        return shows_stop(self.core.phase.label, self.core.action.label)
 
     def counts(self) -> CommandCounts:
         """Return who holds the lease, and what became of the commands so far."""
@@ -232,31 +190,9 @@ class RealtimeProcess:
             if frame:
                 self.loop.send(frame + b"\0")
 
-    def _serve_board(self) -> None:
-        try:
-            while not self._stopping.is_set():
-                try:
-                    self._read_board()
-                except OSError as gone:
-                    self._find_board_again(str(gone))
-        except Exception as failure:  # `alive` turns false, and the process ends
-            self.failure = failure
-            logger.exception("the board's thread failed")
-
-    def _read_board(self) -> None:
-        data = self._port.read(_POLL_S)
+    def _read_board(self, data: bytes) -> None:
         estimate: Any = self._estimates.take()
         self._step(Arrived(board=data, estimates=[] if estimate is None else [estimate]))
-
-    def _find_board_again(self, why: str) -> None:
-        """Disarm, and wait for the port; the loop ticks on and writes to nowhere meanwhile."""
-        self._port.disconnect()
-        self._step(Arrived(board_lost=why))
-        while not self._stopping.wait(RETRY_S):
-            if self._port.reconnect():
-                self.log("warning", "the board's port is there again")
-                return
-            self._step(Arrived())
 
     def _timing(self, stamp_ns: int) -> LoopTiming:
         return telemetry.wall_clock_timing(stamp_ns, self.rig.control.loop_hz, self.loop)

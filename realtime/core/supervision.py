@@ -63,6 +63,8 @@ class StepCheck:
 class HostCheck:
     """Whether the model process answers, and in time. Nothing is found before its first answer.
 
+    `causes`, a bit set, holds the failsafe causes that stood at the last `overdue`: none, HOST_SILENT, or HOST_LOST as well.
+
     Args:
         lost_after_ns: without an answer for so long, contact ends (ns).
     """
@@ -71,6 +73,7 @@ class HostCheck:
         self._lost_after_ns = lost_after_ns
         self._answered_ns: int | None = None
         self._complaint = ""
+        self.causes = 0
 
     def answered(self, stamp_ns: int, now_ns: int) -> SupervisionFinding | None:
         """Take in an estimate for a pose of `stamp_ns` that arrived at `now_ns` (ns)."""
@@ -79,18 +82,15 @@ class HostCheck:
         limit_ms = HOST_LATE_NS * 1e-6
         return self._new(0, f"estimates are more than {limit_ms:.0f} ms old: the model process is slow" if late else "")
 
-    def causes(self, now_ns: int) -> int:
-        """Return the failsafe causes that stand at `now_ns`: none, HOST_SILENT, or HOST_LOST as well."""
-        if self._answered_ns is None or now_ns - self._answered_ns <= HOST_SILENT_NS:
-            return 0
-        return safety.HOST_SILENT | (safety.HOST_LOST if now_ns - self._answered_ns > self._lost_after_ns else 0)
-
     def overdue(self, now_ns: int) -> SupervisionFinding | None:
         """Return a finding when the last estimate is too long ago, once."""
-        causes = self.causes(now_ns)
-        if not causes:
+        late_ns = 0 if self._answered_ns is None else now_ns - self._answered_ns
+        self.causes = safety.HOST_SILENT if late_ns > HOST_SILENT_NS else 0
+        if not self.causes:
             return None
-        return self._new(causes, f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process does not answer")
+        if late_ns > self._lost_after_ns:
+            self.causes |= safety.HOST_LOST
+        return self._new(self.causes, f"no estimate for {HOST_SILENT_NS * 1e-6:.0f} ms: the model process does not answer")
 
     def _new(self, causes: int, complaint: str) -> SupervisionFinding | None:
         before, self._complaint = self._complaint, complaint
@@ -105,12 +105,12 @@ class Supervision:
 
     def __init__(self, encoder_counts_per_step: tuple[float, float, float], host_lost_after_ns: int) -> None:
         self.steps, self.host = StepCheck(encoder_counts_per_step), HostCheck(host_lost_after_ns)
-        self._lasting = self._host_causes = 0
+        self._lasting = 0
 
     @property
     def causes(self) -> int:
         """The bit set of failsafe causes that stand."""
-        return self._lasting | self._host_causes
+        return self._lasting | self.host.causes
 
     def restart(self) -> None:
         """Forget all findings; for arming and clearing, when the operator has seen what was wrong."""
@@ -132,5 +132,4 @@ class Supervision:
 
     def host_overdue(self, now_ns: int) -> SupervisionFinding | None:
         """Check at every step that estimates keep coming. Return a new finding."""
-        self._host_causes = self.host.causes(now_ns)
         return self.host.overdue(now_ns)

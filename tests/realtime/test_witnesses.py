@@ -39,7 +39,8 @@ class Witnesses:
                 force.noise_N2, force.estimate_stamp_ns = SD_N**2, inputs.now_ns - 30 * MS
                 force.sensor_then = sensor_N
                 force.arrival_ns[SOURCE_ESTIMATE] = inputs.estimate.arrival_ns = inputs.now_ns
-            witnesses.take_forces(self.state.witness, force, True, new_estimate, 1e-3)
+            force.new[SOURCE_SENSOR], force.new[SOURCE_ESTIMATE] = 1, new_estimate
+            witnesses.take_forces(self.state.witness, force, 1e-3)
             worst = max(worst, witnesses.disagree(self.state.witness, inputs, 1e-3))
         return worst
 

@@ -74,9 +74,8 @@ class RigDraw:
             heart,
         )
 
-    @property
-    def limit_N(self) -> float:
-        """Return the greatest true force that is allowed.
+    def limit_N(self, rig: Rig) -> float:
+        """Return the greatest true force (N) that is allowed with the catheter and limits of `rig`.
 
         It is PEAK_N, or what a catheter that stands still gets from this wall, if that is more: the requested force and the
         wall's whole motion times the stiffness of catheter and wall in series. A board without its link cannot move the
@@ -84,7 +83,7 @@ class RigDraw:
         """
         usual = HeartConfig()
         swing_m = 2.0 * (self.heart.beat_m + usual.respiration_m)
-        free_N_per_m = self.stiffness / load_rig(SIMULATED_RIG).control.tip_compliance_m_per_N
+        free_N_per_m = self.stiffness / rig.control.tip_compliance_m_per_N
         in_series_N_per_m = 1.0 / (1.0 / free_N_per_m + 1.0 / self.wall_N_per_m)
         return max(PEAK_N, JOB.force_N + in_series_N_per_m * swing_m)
 
@@ -204,6 +203,7 @@ def run_on_rig(plans: list[RunPlan], seed: int, board_kind: str) -> Iterator[Run
     rig, number = load_rig(SIMULATED_RIG), plans[0].rig
     rig_seed = int(np.random.default_rng((seed, 1_000_000 + number)).integers(2**31))
     drawn = RigDraw.of(seed, number)
+    limit_N = drawn.limit_N(rig)
     with forkable_board(board_kind) as board:
         world = World(rig, drawn.plant(rig, rig_seed), board, rig_seed)
         service = EstimationService(load_estimator(DEFAULT_ESTIMATOR, rig))
@@ -217,7 +217,7 @@ def run_on_rig(plans: list[RunPlan], seed: int, board_kind: str) -> Iterator[Run
                 )
             for plan in plans:
                 if plan.phase == phase:
-                    yield _forked(run, board, plan, drawn.limit_N) if reached else RunResult(plan, {}, True, 0.0, "", ())
+                    yield _forked(run, board, plan, limit_N) if reached else RunResult(plan, {}, True, 0.0, "", ())
 
 
 def _nothing(topic: str, message: Message) -> None:
