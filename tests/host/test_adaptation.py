@@ -46,6 +46,7 @@ def median(error: NDArray) -> float:
     return float(np.median(np.hypot(*error.T)))
 
 
+@pytest.mark.slow
 def test_ten_percent_drift_costs_the_force_little_with_adaptation() -> None:
     without, with_it, states = run(lambda t: 1.0 - 0.1 * min(1.0, t / 40.0))
     undisturbed, _, _ = run(lambda t: 1.0)

@@ -114,6 +114,7 @@ def take_in(
         encode(answer)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(arrived=st.lists(payloads(), min_size=1, max_size=6), recorded_ns=st.integers(0, 2**62))
 def test_recorder_picture_and_estimator_go_on(
@@ -125,6 +126,7 @@ def test_recorder_picture_and_estimator_go_on(
     assert not readers[0].failure
 
 
+@pytest.mark.slow
 @settings(
     max_examples=6,
     deadline=None,

@@ -144,6 +144,7 @@ def test_without_go_nothing_is_commanded(tmp_path: Path, capsys: pytest.CaptureF
         experiment(tmp_path / "s.toml", go=True, simulated=True)
 
 
+@pytest.mark.slow
 def test_the_simulated_rig_goes_where_the_script_says(tmp_path: Path) -> None:
     recording = RecordingFile(run_simulated(Script(**FREE), RIG, tmp_path, "native", 1, ()))
     tip = recording.table("pose/tip")

@@ -274,6 +274,7 @@ def test_cubic_stiffening_bends_less_and_stays_an_equilibrium() -> None:
     assert np.abs(pcar.static_residual(stiff, b.curvature_per_m, force)).max() < 1e-16
 
 
+@pytest.mark.slow
 def test_puncture_at_the_free_point_needs_no_reaction() -> None:
     arcs = pcar.arcs_of(THERMOCOOL, 0.0485, 15.7)
     force = [0.03, -0.12]

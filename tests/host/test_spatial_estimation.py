@@ -75,6 +75,7 @@ def test_the_soft_catheter_of_the_thesis_too(case: int) -> None:
             assert found.converged and np.abs(found.force_N - force).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_soft_catheter_pulled_hard_is_found_on_its_branch() -> None:
     """0.3 N on the softest catheter: the tip-frame force is too sensitive to search for, the base-frame force is not."""
     found = posed(LIVEWIRE, 20.0, np.array([0.1, -0.05, 0.28]), insertion=0.04)
@@ -340,6 +341,7 @@ def recording(count: int) -> tuple[Array, Array, Array, Array]:
     return np.array(curvature), np.array(force), np.array(positions), np.array(quaternions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [1, 2, 3, 4, 5, 6])
 def test_tracker_and_batch_follow_a_recording(case: int) -> None:
     curvature, force, positions, quaternions = recording(40)

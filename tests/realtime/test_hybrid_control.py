@@ -242,6 +242,7 @@ def test_the_pi_form_holds_the_force_with_the_gains_of_the_experiments(rig: Rig,
     assert abs(late.mean() - 0.1) < 3e-3 and late.std() < 7e-3
 
 
+@pytest.mark.slow
 def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_the_wall(rig: Rig) -> None:
     """Fig. 7.12: the steady error falls with K_if. The desired position is 3 mm in front of the wall."""
     error_N = []
@@ -252,6 +253,7 @@ def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_
     assert error_N[0] > 0.02 and abs(error_N[1]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
     """Nothing of the simulator's stiffness is built in: a wall of 300 N/m instead of 1000."""
     run = bench(rig, HeartConfig())

@@ -319,6 +319,7 @@ def test_records_that_do_not_fit_are_refused() -> None:
         make()[0].send(b"x" * 65)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(config.DISABLE_JIT), reason="nothing is compiled with NUMBA_DISABLE_JIT=1")
 def test_the_compiled_loop_calls_neither_the_interpreter_nor_an_allocator(tmp_path: Path) -> None:
     script = Path(__file__).with_name("list_compiled_calls.py")

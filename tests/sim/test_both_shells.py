@@ -153,6 +153,7 @@ def eventful(run: Recorded) -> None:
     run.run(0.6)
 
 
+@pytest.mark.slow
 def test_the_wall_clock_shell_says_and_does_what_the_lock_step_says_and_does(shell: RealtimeProcess) -> None:
     with LibraryBoard() as board:
         run = Recorded(board)

@@ -73,6 +73,7 @@ def test_a_rig_without_effects_is_the_nominal_one(closed: bool) -> None:
     assert session.time_s[1][0] > session.time_s[0][-1] + 3.0  # one clock through the session
 
 
+@pytest.mark.slow
 def test_feedback_hides_a_standing_effect() -> None:
     case = concealed_rig.draw(np.random.default_rng(4), True)
     shift = [
@@ -173,6 +174,7 @@ def test_a_case_has_the_size_it_was_to_have(kind: str, category: str, tmp_path: 
     assert set(label["noise_rms_heldout"]) == set(label["mismatch_rms_heldout"])
 
 
+@pytest.mark.slow
 def test_a_rig_case_from_seed_to_files(tmp_path: Path) -> None:
     label = concealed.make(plan("single", "rig", 3, 1.0, closed=True), tmp_path)
     assert 0.75 < label["rho"] < 1.33

@@ -101,6 +101,7 @@ def test_help_names_every_option() -> None:
         assert word in text
 
 
+@pytest.mark.slow
 def test_progress_goes_to_standard_error(tmp_path: Path) -> None:
     nominal, files = planted.transmission(tmp_path, "none", 0)
     code = (

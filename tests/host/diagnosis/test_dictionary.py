@@ -38,6 +38,7 @@ def test_a_product_of_channels_is_read_off(tmp_path: Path) -> None:
     assert place.forms[0][1] == pytest.approx(0.15, rel=0.1)  # at the input, before the gain
 
 
+@pytest.mark.slow
 def test_micrometres_that_only_the_force_shows_are_seen(tmp_path: Path) -> None:
     problem, fit = fitted(rig_cases.write(tmp_path, rig_cases.Truth(), 0, duration_s=12.0))
     assert not any(place.sure for place in places(problem, fit))

@@ -108,6 +108,7 @@ def test_a_module_equals_the_simulation(tmp_path: Path, kind: str, keys: tuple[s
     assert float(np.max(np.abs(out["y"] - exact))) <= 1e-9 * float(np.max(np.abs(exact)))
 
 
+@pytest.mark.slow
 def test_a_module_imports_nothing_of_the_project(tmp_path: Path) -> None:
     (tmp_path / "extended.py").write_text(module_of(case(tmp_path, "axis", ("coulomb_friction@axis",))))
     probe = (

@@ -18,6 +18,7 @@ def _play_and_delay(number: int) -> dict[str, Any]:
     return {**columns, "load": np.interp(columns["t"] - 0.08, columns["t"], columns["load"])}
 
 
+@pytest.mark.slow
 def test_a_pair_is_found_where_every_single_effect_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     found = search.good_enough
     monkeypatch.setattr(search, "good_enough", lambda trial, base: bool(base.terms) and found(trial, base))

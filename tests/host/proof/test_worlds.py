@@ -57,6 +57,7 @@ def test_operators_do_what_their_names_say() -> None:
     assert np.max(np.abs(op.maxwell_slip(x, 0.05))) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_pressed_rod_agrees_with_the_nominal_rod_under_its_own_force() -> None:
     p = np.array([-0.065, 0.95, 29.0, 8e-4, nominal_rod.TORSION_TO_BENDING, nominal_rod.DISTAL_M])
     n = 40
