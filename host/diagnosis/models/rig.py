@@ -14,7 +14,17 @@ from host.diagnosis.model.effect import Candidate, Context, Parameter, Port
 from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, tolerance_of
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.model.operators import calm, fill
-from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, drag_along, matrices, rotation_logs, shapes
+from host.diagnosis.models.rig_kernel import (
+    Handle,
+    Loads,
+    ShaftBuild,
+    Wall,
+    contact,
+    drag_along,
+    matrices,
+    rotation_logs,
+    shapes,
+)
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -324,21 +334,15 @@ class RigModel(Model):
             while len(kept) > 1:
                 kept.pop(next(iter(kept)))
             kept[key] = shapes(
-                state["insertion"],
-                state["roll"],
-                state["kappa"],
-                -state["push"],
-                state["extra"],
-                state["load"],
-                state["point"],
-                state["point_at"],
-                state["flex"],
-                1.0 / self.spec.torsion_to_bending,
-                self.spec.distal_length_m,
-                self.spec.shaft_sensor_offset_m,
+                Handle(state["insertion"], state["roll"], state["kappa"]),
+                Loads(-state["push"], state["extra"], state["load"], state["point"], state["point_at"]),
+                ShaftBuild(
+                    state["flex"],
+                    1.0 / self.spec.torsion_to_bending,
+                    self.spec.distal_length_m,
+                    self.spec.shaft_sensor_offset_m,
+                ),
                 self.normal,
-                NODES,
-                WEIGHTS,
             )
         return kept[key]
 
@@ -396,20 +400,7 @@ class RigModel(Model):
 
 def _pressed(law: dict[str, Any], soft: Array, dt_s: float) -> Array:
     """Normal force (n,) of the contact law on a shaft of compliance `soft` (n,) along the normal."""
-    return np.asarray(
-        contact(
-            law["gap"],
-            soft,
-            law["stiffness"],
-            law["exponent"],
-            law["reference"],
-            law["damping"],
-            law["crossley"],
-            law["relax"],
-            law["relax_time"],
-            dt_s,
-        )
-    )
+    return np.asarray(contact(law["gap"], soft, Wall(*(law[name] for name in Wall._fields)), dt_s))
 
 
 def _posed(shape: tuple[Array, ...], state: dict[str, Any]) -> dict[str, Any]:

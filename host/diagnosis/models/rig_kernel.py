@@ -3,34 +3,98 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 Array = npt.NDArray[np.float64]
-NODES, WEIGHTS = (np.ascontiguousarray(a) for a in np.polynomial.legendre.leggauss(5))
+Vector = tuple[float, float, float]
+_NODES, _WEIGHTS = (np.ascontiguousarray(a) for a in np.polynomial.legendre.leggauss(5))
 SHORTEST_M = 1e-3
-NO_LOAD = (0.0, 0.0, 0.0)
+_NO_LOAD = (0.0, 0.0, 0.0)
+
+
+class Handle(NamedTuple):
+    """Joints at n samples: insertion (m), roll (rad), unloaded curvature of the arc (1/m); each (n,)."""
+
+    insertion: Array
+    roll: Array
+    kappa: Array
+
+
+class Loads(NamedTuple):
+    """Loads at n samples, base frame.
+
+    force: (3, n) N on the tip. extra: (3, n) N, on the tip without contact too. per_length: (3, n) N/m on what is outside
+    the sheath. point: (3, n) N at arc length point_at (n,), in m.
+    """
+
+    force: Array
+    extra: Array
+    per_length: Array
+    point: Array
+    point_at: Array
+
+
+class ShaftBuild(NamedTuple):
+    """What the shaft is made of.
+
+    flex: (n,) 1/EI, 1/(N m^2). twist_ratio: EI/GJ. distal: length (m) of the arc when it is fully out. offset: distance (m)
+    of the second sensor behind the tip.
+    """
+
+    flex: Array
+    twist_ratio: float
+    distal: float
+    offset: float
+
+
+class Wall(NamedTuple):
+    """Law of contact: k r (depth/r)^exponent + damping depth' + crossley k depth depth' + a Maxwell branch.
+
+    stiffness: (n,) k, N/m. exponent: 1 is linear. reference: r, m. relax, relax_time: the branch's stiffness relative to k,
+    and its time constant (s).
+    """
+
+    stiffness: Array
+    exponent: float
+    reference: float
+    damping: float
+    crossley: float
+    relax: float
+    relax_time: float
+
+
+class _Arc(NamedTuple):
+    """The shaft of one sample at roll 0: length (m), straight part (m), curvature of the rest (1/m), 1/EI and 1/GJ."""
+
+    length: float
+    straight: float
+    kappa: float
+    flex: float
+    twist: float
 
 
 @njit(cache=True)
-def _free_point(s: float, straight: float, kappa: float) -> tuple[float, float, float]:
+def _free_point(arc: _Arc, s: float) -> Vector:
     """(y, z, angle) of the unloaded arc at arc length s, roll 0: bends towards -y."""
-    if s <= straight:
+    if s <= arc.straight:
         return 0.0, s, 0.0
-    a = s - straight
-    theta = kappa * a
+    a = s - arc.straight
+    theta = arc.kappa * a
     if abs(theta) < 1e-5:
-        return -0.5 * theta * a, straight + a, theta
-    return -(1.0 - math.cos(theta)) / kappa, straight + math.sin(theta) / kappa, theta
+        return -0.5 * theta * a, arc.straight + a, theta
+    return -(1.0 - math.cos(theta)) / arc.kappa, arc.straight + math.sin(theta) / arc.kappa, theta
 
 
 @njit(cache=True)
-def _moments_beyond(s: float, length: float, straight: float, kappa: float) -> tuple[float, float]:
+def _moments_beyond(arc: _Arc, s: float) -> tuple[float, float]:
     """Integrals of (y, z) along the unloaded arc from s to its tip, roll 0."""
+    straight, kappa = arc.straight, arc.kappa
     k = kappa if abs(kappa) > 1e-3 else (1e-3 if kappa >= 0.0 else -1e-3)
-    a, b = max(s - straight, 0.0), length - straight
+    a, b = max(s - straight, 0.0), arc.length - straight
     sy = -((b - a) - (math.sin(k * b) - math.sin(k * a)) / k) / k
     sz = straight * (b - a) + (math.cos(k * a) - math.cos(k * b)) / (k * k)
     if s < straight:
@@ -39,47 +103,41 @@ def _moments_beyond(s: float, length: float, straight: float, kappa: float) -> t
 
 
 @njit(cache=True)
-def _deflection(
-    s1: float,
-    length: float,
-    straight: float,
-    kappa: float,
-    fx: float,
-    fy: float,
-    fz: float,
-    load: tuple[float, float, float],
-    flex: float,
-    twist: float,
-    nodes: Array,
-    weights: Array,
-    out: Array,
-) -> None:
-    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force and a load per length, roll 0: integrals of
-    curvature change over [0, s1].
+def _is_zero(vector: Vector) -> bool:
+    return vector[0] == 0.0 and vector[1] == 0.0 and vector[2] == 0.0
+
+
+@njit(cache=True)
+def _deflection(arc: _Arc, s1: float, force: Vector, load: Vector, out: Array) -> None:
+    """Displacement out[0:3] and rotation out[3:6] at s1 by a tip force and a load per length, roll 0.
+
+    They are integrals of the change of curvature over [0, s1].
     """
     out[:] = 0.0
-    yt, zt, _ = _free_point(length, straight, kappa)
-    y1, z1, _ = _free_point(s1, straight, kappa)
-    loaded = load[0] != 0.0 or load[1] != 0.0 or load[2] != 0.0
+    fx, fy, fz = force
+    straight = arc.straight
+    yt, zt, _ = _free_point(arc, arc.length)
+    y1, z1, _ = _free_point(arc, s1)
+    loaded = not _is_zero(load)
     for part in range(2):
         a = 0.0 if part == 0 else min(straight, s1)
         b = min(straight, s1) if part == 0 else s1
         if b - a <= 0.0:
             continue
-        for k in range(nodes.size):
-            s = 0.5 * (a + b) + 0.5 * (b - a) * nodes[k]
-            w = 0.5 * (b - a) * weights[k]
-            y, z, theta = _free_point(s, straight, kappa)
+        for k in range(_NODES.size):
+            s = 0.5 * (a + b) + 0.5 * (b - a) * _NODES[k]
+            w = 0.5 * (b - a) * _WEIGHTS[k]
+            y, z, theta = _free_point(arc, s)
             dy, dz = yt - y, zt - z
             mx, my, mz = dy * fz - dz * fy, dz * fx, -dy * fx
             if loaded:
-                sy, sz = _moments_beyond(s, length, straight, kappa)
-                sy, sz = sy - (length - s) * y, sz - (length - s) * z
+                sy, sz = _moments_beyond(arc, s)
+                sy, sz = sy - (arc.length - s) * y, sz - (arc.length - s) * z
                 mx, my, mz = mx + sy * load[2] - sz * load[1], my + sz * load[0], mz - sy * load[0]
             c, sn = math.cos(theta), math.sin(theta)
-            about_b = flex * (my * c + mz * sn)
-            about_t = twist * (-my * sn + mz * c)
-            kx, ky, kz = w * flex * mx, w * (about_b * c - about_t * sn), w * (about_b * sn + about_t * c)
+            about_b = arc.flex * (my * c + mz * sn)
+            about_t = arc.twist * (-my * sn + mz * c)
+            kx, ky, kz = w * arc.flex * mx, w * (about_b * c - about_t * sn), w * (about_b * sn + about_t * c)
             ey, ez = y1 - y, z1 - z
             out[0] += ky * ez - kz * ey
             out[1] += -kx * ez
@@ -90,23 +148,12 @@ def _deflection(
 
 
 @njit(cache=True)
-def _add_point(
-    s1: float,
-    at: float,
-    straight: float,
-    kappa: float,
-    force: tuple[float, float, float],
-    flex: float,
-    twist: float,
-    nodes: Array,
-    weights: Array,
-    work: Array,
-    out: Array,
-) -> None:
-    """Adds to `out` (6,) the deflection at s1 by a force at arc length `at`, roll 0; beyond it the shaft only follows."""
-    _deflection(min(s1, at), at, straight, kappa, *force, NO_LOAD, flex, twist, nodes, weights, work)
-    y, z, _ = _free_point(at, straight, kappa)
-    y1, z1, _ = _free_point(max(s1, at), straight, kappa)
+def _add_point(arc: _Arc, s1: float, at: float, force: Vector, work: Array, out: Array) -> None:
+    """Add to `out` (6,) the deflection at s1 by a force at arc length `at`, roll 0; beyond it the shaft only follows."""
+    inner = _Arc(at, arc.straight, arc.kappa, arc.flex, arc.twist)
+    _deflection(inner, min(s1, at), force, _NO_LOAD, work)
+    y, z, _ = _free_point(arc, at)
+    y1, z1, _ = _free_point(arc, max(s1, at))
     ey, ez = y1 - y, z1 - z
     out += work
     out[0] += work[4] * ez - work[5] * ey
@@ -115,9 +162,9 @@ def _add_point(
 
 
 @njit(cache=True)
-def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p: Array, R: Array) -> None:
+def _pose(arc: _Arc, s1: float, roll: float, bend: Array, p: Array, R: Array) -> None:
     """Position p (3,) and rotation R (3, 3) at s1 in the base frame after deflection `bend`."""
-    y, z, theta = _free_point(s1, straight, kappa)
+    y, z, theta = _free_point(arc, s1)
     c, s = math.cos(roll), math.sin(roll)
     ct, st = math.cos(theta), math.sin(theta)
     x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
@@ -137,172 +184,115 @@ def _pose(s1: float, straight: float, kappa: float, roll: float, bend: Array, p:
 
 
 @njit(cache=True)
-def _free_tip(
-    length: float,
-    straight: float,
-    kappa: float,
-    c: float,
-    s: float,
-    always: tuple[float, float, float],
-    even: tuple[float, float, float],
-    press: tuple[float, float, float],
-    at: float,
-    flex: float,
-    twist: float,
-    nodes: Array,
-    weights: Array,
-    work: Array,
-    bend: Array,
-    out: Array,
-) -> None:
-    """Where the tip (3,) would be without contact, base frame; c, s: cosine and sine of the roll; even, press: at roll 0."""
-    y, z, _ = _free_point(length, straight, kappa)
-    ex, ey, ez = always
-    bend[:] = 0.0
-    if ex != 0.0 or ey != 0.0 or ez != 0.0 or even[0] != 0.0 or even[1] != 0.0 or even[2] != 0.0:
-        gx, gy = c * ex + s * ey, -s * ex + c * ey
-        _deflection(length, length, straight, kappa, gx, gy, ez, even, flex, twist, nodes, weights, bend)
-    if press[0] != 0.0 or press[1] != 0.0 or press[2] != 0.0:
-        _add_point(length, at, straight, kappa, press, flex, twist, nodes, weights, work, bend)
-    x0, y0 = bend[0], y + bend[1]
-    out[0], out[1], out[2] = c * x0 - s * y0, s * x0 + c * y0, z + bend[2]
+def _to_roll_0(c: float, s: float, vector: Vector) -> Vector:
+    """Turn a vector of the base frame back by the roll of cosine c and sine s."""
+    return c * vector[0] + s * vector[1], -s * vector[0] + c * vector[1], vector[2]
 
 
 @njit(cache=True)
-def _softness(
-    length: float,
-    straight: float,
-    kappa: float,
-    c: float,
-    s: float,
-    normal: Array,
-    flex: float,
-    twist: float,
-    nodes: Array,
-    weights: Array,
-    bend: Array,
-    out: Array,
-) -> None:
-    """Displacement (3,) of the tip by a unit force along `normal`, base frame."""
-    nx, ny, nz = normal[0], normal[1], normal[2]
-    gx, gy = c * nx + s * ny, -s * nx + c * ny
-    _deflection(length, length, straight, kappa, gx, gy, nz, NO_LOAD, flex, twist, nodes, weights, bend)
-    out[0], out[1], out[2] = c * bend[0] - s * bend[1], s * bend[0] + c * bend[1], bend[2]
+def _column(values: Array, i: int) -> Vector:
+    return values[0, i], values[1, i], values[2, i]
 
 
 @njit(cache=True)
 def shapes(
-    insertion: Array,
-    roll: Array,
-    kappa: Array,
-    force: Array,
-    extra: Array,
-    load: Array,
-    point: Array,
-    point_at: Array,
-    flex: Array,
-    twist_ratio: float,
-    distal: float,
-    offset: float,
-    normal: Array,
-    nodes: Array,
-    weights: Array,
+    handle: Handle, loads: Loads, build: ShaftBuild, normal: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Poses under tip force, and the free tip with its compliance.
+    """Poses under load, and the free tip with its compliance.
 
-    Arguments:
-        insertion, roll, kappa: (n,). force: (3, n) on the tip, base frame; extra: (3, n) further tip force that is there
-        without contact; load: (3, n) force per exposed length; point: (3, n) a force at arc length point_at (n,).
-        flex: (n,) 1/EI. twist_ratio: EI/GJ. distal: length of the arc fully out. offset: of the second sensor behind the
-        tip.
+    Args:
+        handle: joints at n samples.
+        loads: loads at n samples.
+        build: stiffness and lengths.
         normal: (3,) of the wall.
+
     Returns:
-        tip position (3, n), tip rotation (3, 3, n), shaft position, shaft rotation, free tip (3, n), compliance by a
-        unit normal force (3, n).
+        Tip position (3, n) m, tip rotation (3, 3, n), the same of the second sensor, the tip without contact (3, n) m, and
+        its compliance (3, n) m/N by a unit force along the normal.
     """
+    insertion, roll, kappa = handle
     n = insertion.size
     tip, shaft, free, soft = np.empty((3, n)), np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
     tip_R, shaft_R = np.empty((3, 3, n)), np.empty((3, 3, n))
     bend, unit, p, R = np.zeros(6), np.zeros(6), np.zeros(3), np.zeros((3, 3))
     for i in range(n):
         straight = max(insertion[i], 0.0)
-        length = straight + max(distal + min(insertion[i], 0.0), SHORTEST_M)
+        length = straight + max(build.distal + min(insertion[i], 0.0), SHORTEST_M)
         c, s = math.cos(roll[i]), math.sin(roll[i])
-        twist = flex[i] * twist_ratio
-        fx, fy, fz = force[0, i] + extra[0, i], force[1, i] + extra[1, i], force[2, i] + extra[2, i]
-        gx, gy = c * fx + s * fy, -s * fx + c * fy
-        even = (c * load[0, i] + s * load[1, i], -s * load[0, i] + c * load[1, i], load[2, i])
-        _deflection(length, length, straight, kappa[i], gx, gy, fz, even, flex[i], twist, nodes, weights, bend)
-        at = min(point_at[i], length)
-        px, py, pz = point[0, i], point[1, i], point[2, i]
-        pressed = px != 0.0 or py != 0.0 or pz != 0.0
-        press = (c * px + s * py, -s * px + c * py, pz)
-        if pressed:
-            _add_point(length, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
-        _pose(length, straight, kappa[i], roll[i], bend, p, R)
+        arc = _Arc(length, straight, kappa[i], build.flex[i], build.flex[i] * build.twist_ratio)
+        at = min(loads.point_at[i], length)
+        even = _to_roll_0(c, s, _column(loads.per_length, i))
+        press = _to_roll_0(c, s, _column(loads.point, i))
+        always = _column(loads.extra, i)
+        fx, fy, fz = _column(loads.force, i)
+        push = _to_roll_0(c, s, (fx + always[0], fy + always[1], fz + always[2]))
+        # The tip under all loads.
+        _deflection(arc, length, push, even, bend)
+        if not _is_zero(press):
+            _add_point(arc, length, at, press, unit, bend)
+        _pose(arc, length, roll[i], bend, p, R)
         tip[:, i] = p
         tip_R[:, :, i] = R
-        s1 = length - offset
+        # The second sensor; in the sheath it lies on the axis.
+        s1 = length - build.offset
         if s1 > 0.0:
-            _deflection(s1, length, straight, kappa[i], gx, gy, fz, even, flex[i], twist, nodes, weights, bend)
-            if pressed:
-                _add_point(s1, at, straight, kappa[i], press, flex[i], twist, nodes, weights, unit, bend)
-            _pose(s1, straight, kappa[i], roll[i], bend, p, R)
+            _deflection(arc, s1, push, even, bend)
+            if not _is_zero(press):
+                _add_point(arc, s1, at, press, unit, bend)
+            _pose(arc, s1, roll[i], bend, p, R)
         else:
             bend[:] = 0.0
-            _pose(0.0, straight, 0.0, roll[i], bend, p, R)
+            _pose(arc, 0.0, roll[i], bend, p, R)
             p[2] = s1
         shaft[:, i] = p
         shaft_R[:, :, i] = R
-        always = (extra[0, i], extra[1, i], extra[2, i])
-        _free_tip(length, straight, kappa[i], c, s, always, even, press, at, flex[i], twist, nodes, weights, unit, bend, p)
-        free[:, i] = p
-        _softness(length, straight, kappa[i], c, s, normal, flex[i], twist, nodes, weights, unit, p)
-        soft[:, i] = p
+        # The tip without contact.
+        bend[:] = 0.0
+        if not (_is_zero(always) and _is_zero(even)):
+            _deflection(arc, length, _to_roll_0(c, s, always), even, bend)
+        if not _is_zero(press):
+            _add_point(arc, length, at, press, unit, bend)
+        y, z, _ = _free_point(arc, length)
+        x0, y0 = bend[0], y + bend[1]
+        free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z + bend[2]
+        # Its displacement by a unit force along the normal.
+        _deflection(arc, length, _to_roll_0(c, s, (normal[0], normal[1], normal[2])), _NO_LOAD, bend)
+        soft[0, i], soft[1, i], soft[2, i] = c * bend[0] - s * bend[1], s * bend[0] + c * bend[1], bend[2]
     return tip, tip_R, shaft, shaft_R, free, soft
 
 
 @njit(cache=True)
-def contact(
-    gap: Array,
-    soft: Array,
-    stiffness: Array,
-    exponent: float,
-    reference: float,
-    damping: float,
-    crossley: float,
-    relax: float,
-    relax_time: float,
-    dt_s: float,
-) -> Array:
-    """Normal force (n,) on the wall in equilibrium with the shaft.
+def contact(gap: Array, soft: Array, wall: Wall, dt_s: float) -> Array:
+    """Return the normal force (n,) in N on the wall in equilibrium with the shaft.
 
-    gap: (n,) how far the free tip would be inside; soft: (n,) normal compliance of the shaft; depth = gap - soft * force.
-    Law: k r (depth/r)^exponent + damping depth' + crossley k depth depth' + a Maxwell branch (relax k, relax_time).
-    exponent 1: linear.
+    Args:
+        gap: (n,) m, how far the free tip would be inside; depth = gap - soft * force.
+        soft: (n,) m/N, normal compliance of the shaft.
+        wall: law of contact.
+        dt_s: period of the samples.
     """
     out = np.zeros(gap.size)
     depth_old, slow = 0.0, 0.0
-    decay = math.exp(-dt_s / relax_time) if relax_time > 0.0 else 0.0
+    plain = wall.exponent == 1.0 and wall.damping == 0.0 and wall.crossley == 0.0 and wall.relax == 0.0
+    decay = math.exp(-dt_s / wall.relax_time) if wall.relax_time > 0.0 else 0.0
     for i in range(gap.size):
-        k, c = stiffness[i], max(soft[i], 0.0)
+        k, c = wall.stiffness[i], max(soft[i], 0.0)
         if gap[i] <= 0.0:
             depth_old, slow = 0.0, slow * decay
             continue
         low, high = 0.0, gap[i] / max(c, 1e-9)
         high = min(high, 50.0)
         f = min(gap[i] / (1.0 / k + c), high)
-        plain = exponent == 1.0 and damping == 0.0 and crossley == 0.0 and relax == 0.0
         for _ in range(0 if plain else 60):
             depth = gap[i] - c * f
             rate = (depth - depth_old) / dt_s
             branch = depth + (slow - depth) * decay
             law = (
-                k * reference * (max(depth, 0.0) / reference) ** exponent
-                + damping * rate
-                + crossley * k * max(depth, 0.0) * rate
+                k * wall.reference * (max(depth, 0.0) / wall.reference) ** wall.exponent
+                + wall.damping * rate
+                + wall.crossley * k * max(depth, 0.0) * rate
             )
-            law += relax * k * (depth - branch)
+            law += wall.relax * k * (depth - branch)
             if law > f:
                 low = f
             else:

@@ -14,7 +14,7 @@ from host.diagnosis.estimation.fit import free, jacobian, size_of
 from host.diagnosis.model.force_kernel import along, run_axis, slot_array
 from host.diagnosis.model.nominal import read_nominal
 from host.diagnosis.models.axis import stages
-from host.diagnosis.models.rig_kernel import NODES, WEIGHTS, contact, matrices, rotation_logs, shapes
+from host.diagnosis.models.rig_kernel import Handle, Loads, ShaftBuild, Wall, contact, matrices, rotation_logs, shapes
 from host.diagnosis.pipeline import prepare
 from host.diagnosis.selection.search import fit_nominal
 from tests.host.diagnosis import rig_cases
@@ -112,21 +112,10 @@ def shape(
     """One sample of the kernel."""
     one = np.ones(1)
     return shapes(
-        d * one,
-        roll * one,
-        kappa * one,
-        force[:, None],
-        np.zeros((3, 1)),
-        np.array(load)[:, None],
-        np.zeros((3, 1)),
-        np.zeros(1),
-        one / rig_cases.EI,
-        rig_cases.EI / rig_cases.GJ,
-        rig_cases.DISTAL,
-        rig_cases.BEHIND,
+        Handle(d * one, roll * one, kappa * one),
+        Loads(force[:, None], np.zeros((3, 1)), np.array(load)[:, None], np.zeros((3, 1)), np.zeros(1)),
+        ShaftBuild(one / rig_cases.EI, rig_cases.EI / rig_cases.GJ, rig_cases.DISTAL, rig_cases.BEHIND),
         np.array([0.0, 0.0, 1.0]),
-        NODES,
-        WEIGHTS,
     )
 
 
@@ -176,9 +165,9 @@ def test_bent_and_rolled_shaft_matches_rigid_segments(seed: int) -> None:
 
 def test_contact_is_the_equilibrium_of_two_springs() -> None:
     gap = np.array([-1e-3, 0.0, 1e-3, 2e-3])
-    force = contact(gap, np.full(4, 0.01), np.full(4, 500.0), 1.0, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.01)
+    force = contact(gap, np.full(4, 0.01), Wall(np.full(4, 500.0), 1.0, 1e-3, 0.0, 0.0, 0.0, 0.0), 0.01)
     assert np.allclose(force, np.maximum(gap, 0) / (1 / 500 + 0.01))
-    bent = contact(gap, np.full(4, 0.01), np.full(4, 500.0), 1.5, 1e-3, 0.0, 0.0, 0.0, 0.0, 0.01)
+    bent = contact(gap, np.full(4, 0.01), Wall(np.full(4, 500.0), 1.5, 1e-3, 0.0, 0.0, 0.0, 0.0), 0.01)
     depth = gap - 0.01 * bent
     assert np.allclose(bent[2:], 500 * 1e-3 * (depth[2:] / 1e-3) ** 1.5, atol=1e-6)
 
