@@ -40,7 +40,9 @@ def diagnose(
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(help="File for the extended model: .py (module) or .json (a simulator's parameters)."),
+        typer.Option(
+            help="File for the extended model: .py (module), .json or .xml (a simulator's parameters), .toml (rig)."
+        ),
     ] = None,
     trust: Annotated[
         bool,
@@ -79,6 +81,8 @@ def diagnose(
             print(f"script: {script}", file=sys.stderr)
     if export is not None:
         print(f"model: {verdict.export(export)}", file=sys.stderr)
+        for sentence in verdict.not_exported:
+            print(f"not exported: {sentence}", file=sys.stderr)
     if json:
         write_json(verdict.as_dict())
     else:

@@ -29,6 +29,7 @@ class Verdict:
 
     def __init__(self, content: dict[str, Any], diagnosis: Diagnosis | None) -> None:
         self._content, self.diagnosis = content, diagnosis
+        self.not_exported: list[str] = []  # what the file last exported cannot hold of the model, a sentence each
 
     @property
     def verdict(self) -> str:
@@ -55,10 +56,11 @@ class Verdict:
         """Write the nominal model with the effects that were found.
 
         Parameters:
-            path: `.py` (a module that runs without the diagnosis) or `.json` (names and values of a simulator's parameters).
+            path: `.py` (a module that runs without the diagnosis), `.json` (names and values of a simulator's parameters),
+                `.xml` (kind mujoco: the model file with them) or `.toml` (a recorded rig: its file).
 
         Returns:
-            The path.
+            The path. `not_exported` says what the file cannot hold.
 
         Raises:
             InputError: a model that cannot be written so, or recordings in which there was nothing to compare.
@@ -67,7 +69,8 @@ class Verdict:
 
         if self.diagnosis is None:
             raise InputError("--export", "no model: there was nothing to compare", "recordings that can be compared")
-        return export(self.diagnosis, Path(path))
+        self.not_exported = export(self.diagnosis, Path(path))
+        return Path(path)
 
     def write(self, folder: Path | str) -> Path:
         """Write verdict.json and, if there was something to compare, report.html and the scripts of proposed experiments.

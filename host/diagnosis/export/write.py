@@ -1,4 +1,4 @@
-"""The extended model as a file: a Python module, or the parameters of a simulator.
+"""The extended model as a file: a Python module, a simulator's parameters or model file, or a rig file.
 
 `export` chooses by the suffix. A module holds the source of every function that the model needs, gathered from the finder
 (`sources`), and the fitted numbers; it runs with numpy and scipy alone.
@@ -6,15 +6,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+from host.diagnosis.export.mjcf import mjcf_of
 from host.diagnosis.export.module import module_of
 from host.diagnosis.export.parameters import parameters_of
+from host.diagnosis.export.rig import rig_patch, rig_text
 from host.diagnosis.pipeline import Diagnosis
 from protocol.errors import InputError
 
 __all__ = ["check_target", "export"]
-WRITERS = {".py": module_of, ".json": parameters_of}
+Content = tuple[str, list[str]]  # text, and sentences about what the format cannot hold
+
+
+def _rig_file(result: Diagnosis, path: Path) -> Content:
+    patch = rig_patch(result)
+    return rig_text(patch), patch.left_out
+
+
+WRITERS: dict[str, Callable[[Diagnosis, Path], Content]] = {
+    ".py": lambda result, path: (module_of(result), []),
+    ".json": lambda result, path: (parameters_of(result), []),
+    ".xml": lambda result, path: (mjcf_of(result, path), []),
+    ".toml": _rig_file,
+}
 
 
 def check_target(path: Path) -> None:
@@ -25,20 +41,22 @@ def check_target(path: Path) -> None:
         raise InputError("--export", str(path), "a file in a folder that exists")
 
 
-def export(result: Diagnosis, path: Path) -> Path:
+def export(result: Diagnosis, path: Path) -> list[str]:
     """Write the nominal model with the effects that were found to `path`.
 
     Parameters:
         result: a diagnosis.
-        path: `.py` (a module that runs without the finder) or `.json` (names and values of the simulator's parameters).
+        path: `.py` (a module that runs without the finder), `.json` (names and values of the simulator's parameters),
+            `.xml` (MuJoCo's model file with them) or `.toml` (the file of a recorded rig).
 
     Returns:
-        The path.
+        What the file cannot hold of the model, a sentence each.
 
     Raises:
         InputError: a suffix or a model that cannot be written so; names the effects that stand in the way.
         OSError: the file cannot be written.
     """
     check_target(path)
-    path.write_text(WRITERS[path.suffix](result), encoding="utf-8")
-    return path
+    text, left_out = WRITERS[path.suffix](result, path)
+    path.write_text(text, encoding="utf-8")
+    return left_out

@@ -66,7 +66,7 @@ class MujocoModel(SimulatedModel):
         try:
             return int(named(name).id)
         except KeyError as error:
-            raise InputError(f"mujoco.{kind}s", name, Description(f"one of {self.path.name}: {error.args[0]}")) from None
+            raise InputError(f"mujoco.{kind}s", name, Description(f"one of {self.path.name}: {one_line(error)}")) from None
 
     def _own_offers(self, taken: set[str]) -> list[OfferSpec]:
         """Friction, damping, stiffness and inertia of joints, payload of their bodies, and gears, all off as in the file."""
@@ -203,7 +203,9 @@ def compiled(path: Path, payloads: list[str]) -> Any:
     try:
         return model.compile()
     except ValueError as error:
-        raise InputError("mujoco.model", Description(f"{path}: {error}"), "a model file that MuJoCo compiles") from None
+        raise InputError(
+            "mujoco.model", Description(f"{path}: {one_line(error)}"), "a model file that MuJoCo compiles"
+        ) from None
 
 
 def specified(path: Path, payloads: dict[str, float]) -> Any:
@@ -213,15 +215,23 @@ def specified(path: Path, payloads: dict[str, float]) -> Any:
     try:
         model = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError) as error:
-        raise InputError("mujoco.model", Description(f"{path}: {error}"), "a model file of MuJoCo (MJCF)") from None
+        raise InputError(
+            "mujoco.model", Description(f"{path}: {one_line(error)}"), "a model file of MuJoCo (MJCF)"
+        ) from None
     for name, mass in payloads.items():
-        parent, at = _carrier(path, model, name)
+        parent, at = carrier(path, model, name)
         added = parent.add_body(name=f"{name}_payload", pos=at)
         added.mass, added.inertia, added.explicitinertial = mass, [PAYLOAD_INERTIA_KG_M2] * 3, True
+        added.ipos = [0.0, 0.0, 0.0]  # left out, MuJoCo takes the body's place for it: the mass would be twice as far
     return model
 
 
-def _carrier(path: Path, model: Any, name: str) -> tuple[Any, list[float]]:
+def one_line(error: Exception) -> str:
+    """MuJoCo's message, which spans several lines, as one."""
+    return " ".join(str(error).split())
+
+
+def carrier(path: Path, model: Any, name: str) -> tuple[Any, list[float]]:
     """Body that carries the payload at body or site `name`, and the place in it. Raises InputError."""
     body, site = model.body(name), model.site(name)
     if body is None and site is None:

@@ -209,7 +209,7 @@ class SimulatedModel(Model):
 
     def simulate_all(self, segments: list[Segment], theta: Array, active: list[ActiveEffect]) -> list[Array]:
         """Outputs of several recordings; those whose run is not kept are run together."""
-        runs = [self._run_of(segment, theta, active) for segment in segments]
+        runs = [self.run_of(segment, theta, active) for segment in segments]
         new = {run.key: run for run in runs if run.key not in self._kept}
         began = time.perf_counter()
         wholes = dict(zip(new, self.run_many(list(new.values())), strict=True))
@@ -235,7 +235,8 @@ class SimulatedModel(Model):
         begin = segment.begin
         return {} if begin is None else dict(zip(begin.names, map(float, begin.values), strict=True))
 
-    def _run_of(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> SimulatorRun:
+    def run_of(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> SimulatorRun:
+        """What the simulator is given for one recording."""
         begin = self._begin_of(segment)
         given = {}
         for name in self.section.inputs:
