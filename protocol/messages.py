@@ -157,7 +157,7 @@ def decode(message_class: type[MessageType], payload: bytes) -> MessageType:
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload: found {len(payload)} bytes, wanted at most {MAX_PAYLOAD_BYTES}")
     try:
-        arrived = _decoder(message_class).decode(payload)
+        arrived: MessageType = _decoder(message_class).decode(payload)
     except (ValueError, RecursionError) as error:  # msgspec's errors and UnicodeDecodeError are ValueErrors
         raise ValueError(_explanation(message_class, payload, error)) from None
     # A field with a default would pass when it is missing; every field has to be there, and none twice.

@@ -31,7 +31,8 @@ def start(bank: Bank, low_Hz: float, high_Hz: float, memory_s: float, level: flo
 @njit(cache=True)
 def frequency_Hz(bank: Bank, place: float) -> float:
     """Return the frequency (Hz) at a place on the grid, 0 to POINTS - 1, fractions allowed."""
-    return bank.low_Hz * (bank.high_Hz / bank.low_Hz) ** (place / (POINTS - 1))
+    ratio: float = (bank.high_Hz / bank.low_Hz) ** (place / (POINTS - 1))
+    return bank.low_Hz * ratio
 
 
 @njit(cache=True)

@@ -22,8 +22,10 @@ _POLL_NS = 20_000
 def now_ns(clock: np.ndarray) -> int:
     """Time of the clock whose `Clock.words`, (8,) int64, are given."""
     if clock[KIND] == MONOTONIC:
-        return monotonic_ns()
-    return load_acquire(clock, NOW)
+        machine_ns: int = monotonic_ns()
+        return machine_ns
+    virtual_ns: int = load_acquire(clock, NOW)
+    return virtual_ns
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -56,7 +56,8 @@ def _record_view(words: np.ndarray, dtype: np.dtype) -> np.recarray:
 
 @njit(cache=True, error_model="numpy")
 def _slot(words: np.ndarray, number: int) -> int:
-    return FIRST_SLOT + (number % SLOTS) * (words[PAYLOAD_WORDS] // LINE_WORDS + 1) * LINE_WORDS
+    lines: int = words[PAYLOAD_WORDS] // LINE_WORDS + 1
+    return FIRST_SLOT + (number % SLOTS) * lines * LINE_WORDS
 
 
 @njit(cache=True, error_model="numpy")
