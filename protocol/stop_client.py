@@ -22,6 +22,8 @@ CONFIRM_S = 0.1
 ANSWER_S = 1.0
 # After the rig has confirmed a stop on one path, the others have so long to answer.
 OTHERS_S = 0.2
+# Name of the threads of `stop_over`, before that of the path.
+_ASKING = "stop by "
 _CREDENTIALS = struct.Struct("3i")
 
 
@@ -109,7 +111,7 @@ def stop_over(
     """
     arriving: queue.SimpleQueue[PathAnswer] = queue.SimpleQueue()
     for name, path in paths.items():
-        threading.Thread(target=lambda path=path: arriving.put(path()), name=f"stop by {name}", daemon=True).start()
+        threading.Thread(target=lambda path=path: arriving.put(path()), name=f"{_ASKING}{name}", daemon=True).start()
     answers: dict[str, PathAnswer] = {}
     until_s: float | None = None
     while len(answers) < len(paths):
@@ -122,3 +124,8 @@ def stop_over(
         if answer.confirmed and until_s is None:
             until_s = time.monotonic() + others_s
     return tuple(answers.get(name) or PathAnswer(name, False, False, "no answer yet") for name in paths)
+
+
+def still_asking() -> bool:
+    """Whether a path of `stop_over` in this process has not come to its end yet."""
+    return any(thread.name.startswith(_ASKING) for thread in threading.enumerate())

@@ -181,6 +181,9 @@ def main() -> None:
     compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
         build(argv)()
+    except SystemExit as ending:
+        _leave_stalled_stop(ending)
+        raise
     except BrokenPipeError:  # the reader of the output has closed it, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
@@ -189,6 +192,18 @@ def main() -> None:
     finally:
         if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server passes the signal on as it ends: nothing is left to do
             signal.signal(signal.SIGTERM, lambda number, frame: None)
+
+
+def _leave_stalled_stop(ending: SystemExit) -> None:
+    """End the program at once where a stop still waits in zenoh for a process that is stalled.
+
+    An interpreter that ends below such a thread aborts the program, and its exit status would be lost.
+    """
+    stop_client = sys.modules.get("protocol.stop_client")
+    if stop_client is not None and stop_client.still_asking():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(ending.code if isinstance(ending.code, int) else 1 if ending.code else 0)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 import time
 from pathlib import Path
@@ -48,9 +47,7 @@ def stop(
     verdict = "stop confirmed" if confirmed else "stop NOT CONFIRMED: use the emergency stop"
     print(f"seldinger: {verdict}", file=sys.stderr, flush=True)
     if not confirmed:
-        # A thread may still wait in zenoh for a process that is stalled: the exit must not wait for it.
-        sys.stdout.flush()
-        os._exit(1)
+        raise typer.Exit(1)
 
 
 def _print_answer(answer: PathAnswer) -> None:

@@ -217,9 +217,9 @@ class Operator:
 
         def armed() -> bool:
             time.sleep(0.1)
-            if not self.commander.take().accepted or not self.commander.arm().accepted:
+            if not self.commander.take().accepted:
                 return False
-            if self.wait(3.0, lambda: self.mode() == "hold"):
+            if self.commander.arm().accepted and self.wait(3.0, lambda: self.mode() == "hold"):
                 return True
             self.commander.clear_fault()
             return False
@@ -240,7 +240,9 @@ class Operator:
                 self.state and self.state.tip_m and np.linalg.norm(np.array(self.state.tip_m) - before) < 5e-4
             )
 
-        while time.monotonic() < until and self.arm(lambda share: each("start", share)):
+        while time.monotonic() < until:
+            if not self.arm(lambda share: each("start", share)):
+                continue
             self.commander.target(tuple(map(float, before)))
             self.wait(_BEFORE_S, there)
             if self.commander.press(job.target_m, job.into, job.force_N).accepted:

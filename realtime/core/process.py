@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
 from typing import Any
 
-import numpy as np
-
 from protocol.reply_seal import ReplySeal
 from protocol.rig_file import Rig
-from protocol.topics import CommandCounts, Log, LoopTiming, Message, Reply
+from protocol.topics import CommandCounts, Log, LoopTiming, Reply
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import control_loop, telemetry
 from realtime.core.lines import force_config, tracker_config
-from realtime.core.rig_core import Arrived, CommandRequest, Leaving, RigCore, Tick
+from realtime.core.rig_core import Arrived, CommandRequest, RigCore
+from realtime.core.shared_core import SharedCore
 from realtime.core.stop_listener import StopListener
 from realtime.core.stop_path import StopPath
 from realtime.drivers.board_port import BoardPort
@@ -29,7 +26,6 @@ from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.scheduling import RealtimeSettings
 
 _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command reply commander".split()
-logger = logging.getLogger("seldinger.realtime")
 
 
 class RealtimeProcess:
@@ -53,16 +49,14 @@ class RealtimeProcess:
         open_timeout_s: float = 10.0,
     ) -> None:
         self.rig, self.clock = rig, Clock.monotonic()
-        self._lock, self._publish_lock = threading.Lock(), threading.Lock()
-        self._mailboxes = input_mailboxes(INPUTS, numbered=False)
-        records = {name: box.record[0] for name, box in self._mailboxes.items()}
+        mailboxes = input_mailboxes(INPUTS, numbered=False)
+        records = {name: box.record[0] for name, box in mailboxes.items()}
         self.core = RigCore(rig, records, self._timing, force_source)
         paths = rig.local.prepare()
-        self._unpublished: list[tuple[str, Message]] = []
         self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s)
         self._session = Session.of_rig(rig)
         self._seal = ReplySeal(paths.reply_key)
-        self._publishers = {name: self._session.publisher(name) for name in _TOPICS}
+        publishers = {name: self._session.publisher(name) for name in _TOPICS}
         self._estimates = self._session.latest("force/estimate")
         self.loop = NativeLoop(
             tick,
@@ -70,33 +64,36 @@ class RealtimeProcess:
             new(STATE),
             INPUTS,
             OUTPUTS,
-            self._mailboxes,
+            mailboxes,
             clock=self.clock,
             period_ns=round(1e9 / rig.control.loop_hz),
             fd=self._port.fileno(),
             realtime=RealtimeSettings(),
             run=control_loop.run,
         )
+        self.shared = SharedCore(
+            self.core, self.loop, mailboxes, self.clock.now_ns, lambda topic, message: publishers[topic].put(message)
+        )
         self._tracker = AuroraThread(
             lambda: open_serial(tracker_port or rig.tracker.port, 9600),
-            lambda sample: self._step(Arrived(poses=[sample])),
+            lambda sample: self.shared.step(Arrived(poses=[sample])),
             tracker_config(rig),
-            lambda event: self._step(Arrived(device_events=[event])),
+            lambda event: self.shared.step(Arrived(device_events=[event])),
         )
         self._force = NetFtThread(
             rig.force_sensor.address,
-            lambda sample: self._step(Arrived(forces=[sample])),
+            lambda sample: self.shared.step(Arrived(forces=[sample])),
             force_config(rig),
-            lambda event: self._step(Arrived(device_events=[event])),
+            lambda event: self.shared.step(Arrived(device_events=[event])),
             force_port,
         )
         self._board = BoardThread(
             self._port,
             self._read_board,
-            lambda why: self._step(Arrived(board_lost=why)),
+            lambda why: self.shared.step(Arrived(board_lost=why)),
             lambda: self.log("warning", "the board's port is there again"),
         )
-        self.stop_path = StopPath(self.core, self.loop, self._take, self.clock.now_ns)
+        self.stop_path = StopPath(self.core, self.loop, self.shared.take, self.clock.now_ns)
         self._stops = StopListener(paths.stop_socket, self.stop_path.stop, self.stop_path.status)
 
     def start(self) -> None:
@@ -117,11 +114,7 @@ class RealtimeProcess:
         """Disarm, let the stages come to rest, end the loop and the threads, close the ports."""
         self._stops.close()
         # A core that does not come back must not keep the loop from being ended: without set-points the board stops.
-        if self._lock.acquire(timeout=1.0):
-            try:
-                self._send(self.core.shut_down())
-            finally:
-                self._lock.release()
+        self.shared.shut_down(wait_s=1.0)
         time.sleep(0.1)
         self._board.stop()
         self._tracker.stop()
@@ -143,7 +136,7 @@ class RealtimeProcess:
 
     def request(self, name: str, payload: bytes) -> Reply | None:
         """Answer what commander `name` asks; called on a thread of zenoh's."""
-        return self._step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
+        return self.shared.step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
     def counts(self) -> CommandCounts:
         """Return who holds the lease, and what became of the commands so far."""
@@ -151,48 +144,11 @@ class RealtimeProcess:
 
     def log(self, level: str, text: str) -> None:
         """Publish a log line of the process itself."""
-        self._step(Arrived(log_lines=[Log(stamp_ns=self.clock.now_ns(), level=level, source="realtime", text=text)]))
-
-    def _step(self, arrived: Arrived) -> Leaving:
-        """Take the core one step further, with all ticks that have run meanwhile, and publish what comes of it."""
-        leaving = self._take(arrived)
-        with self._publish_lock:
-            messages, self._unpublished = self._unpublished, []
-            for topic, message in messages:
-                if isinstance(message, Log):
-                    logger.log(getattr(logging, message.level.upper()), "%s: %s", message.source, message.text)
-                self._publishers[topic].put(message)
-        return leaving
-
-    def _take(self, arrived: Arrived, wait_s: float = -1.0) -> Leaving:
-        """Take the core one step further; what is to be published waits for the next `_step`.
-
-        Raises TimeoutError where another thread works in the core for longer than `wait_s` (-1: waits without a limit).
-        """
-        if not self._lock.acquire(timeout=wait_s):
-            raise TimeoutError
-        try:
-            records = self.loop.telemetry.drain()
-            outputs = records["outputs"].view(np.recarray)
-            arrived.ticks = [Tick(int(number), outputs[i]) for i, number in enumerate(records["loop"]["tick"])]
-            arrived.loop_runs = self.loop.alive
-            leaving = self.core.step(self.clock.now_ns(), arrived)
-            self._send(leaving)
-            self._unpublished += leaving.messages
-        finally:
-            self._lock.release()
-        return leaving
-
-    def _send(self, leaving: Leaving) -> None:
-        for name in leaving.changed:
-            self._mailboxes[name].publish()
-        for frame in b"".join(leaving.frames).split(b"\0"):
-            if frame:
-                self.loop.send(frame + b"\0")
+        self.shared.step(Arrived(log_lines=[Log(stamp_ns=self.clock.now_ns(), level=level, source="realtime", text=text)]))
 
     def _read_board(self, data: bytes) -> None:
         estimate: Any = self._estimates.take()
-        self._step(Arrived(board=data, estimates=[] if estimate is None else [estimate]))
+        self.shared.step(Arrived(board=data, estimates=[] if estimate is None else [estimate]))
 
     def _timing(self, stamp_ns: int) -> LoopTiming:
         return telemetry.wall_clock_timing(stamp_ns, self.rig.control.loop_hz, self.loop)

@@ -78,7 +78,7 @@ def test_a_stop_gets_through_idle_clients(process: RealtimeProcess, rig: Rig) ->
 
 
 def test_a_core_that_hangs_ends_the_loop_so_that_the_board_stops(process: RealtimeProcess, rig: Rig) -> None:
-    with process._lock:
+    with process.shared._lock:
         answer = stop_by_socket(rig.local, PATIENCE_S)
         assert answer.answered and not answer.confirmed and "the loop was ended" in answer.text
         assert until(lambda: not process.alive)
@@ -203,6 +203,26 @@ def test_the_paths_are_used_at_the_same_time() -> None:
     answers = stop_over({"late": late, "prompt": lambda: PathAnswer("prompt", True, True, "done")})
     assert [(a.path, a.confirmed) for a in answers] == [("late", False), ("prompt", True)]
     assert time.monotonic() - begin_s < 4.5
+
+
+@pytest.mark.parametrize("status", [0, 1])
+def test_a_program_ends_with_its_status_while_a_path_still_waits(status: int) -> None:
+    program = f"""
+import sys, time, typer
+from host.cli import main
+from protocol.stop_client import PathAnswer, stop_over
+def wait():
+    while True:
+        time.sleep(0.001)
+def command():
+    stop_over({{"stalled": wait, "prompt": lambda: PathAnswer("prompt", True, True, "done")}}, others_s=0.0)
+    print("said")
+    raise SystemExit({status})
+main.build = lambda argv: command
+main.main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "said\n", "")
 
 
 @pytest.mark.parametrize("mode", [0o757, 0o777])

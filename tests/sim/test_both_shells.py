@@ -162,13 +162,13 @@ def test_the_wall_clock_shell_says_and_does_what_the_lock_step_says_and_does(she
     replies: list[tuple[Reply | None, Reply | None]] = []
     loop, network, clock = shell.loop, shell._session, shell.clock
     assert isinstance(loop, StandIn) and isinstance(network, Network)
-    shell._step(Arrived())  # the scenario's own first period
+    shell.shared.step(Arrived())  # the scenario's own first period
     loop.period(0)
     network.messages.clear()
     different = 0
     for turn in run.turns:
         clock.advance_to(turn.now_ns)
-        leaving = shell._step(turn.arrived)
+        leaving = shell.shared.step(turn.arrived)
         assert b"".join(leaving.frames) == b"".join(turn.leaving.frames)
         assert leaving.changed == turn.leaving.changed
         replies += list(zip(leaving.replies, turn.leaving.replies, strict=True))
