@@ -41,7 +41,7 @@ def diagnose(
     export: Annotated[
         Path | None,
         typer.Option(
-            help="File for the extended model: .py (module), .json or .xml (a simulator's parameters), .toml (rig)."
+            help="File for the extended model: .py (module), .json, .xml, .ssv (a simulator's parameters), .toml (rig)."
         ),
     ] = None,
     trust: Annotated[

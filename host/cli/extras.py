@@ -16,6 +16,7 @@ EXTRAS: dict[str, tuple[str, str]] = {
     "pandas": ("pandas", "tables"),
     "distributed": ("distributed", "cluster"),
     "mujoco": ("mujoco", "mujoco"),
+    "fmpy": ("fmpy", "fmu"),
     "pysindy": ("pysindy", "baselines"),
     "nidaqmx": ("nidaqmx", "daq"),
 }

@@ -57,7 +57,8 @@ class Verdict:
 
         Parameters:
             path: `.py` (a module that runs without the diagnosis), `.json` (names and values of a simulator's parameters),
-                `.xml` (kind mujoco: the model file with them) or `.toml` (a recorded rig: its file).
+                `.xml` (kind mujoco: the model file with them), `.ssv` (kind fmu: a parameter set) or `.toml` (a recorded
+                rig: its file).
 
         Returns:
             The path. `not_exported` says what the file cannot hold.

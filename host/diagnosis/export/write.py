@@ -11,7 +11,7 @@ from pathlib import Path
 
 from host.diagnosis.export.mjcf import mjcf_of
 from host.diagnosis.export.module import module_of
-from host.diagnosis.export.parameters import parameters_of
+from host.diagnosis.export.parameters import parameters_of, ssv_of
 from host.diagnosis.export.rig import rig_patch, rig_text
 from host.diagnosis.pipeline import Diagnosis
 from protocol.errors import InputError
@@ -29,6 +29,7 @@ WRITERS: dict[str, Callable[[Diagnosis, Path], Content]] = {
     ".py": lambda result, path: (module_of(result), []),
     ".json": lambda result, path: (parameters_of(result), []),
     ".xml": lambda result, path: (mjcf_of(result, path), []),
+    ".ssv": lambda result, path: (ssv_of(result), []),
     ".toml": _rig_file,
 }
 
@@ -47,7 +48,7 @@ def export(result: Diagnosis, path: Path) -> list[str]:
     Parameters:
         result: a diagnosis.
         path: `.py` (a module that runs without the finder), `.json` (names and values of the simulator's parameters),
-            `.xml` (MuJoCo's model file with them) or `.toml` (the file of a recorded rig).
+            `.xml` (MuJoCo's model file with them), `.ssv` (they for tools of FMI) or `.toml` (the file of a recorded rig).
 
     Returns:
         What the file cannot hold of the model, a sentence each.

@@ -249,6 +249,33 @@ class MujocoSpec(SimulatorSpec):
         return {"inputs": list(given.get("actuators", {})), "outputs": list(given.get("sensors", {})), **given}
 
 
+class FmuSpec(SimulatorSpec):
+    """A functional mock-up unit for co-simulation. A parameter bears the name of its FMI variable.
+
+    `variables`: channel -> FMI variable, where the names differ. `initial`: state at the first sample (an output, its
+    rate, such as `angle_rate`, or one of `states`) -> FMI variable that starts it.
+    """
+
+    model: str
+    subsystem: str = "unit"
+    variables: dict[str, str] = {}
+    initial: dict[str, str] = {}
+
+    @model_validator(mode="after")
+    def _known(self) -> FmuSpec:
+        for name in self.variables:
+            if name not in (*self.inputs, *self.outputs):
+                raise ValueError(f"variables of inputs or outputs, not {name}")
+        begins = {*self.states, *self.outputs, *(f"{name}_rate" for name in self.outputs)}
+        for name in self.initial:
+            if name not in begins:
+                raise ValueError(f"initial of {', '.join(sorted(begins))}, not {name}")
+        for name in self.states:
+            if name not in self.initial:
+                raise ValueError(f"initial with a variable for the state {name}")
+        return self
+
+
 class RigSpec(Request):
     """Geometry of the catheter rig that is held; what may be refitted stands under `parameters`."""
 
@@ -276,7 +303,7 @@ class NominalSpec(Request):
     """A whole nominal TOML."""
 
     name: str
-    kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "rig"]
+    kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "fmu", "rig"]
     data: DataSpec = DataSpec()
     channels: dict[str, ChannelSpec] = {}
     parameters: dict[str, ParameterSpec] = {}
@@ -286,6 +313,7 @@ class NominalSpec(Request):
     callable: CallableSpec | None = None
     linear: LinearSpec | None = None
     mujoco: MujocoSpec | None = None
+    fmu: FmuSpec | None = None
     offer: list[OfferSpec] = []
     rig: RigSpec | None = None
     effect: list[EffectSpec] = []
@@ -315,7 +343,7 @@ class NominalSpec(Request):
     @property
     def simulator(self) -> SimulatorSpec | None:
         """The section of a kind that runs a simulator."""
-        sections = {"callable": self.callable, "linear": self.linear, "mujoco": self.mujoco}
+        sections = {"callable": self.callable, "linear": self.linear, "mujoco": self.mujoco, "fmu": self.fmu}
         return sections.get(self.kind)
 
     @property

@@ -15,7 +15,7 @@ def code_of(spec: NominalSpec) -> str:
     path = code_path(spec)
     if spec.callable is not None and isinstance(spec.callable.function, str):
         return f"the Python function {spec.callable.function} ({path or 'an installed module'})"
-    return ""
+    return f"the code of {path}" if path is not None else ""
 
 
 def code_path(spec: NominalSpec) -> Path | None:
@@ -23,6 +23,8 @@ def code_path(spec: NominalSpec) -> Path | None:
     if spec.callable is not None and isinstance(spec.callable.function, str):
         path = Path(spec.folder, *spec.callable.function.partition(":")[0].split(".")).with_suffix(".py")
         return path if path.is_file() else None
+    if spec.fmu is not None:
+        return Path(spec.folder, spec.fmu.model)
     return None
 
 

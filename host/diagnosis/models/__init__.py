@@ -33,6 +33,10 @@ def build(spec: NominalSpec) -> Model:
         from host.diagnosis.models.mjcf import MujocoModel
 
         return MujocoModel(spec)
+    if spec.kind == "fmu":
+        from host.diagnosis.models.fmu import FmuModel
+
+        return FmuModel(spec)
     from host.diagnosis.models.external import ExternalModel
 
     return ExternalModel(spec)

@@ -93,7 +93,7 @@ class SimulatorRun:
 
 
 class SimulatedModel(Model):
-    """Base of the kinds `callable`, `linear` and `mujoco`."""
+    """Base of the kinds `callable`, `linear`, `mujoco` and `fmu`."""
 
     scan_points = 24
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
