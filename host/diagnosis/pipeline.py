@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from host.diagnosis.design.experiment import Design, design
 from host.diagnosis.effects import candidates
@@ -167,9 +168,20 @@ def diagnose(
         InputError: the recordings do not fit the nominal model's file.
         NothingToCompare: a channel that the comparison needs says nothing.
     """
+    with threadpool_limits(1, "blas"):  # products of a few columns: threads that wait for each other took 4 times the work
+        return _diagnosed(spec, sources, progress, left_out, rules, Budget(time_budget_s))
+
+
+def _diagnosed(
+    spec: NominalSpec,
+    sources: Sequence[Path | Table],
+    progress: Progress,
+    left_out: frozenset[str],
+    rules: SelectionRules,
+    budget: Budget,
+) -> Diagnosis:
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
-    budget = Budget(time_budget_s)
     data = inspected(spec, sources)
     if not data.recordings:
         raise NothingToCompare(data.findings)

@@ -13,7 +13,7 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
     return (
         Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        build_up(s, 0.3, 4),
+        build_up(s, form, 4),
     )
 
 
@@ -22,7 +22,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     unit = "" if s.unit == s.source_unit else f"{s.unit}/{s.source_unit}"
     return (
         Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        yielding(s, 5),
+        yielding(s, form, 5),
     )
 
 

@@ -11,27 +11,38 @@ from host.diagnosis.model.operators import SLIP_ELEMENTS, dahl, maxwell_slip, wi
 RATIO = {"maxwell": 2.0, "general": 3.0}  # of the distances of neighbouring elements: all alike, or over a decade and more
 
 
-def build_up(s: Scale, longest: float, count: int) -> Parameter:
-    """Distance over which lost motion builds up: `count` starts up to `longest` of the span."""
+def build_up(s: Scale, form: str, count: int) -> Parameter:
+    """Distance over which lost motion builds up: `count` starts up to what the recorded travel can show."""
+    most = farthest(s.span, form)
     return Parameter(
-        "distance", s.unit, spread(0.01 * s.span, longest * s.span, count), 1e-3 * s.span, 3.0 * s.span, log=True
+        "distance", s.unit, spread(0.01 * s.span, min(0.6 * s.span, 0.7 * most), count), 1e-3 * s.span, most, log=True
     )
 
 
-def yielding(s: Scale, count: int, first: float = 3e-3, least: float = 3e-4) -> Parameter:
+def farthest(span: float, form: str) -> float:
+    """Longest distance that travel over `span` can show.
+
+    An element of Maxwell slip that never slides is a spring: a gain, and an offset that each recording begins with. It
+    slides from one side to the other within twice its distance. Dahl's friction forgets along the way instead.
+    """
+    return 0.5 * span / RATIO[form] if form in RATIO else 3.0 * span
+
+
+def yielding(s: Scale, form: str, count: int, first: float = 3e-3, least: float = 3e-4) -> Parameter:
     """Distance over which a friction force builds up: `count` starts from `first` of the span on, no less than `least`."""
     span = s.motion_span
-    grid = spread(first * span, 0.3 * span, count)
-    return Parameter("distance", s.motion_unit, grid, least * span, 3.0 * span, log=True)
+    most = farthest(span, form)
+    grid = spread(first * span, min(0.3 * span, 0.7 * most), count)
+    return Parameter("distance", s.motion_unit, grid, least * span, most, log=True)
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion when fully built up, and the distance over which that happens; of four elements in form `general`."""
     if form == "general":
-        return (*levels("lost_motion", s), build_up(s, 0.6, 4))
+        return (*levels("lost_motion", s), build_up(s, form, 4))
     return (
         Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        build_up(s, 0.6, 5),
+        build_up(s, form, 5),
     )
 
 
@@ -44,10 +55,10 @@ def levels(name: str, s: Scale) -> tuple[Parameter, ...]:
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Friction force when fully built up, and the distance over which that happens; of four elements in form `general`."""
     if form == "general":
-        return (*levels("force", s), yielding(s, 5, 2.0 * BRISTLES, BRISTLES))
+        return (*levels("force", s), yielding(s, form, 5, 2.0 * BRISTLES, BRISTLES))
     return (
         Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True),
-        yielding(s, 6, 2.0 * BRISTLES, BRISTLES),
+        yielding(s, form, 6, 2.0 * BRISTLES, BRISTLES),
     )
 
 

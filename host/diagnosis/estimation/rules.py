@@ -48,6 +48,7 @@ class SelectionRules:
     exchange_fits: int = 4  # rivals fitted in each place
     exchange_promise: float = 0.4  # least part of the best projected gain
     swap_fits: int = 3
+    simpler_fits: int = 3  # simpler shapes of the best candidate that are fitted after it
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 
     # Indistinguishable: rivals in an effect's place.

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.posterior import coarse
 from host.diagnosis.selection.screening import term_of, without
 from host.diagnosis.selection.search import Found
-from host.diagnosis.selection.trial import Trial
+from host.diagnosis.selection.trial import Trial, at_bound
 from host.diagnosis.selection.unlisted import Rest, equations_for
 from host.diagnosis.symbolic.dictionary import equation_at
 
@@ -96,6 +96,9 @@ def _equals(
         other = finish(
             problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
         )
+        contained = candidate.effect.id in trial.candidate.effect.contains
+        if contained and (at_bound(other) or _collapsed(problem, best, other)):
+            continue
         ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
@@ -120,6 +123,23 @@ def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[T
             ):
                 kept.setdefault(trial.candidate.name, trial)
     return sorted(kept.values(), key=lambda trial: -trial.score)
+
+
+def _collapsed(problem: Problem, best: Fit, other: Fit) -> bool:
+    """Whether `other`, which contains the best model, ended as that model: their outputs differ by less than chance.
+
+    Its further parameters are then where they change nothing, such as a limit that is never reached. It says what the
+    best model says, so it is no other explanation.
+    """
+    lead = 0.0
+    for segment, a, b in zip(problem.segments, best.residuals, other.residuals, strict=True):
+        for row in range(len(problem.noise)):
+            used = (segment.fit | segment.heldout) & np.isfinite(a[row]) & np.isfinite(b[row])
+            if used.any():
+                left = np.where(used, a[row], np.nan)
+                power = float(np.nanmean(left**2)) * correlation_time(left)
+                lead += float(np.sum((a[row] - b[row])[used] ** 2)) / max(power, 1e-300)
+    return 0.5 * lead < problem.rules.parameter_penalty * max(len(other.values) - len(best.values), 1)
 
 
 def _indistinguishable(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: SelectionRules) -> bool:

@@ -225,6 +225,7 @@ def _grow(
             progress(f"fitting {item.candidate.key}", count / len(promising))
             trials.append(try_fit(problem, best, item, noise_sd))
         rank(trials, best)
+        trials = _with_simpler(problem, best, trials, ranked, noise_sd)
         winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
         if winner is None:
             steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
@@ -237,6 +238,30 @@ def _grow(
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
     found.best = best
+
+
+def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
+    """`trials`, and the simpler shapes of the first that were screened but not fitted; ranked again.
+
+    A richer shape can promise more than each of the simpler ones it contains, and several rich ones fill the places of a
+    port. Which of them the data call for shows only where all are fitted.
+    """
+    if not trials or problem.budget.spent():
+        return trials
+    top, fitted = trials[0].candidate, {trial.candidate.key for trial in trials}
+    missing = [
+        item
+        for item in ranked
+        if item.candidate.key not in fitted
+        and item.candidate.effect.id in top.effect.contains
+        and related(item.candidate, top)
+        and item.promise > problem.rules.screening_log_likelihood
+    ]
+    if not missing:
+        return trials
+    more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.simpler_fits])]
+    rank(more, best)
+    return more
 
 
 def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress) -> None:
@@ -380,10 +405,12 @@ def _in_place_of(
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
+    simpler = len(winner.fit.values) < len(found.best.values) and related(winner.candidate, term.candidate)
     ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd)
     more = len(winner.fit.values) - len(found.best.values)
     if (
-        ahead.log_likelihood
+        simpler  # preferred by `rank`, which weighs what the finer shape takes more
+        or ahead.log_likelihood
         > (problem.rules.heldout_log_likelihood if more >= 0 else -problem.rules.parameter_penalty)
         + problem.rules.parameter_penalty * more
     ):

@@ -161,3 +161,26 @@ def test_a_lost_sign_behind_two_lags() -> None:
     verdict = diagnose(runs, nominal).as_dict()
     assert [effect["id"] for effect in verdict["effects"]] == ["rectified_sensor"]
     assert verdict["fit"]["rmse_after"] < 1.3 * NOISE
+
+
+def test_a_spring_under_another_load_in_each_recording_is_not_friction() -> None:
+    nominal = {
+        **GEAR,
+        "channels": {**GEAR["channels"], "load": {"column": "f", "unit": "N m"}},
+        "link": [{**GEAR["link"][0], "load": ["load"]}],
+    }
+    recordings = []
+    for seed in range(1, 7):
+        x, rng = motion(seed)(T), np.random.default_rng(100 + seed)
+        load = 0.03 * seed * (1.0 + 0.2 * x) + 1e-4 * rng.normal(size=T.size)
+        tip = 1.3 * _gap(x, 0.02) + 0.4 * load + NOISE * rng.normal(size=T.size)
+        recordings.append({"t": T, "m": x, "f": load, "y": tip})
+    verdict = diagnose(recordings, nominal).as_dict()
+    assert {effect["id"] for effect in verdict["effects"]} == {"compliance", "backlash"}
+
+
+def _gap(x: Array, half_width: float) -> Array:
+    out = x.copy()
+    for k in range(1, x.size):
+        out[k] = np.clip(out[k - 1], x[k] - half_width, x[k] + half_width)
+    return out
