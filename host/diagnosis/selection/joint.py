@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, minimize, set_starts
+from host.diagnosis.selection.screening import above_noise
 from host.diagnosis.selection.trial import Trial, bound_by, related
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +27,8 @@ def best_pair(
     """
     rules = problem.rules
     singles = _singles(trials, rules.joint_singles)
-    if not singles or singles[0].both.log_likelihood < rules.pooled_log_likelihood:
+    called_for = bool(singles) and singles[0].both.log_likelihood >= rules.pooled_log_likelihood
+    if not called_for and not above_noise(problem, nominal, rules.residual_over_noise):
         return None  # nothing calls for an effect, so nothing calls for two
     pairs = [(a, b) for a, b in itertools.combinations(singles, 2) if not related(a.candidate, b.candidate)]
     found = []

@@ -200,6 +200,19 @@ def enough(problem: Problem) -> Problem:
     return replace(problem, segments=segments)
 
 
+def above_noise(problem: Problem, fit: Fit, factor: float) -> bool:
+    """Whether `fit` leaves more than `factor` times the noise of some output, in samples to fit and held out alike."""
+    for row, noise in enumerate(problem.noise):
+        powers = []
+        for which in ("fit", "heldout"):
+            pairs = zip(problem.segments, fit.residuals, strict=True)
+            left = np.concatenate([r[row][getattr(segment, which) & np.isfinite(r[row])] for segment, r in pairs])
+            powers.append(float(np.mean(left**2)) if left.size else np.inf)
+        if min(powers) > (factor * noise.sigma) ** 2:
+            return True
+    return False
+
+
 def _smaller(problem: Problem) -> Problem:
     """Few recordings, every so many samples of them: enough to screen by."""
     few = enough(problem)

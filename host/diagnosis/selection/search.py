@@ -26,7 +26,7 @@ from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.joint import best_pair
 from host.diagnosis.selection.restart import hidden
-from host.diagnosis.selection.screening import Screened, enough, screen, without
+from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, without
 from host.diagnosis.selection.trial import Trial, at_bound, good_enough, rank, related, weighty
 from host.diagnosis.symbolic.dictionary import Form
 
@@ -214,9 +214,7 @@ def _grow(
     while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
         ranked = screen(problem, best, candidate_effects, progress)
         trials: list[Trial] = []
-        promising = _varied(
-            [item for item in ranked if item.promise > problem.rules.screening_log_likelihood], problem.rules
-        )
+        promising = _promising(problem, best, ranked)
         if not best.terms:
             promising += hidden(problem, best, candidate_effects)
         for count, item in enumerate(promising):
@@ -238,6 +236,19 @@ def _grow(
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
     found.best = best
+
+
+def _promising(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
+    """Candidates to fit: those that promise enough, and the first few wherever the residual is above noise.
+
+    A promise counts independent samples by what one projection leaves. In a recording of seconds a slow residual has few
+    of them until a full fit has taken it away.
+    """
+    rules = problem.rules
+    enough = [item for item in ranked if item.promise > rules.screening_log_likelihood]
+    if len(enough) < rules.least_fits and above_noise(problem, best, rules.noise_uncertainty):
+        enough = ranked[: rules.least_fits]
+    return _varied(enough, rules)
 
 
 def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
