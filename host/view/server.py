@@ -32,6 +32,8 @@ MAX_PAGES, MAX_ASKED_AT_ONCE, MAX_MESSAGE_BYTES = 8, 4, 1024
 STUCK_S = 10.0
 # The web socket's own pings: a client that answers none in this time is disconnected.
 PING_S = 5.0
+# A page that has not answered a ping for this long is gone. A browser on a busy computer needs some seconds.
+GONE_S = 20.0
 # What a page sends every second, so that pages in use and idle connections are distinguished.
 PRESENT = '"present"'
 REPLACED = "closed, because newer pages were opened; reload to open it again"
@@ -236,7 +238,7 @@ class ViewServer:
             http=LimitedHttp,
             ws="websockets-sansio",
             ws_ping_interval=PING_S,
-            ws_ping_timeout=PING_S,
+            ws_ping_timeout=GONE_S,
             server_header=False,
             timeout_graceful_shutdown=1,
         )
