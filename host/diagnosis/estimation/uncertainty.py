@@ -34,11 +34,13 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     parameters = problem.parameters(fit.terms)
     sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=True)]
     base = problem.stacked(fit.terms, fit.values)
-    J = np.column_stack([jacobian(problem, fit.terms, fit.values, base, sizes), _by_begin(problem, fit, base)])
-    inverse = _inverse(J.T @ J)
+    by_begin, known = _by_begin(problem, fit, base)
+    rates = jacobian(problem, fit.terms, fit.values, base, sizes)
+    J, prior = np.column_stack([rates, by_begin]), np.diag(np.concatenate((np.zeros(rates.shape[1]), known)))
+    inverse = _inverse(J.T @ J + prior)
     quantile = float(stats.norm.ppf(0.5 + 0.5 * level))
     even = np.sqrt(np.maximum(np.diag(inverse @ _coloured(problem, J, base) @ inverse), 0.0))
-    spread, freedom = _jackknife(_blocks(problem, J, base))
+    spread, freedom = _jackknife(_blocks(problem, J, base), prior)
     fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
     coarse, count = _across_recordings(problem, fit, sizes, inverse)
     scattered = coarse > stats.f.ppf(LARGER, count - 1, np.maximum(freedom, 2.0)) * (fine / quantile) ** 2
@@ -112,21 +114,31 @@ def _across_recordings(problem: Problem, fit: Fit, sizes: list[float], inverse: 
     return np.diag(covariance), max(count, 2)
 
 
-def _by_begin(problem: Problem, fit: Fit, base: Array) -> Array:
-    """Rate of the weighted simulation by the state from which each recording runs freely, where a model has one: it
-    is estimated too.
+def _by_begin(problem: Problem, fit: Fit, base: Array) -> tuple[Array, Array]:
+    """Rates of the weighted simulation by the state from which each recording runs freely, where a model has one, because
+    it is estimated too; and how well each state is known beforehand.
+
+    Columns are for one standard deviation of the measured state. Its precision in the units of the residuals is their
+    level, counted by correlation time: without it, a block that holds the begin of a recording would leave that state
+    free when it is left out.
     """
-    columns = []
+    columns, known, at, rows = [], [], 0, len(problem.model.outputs)
     for segment in problem.segments:
+        n = rows * int(segment.fit.sum())
+        part, at = base[at : at + n].reshape(rows, -1), at + n
         begin = segment.begin
-        if segment.fit.any() and begin is not None:
+        if n and begin is not None:
+            level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in part]))
             values = begin.values
             for k in np.flatnonzero(begin.spread > 0.0):
                 begin.values = values + np.eye(values.size)[k] * begin.spread[k]
                 columns.append(base - problem.stacked(fit.terms, fit.values))
+                known.append(level)
             begin.values = values
-    used = [column for column in columns if np.any(column)]
-    return np.array(used).T if used else np.zeros((base.size, 0))
+    used = [k for k, column in enumerate(columns) if np.any(column)]
+    if not used:
+        return np.zeros((base.size, 0)), np.zeros(0)
+    return np.array([columns[k] for k in used]).T, np.array([known[k] for k in used])
 
 
 def _parts(problem: Problem, J: Array, base: Array) -> Iterator[tuple[Array, Array]]:
@@ -162,9 +174,12 @@ def _blocks(problem: Problem, J: Array, base: Array) -> list[tuple[Array, Array]
     return found
 
 
-def _jackknife(blocks: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Standard deviations of the parameters by leaving out one block at a time, and their degrees of freedom."""
-    whole, count = np.sum([A for A, _ in blocks], axis=0), len(blocks)
+def _jackknife(blocks: list[tuple[Array, Array]], prior: Array) -> tuple[Array, Array]:
+    """Standard deviations of the parameters by leaving out one block at a time, and their degrees of freedom.
+
+    `prior`: precision of what is known beforehand, which no block holds.
+    """
+    whole, count = np.sum([A for A, _ in blocks], axis=0) + prior, len(blocks)
     changes, expected = [], []
     for A, score in blocks:
         inverse = _inverse(whole - A)

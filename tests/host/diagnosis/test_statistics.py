@@ -127,13 +127,33 @@ def test_the_jackknife_knows_when_few_blocks_carry_a_parameter(seed: int) -> Non
         r = rng.standard_normal(600)
         r -= J @ np.linalg.lstsq(J, r, rcond=None)[0]
         blocks = [(J[k : k + 10].T @ J[k : k + 10], J[k : k + 10].T @ r[k : k + 10]) for k in range(0, 600, 10)]
-        each = _jackknife(blocks)
+        each = _jackknife(blocks, np.zeros((2, 2)))
         spread.append(each[0])
         freedom.append(each[1])
     true = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     assert np.sqrt(np.mean(np.square(spread), axis=0))[0] == pytest.approx(true[0], rel=0.1)
     assert np.all(np.sqrt(np.mean(np.square(spread), axis=0)) > 0.95 * true)
     assert np.mean(freedom, axis=0)[1] < 5.0 < 40.0 < np.mean(freedom, axis=0)[0]
+
+
+def test_a_block_with_the_begin_of_a_recording_does_not_leave_its_state_free() -> None:
+    """A parameter and the state at the first sample, which dies out within the first of five blocks."""
+    rng, n = np.random.default_rng(5), 600
+    t = np.arange(n) / n
+    J = np.column_stack([0.3 + np.sin(9.0 * t), 2.0 * np.exp(-t / 0.03)])
+    prior = np.diag([0.0, 1.0])  # the state was measured to one standard deviation, of which its column is made
+    true = np.sqrt(np.linalg.inv(J.T @ J + prior)[0, 0])
+    spread = {"known": [], "free": []}
+    for _ in range(200):
+        state = rng.standard_normal()
+        y = J[:, 1] * state + rng.standard_normal(n)
+        r = y - J @ np.linalg.solve(J.T @ J + prior, J.T @ y)
+        blocks = [(J[k : k + 120].T @ J[k : k + 120], J[k : k + 120].T @ r[k : k + 120]) for k in range(0, n, 120)]
+        spread["known"].append(_jackknife(blocks, prior)[0][0])
+        spread["free"].append(_jackknife(blocks, np.zeros((2, 2)))[0][0])
+    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in spread.items()}
+    assert 0.9 * true < rms["known"] < 1.5 * true
+    assert rms["free"] > 3.0 * true
 
 
 def test_noise_is_what_does_not_repeat() -> None:
