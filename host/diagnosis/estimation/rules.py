@@ -49,6 +49,7 @@ class SelectionRules:
     exchange_fits: int = 4  # rivals fitted in each place
     exchange_promise: float = 0.4  # least part of the best projected gain
     swap_fits: int = 3
+    most_refits: int = 2  # times that a step is judged again because a trial led to a better minimum without it
     simpler_fits: int = 3  # simpler shapes of the best candidate that are fitted after it
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 

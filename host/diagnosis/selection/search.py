@@ -18,6 +18,7 @@ from host.diagnosis.estimation.fit import (
     get_starts,
     minimize,
     reweigh,
+    robust,
     set_starts,
 )
 from host.diagnosis.estimation.initial_state import estimate_state
@@ -89,11 +90,7 @@ def fit_nominal(problem: Problem) -> Fit:
         settle(problem, fit.values)
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values)
-    settle(problem, fit.values)
-    reweigh(problem, fit)
-    finish(problem, fit)
-    set_starts(problem, first_needs(problem, fit))
-    return fit
+    return settled(problem, fit)
 
 
 def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Trial:
@@ -210,7 +207,7 @@ def _grow(
 ) -> None:
     """Forward, upgrade, swap and backward moves from `found.best` on; `earned`: likelihood so far."""
     best, steps = found.best, found.steps
-    rules = problem.rules
+    rules, refits = problem.rules, 0
     while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
         ranked = screen(problem, best, candidate_effects, progress)
         trials: list[Trial] = []
@@ -228,6 +225,14 @@ def _grow(
         if winner is None:
             steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
             break
+        better = _better_base(problem, best, winner) if refits < rules.most_refits else None
+        if better is not None:  # the gain was that of a better minimum: judged again over that
+            refits += 1
+            steps.append(Step("refit", winner.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+            best = better
+            if not best.terms:
+                found.nominal = best
+            continue
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
@@ -236,6 +241,34 @@ def _grow(
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
     found.best = best
+
+
+def _better_base(problem: Problem, base: Fit, trial: Trial) -> Fit | None:
+    """`base` fitted again from the parameters that a trial found, if that ends in a better minimum; else None.
+
+    A fit can end in a poor local minimum. The first candidate that leads out of it would be taken for what is missing.
+    """
+    if trial.replaced:
+        return None
+    again = minimize(problem, base.terms, trial.fit.values[: len(base.values)], rounds=problem.rules.further_iterations)
+    cost = robust(problem.stacked(base.terms, base.values))[0]
+    if again.cost > (1.0 - problem.rules.least_excess_reduction) * cost:
+        return None
+    again = minimize(problem, again.terms, again.values)
+    if base.terms:
+        again = refined(problem, again)
+        reweigh(problem, again)
+        return again
+    return settled(problem, again)
+
+
+def settled(problem: Problem, fit: Fit) -> Fit:
+    """A nominal fit with its residuals; outputs weighed by it, and memories begun where it wants them."""
+    settle(problem, fit.values)
+    reweigh(problem, fit)
+    finish(problem, fit)
+    set_starts(problem, first_needs(problem, fit))
+    return fit
 
 
 def _promising(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
