@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from host.diagnosis.effects.presliding_friction import build_up, yielding
@@ -13,7 +15,7 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Lost motion per load, and the distance of its build-up."""
     return (
         Parameter("coefficient", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        build_up(s, form, 4),
+        replace(build_up(s, form, 4), vanishes=True),
     )
 
 
@@ -22,7 +24,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     unit = "" if s.unit == s.source_unit else f"{s.unit}/{s.source_unit}"
     return (
         Parameter("coefficient", unit, (s.need / s.source_rms,), 0.0, np.inf, linear=True),
-        yielding(s, form, 5),
+        replace(yielding(s, form, 5), vanishes=True),
     )
 
 

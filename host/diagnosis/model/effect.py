@@ -28,6 +28,7 @@ class Parameter:
     log: bool = False
     linear: bool = False
     step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
+    vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
     @property

@@ -14,6 +14,7 @@ from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Sca
 from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
+FORCES = ("N", "mN", "kN", "N m", "Nm", "N*m", "mN m")  # units of a load
 Mask = npt.NDArray[np.bool_]
 ActiveEffect = tuple[Candidate, Array]
 
@@ -66,6 +67,11 @@ class Segment:
     def weights(self) -> Array:
         """Scale of each output's residual, (outputs, 1); ones before the first fit."""
         return (np.ones(self.y.shape[0]) if self.weight is None else self.weight)[:, None]
+
+
+def forces_among(channels: tuple[str, ...], units: dict[str, str]) -> tuple[str, ...]:
+    """Those `channels` that are measured in units of force: where a nominal model names no load, they may be one."""
+    return tuple(name for name in channels if units.get(name) in FORCES)
 
 
 class Model(ABC):

@@ -11,7 +11,17 @@ from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.force_kernel import along, slot_array
-from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import (
+    ActiveEffect,
+    Model,
+    Output,
+    Segment,
+    apply_effects,
+    filled,
+    forces_among,
+    stack,
+    tolerance_of,
+)
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
 
@@ -49,7 +59,7 @@ class ImpedanceModel(Model):
         self.outputs = (Output(self.spec.output, force, name),)
         loads, others = tuple(self.spec.load), tuple(self.spec.others)
         self.ports = (
-            Port(name, "force", name, (self.spec.output,), loads, others),
+            Port(name, "force", name, (self.spec.output,), loads or forces_among(others, self.units), others),
             Port(f"{name}_reading", "drift+timing+limit+mix", name, (self.spec.output,), (), others),
         )
         unit = {

@@ -7,7 +7,17 @@ import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.model import ActiveEffect, Model, Output, Segment, apply_effects, filled, stack, tolerance_of
+from host.diagnosis.model.model import (
+    ActiveEffect,
+    Model,
+    Output,
+    Segment,
+    apply_effects,
+    filled,
+    forces_among,
+    stack,
+    tolerance_of,
+)
 from host.diagnosis.model.nominal import LinkSpec, NominalSpec
 from host.diagnosis.model.operators import lag
 
@@ -36,9 +46,11 @@ class TransmissionModel(Model):
         ports: list[Port] = []
         parameters: list[Parameter] = []
         for name, link in zip(names, self.links, strict=True):
+            others = tuple(link.others)
+            loads = tuple(link.load) or forces_among(others, self.units)
             turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
             ports += [
-                Port(name, turn, link.subsystem, (link.output,), tuple(link.load), tuple(link.others)),
+                Port(name, turn, link.subsystem, (link.output,), loads, others),
                 Port(f"{name}_reading", "drift", link.subsystem, (link.output,)),
             ]
             prefix = "" if len(self.links) == 1 else f"{name}_"

@@ -44,7 +44,7 @@ def bound_by(fit: Fit, term: Term) -> bool:
         any(
             p.high > p.low
             and (
-                (np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999))
+                (np.isfinite(p.low) and p.low != 0.0 and not p.vanishes and value <= p.low * (1.001 if p.low > 0 else 0.999))
                 or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high))
             )
             for p, value in zip(term.parameters, values, strict=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from host.studies.proof.calibration import CalibrationTable, Curve, fit
+from host.studies.proof.scoring import none_listed
 from host.studies.proof.worlds.suite import read_labels
 from sim.concealed.label import Label
 
@@ -35,7 +36,7 @@ def statements(judged: Judged, kind: str) -> list[tuple[float, bool]]:
     for label, verdict in judged:
         if kind == "none":
             p = verdict.get("probability_none_raw", verdict.get("probability_none"))
-            true = all(name == "unlisted" for names in label["names"] for name in names)  # none of the vocabulary
+            true = none_listed(label)
         else:
             first = (verdict.get("effects") or [{}])[0]
             p = first.get("probability_raw", first.get("probability"))

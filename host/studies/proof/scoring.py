@@ -115,13 +115,18 @@ def _confident(
 def _stated(
     label: Label, verdict: dict[str, Any], effects: list[dict[str, Any]], names: list[set[str]], calibrate: Calibration
 ) -> tuple[tuple[float, bool], ...]:
-    """What the verdict says with a probability: that its first effect is there, and that nothing is missing."""
+    """What the verdict says with a probability: that its first effect is there, that none of the vocabulary is missing."""
     out = []
     if effects and isinstance(effects[0].get("probability"), (int, float)):
         out.append((calibrate("effect", effects[0]), any(str(effects[0].get("id")) in n for n in names)))
     if isinstance(verdict.get("probability_none"), (int, float)):
-        out.append((calibrate("none", verdict), not label["planted"]))
+        out.append((calibrate("none", verdict), none_listed(label)))
     return tuple(out)
+
+
+def none_listed(label: Label) -> bool:
+    """Whether no effect of the vocabulary is missing: nothing is, or only physics outside it. `probability_none` says so."""
+    return all(name == "unlisted" for names in label["names"] for name in names)
 
 
 def _claim(effect: dict[str, Any]) -> tuple[str, set[str]]:

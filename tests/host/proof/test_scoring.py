@@ -187,6 +187,12 @@ def test_table_of_a_finder_that_knows_all() -> None:
     assert table["detected_rho_0.25"] is None
 
 
+@pytest.mark.parametrize(("label", "true"), [(LABEL, False), (NULL, True), (OUTSIDE, True)])
+def test_none_of_the_vocabulary_is_true_outside_it(label: dict, true: bool) -> None:  # type: ignore[type-arg]
+    verdict = {"verdict": "mismatch_not_identified", "effects": [], "probability_none": 0.8}
+    assert judge(label, verdict).stated == ((0.8, true),)
+
+
 def test_detection_is_counted_at_its_own_rho() -> None:
     near = [
         judge(LABEL | {"rho": rho}, verdict) for rho, verdict in ((0.2, SILENT), (0.3, DOUBT), (0.45, DOUBT), (2.0, SILENT))
