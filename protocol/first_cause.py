@@ -114,6 +114,10 @@ RULES: dict[str, Rule] = {
     "force_unreached": Rule(
         "The requested force is not reached: the catheter gives way.", "Request less force, or expose less of the catheter."
     ),
+    "body_contact": Rule(
+        "The catheter's body touches something away from the tip.",
+        "Look where (topic contact, or the page), and lead the catheter away from it; do not trust the estimated force.",
+    ),
     "still_pressed": Rule(
         "A force remains on the stopped tip.",
         "Pull the catheter back by hand until the force is gone.",

@@ -246,6 +246,11 @@ class EstimationSection(_Section):
     insertion_walk_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0001
     curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.1
     roll_walk_rad: Annotated[float, Field(gt=0, le=1)] = 0.1
+    adaptation: bool = True
+    adaptation_limit: Annotated[float, Field(gt=0, le=0.3)] = 0.3
+    adaptation_sd: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    curvature_exponent: Annotated[float, Field(ge=0, le=1)] = 0.5
+    contact_watch: bool = True
 
 
 class Safety(_Section):

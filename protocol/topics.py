@@ -31,6 +31,7 @@ __all__ = [
     "TOPICS",
     "Alarm",
     "BoardCounters",
+    "BodyContact",
     "Command",
     "CommandCounts",
     "ForceEstimate",
@@ -43,6 +44,7 @@ __all__ = [
     "RigState",
     "SimulatedTruth",
     "Stage",
+    "Stiffness",
     "Topic",
     "check_name",
     "columns",
@@ -56,6 +58,8 @@ __all__ = [
 ]
 
 FRAMES = ("base", "tip")
+CONTACT_PLACES = ("tip", "body", "tip and body", "not observable")
+ADAPTATIONS = ("learning", "frozen", "limited", "not observable")
 LOG_LEVELS = ("info", "warning", "error")
 ACTIONS = (
     "clock", "take", "release", "arm", "disarm", "target", "force", "hold", "jog", "zero", "mark", "stop", "clear_fault"
@@ -67,6 +71,12 @@ RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 _XYZ_m = ("x_m", "y_m", "z_m")
 _FORCE = ("fx_N", "fy_N", "fz_N")
 _LASTING = tuple(f"lasting_c{row}{column}_N2" for row in "xyz" for column in "xyz")
+_BODY_FORCE, _TIP_FORCE = (tuple(f"{where}_{name}" for name in _FORCE) for where in ("body", "tip"))
+_BODY_COVARIANCE, _TIP_COVARIANCE = (
+    tuple(f"{where}_c{row}{column}_N2" for row in "xyz" for column in "xyz") for where in ("body", "tip")
+)
+_NOMINAL = tuple(f"nominal_{name}" for name in _FORCE)
+_NOMINAL_COVARIANCE = tuple(f"nominal_c{row}{column}_N2" for row in "xyz" for column in "xyz")
 _COVARIANCE = tuple(f"c{row}{column}_N2" for row in "xyz" for column in "xyz")
 
 # Time histograms: bucket k holds times from 2^(k / 4) to 2^((k + 1) / 4) us; the first and the last are open.
@@ -111,6 +121,7 @@ UnitPart = Annotated[float, bounds("", -2.0, 2.0)]
 Number = Annotated[float, bounds("", -1e12, 1e12)]
 Score = Annotated[float, bounds("", 0.0, 1e12)]
 Share = Annotated[float, bounds("", 0.0, 1.0)]
+Ratio = Annotated[float, bounds("", 0.0, 100.0)]
 Duration_us = Annotated[float, bounds("us", 0.0, 1e12)]
 Duration_ms = Annotated[float, bounds("ms", 0.0, 1e9)]
 Rate_hz = Annotated[float, bounds("Hz", 1.0, 1e5)]
@@ -185,6 +196,19 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
         ]
         | None
     ) = None
+    nominal_force_N: (
+        Annotated[
+            tuple[Force_N, ...],
+            columns_of("force by the stiffness of the catheter's file; nil where the stiffness is not adapted", _NOMINAL),
+        ]
+        | None
+    ) = None
+    nominal_covariance_N2: (
+        Annotated[tuple[Covariance_N2, ...], columns_of("covariance of that force, row by row", _NOMINAL_COVARIANCE)] | None
+    ) = None
+    body_contact: Annotated[
+        bool, doc("the catheter touches away from the tip (topic `contact`): the force is not the tip's")
+    ] = False
     residual: Annotated[Number | None, doc("residual of the best force")] = None
     published_ns: Annotated[Stamp_ns, doc("when the estimate left the estimator")]
     compute_us: Annotated[Duration_us, doc("time the estimator took")]
@@ -197,6 +221,47 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
             raise ValueError("ForceEstimate: found converged without force or covariance, wanted both")
         if min(self.covariance_N2[0], self.covariance_N2[4], self.covariance_N2[8]) < 0:
             raise ValueError("ForceEstimate.covariance_N2: found a negative variance, wanted none")
+        if (self.nominal_force_N is None) != (self.nominal_covariance_N2 is None):
+            raise ValueError("ForceEstimate: found nominal_force_N or nominal_covariance_N2 alone, wanted both or neither")
+
+
+class Stiffness(Message, frozen=True, kw_only=True):
+    """The catheter's stiffness as adapted while the rig runs (8.1.2). `stamp_ns` is that of the newest tip pose."""
+
+    scale: Annotated[Ratio, doc("stiffness in use, relative to the catheter's file")]
+    sd: Annotated[Ratio, doc("relative standard deviation of the stiffness in use")]
+    adaptation: Annotated[str, choice("what the adaptation does", ADAPTATIONS)]
+    text: Annotated[Text, doc("why, in words")] = ""
+    samples: Annotated[Count, doc("free poses used since the start")]
+    changes: Annotated[Count, doc("sudden changes of the stiffness found since the start")]
+
+
+class BodyContact(Message, frozen=True, kw_only=True):
+    """Where the catheter is touched, by the poses of the last half second. `stamp_ns` is that of the newest tip pose.
+
+    Forces and places are nil where the poses do not determine them.
+    """
+
+    place: Annotated[str, choice("what explains the poses; tip: a force on the tip, or none", CONTACT_PLACES)]
+    sensors: Annotated[U8, doc("poses of one frame that were used")]
+    excess: Annotated[
+        Score, doc("mean chi square of the best tip force, relative to its limit; above 1 it explains nothing")
+    ]
+    body_offset_m: Annotated[Travel_m | None, doc("place of the contact of the body, back from the tip")] = None
+    body_offset_sd_m: Annotated[Travel_m | None, doc("its standard deviation")] = None
+    body_force_N: Annotated[tuple[Force_N, ...], columns_of("force of the body on what it touches", _BODY_FORCE)] | None = (
+        None
+    )
+    body_covariance_N2: (
+        Annotated[tuple[Covariance_N2, ...], columns_of("its covariance, row by row", _BODY_COVARIANCE)] | None
+    ) = None
+    tip_force_N: (
+        Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue, with that", _TIP_FORCE)] | None
+    ) = None
+    tip_covariance_N2: (
+        Annotated[tuple[Covariance_N2, ...], columns_of("its covariance, row by row", _TIP_COVARIANCE)] | None
+    ) = None
+    text: Annotated[Text, doc("the same in words; what the poses do not determine")] = ""
 
 
 class RigState(Message, frozen=True, kw_only=True):
@@ -414,6 +479,8 @@ _TABLE = (
     Topic("pose/shaft", Pose, 40, "state", "realtime -> host, tools", "tracker tool down the shaft"),
     Topic("force/sensor", ForceSensor, 500, "state", "realtime -> host, tools", "measured force"),
     Topic("force/estimate", ForceEstimate, 40, "state", "host -> realtime, tools", "force estimated from poses"),
+    Topic("stiffness", Stiffness, 4, "state", "host -> tools", "stiffness of the catheter as adapted"),
+    Topic("contact", BodyContact, 4, "state", "host -> tools", "contact away from the tip: whether, where, and which force"),
     Topic("state", RigState, 100, "state", "realtime -> host, tools", "mode, safety action and cause, target"),
     Topic("board", BoardCounters, 20, "state", "realtime -> host, tools", "counters of the stepper board"),
     Topic("loop", LoopTiming, 2, "state", "realtime -> host, tools", "timing of the control loop"),

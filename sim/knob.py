@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from sim.catheter_chain import CatheterConfig
+
 DEGREE = math.pi / 180.0
 
 
@@ -25,6 +27,8 @@ class KnobConfig:
     curvature_at_stop_per_m: float = 45.0
     changeover_rad: float = 0.0
     centre_rad: float = 0.0
+    wire_stiffness_N_per_m: float = math.inf
+    calibrated_Nm2: float = 0.1902e-3
 
 
 KNOB_PARAMETERS = np.dtype(
@@ -33,13 +37,21 @@ KNOB_PARAMETERS = np.dtype(
 KNOB_STATE = np.dtype([("seated", "f8"), ("curvature", "f8")], align=True)
 
 
-def parameters(config: KnobConfig) -> np.record:
-    """`config` as the kernel's record; gain in 1/m per rad between slack and stop."""
+def parameters(config: KnobConfig, catheter: CatheterConfig) -> np.record:
+    """`config` as the kernel's record; gain in 1/m per rad between slack and stop, for the stiffness of `catheter`."""
     p = np.zeros(1, KNOB_PARAMETERS).view(np.recarray)[0]
     p.slack, p.stop, p.centre = config.slack_rad, config.stop_rad, config.centre_rad
-    p.gain = config.curvature_at_stop_per_m / (config.stop_rad - config.slack_rad)
+    p.gain = config.curvature_at_stop_per_m / (config.stop_rad - config.slack_rad) * _softer(config, catheter)
     p.changeover = config.changeover_rad
     return p
+
+
+def _softer(config: KnobConfig, catheter: CatheterConfig) -> float:
+    """Curvature over that at the calibrated stiffness: the wire's moment k_w e (path - e L kappa) balances EI kappa."""
+    if math.isinf(config.wire_stiffness_N_per_m):
+        return 1.0
+    wire_Nm2 = config.wire_stiffness_N_per_m * catheter.wire_offset_m**2 * catheter.distal_length_m
+    return (config.calibrated_Nm2 + wire_Nm2) / (catheter.distal_Nm2[0] + wire_Nm2)
 
 
 def start() -> np.record:

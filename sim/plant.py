@@ -64,7 +64,7 @@ class Plant:
                 catheter_chain.start(),
                 vessel.parameters(c.vessel),
                 vessel.start(c.vessel, c.start_stage[0], c.start_stage[1]),
-                knob.parameters(c.knob),
+                knob.parameters(c.knob, c.catheter),
                 knob.start(),
                 tissue.parameters(c.tissue),
                 tissue.start(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -22,6 +23,16 @@ from sim.world import World
 TARGET_M = (0.0, -0.0107, 0.025)
 
 Estimator = Callable[[Message, Message | None, Message, Message | None], ForceEstimate | None]
+
+
+@runtime_checkable
+class ReportingEstimator(Protocol):
+    """An estimator that has more to publish than the force."""
+
+    def reports(self) -> list[tuple[str, Message]]:
+        """Return (topic, message) of what is new since the last call."""
+        ...
+
 
 SETTLE_S = 3.0
 START_TIMEOUT_S = 10.0
@@ -102,6 +113,9 @@ class Scenario:
         if estimate is not None:
             assert isinstance(message, Pose)
             self.loop.estimate_at(msgspec.structs.replace(estimate, published_ns=message.arrival_ns + self._delay_ns))
+        if isinstance(self._estimator, ReportingEstimator):
+            for reported, report in self._estimator.reports():
+                self._publish(reported, report)
 
     def step(self) -> None:
         """One period of the loop."""

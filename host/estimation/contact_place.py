@@ -66,7 +66,7 @@ def estimate_contact(
     rod = rod_record(catheter, insertion_m, curvature_per_m)
     if len(sensors) < 2:
         raise InputError("sensors", len(sensors), "at least 2, to find a place as well as a force")
-    offsets, positions, quaternions, weights = _measured(sensors)
+    offsets, positions, quaternions, weights = measured_poses(sensors)
     total = float(rod[6] + rod[7])
     shortest = 0.15 * total
 
@@ -83,7 +83,7 @@ def estimate_contact(
     return _report(model, best, best_cost, rod, catheter.distal_length_m, offsets, positions, quaternions)
 
 
-def _measured(sensors: Sequence[PoseSensor]) -> tuple[Array, Array, Array, Array]:
+def measured_poses(sensors: Sequence[PoseSensor]) -> tuple[Array, Array, Array, Array]:
     """Offsets (k,), positions (k, 3), quaternions (k, 4), inverse roots (k, 6, 6) of the poses' covariances."""
     k = len(sensors)
     offsets, positions, quaternions, weights = np.empty(k), np.empty((k, 3)), np.empty((k, 4)), np.zeros((k, 6, 6))

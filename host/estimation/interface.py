@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from protocol.catheter import Catheter
+from protocol.topics import Message
 
 Array = NDArray[np.float64]
 
@@ -22,6 +25,7 @@ class Actuation(NamedTuple):
     """The distal end's joints when the pose was measured, as the controller has them through the transmission.
 
     force_direction (3,): unit vector in the base frame along which the controller presses; None where it does not.
+    mode: phase of the control loop, a label of `protocol.enums.Phase`; empty where it is not known.
     """
 
     insertion_m: float
@@ -29,6 +33,7 @@ class Actuation(NamedTuple):
     curvature_per_m: float
     stamp_ns: int
     force_direction: Array | None = None
+    mode: str = ""
 
 
 class TipForce(NamedTuple):
@@ -37,6 +42,8 @@ class TipForce(NamedTuple):
     `lasting_covariance_N2` (3, 3) is the part of the covariance that poses shortly after each other share: errors of
     insertion, curvature, roll and stiffness. What remains of `covariance_N2` is noise, new in each pose.
     A pose that no force explains is not an error: `converged` is false, and `residual` says how far off it is.
+    `nominal` is the answer with the stiffness of the catheter's file, where another stiffness is in use. With `body_contact`
+    the poses tell of a contact away from the tip: the force is then not the tip's.
     """
 
     force_N: Array
@@ -45,11 +52,31 @@ class TipForce(NamedTuple):
     residual: float
     stamp_ns: int
     lasting_covariance_N2: Array | None = None
+    nominal: TipForce | None = None
+    body_contact: bool = False
 
 
 class Estimator(Protocol):
-    """Called once for each tip pose; may keep the branch it is on between calls, nothing else."""
+    """Called once for each tip pose; may keep the branch it is on and what it has learned of the actuation."""
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force that explains `pose_tip` (and `pose_shaft`, where it was seen) at that actuation."""
+        ...
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """An estimator that has more to say than the force."""
+
+    def reports(self) -> list[tuple[str, Message]]:
+        """Return (topic, message) of what is new since the last call, and forget it."""
+        ...
+
+
+@runtime_checkable
+class StiffnessUser(Protocol):
+    """An estimator whose stiffness can be changed while it runs."""
+
+    def use_stiffness(self, catheter: Catheter, relative_sd: float) -> None:
+        """Use the stiffness of `catheter` from now on, known to `relative_sd`."""
         ...

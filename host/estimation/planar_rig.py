@@ -8,7 +8,7 @@ not estimated: it is reported as zero with `out_of_plane_sd_N`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,11 @@ class PlanarRigEstimator:
             ActuationKnowledge.from_rig(rig),
             ContactKnowledge.from_rig(rig),
         )
+
+    def use_stiffness(self, catheter: Catheter, relative_sd: float) -> None:
+        """Use the stiffness of `catheter` from now on, known to `relative_sd`."""
+        self._catheter = catheter
+        self._contact = replace(self._contact, stiffness_sd=relative_sd)
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""

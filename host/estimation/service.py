@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from host.estimation.interface import Actuation, Estimator, PoseReading
+from host.estimation.interface import Actuation, Estimator, PoseReading, Reporting, TipForce
 from protocol.errors import InputError
 from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Message, Pose, RigState, Stage
@@ -51,6 +51,7 @@ class EstimationService:
         self._stages: deque[Stage] = deque()
         self._shaft: Pose | None = None
         self._force_direction: np.ndarray | None = None
+        self._mode = ""
         self._waiting: Pose | None = None
         self.answered = 0
         self.unanswered = 0
@@ -65,6 +66,7 @@ class EstimationService:
         elif isinstance(message, RigState):
             direction = message.force_direction
             self._force_direction = None if direction is None else np.array(direction)
+            self._mode = message.mode
         elif isinstance(message, Pose) and topic == "pose/shaft":
             self._shaft = message
         elif isinstance(message, Pose) and topic == "pose/tip" and not message.missing:
@@ -101,7 +103,13 @@ class EstimationService:
         if abs(nearest.stamp_ns - stamp_ns) > HISTORY_NS:
             return None
         actuation = _actuation(nearest)
-        return None if actuation is None else actuation._replace(force_direction=self._force_direction)
+        if actuation is None:
+            return None
+        return actuation._replace(force_direction=self._force_direction, mode=self._mode)
+
+    def reports(self) -> list[tuple[str, Message]]:
+        """Return (topic, message) of what the estimator reports in addition to the force, new since the last call."""
+        return self._estimator.reports() if isinstance(self._estimator, Reporting) else []
 
     def _shaft_of(self, tip: Pose) -> PoseReading | None:
         shaft = self._shaft
@@ -117,7 +125,7 @@ class EstimationService:
             self.last_failure = f"{type(error).__name__}: {error}"
             answer = None
         compute_us = (self._timer_ns() - begin_ns) * 1e-3
-        good = answer is not None and answer.converged and _plausible(answer.force_N, answer.covariance_N2)
+        good = answer is not None and _good(answer) and (answer.nominal is None or _good(answer.nominal))
         self.answered += good
         self.unanswered += not good
         if answer is None or not good:
@@ -126,6 +134,7 @@ class EstimationService:
                 frame="base",
                 converged=False,
                 published_ns=now_ns,
+                body_contact=answer is not None and answer.body_contact,
                 residual=None if answer is None else answer.residual,
                 compute_us=compute_us,
             )
@@ -134,14 +143,23 @@ class EstimationService:
             frame="base",
             converged=True,
             published_ns=now_ns,
-            force_N=tuple(map(float, answer.force_N)),
-            covariance_N2=tuple(map(float, np.ravel(answer.covariance_N2))),
-            lasting_covariance_N2=(
-                None if answer.lasting_covariance_N2 is None else tuple(map(float, np.ravel(answer.lasting_covariance_N2)))
-            ),
+            force_N=_numbers(answer.force_N),
+            covariance_N2=_numbers(answer.covariance_N2),
+            lasting_covariance_N2=_numbers(answer.lasting_covariance_N2),
+            nominal_force_N=_numbers(answer.nominal and answer.nominal.force_N),
+            nominal_covariance_N2=_numbers(answer.nominal and answer.nominal.covariance_N2),
+            body_contact=answer.body_contact,
             residual=answer.residual,
             compute_us=compute_us,
         )
+
+
+def _numbers(values: np.ndarray | None) -> tuple[float, ...] | None:
+    return None if values is None else tuple(map(float, np.ravel(values)))
+
+
+def _good(answer: TipForce) -> bool:
+    return answer.converged and _plausible(answer.force_N, answer.covariance_N2)
 
 
 def _plausible(force_N: np.ndarray, covariance_N2: np.ndarray) -> bool:

@@ -8,6 +8,7 @@ which cases 4 and 6 leave out. Source: chapter 5, weighted, with the errors of t
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,11 @@ class SpatialRigEstimator:
             ActuationKnowledge.from_rig(rig),
             ContactKnowledge.from_rig(rig),
         )
+
+    def use_stiffness(self, catheter: Catheter, relative_sd: float) -> None:
+        """Use the stiffness of `catheter` from now on, known to `relative_sd`."""
+        self._catheter = catheter
+        self._contact = replace(self._contact, stiffness_sd=relative_sd)
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: InputError (bad input)."""

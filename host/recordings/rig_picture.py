@@ -149,6 +149,7 @@ class Picture:
             "scene": self._drawn(),
             "loop": self._loop(),
             "board": self._board(),
+            "model": self._model(),
         }
         self._force_rows.clear()
         self._estimate_rows.clear()
@@ -203,6 +204,19 @@ class Picture:
             "longest_gap_where",
         )
         return {**{name: loop.get(name) for name in names}, "longest_gap_ms": _ms(loop.get("longest_gap_ns"))}
+
+    def _model(self) -> dict[str, Any] | None:
+        """What the model process has learned of the catheter and its contacts; None before it has said anything."""
+        stiffness, contact = self._newest.get("stiffness", {}), self._newest.get("contact", {})
+        if not stiffness and not contact:
+            return None
+        return {
+            **{name: stiffness.get(name) for name in ("scale", "sd", "adaptation", "text")},
+            "place": contact.get("place"),
+            "body_offset_m": contact.get("body_offset_m"),
+            "body_offset_sd_m": contact.get("body_offset_sd_m"),
+            "contact_text": contact.get("text"),
+        }
 
     def _board(self) -> dict[str, Any] | None:
         board = self._newest.get("board")

@@ -22,6 +22,8 @@ from realtime.loop.service_notify import ServiceNotifier
 
 POLL_S = 0.002
 QUIET_S = 1.0
+# What an estimator may report in addition to the force.
+REPORTED = ("stiffness", "contact")
 
 
 class EstimatorProcess:
@@ -40,6 +42,7 @@ class EstimatorProcess:
         self._now_ns = time.monotonic_ns if clock == "wall" else lambda: self._newest_ns
         self._everything = session.everything()
         self._forces = session.publisher("force/estimate")
+        self._reports = {topic: session.publisher(topic) for topic in REPORTED}
         self._logs = session.publisher("log")
         self._received_s = self._logged_s = time.monotonic()
         self._logged = ""
@@ -58,6 +61,8 @@ class EstimatorProcess:
         estimate = self.service.answer(self._now_ns())
         if estimate is not None:
             self._forces.put(estimate)
+        for topic, report in self.service.reports():
+            self._reports[topic].put(report)
         self._log_once(self._everything.complaint or self.service.last_failure)
         self._flush_when_quiet(bool(taken))
         return bool(taken)

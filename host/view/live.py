@@ -30,6 +30,8 @@ DEPTHS = {
     "force/sensor": 1,
     "board": 1,
     "loop": 1,
+    "stiffness": 1,
+    "contact": 1,
     "state": 64,
     "force/estimate": 64,
     "log": 32,

@@ -18,7 +18,8 @@ from protocol.errors import InputError
 from protocol.requests import Request, read_json
 
 # Topics whose every message is shown, and those of which only the newest counts.
-EVERY, NEWEST = ("state", "force/estimate", "log"), ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "loop")
+EVERY = ("state", "force/estimate", "log")
+NEWEST = ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "loop", "stiffness", "contact")
 # Of the others the last few: a tool that was not seen leaves the pose before it standing.
 LAST = 3
 # After a jump the traces are filled with so much of the past.

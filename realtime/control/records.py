@@ -42,6 +42,8 @@ class Force:
     arrival_ns: int = whole("ns", "when it arrived")
     force_N: Floats = real("N", "force on the tissue", 3)
     covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
+    nominal_N: Floats = real("N", "an estimate's force without adaptation of the stiffness; zero for the sensor", 3)
+    nominal_covariance_N2: Matrix = real("N^2", "covariance of that; zero for the sensor", 3, 3)
 
 
 class BoardRecord:
@@ -347,6 +349,8 @@ class ForceSourceState:
     arrival_ns: Ints = whole("ns", "when the newest plausible reading arrived", 2)
     normal_N: Floats = real("N", "its compression", 2)
     noise_N2: float = real("N^2", "variance of the newest estimate along the normal")
+    nominal_N: float = real("N", "compression by the newest estimate without adaptation of the stiffness")
+    nominal_noise_N2: float = real("N^2", "its variance")
     equal: int = whole("", "equal readings of the sensor in a row")
     head: int = whole("", "newest place of the ring")
     ring_ns: Ints = whole("ns", "stamps of the sensor's last readings", FORCE_RING)
@@ -374,8 +378,8 @@ class WitnessState:
     """Sensor, estimate and geometry compared (`witnesses`)."""
 
     sensor_N: float = real("N", "compression by the sensor, averaged over 10 ms")
-    estimate_N: float = real("N", "compression by the estimate, averaged over 60 ms")
-    estimate_sd_N: float = real("N", "standard deviation that the newest estimate states")
+    estimate_N: float = real("N", "compression by the estimate, the greater of both stiffnesses, averaged over 60 ms")
+    estimate_sd_N: float = real("N", "standard deviation of the newest estimate without adaptation")
     estimate_ns: int = whole("ns", "stamp of the newest estimate")
     difference_N: float = real("N", "estimate minus sensor at the same times, averaged")
     pairs: int = whole("", "pairs that were compared since arming")

@@ -42,6 +42,12 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         "the requested force is not reached, because the catheter gives way: request less, or expose less of the catheter",
     ),
     ("still_pressed", ACTION_WARN, False, "a force remains on the stopped tip: pull the catheter back by hand"),
+    (
+        "body_contact",
+        ACTION_WARN,
+        False,
+        "the catheter's body touches something: the estimated force is not that of the tip; see the topic contact for where",
+    ),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 (
@@ -64,6 +70,7 @@ CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
     HOST_LOST,
     FORCE_UNREACHED,
     STILL_PRESSED,
+    BODY_CONTACT,
 ) = (1 << index for index in range(len(CAUSES)))
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 

@@ -4,7 +4,8 @@ The loop works with one force source. This block compares all of them from armin
 wrong source can press unseen:
 
 - sensor: the newest reading,
-- estimate: the model process' answer,
+- estimate: the model process' answer, by the stiffness of the catheter's file; for too much force also by the adapted
+  one, whichever is greater,
 - geometry: the distance by which the measured tip stays behind the free tip of the kinematics, along the inward normal,
   since the catheter was last free, over the compliance of the rig file. It needs neither of the others.
 
@@ -68,11 +69,14 @@ def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -
         return
     dt_s = min(max((force.estimate_stamp_ns - state.estimate_ns) * 1e-9, 0.0), 0.1)
     state.estimate_ns = force.estimate_stamp_ns
-    state.estimate_sd_N = math.sqrt(force.noise_N2)
-    state.estimate_N += _share(dt_s, _ESTIMATE_S) * (force.normal_N[SOURCE_ESTIMATE] - state.estimate_N)
+    # An adapted stiffness may be wrong: it is not let lower what the estimate says of too much force, nor take part in the
+    # comparison with the sensor, which adapts nothing.
+    state.estimate_sd_N = math.sqrt(force.nominal_noise_N2)
+    greatest_N = max(force.normal_N[SOURCE_ESTIMATE], force.nominal_N)
+    state.estimate_N += _share(dt_s, _ESTIMATE_S) * (greatest_N - state.estimate_N)
     if force.sensor_then == force.sensor_then:  # a reading of the sensor at the estimate's time, else NaN
         state.pairs += 1
-        difference_N = force.normal_N[SOURCE_ESTIMATE] - force.sensor_then
+        difference_N = force.nominal_N - force.sensor_then
         share = max(_share(dt_s, _DIFFERENCE_S), 1.0 / state.pairs)
         state.difference_N += share * (difference_N - state.difference_N)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from protocol.rig_file import Rig
+from protocol.topics import ForceEstimate
 
 
 def rotation(quaternion_wxyz: tuple[float, ...] | np.ndarray) -> np.ndarray:
@@ -60,9 +61,16 @@ class Intake:
         record.force_N[:] = self._sensor_rotation @ (np.asarray(force_N) - self.zero_N)
 
     @staticmethod
-    def estimate(record: np.record, stamp_ns: int, arrival_ns: int, force_N: np.ndarray, covariance_N2: np.ndarray) -> None:
-        """A force estimate (base frame, on the tissue; (3,) N, (3, 3) N2) into a FORCE record."""
+    def estimate(record: np.record, estimate: ForceEstimate, arrival_ns: int) -> bool:
+        """A force estimate (base frame, on the tissue) into a FORCE record. Return whether it has a force."""
+        force_N, covariance_N2 = estimate.force_N, estimate.covariance_N2
+        if not estimate.converged or force_N is None or covariance_N2 is None:
+            return False
         record.count += 1
-        record.stamp_ns, record.arrival_ns = stamp_ns, arrival_ns
+        record.stamp_ns, record.arrival_ns = estimate.stamp_ns, arrival_ns
         record.force_N[:] = force_N
-        record.covariance_N2[:] = covariance_N2
+        record.covariance_N2.flat = covariance_N2
+        adapted = estimate.nominal_force_N is not None
+        record.nominal_N[:] = estimate.nominal_force_N if adapted else force_N
+        record.nominal_covariance_N2.flat = estimate.nominal_covariance_N2 if adapted else covariance_N2
+        return True

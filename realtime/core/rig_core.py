@@ -39,7 +39,7 @@ LONGEST_GAP_NS = 10_000_000
 # A cause that comes and goes, as a stale pose may at every frame, is logged again after this time without it.
 CAUSE_QUIET_NS = 1_000_000_000
 # Warnings that are logged: the loop goes on, and the operator has to know.
-_LOGGED_WARNINGS = safety.STILL_PRESSED | safety.FORCE_UNREACHED
+_LOGGED_WARNINGS = safety.STILL_PRESSED | safety.FORCE_UNREACHED | safety.BODY_CONTACT
 # Causes whose log line carries what sensor, estimate and geometry say.
 _FORCE_CAUSES = safety.OVER_FORCE | safety.FORCE_UNDECIDED | safety.FORCE_DISAGREES | _LOGGED_WARNINGS
 _BOARD_ERRORS = (BoardEventKind.FAULT, BoardEventKind.RESET, BoardEventKind.MISMATCH)
@@ -337,13 +337,9 @@ class RigCore:
     # --- the model process, cross-checks ---
 
     def _take_estimate(self, estimate: ForceEstimate) -> None:
-        self._report(self.supervision.host_answered(estimate.stamp_ns, self.now_ns))
-        if not estimate.converged or estimate.force_N is None or estimate.covariance_N2 is None:
-            return
-        record = self._records["estimate"]
-        covariance_N2 = np.array(estimate.covariance_N2).reshape(3, 3)
-        self._intake.estimate(record, estimate.stamp_ns, self.now_ns, np.array(estimate.force_N), covariance_N2)
-        self._leaving.changed.add("estimate")
+        self._report(self.supervision.host_answered(estimate, self.now_ns))
+        if self._intake.estimate(self._records["estimate"], estimate, self.now_ns):
+            self._leaving.changed.add("estimate")
 
     def _report(self, finding: SupervisionFinding | None) -> None:
         """Log a finding of the supervision."""

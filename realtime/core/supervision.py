@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.serial_frames import AXES
+from protocol.topics import ForceEstimate
 from realtime.control import safety
 from realtime.control.records import N_AXES
 
@@ -100,17 +101,19 @@ class HostCheck:
 class Supervision:
     """All checks together. `causes` is the bit set of failsafe causes that stand.
 
-    Lost steps stay until `restart`; causes of the model process stand while it does not answer.
+    Lost steps stay until `restart`; causes of the model process stand while it does not answer, a contact of the body while
+    it reports one.
     """
 
     def __init__(self, encoder_counts_per_step: tuple[float, float, float], host_lost_after_ns: int) -> None:
         self.steps, self.host = StepCheck(encoder_counts_per_step), HostCheck(host_lost_after_ns)
-        self._lasting = 0
+        self._lasting = self._body_causes = 0
 
     @property
     def causes(self) -> int:
         """The bit set of failsafe causes that stand."""
-        return self._lasting | self.host.causes
+        # What a model process that is silent said last says nothing of now.
+        return self._lasting | (self.host.causes or self._body_causes)
 
     def restart(self) -> None:
         """Forget all findings; for arming and clearing, when the operator has seen what was wrong."""
@@ -126,9 +129,10 @@ class Supervision:
             self._lasting |= finding.cause
         return finding
 
-    def host_answered(self, stamp_ns: int, now_ns: int) -> SupervisionFinding | None:
-        """Take in that an estimate for a pose of `stamp_ns` arrived. Return a new finding."""
-        return self.host.answered(stamp_ns, now_ns)
+    def host_answered(self, estimate: ForceEstimate, now_ns: int) -> SupervisionFinding | None:
+        """Take in an estimate that arrived at `now_ns`. Return a new finding."""
+        self._body_causes = safety.BODY_CONTACT if estimate.body_contact else 0
+        return self.host.answered(estimate.stamp_ns, now_ns)
 
     def host_overdue(self, now_ns: int) -> SupervisionFinding | None:
         """Check at every step that estimates keep coming. Return a new finding."""

@@ -3,12 +3,20 @@
 import numpy as np
 
 from protocol.enums import SafetyAction
+from protocol.topics import ForceEstimate
 from realtime.control import safety
 from realtime.core.supervision import HOST_SILENT_NS, STEPS_SWING, Supervision
 
 MS = 1_000_000
 LOST_NS = 2_000_000_000
 ZERO = np.zeros(3, int)
+
+
+def answer(stamp_ns: int, body_contact: bool = False) -> ForceEstimate:
+    """An answer of the model process for a pose of `stamp_ns`."""
+    return ForceEstimate(
+        stamp_ns=stamp_ns, frame="base", converged=False, published_ns=stamp_ns, compute_us=0.0, body_contact=body_contact
+    )
 
 
 def made() -> Supervision:
@@ -54,12 +62,12 @@ def test_a_silent_model_process_holds_and_a_lost_one_retracts() -> None:
     supervision = made()
     supervision.host_overdue(10**12)
     assert supervision.causes == 0  # it never answered: there may be none
-    supervision.host_answered(0, 10 * MS)
+    supervision.host_answered(answer(0), 10 * MS)
     supervision.host_overdue(10 * MS + HOST_SILENT_NS + 1)
     assert supervision.causes == safety.HOST_SILENT
     supervision.host_overdue(10 * MS + LOST_NS + 1)
     assert safety.action_of(supervision.causes) == SafetyAction.RETRACT
-    supervision.host_answered(10 * MS + LOST_NS, 20 * MS + LOST_NS)
+    supervision.host_answered(answer(10 * MS + LOST_NS), 20 * MS + LOST_NS)
     supervision.host_overdue(20 * MS + LOST_NS)
     assert supervision.causes == 0
 
@@ -73,3 +81,15 @@ def test_a_silent_and_a_slow_model_process_are_logged_once_each() -> None:
     slow = host.answered(0, 900 * MS)
     assert slow is not None and "slow" in slow.text and slow.cause == 0 and host.answered(0, 910 * MS) is None
     assert host.answered(920 * MS, 930 * MS) is None
+
+
+def test_a_contact_of_the_body_warns_while_it_is_reported_and_never_stops() -> None:
+    supervision = made()
+    supervision.host_answered(answer(0, body_contact=True), 10 * MS)
+    assert supervision.causes == safety.BODY_CONTACT
+    assert safety.decide(supervision.causes, 0, False) == (SafetyAction.WARN, 0)
+    supervision.host_answered(answer(25 * MS), 35 * MS)
+    assert supervision.causes == 0
+    supervision.host_answered(answer(50 * MS, body_contact=True), 60 * MS)
+    supervision.host_overdue(60 * MS + HOST_SILENT_NS + 1)
+    assert supervision.causes == safety.HOST_SILENT  # what it said last says nothing of now

@@ -24,7 +24,7 @@ class Witnesses:
         witnesses.start(self.state.witness)
         self.rng = np.random.default_rng(4)
 
-    def run(self, seconds: float, sensor_N: float, estimate_N: float) -> int:
+    def run(self, seconds: float, sensor_N: float, estimate_N: float, adapted: float = 1.0) -> int:
         """Return the greatest answer of `disagree` over a time with these forces, in noise."""
         worst, force, inputs = 0, self.state.force, self.inputs
         for _ in range(round(seconds * 1000)):
@@ -35,8 +35,10 @@ class Witnesses:
             force.arrival_ns[SOURCE_SENSOR] = inputs.now_ns
             new_estimate = inputs.now_ns % (25 * MS) == 0
             if new_estimate:
-                force.normal_N[SOURCE_ESTIMATE] = estimate_N + SD_N * self.rng.normal()
-                force.noise_N2, force.estimate_stamp_ns = SD_N**2, inputs.now_ns - 30 * MS
+                force.nominal_N = estimate_N + SD_N * self.rng.normal()
+                force.normal_N[SOURCE_ESTIMATE] = adapted * force.nominal_N
+                force.noise_N2, force.nominal_noise_N2 = (adapted * SD_N) ** 2, SD_N**2
+                force.estimate_stamp_ns = inputs.now_ns - 30 * MS
                 force.sensor_then = sensor_N
                 force.arrival_ns[SOURCE_ESTIMATE] = inputs.estimate.arrival_ns = inputs.now_ns
             force.new[SOURCE_SENSOR], force.new[SOURCE_ESTIMATE] = 1, new_estimate
@@ -72,6 +74,22 @@ def test_each_witness_alone_proves_too_much_force(sensor_N: float, estimate_N: f
     rig.run(1.0, sensor_N, estimate_N)
     rig.state.witness.geometry_N = geometry_N
     assert witnesses.over(rig.params, rig.state.witness, rig.state.force, rig.inputs)
+
+
+@pytest.mark.parametrize("adapted", [0.7, 0.8, 1.25, 1.3])
+def test_an_adapted_stiffness_hides_nothing_from_the_witnesses(adapted: float) -> None:
+    """What is found without adaptation is found with it, at the same forces; a stiffer catheter adds too much force."""
+    for sensor_N, estimate_N in ((0.2, 0.0), (0.0, 0.2), (0.2, 0.5)):
+        rig = Witnesses()
+        rig.run(1.0, 0.0, 0.0, adapted)
+        assert rig.run(0.75, sensor_N, estimate_N, adapted) == 2
+    for estimate_N, without in ((0.7, True), (0.55, False)):
+        rig = Witnesses()
+        rig.run(1.0, 0.0, estimate_N, adapted)
+        found = witnesses.over(rig.params, rig.state.witness, rig.state.force, rig.inputs)
+        assert found or not without
+        if adapted * estimate_N > 0.66:
+            assert found
 
 
 def test_what_is_below_the_limit_is_not_too_much() -> None:

@@ -16,6 +16,7 @@ from realtime.control import free_tip, target_predictor
 from realtime.control.configure import tick_parameters
 from realtime.control.records import TARGET_STATE, new
 from realtime.control.target_models import LOCAL, position
+from realtime.core.lockstep import Publish
 from sim import heart
 from sim.aurora_emulator import Pose
 from sim.forked_board import forkable_board
@@ -70,10 +71,17 @@ def _silent(topic: str, message: Message) -> None:
     """What the loop publishes is not needed: the study looks at the world."""
 
 
-def _scenario(rig: Rig, seed: int, source: str = "sensor", world_type: type[World] = World, **plant: Any) -> Scenario:
+def _scenario(
+    rig: Rig,
+    seed: int,
+    source: str = "sensor",
+    world_type: type[World] = World,
+    publish: Publish = _silent,
+    **plant: Any,
+) -> Scenario:
     estimator = EstimationService(load_estimator(DEFAULT_ESTIMATOR, rig)) if source == "estimate" else None
     world = world_type(rig, simulated_plant(rig, seed, **plant), forkable_board("native"), seed)
-    return Scenario(rig, world, _silent, estimator=estimator, force_source=source)
+    return Scenario(rig, world, publish, estimator=estimator, force_source=source)
 
 
 def hold(
@@ -84,9 +92,14 @@ def hold(
     source: str = "sensor",
     force_N: float = 0.2,
     still_after_s: float = np.inf,
+    publish: Publish = _silent,
+    **plant: Any,
 ) -> Held:
-    """Approach and press for `seconds`; from `still_after_s` after contact on, the catheter is held still."""
-    run = _scenario(rig, seed, source, heart=beat)
+    """Approach and press for `seconds`; from `still_after_s` after contact on, the catheter is held still.
+
+    plant: parts of `sim.plant.PlantConfig` that are not the default ones.
+    """
+    run = _scenario(rig, seed, source, publish=publish, heart=beat, **plant)
     rows: list[tuple[float, float, int]] = []
     if not run.arm():
         return Held(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), False)

@@ -59,6 +59,23 @@ export function showLoop(loop, frame) {
   fill(element("loop"), rows);
 }
 
+export function showModel(model) {
+  if (!model) return fill(element("model"), [["", "no data yet"]]);
+  const known = value => value !== null && value !== undefined;
+  const rows = [];
+  if (known(model.scale)) {
+    rows.push(["stiffness of the file's", `${(100 * model.scale).toFixed(1)} ± ${(100 * model.sd).toFixed(1)} %`],
+      ["adaptation", model.adaptation + (model.text ? `: ${model.text}` : ""), model.adaptation === "limited" ? "bad" : ""]);
+  }
+  if (known(model.place)) {
+    const where = known(model.body_offset_m) ? `, ${(1000 * model.body_offset_m).toFixed(0)} ± ${(1000 * model.body_offset_sd_m).toFixed(0)} mm behind the tip` : "";
+    const away = model.place !== "tip";
+    rows.push(["contact away from the tip", away ? `${model.place}${where}` : "none", away ? "bad" : ""]);
+    if (away && model.contact_text) rows.push(["", model.contact_text]);
+  }
+  fill(element("model"), rows);
+}
+
 export function showBoard(board) {
   if (!board) return fill(element("board"), [["", "no data yet"]]);
   const fault = board.fault ? board.fault_name || `fault ${board.fault}` : "none";

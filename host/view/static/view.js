@@ -2,7 +2,7 @@
 
 import {Controls} from "/static/controls.js";
 import {Drive} from "/static/drive.js";
-import {showBoard, showLog, showLoop, showSafety} from "/static/panels.js";
+import {showBoard, showModel, showLog, showLoop, showSafety} from "/static/panels.js";
 import {Player} from "/static/player.js";
 import {Traces} from "/static/traces.js";
 
@@ -101,6 +101,7 @@ function draw() {
   showSafety(frame, live);
   showLoop(frame.loop, frame);
   showBoard(frame.board);
+  showModel(frame.model);
   if (frame.play) page.player.show(frame.play);
   const now = frame.play ? frame.play.at : frame.t;
   force.draw(now);
