@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
@@ -20,6 +21,8 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 BLOCKS_OF_A_LONE_RECORDING = 10
+FEWEST_ROWS = 50  # of a recording
+GAP_SAMPLES = 10  # missing in a row in every channel, beyond which an input cannot be bridged by a line
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,33 @@ def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec],
         segments += [
             _cut(whole, segment.name, segment.rows[0], segment.rows[1], lead=spec.data.lead_rows) for segment in cuts
         ] or [whole]
-    return _split(_named_apart(segments), spec.data.heldout)
+    parts = [part for segment in segments for part in _at_gaps(segment)]
+    return _split(_named_apart(parts), spec.data.heldout)
+
+
+def _at_gaps(segment: Recording) -> list[Recording]:
+    """The recording, cut where nothing was recorded for more than GAP_SAMPLES.
+
+    What went in there is not known, so neither is the state behind it: each part is simulated from a state of its own.
+    Time runs on. Parts of fewer than FEWEST_ROWS are left out, unless there is no other.
+    """
+    seen = np.any([np.isfinite(values) for values in segment.channels.values()], axis=0)
+    rows = np.flatnonzero(seen)
+    if rows.size == 0:
+        return [segment]
+    ends = np.flatnonzero(np.diff(rows) > GAP_SAMPLES)
+    if ends.size == 0:
+        return [segment]
+    firsts, lasts = [rows[0], *rows[ends + 1]], [*rows[ends], rows[-1]]
+    parts = []
+    for first, last in zip(firsts, lasts, strict=True):
+        part = slice(int(first), int(last) + 1)
+        used = segment.fit[part].any() or not segment.fit.any()
+        if last + 1 - first >= FEWEST_ROWS and used:
+            channels = {name: values[part] for name, values in segment.channels.items()}
+            masks = {"fit": segment.fit[part], "heldout": segment.heldout[part]}
+            parts.append(replace(segment, time_s=segment.time_s[part], channels=channels, **masks))
+    return parts or [segment]
 
 
 def _named_apart(segments: list[Recording]) -> list[Recording]:
@@ -134,8 +163,8 @@ def _one(
     short = [key for key, values in channels.items() if values.size != n]
     if short:
         raise InputError(f"channels.{short[0]}", f"{channels[short[0]].size} rows in {name}", f"{n} rows")
-    if n < 50:
-        raise InputError("recording", f"{n} rows in {name}", "at least 50 rows")
+    if n < FEWEST_ROWS:
+        raise InputError("recording", f"{n} rows in {name}", f"at least {FEWEST_ROWS} rows")
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
     time_s, timed = _time_line(spec, name, columns, n)
     dt_s = float(np.median(np.diff(time_s)))
@@ -200,7 +229,12 @@ def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recor
 def _split(segments: list[Recording], patterns: list[str] | None) -> list[Recording]:
     used = [p.fit if p.fit.any() else np.ones(p.n, dtype=bool) for p in segments]
     if patterns is not None:
-        out = [any(fnmatch(p.name, pattern) for pattern in patterns) for p in segments]
+        # a recording that was cut at a gap, or that shares its name with another, has a number behind its name
+        names = [re.sub(r" \(\d+\)$", "", p.name) for p in segments]
+        out = [
+            any(fnmatch(name, pattern) for pattern in patterns for name in pair)
+            for pair in zip(names, (p.name for p in segments), strict=True)
+        ]
         if len(segments) > 1 and (all(out) or not any(out)):
             raise InputError(
                 "data.heldout",

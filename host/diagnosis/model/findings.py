@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.dataset import GAP_SAMPLES, Recording
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives, smoothing_window, white_level
 from host.diagnosis.model.readings import Finding, coarse, counts, resolution, without_outliers
@@ -165,7 +165,8 @@ def _stamps(column: str | None, recordings: list[Recording], findings: list[Find
                 "clock",
                 "time",
                 f"Time stamps are not even: in {worst.name} a period differs from the median one, {worst.dt_s:.4g} s, by up "
-                f"to {worst.jitter:.3g} of it. Channels were interpolated to even steps; longer gaps are left out.",
+                f"to {worst.jitter:.3g} of it. Channels were interpolated to even steps; longer gaps are left out. Behind a "
+                f"gap of more than {GAP_SAMPLES} samples a recording begins again, from a state of its own.",
             )
         )
     periods = [recording.dt_s for recording in recordings if recording.timed]
