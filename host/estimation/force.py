@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.estimation import planar
 from host.estimation.planar import PlanarEstimate, RecordingEstimate
-from host.estimation.reach import REACH_MARGIN_M, check_reach, out_of_reach
+from host.estimation.reach import REACH_MARGIN_M, check_apart, check_reach, out_of_reach
 from host.estimation.sensor_noise import PoseSensor, SurfacePrior
 from host.estimation.spatial import ONE_TO_ONE, SpatialEstimate, checked_case, estimate_cosserat, quieter_than_noise
 from host.estimation.spatial_batch import BatchEstimate, estimate_batch
@@ -99,11 +99,12 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
         `residual` (dimensionless), `chi_square`, `warnings`, `solutions_N` (k, 3), ...
         BatchEstimate for n samples: `force_N` (n, 3), `covariance_N2` (n, 3, 3), `converged` (n,), `residual` (n,).
         PlanarEstimate or RecordingEstimate for the planar model: `force_N` (2,) or (n, 2) in the base frame, ...
-        A pose that no force explains is no error: `converged` is False. So is, among n samples, a pose out of reach.
+        A pose that no force explains is no error: `converged` is False.
 
     Raises:
         InputError: a value is not finite, out of its range or of a wrong shape, or a sensor is further from the sheath's
-            exit than the exposed length and 20 mm (one sample only); names the argument.
+            exit than the exposed length and 20 mm, or from the sensor before it than the catheter between them and 20 mm;
+            names the argument, and among n samples the first that is wrong (sensors.0.position_m.17).
 
     Source:
         Thesis, (5.3) to (5.11) with (5.5) corrected, and chapter 4 for the planar model; weights and covariance are ours.
@@ -134,8 +135,8 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
             _stacked("position_m", [sensor[1] for sensor in used], 3),
             _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
         )
+        _check_rows(poses.positions_m, poses.offsets_m, catheter.distal_length_m + np.asarray(insertion_m))
         found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
-        found.converged[out_of_reach(poses.positions_m, catheter.distal_length_m + np.asarray(insertion_m))] = False
         if not ordered and case in ONE_TO_ONE:
             _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
         return found
@@ -154,6 +155,19 @@ def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[A
             return
         if far and math.isfinite(exposed_m):
             check_reach(f"sensors.{index}.position_m", sensor[1], exposed_m)
+    if len(sensors) > 1 and all(np.all(np.isfinite(sensor[1])) for sensor in sensors):
+        check_apart("sensors.{}.position_m", [sensor[0] for sensor in sensors], [sensor[1] for sensor in sensors])
+
+
+def _check_rows(positions_m: Array, offsets_m: Sequence[float], exposed_m: Array) -> None:
+    """Raise InputError for the first of n samples, positions (n, k, ...), that the catheter cannot reach."""
+    if exposed_m.size not in (1, len(positions_m)):
+        return  # lengths that do not match are named by the estimator
+    for row in np.flatnonzero(out_of_reach(positions_m, offsets_m, exposed_m)):
+        exposed = float(np.broadcast_to(exposed_m, len(positions_m))[row])
+        for index, position in enumerate(positions_m[row]):
+            check_reach(f"sensors.{index}.position_m.{row}", position, exposed)
+        check_apart(f"sensors.{{}}.position_m.{row}", offsets_m, list(positions_m[row]))
 
 
 class Poses(NamedTuple):
@@ -223,6 +237,5 @@ def _planar(
         return planar.estimate(arcs, [*np.ravel(position), angle], prior=prior, thorough=thorough)
     _only_one(prior=prior, thorough=thorough or None)
     pose = np.column_stack([np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)])
-    recorded = planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)
-    recorded.converged[out_of_reach(pose[:, :2], catheter.distal_length_m + np.asarray(insertion_m))] = False
-    return recorded
+    _check_rows(pose[:, None, :2], [0.0], catheter.distal_length_m + np.asarray(insertion_m))
+    return planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)

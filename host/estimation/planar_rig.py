@@ -111,6 +111,7 @@ class PlanarRigEstimator:
         poses = {0.0: self._planar(pose_tip, y_axis, actuation)}
         seen = pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all()
         if pose_shaft is not None and seen and self._shaft_offset_m < outside - 1e-3:
+            check_reach("pose_shaft.position_m", pose_shaft.position_m, outside)
             poses[self._shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
         self.errors.move_to(actuation)
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,10 +30,31 @@ def check_reach(key: str, position_m: ArrayLike, exposed_m: float) -> None:
         )
 
 
-def out_of_reach(positions_m: NDArray[np.float64], exposed_m: ArrayLike) -> NDArray[np.bool_]:
-    """Whether positions (n, ..., 2 or 3) of n samples, any sensor of each, lie further off than the catheter reaches.
+def check_apart(key: str, offsets_m: Sequence[float], positions_m: Sequence[ArrayLike]) -> None:
+    """Raise InputError where two neighbouring sensors are further apart than the catheter between them is long.
 
-    exposed_m: (n,) or one length.
+    Arguments: `offsets_m` (k,), arc lengths back from the tip; `positions_m`, k positions. `key` has a place for the index.
     """
-    distance = np.linalg.norm(positions_m, axis=-1).reshape(len(positions_m), -1).max(axis=1)
-    return np.asarray(distance > np.asarray(exposed_m) + REACH_MARGIN_M)
+    for i in range(1, len(positions_m)):
+        between_m = abs(offsets_m[i] - offsets_m[i - 1])
+        apart_m = math.dist(np.ravel(positions_m[i]), np.ravel(positions_m[i - 1]))
+        if apart_m > between_m + REACH_MARGIN_M:
+            raise InputError(
+                key.format(i),
+                [float(part) for part in np.ravel(positions_m[i])],
+                f"a position at most {1e3 * (between_m + REACH_MARGIN_M):.1f} mm from the sensor before it "
+                f"(catheter between them {1e3 * between_m:.1f} mm and {1e3 * REACH_MARGIN_M:.0f} mm), "
+                f"not {1e3 * apart_m:.1f} mm",
+            )
+
+
+def out_of_reach(positions_m: NDArray[np.float64], offsets_m: Sequence[float], exposed_m: ArrayLike) -> NDArray[np.bool_]:
+    """Whether `check_reach` or `check_apart` would refuse positions (n, k, 2 or 3) of n samples; not for what is not finite.
+
+    Arguments: offsets_m (k,), arc lengths back from the tip; exposed_m, (n,) or one length.
+    """
+    exposed = np.broadcast_to(np.asarray(exposed_m), len(positions_m))[:, None]
+    far = np.linalg.norm(positions_m, axis=-1) > exposed + REACH_MARGIN_M
+    between = np.abs(np.diff(np.asarray(offsets_m)))
+    apart = np.linalg.norm(np.diff(positions_m, axis=1), axis=-1) > between + REACH_MARGIN_M
+    return np.asarray(far.any(axis=1) | apart.any(axis=1))

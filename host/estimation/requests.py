@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from host.estimation.reach import check_reach
+from host.estimation.reach import check_apart, check_reach
 from host.mechanics.requests import PICTURE_POINTS, Actuated, Coordinate, ShapePicture, Station, catheter_for
 from protocol.requests import Request
 
@@ -104,6 +104,8 @@ def _spatial(request: CosseratEstimate, with_picture: bool) -> tuple[dict[str, A
     exposed_m = catheter.distal_length_m + request.insertion_m
     for index, sensor in enumerate(request.sensors):
         check_reach(f"sensors.{index}.position_m", sensor.position_m, exposed_m)
+    used = request.sensors[: SENSORS_OF_CASE[request.case]]
+    check_apart("sensors.{}.position_m", [sensor.offset_m for sensor in used], [sensor.position_m for sensor in used])
     sensors = [PoseSensor(sensor.offset_m, sensor.position_m, sensor.quaternion_wxyz) for sensor in request.sensors]
     actuation = (catheter, request.insertion_m, request.curvature_per_m)
     found = estimate_cosserat(*actuation, request.case, sensors)

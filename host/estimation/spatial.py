@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from host.estimation.position_curve import every_force, has_chord
 from host.estimation.sensor_noise import (
     ORIENTATION_STD_rad,
     PoseSensor,
@@ -33,15 +34,13 @@ from host.estimation.spatial_kernels import (
     Scratch,
     Search,
     Sensors,
-    best_of,
     estimate,
-    estimate_sample,
     new_scratch,
     sample_of,
-    search,
     unweighted,
 )
 from host.estimation.spatial_residuals import ROWS_OF_CASE
+from host.estimation.spatial_search import best_of, estimate_sample, search
 from host.mechanics.rod import finite, number, rod_record
 from host.mechanics.rotations import conjugate, quaternion_of_vector, quaternion_product, rotation_matrix
 from host.mechanics.tip_shooting import load_number
@@ -175,7 +174,8 @@ def estimate_cosserat(  # noqa: PLR0913 - keyword arguments of a public function
     its branch; prior: the surface's normal; largest_force_N: no force above it is considered; thorough: look for a
     better force wherever the first one leaves any residual, not only more than noise would (some milliseconds more).
     Result: `converged` False where no force explains the poses; several `solutions_N` where cases 1, 3, 5 leave the
-    choice open (then force_N is the smallest of them, unless previous_force_N is given).
+    choice open (then force_N is the smallest of them, in cases 1 and 3 of those that grow from zero with their load,
+    unless previous_force_N is given).
     Raises: InputError naming the key. Source: (5.3) to (5.11) with (5.5) put right, weighted by the sensors' noise.
     """
     rod, count = rod_record(catheter, insertion_m, curvature_per_m), checked_case(case)
@@ -361,11 +361,21 @@ def _prior_rows(prior: SurfacePrior | None, Z: Array) -> Array:
 def _all_solutions(
     problem: MeasuredPose, largest: float, acceptable: float, x: Array, scratch: Scratch
 ) -> tuple[bool, float, int, Array]:
-    """Every force found, smallest first; x (3,) and the scratch are left at that one, or at the best try."""
+    """Every force found; x (3,) and the scratch are left at the first, or at the best try.
+
+    Those of a position (cases 1 and 3) that grow from zero load come first, then the smallest. The scattered starts look
+    for the answers of case 5, and for the nearest force where no force meets the position.
+    """
     found = np.zeros((MOST_SOLUTIONS, 3))
     starts = np.vstack([np.zeros((1, 3)), start_grid(largest)])
-    count, sweeps = search(problem, largest, starts, acceptable, found, scratch)
-    solutions = found[:count][np.argsort(np.linalg.norm(found[:count], axis=1))]
+    count = sweeps = 0
+    if has_chord(problem):
+        count, sweeps = every_force(problem, largest, acceptable, found, scratch)
+    if count:
+        solutions = found[:count].copy()
+    else:
+        count, sweeps = search(problem, largest, starts, acceptable, found, scratch)
+        solutions = found[:count][np.argsort(np.linalg.norm(found[:count], axis=1))]
     if count:
         x[:] = solutions[0]
         settled, cost, more = estimate(problem, largest, x, scratch)

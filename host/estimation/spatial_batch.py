@@ -16,7 +16,6 @@ from host.estimation.spatial_kernels import (
     Scratch,
     Search,
     Sensors,
-    best_of,
     covariance_of,
     estimate,
     new_scratch,
@@ -24,6 +23,7 @@ from host.estimation.spatial_kernels import (
     unweighted,
 )
 from host.estimation.spatial_residuals import SENSORS_OF_CASE
+from host.estimation.spatial_search import best_of
 from host.mechanics.rod import finite, rod_record, rod_records
 from host.mechanics.threads import core_count, in_threads
 from protocol.catheter import Catheter

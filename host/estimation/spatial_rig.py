@@ -80,6 +80,7 @@ class SpatialRigEstimator:
         check_reach("pose_tip.position_m", pose_tip.position_m, exposed_m)
         offsets, poses = [0.0], [[*pose_tip.position_m, *pose_tip.quaternion_wxyz]]
         if pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all():
+            check_reach("pose_shaft.position_m", pose_shaft.position_m, exposed_m)
             offsets.append(self._shaft_offset_m)
             poses.append([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz])
         self.errors.move_to(actuation)

@@ -13,7 +13,6 @@ from host.estimation.force import estimate_force
 from host.estimation.interface import Actuation, PoseReading
 from host.estimation.planar_rig import PlanarRigEstimator
 from host.estimation.rig_estimator import make_estimator
-from host.estimation.spatial_batch import BatchEstimate
 from host.estimation.spatial_rig import SpatialRigEstimator, _new_fit
 from host.estimation.spatial_rig_kernels import TrackedFrame, model
 from host.mechanics.cosserat import solve_cosserat
@@ -186,10 +185,29 @@ def test_a_sensor_out_of_reach_is_bad_input_from_python_too() -> None:
         estimate_force(BLAZER, -0.07, 18.0, [(0.0, far, q)], case=2)
     with pytest.raises(InputError, match=wanted):
         estimate_force(BLAZER, -0.07, 18.0, [(0.0, far[1:], 0.0)], model="pcar")
-    tip, _ = poses(np.zeros(3), -0.07, 18.0, 0.0)
+    tip, shaft = poses(np.zeros(3), -0.07, 18.0, 0.0)
     rows = np.array([tip.position_m, far]), np.array([tip.quaternion_wxyz, q])
-    many = estimate_force(BLAZER, -0.07, 18.0, [(0.0, *rows)], case=2)
-    assert isinstance(many, BatchEstimate) and many.converged.tolist() == [True, False]
+    with pytest.raises(InputError, match=r"sensors.0.position_m.1: found .*wanted a position at most"):
+        estimate_force(BLAZER, -0.07, 18.0, [(0.0, *rows)], case=2)
+    with pytest.raises(InputError, match=r"sensors.0.position_m.1: found .*wanted a position at most"):
+        estimate_force(BLAZER, -0.07, 18.0, [(0.0, rows[0][:, 1:], np.zeros(2))], model="pcar")
+    for running in (SpatialRigEstimator, PlanarRigEstimator):
+        with pytest.raises(InputError, match=r"pose_shaft\.position_m"):
+            actuation = Actuation(-0.07, 0.0, 18.0, tip.stamp_ns)
+            running.from_rig(load_rig(SIMULATED_RIG)).estimate(tip, shaft._replace(position_m=far), actuation)
+
+
+@pytest.mark.parametrize("case", [3, 4, 5, 6])
+def test_sensors_further_apart_than_the_catheter_between_them_are_bad_input(case: int) -> None:
+    """Both are within the reach of the catheter: what is wrong is only where they are relative to each other."""
+    at, q = np.array([0.0, 0.0, 0.05]), np.array([1.0, 0.0, 0.0, 0.0])
+    sensors = [(0.0, at, q), (0.002, -at, q), (0.004, -at, q)]
+    catheter, wanted = load_catheter("livewire"), r"sensors.1.position_m.*: found .*mm from the sensor before it"
+    with pytest.raises(InputError, match=wanted):
+        estimate_force(catheter, 0.01, 10.0, sensors, case=case)
+    with pytest.raises(InputError, match=wanted):
+        many = [(offset, np.array([position] * 3), np.array([q] * 3)) for offset, position, _ in sensors]
+        estimate_force(catheter, 0.01, 10.0, many, case=case)
 
 
 def test_the_poses_of_one_frame_reach_the_estimator_together() -> None:

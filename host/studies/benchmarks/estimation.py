@@ -23,7 +23,6 @@ from host.estimation.spatial_kernels import (
     QUICK,
     MeasuredPose,
     Scratch,
-    best_of,
     cost_at,
     estimate,
     keep,
@@ -31,6 +30,7 @@ from host.estimation.spatial_kernels import (
     sample_of,
 )
 from host.estimation.spatial_residuals import ROWS_OF_CASE, SENSORS_OF_CASE
+from host.estimation.spatial_search import best_of
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product
 from host.studies.benchmarks.runner import PairedTimes, Report, Row, alternate, row_of
 from host.studies.benchmarks.spatial_cases import LENGTH_m, SENSOR_OFFSETS_m, SpatialCase, direction, random_cases, sensed
