@@ -20,13 +20,14 @@ Judged = list[tuple[Label, dict[str, Any]]]
 
 
 def read_run(folder: Path) -> dict[str, Judged]:
-    """Return (label, verdict) of every case of a finished run, by world. Raises OSError where a part is missing."""
+    """Return (label, verdict) of every case of a run that has a verdict, by world. Raises OSError where labels are missing."""
     note = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
     found: dict[str, Judged] = {}
     for world in note["worlds"]:
         labels = read_labels(folder / world / "sealed" / "labels.json")
         verdicts = folder / world / "verdicts"
-        found[world] = [(la, json.loads((verdicts / f"{la['id']}.json").read_text(encoding="utf-8"))) for la in labels]
+        paths = [(label, verdicts / f"{label['id']}.json") for label in labels]
+        found[world] = [(la, json.loads(path.read_text(encoding="utf-8"))) for la, path in paths if path.exists()]
     return found
 
 

@@ -29,8 +29,11 @@ def block(run: Path, others: Sequence[Path]) -> str:
     note = json.loads((run / "suite.json").read_text(encoding="utf-8"))
     worlds = note["worlds"]
     stated = {world: scored(run, world, as_stated) for world in worlds}
+    counts = {world: len(facts) for world, facts in stated.items()}
+    short = [f"{count} of {world}" for world, count in counts.items() if count < note["cases"]]
+    stopped = f" The run was stopped before its end: {', '.join(short)} have a verdict." if short else ""
     parts = [
-        f"Seed {note['seed']}, {note['cases']} cases of each world, as the finder states its probabilities:",
+        f"Seed {note['seed']}, {note['cases']} cases of each world.{stopped} As the finder states its probabilities:",
         table.worlds_markdown({w: table.tabulate(f) for w, f in stated.items()}, OWN),
     ]
     used = stated
