@@ -20,7 +20,7 @@ Judged = list[tuple[Label, dict[str, Any]]]
 
 
 def read_run(folder: Path) -> dict[str, Judged]:
-    """Return (label, verdict) of every case of a run that has a verdict, by world. Raises OSError where labels are missing."""
+    """Return (label, verdict) of every case that has a verdict, by world. Raises OSError where labels are missing."""
     note = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
     found: dict[str, Judged] = {}
     for world in note["worlds"]:
