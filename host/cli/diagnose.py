@@ -127,7 +127,8 @@ def summary(verdict: dict[str, Any]) -> list[str]:
     for effect in verdict["effects"]:
         lines.append(f"{effect['id']} ({effect['subsystem']}), probability {effect['probability']:.2f}: {effect['says']}")
         for key, p in effect["parameters"].items():
-            lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g})")
+            mark = ", at its bound" if p["at_bound"] else ""
+            lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}){mark}")
         if effect["indistinguishable_from"]:
             lines.append("  indistinguishable from " + ", ".join(effect["indistinguishable_from"]))
     lines += [f"worse: {text}" for text in verdict["worse"]]

@@ -129,8 +129,8 @@ def _at_gaps(segment: Recording) -> list[Recording]:
         used = segment.fit[part].any() or not segment.fit.any()
         if last + 1 - first >= FEWEST_ROWS and used:
             channels = {name: values[part] for name, values in segment.channels.items()}
-            masks = {"fit": segment.fit[part], "heldout": segment.heldout[part]}
-            parts.append(replace(segment, time_s=segment.time_s[part], channels=channels, **masks))
+            fit, heldout = segment.fit[part], segment.heldout[part]
+            parts.append(replace(segment, time_s=segment.time_s[part], channels=channels, fit=fit, heldout=heldout))
     return parts or [segment]
 
 

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from host.diagnosis.model.effect import Parameter
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.pictures import pictures, shown
 from host.diagnosis.report.quantities import interval, quantity, short
-from host.diagnosis.report.verdict import remains, words
+from host.diagnosis.report.verdict import at_bound, remains, words
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
@@ -52,7 +51,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
         lines=lines(result, verdict),
         pictures=pictures(result),
-        effects=[shown_effect(e, units_of(result), bounds_reached(result, e)) for e in verdict["effects"]],
+        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
         nominal=_nominal(result),
         candidates=candidates(result),
         located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
@@ -135,23 +134,6 @@ def units_of(result: Diagnosis) -> dict[str, tuple[str, str]]:
     return {p.key: (p.name, p.unit) for term in result.found.best.terms for p in term.parameters}
 
 
-def bounds_reached(result: Diagnosis, effect: dict[str, Any]) -> frozenset[str]:
-    """Keys of those parameters of an effect that ended at a bound."""
-    named = (effect["id"], effect["port"])
-    terms = [t for t in result.found.best.terms if (t.candidate.effect.id, t.candidate.port.name) == named]
-    return frozenset(
-        p.key
-        for t in terms
-        for p in t.parameters
-        if p.key in effect["parameters"] and _at_bound(p, effect["parameters"][p.key]["value"])
-    )
-
-
-def _at_bound(p: Parameter, value: float) -> bool:
-    near = 1e-3 * max(abs(p.high - p.low), 1e-300) if abs(p.high - p.low) < float("inf") and not p.log else 1e-3 * abs(value)
-    return p.high > p.low and bool(value - p.low <= near or p.high - value <= near)
-
-
 def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
     """When a place is at fault: the longest windows, recording by recording."""
     unit = "s" if timed else "samples"
@@ -166,13 +148,13 @@ def times(place: dict[str, Any], most: int = 3, timed: bool = True) -> str:
     return "; ".join(shown[:most]) + (f"; and {len(shown) - most} more recordings" if len(shown) > most else "")
 
 
-def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]], at_bound: frozenset[str]) -> dict[str, Any]:
+def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> dict[str, Any]:
     """An effect with its numbers as text."""
     rows = []
     for key, p in effect["parameters"].items():
         name, unit = units.get(key, (key, ""))
         low, high = p["ci95"]
-        mark = " at its bound" if key in at_bound else ""
+        mark = " at its bound" if p["at_bound"] else ""
         rows.append((words(name), quantity(p["value"], unit), interval(low, high, unit, p["value"]) + mark))
     return {
         **effect,
@@ -266,7 +248,7 @@ def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
         (
             words(p.name),
             quantity(float(v), p.unit),
-            (interval(a, b, p.unit, float(v)) + (" at its bound" if _at_bound(p, float(v)) else ""))
+            (interval(a, b, p.unit, float(v)) + (" at its bound" if at_bound(p, float(v)) else ""))
             if p.high > p.low
             else "held",
         )

@@ -228,10 +228,13 @@ def _effect(
     for rival, p in probable.rivals:
         by_name[rival.name] = by_name.get(rival.name, 0.0) + p
     shown = {
-        p.key: {"value": float(v), "ci95": [float(a), float(b)]}
+        p.key: {"value": float(v), "ci95": [float(a), float(b)], "at_bound": at_bound(p, float(v))}
         for p, v, (a, b) in zip(parameters, values, spans, strict=True)
         if p.high > p.low
     }
+    says = sentence(candidate, parameters, values)
+    if standing.rests_on and len(result.problem.segments) > 1:
+        says += f" The evidence rests on one recording, {standing.rests_on}."
     return {
         "id": candidate.effect.id,
         "subsystem": candidate.port.subsystem,
@@ -239,13 +242,20 @@ def _effect(
         "probability": probable.effect,
         "probability_raw": probable.raw,
         "alternatives": [{"name": name, "probability": p} for name, p in sorted(by_name.items(), key=lambda item: -item[1])],
-        "says": sentence(candidate, parameters, values),
+        "says": says,
         "equation": equation(candidate),
         "parameters": shown,
         "evidence": {"heldout_log_likelihood_gain": standing.gain.log_likelihood, "p_value": standing.gain.p_value},
+        "rests_on": standing.rests_on,
         "indistinguishable_from": [other.name for other in standing.alike],
         "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
     }
+
+
+def at_bound(p: Parameter, value: float) -> bool:
+    """Whether a fitted value ended at a bound of its parameter."""
+    near = 1e-3 * max(abs(p.high - p.low), 1e-300) if abs(p.high - p.low) < float("inf") and not p.log else 1e-3 * abs(value)
+    return p.high > p.low and bool(value - p.low <= near or p.high - value <= near)
 
 
 def sentence(candidate: Candidate, parameters: tuple[Parameter, ...], values: Any) -> str:

@@ -31,6 +31,7 @@ class Standing:
     alike: tuple[Candidate, ...]
     rivals: tuple[tuple[Candidate, float], ...] = ()  # refitted in its place, with the coarsened difference of likelihoods
     parameters: int = 1
+    rests_on: str = ""  # recording without which the others are not evidence enough
 
 
 def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
@@ -46,8 +47,26 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         alike += tuple(candidate for candidate, _ in said)
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
-        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters)))
+        alone = _rests_on(problem, less, found.best, noise_sd, len(term.parameters))
+        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters), alone))
     return out
+
+
+def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameters: int) -> str:
+    """The recording that the evidence rests on: without it, the gain of all others would let no effect enter.
+
+    The fits are those of all recordings; the evidence is summed without one at a time.
+    """
+    needed = problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * parameters
+    gains = []
+    for left_out, segment in enumerate(problem.segments):
+        keep = [k for k in range(len(problem.segments)) if k != left_out]
+        segments = [problem.segments[k] for k in keep]
+        before, after = [less.residuals[k] for k in keep], [best.residuals[k] for k in keep]
+        gain = compare(segments, "both", before, after, noise_sd).log_likelihood if keep else 0.0
+        gains.append((gain, segment.recording.name))
+    gain, name = min(gains)
+    return name if gain < needed else ""
 
 
 def with_unlisted_rival(standing: list[Standing], rest: Rest) -> list[Standing]:

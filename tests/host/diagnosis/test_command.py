@@ -46,6 +46,7 @@ EFFECT = {
     "probability",
     "probability_raw",
     "alternatives",
+    "rests_on",
     "says",
     "equation",
     "parameters",

@@ -13,11 +13,16 @@ from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Parameter, Port
-from host.diagnosis.selection.equivalence import Standing, with_unlisted_rival
+from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.report.verdict import at_bound
+from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival
 from host.diagnosis.selection.posterior import calibrated, posterior
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
 from host.diagnosis.selection.unlisted import Rest
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart
+from tests.host.diagnosis.test_export import COMMON, KINDS
 
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
 NOTHING = Gain(0.0, 1.0, 0.0)
@@ -48,6 +53,23 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
     weak, strong = (Standing(BACKLASH, Gain(gain, 1e-9, 0.2), Gain(gain, 1e-9, 0.2), ()) for gain in (10.0, 80.0))
     assert [[c.name for c in s.alike] for s in with_unlisted_rival([weak, strong], rest)] == [[], ["unlisted@cable"]]
     assert with_unlisted_rival([weak, strong], replace(rest, doubtful=False)) == [weak, strong]
+
+
+@pytest.mark.parametrize(("shown_in", "rests_on"), [((0,), "r0"), ((0, 2), ""), ((0, 1, 2), "")])
+def test_evidence_that_one_recording_carries_is_named(shown_in: tuple[int, ...], rests_on: str) -> None:
+    rng, t = np.random.default_rng(1), np.arange(600) * 0.01
+    tables = [Table(f"r{k}", {"t": t, "u": np.sin(t), "y": np.sin(t), "w": np.cos(t)}) for k in range(3)]
+    _, problem, _ = prepare(nominal_of({**COMMON, "kind": "transmission", **KINDS["transmission"]}), tables)
+    noise = [1e-3 * rng.standard_normal((1, 600)) for _ in range(3)]
+    removed = [np.sin(8.0 * t)[None, :] * (5e-3 if k in shown_in else 0.0) for k in range(3)]
+    less = Fit((), np.zeros(0), [e + r for e, r in zip(noise, removed, strict=True)])
+    assert _rests_on(problem, less, Fit((), np.zeros(0), noise), np.array([1e-3]), 1) == rests_on
+
+
+@pytest.mark.parametrize(("value", "reached"), [(0.0, True), (0.5, False), (1.0, True)])
+def test_a_value_at_a_bound_is_marked(value: float, reached: bool) -> None:
+    assert at_bound(Parameter("share", "", (0.1,), 0.0, 1.0), value) is reached
+    assert not at_bound(Parameter("offset", "N", (0.1,)), value)
 
 
 @pytest.mark.parametrize(
