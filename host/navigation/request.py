@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from host.navigation import planner, shape, timing
+from host.navigation.loaded_shape import LoadedLine, aimed, pressed, through_hole
 from host.navigation.obstacles import Capsule, Mesh, Obstacle, Sphere, Surroundings, load_mesh, to_line_m
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
@@ -24,6 +26,8 @@ Point = tuple[float, float, float]
 LINE_POINTS = 16
 # Spacing of the way's points (m of tip, about) before time is laid over it.
 SPACING_M = 0.003
+# The tip's last piece lies on the tissue when it presses.
+TISSUE_m = 0.005
 
 
 class SphereRequest(Request):
@@ -53,10 +57,14 @@ class MeshRequest(Request):
 
 
 class PunctureRequest(Request):
-    """The transseptal hole: the catheter passes within `radius_m` of `point_m` (2.19)."""
+    """The transseptal hole: the catheter passes `point_m` (2.19).
+
+    Within `radius_m` it passes freely; further off the hole bends it, with at most `largest_force_N`.
+    """
 
     point_m: Point
     radius_m: Annotated[float, Field(gt=0)]
+    largest_force_N: Annotated[float, Field(ge=0, le=0.5)] = 0.2
 
 
 class JointRequest(Request):
@@ -77,6 +85,7 @@ class PlanRequest(Request):
     start: JointRequest
     obstacles: list[AnyObstacle] = Field(default_factory=list)
     puncture: PunctureRequest | None = None
+    contact_force_N: Point | None = None
     clearance_m: Annotated[float, Field(ge=0, le=0.05)] = 0.001
     seed: int = 1
     samples: Annotated[int, Field(ge=10, le=1_000_000)] = 20_000
@@ -86,7 +95,8 @@ class PlanRequest(Request):
 class PlanAnswer(NamedTuple):
     """A plan: one row for each period, at rest at both ends.
 
-    `clearance_m` is the smallest on the path, measured from the catheter's surface.
+    `clearance_m` is the smallest on the path, measured from the catheter's surface. `puncture_force_N` is the greatest with
+    which the puncture bends the catheter on the path.
     """
 
     time_s: Array
@@ -96,6 +106,7 @@ class PlanAnswer(NamedTuple):
     clearance_m: float
     checks: int
     waypoints: int
+    puncture_force_N: float
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan as JSON: samples by column name, SI units."""
@@ -103,6 +114,7 @@ class PlanAnswer(NamedTuple):
             "found": True,
             "duration_s": float(self.time_s[-1]),
             "clearance_m": self.clearance_m,
+            "puncture_force_N": self.puncture_force_N,
             "waypoints": self.waypoints,
             "collision_checks": self.checks,
             "time_s": self.time_s,
@@ -116,22 +128,70 @@ class _World:
     """Return whether this joint is free of collisions; the planner calls it."""
 
     def __init__(self, request: PlanRequest, rig: Rig, folder: Path) -> None:
-        self.reach = shape.reach_of(rig, load_catheter(rig.catheter.name).diameter_m)
+        self.catheter = load_catheter(rig.catheter.name)
+        self.reach = shape.reach_of(rig, self.catheter.diameter_m)
         self.surroundings = Surroundings([_obstacle(item, folder) for item in request.obstacles])
         self.puncture, self.clearance_m = request.puncture, request.clearance_m
 
+    def line(self, joint: Array) -> LoadedLine | None:
+        """The catheter at `joint`, bent by the puncture where it does not pass it freely; None where it cannot pass."""
+        if self.puncture is None:
+            return LoadedLine(shape.centre_line(self.reach, joint, LINE_POINTS), 0.0)
+        hole, free = np.array(self.puncture.point_m), shape.centre_line(self.reach, joint, 3 * LINE_POINTS)
+        if to_line_m(hole, free) <= self.puncture.radius_m:
+            return LoadedLine(free, 0.0)
+        return through_hole(self.catheter, self.reach, joint, hole, self.puncture.radius_m, 3 * LINE_POINTS)
+
+    def tip(self, joint: Array) -> Array:
+        """Position (3,) m of the tip; NaN where the catheter has no shape."""
+        line = self.line(joint)
+        return np.full(3, np.nan) if line is None else line.points_m[-1]
+
     def clearance(self, joint: Array) -> float:
-        return self.surroundings.clearance_m(shape.centre_line(self.reach, joint, LINE_POINTS), self.reach.radius_m)
+        line = self.line(joint)
+        return 0.0 if line is None else self.surroundings.clearance_m(line.points_m, self.reach.radius_m)
 
     def refused(self, joint: Array) -> str:
         """Why `joint` is not free, "" if it is."""
         if not shape.within(self.reach, joint):
             return "out of the stages' travel"
+        line = self.line(joint)
         if self.puncture is not None:
-            off_m = to_line_m(np.array(self.puncture.point_m), shape.centre_line(self.reach, joint, 3 * LINE_POINTS))
-            if off_m > self.puncture.radius_m:
-                return f"a catheter that passes the puncture {off_m * 1e3:.1f} mm off"
-        clear_m = self.clearance(joint)
+            out_m = abs(float(np.dot(self.puncture.point_m, [math.cos(joint[1]), math.sin(joint[1]), 0.0])))
+            if line is None:
+                return "no shape of the catheter that passes the puncture"
+            if line.force_N > 0.0 and out_m > self.puncture.radius_m:
+                return f"a catheter that passes the puncture {out_m * 1e3:.1f} mm off, out of its bending plane"
+            if line.force_N > self.puncture.largest_force_N:
+                return f"a catheter that passes the puncture only if that bends it with {line.force_N:.2f} N"
+        assert line is not None
+        return self._touches(line.points_m)
+
+    def refused_pressed(self, joint: Array, goal_m: Array, contact_force_N: Array) -> str:
+        """Why the catheter cannot press at the goal, reached from `joint` free; "" if it can.
+
+        The tip stays at the goal while the base goes on, so another joint is looked for, where the loaded tip is there. The
+        last TISSUE_m are left out: they lie on the tissue.
+        """
+
+        def tip(at: Array) -> Array:
+            line = pressed(self.catheter, self.reach, at, contact_force_N, LINE_POINTS)
+            return np.full(3, np.nan) if line is None else line.points_m[-1]
+
+        at = aimed(tip, joint, goal_m, self.reach.scale_m)
+        line = None if at is None else pressed(self.catheter, self.reach, at, contact_force_N, 2 * LINE_POINTS)
+        if at is None or line is None or not shape.within(self.reach, at):
+            return "no shape of the catheter that presses there with this force"
+        kept = np.linalg.norm(line.points_m - goal_m, axis=1) > TISSUE_m
+        why = self._touches(line.points_m[kept]) if np.count_nonzero(kept) > 1 else ""
+        return f"{why} when it presses" if why else ""
+
+    def aim(self, joint: Array, goal_m: Array) -> Array | None:
+        """The joint next to `joint` whose tip, bent by the puncture, is at the goal; None where there is none."""
+        return aimed(self.tip, joint, goal_m, self.reach.scale_m)
+
+    def _touches(self, points_m: Array) -> str:
+        clear_m = self.surroundings.clearance_m(points_m, self.reach.radius_m)
         if clear_m < self.clearance_m:
             return f"a clearance of {clear_m * 1e3:.1f} mm" if clear_m > 0 else "a catheter in an obstacle"
         return ""
@@ -187,9 +247,14 @@ def _goals(request: PlanRequest, rig: Rig, world: _World) -> list[Array]:
     if inside:
         raise InputError("goal_m", request.goal_m, f"a goal in free space; it is {inside}")
     reachable = shape.joints_of(world.reach, rig, goal)
+    if request.puncture is not None:
+        reachable = [found for found in (world.aim(joint, goal) for joint in reachable) if found is not None]
     if not reachable:
         raise InputError("goal_m", request.goal_m, "a goal that the unloaded tip can reach within the stages' travel")
     reasons = [world.refused(joint) for joint in reachable]
+    if request.contact_force_N is not None:
+        force = np.array(request.contact_force_N)
+        reasons = [why or world.refused_pressed(joint, goal, force) for joint, why in zip(reachable, reasons, strict=True)]
     free = [joint for joint, why in zip(reachable, reasons, strict=True) if not why]
     if not free:
         raise InputError("goal_m", request.goal_m, f"a goal that is reached free; there is {reasons[0]}")
@@ -205,8 +270,10 @@ def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> PlanAns
         clear = min(world.clearance(row) for row in joint)
         if clear >= 0.5 * request.clearance_m or len(world.surroundings.obstacles) == 0:
             break
-    tips = np.array([shape.tip(world.reach, row) for row in joint])
-    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), world.surroundings.questions, len(way))
+    lines = [world.line(row) for row in joint]
+    tips = np.array([np.full(3, np.nan) if line is None else line.points_m[-1] for line in lines])
+    force_N = max((line.force_N for line in lines if line is not None), default=0.0)
+    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), world.surroundings.questions, len(way), force_N)
 
 
 def joints_at(rig: Rig, stage: Array) -> Array:

@@ -16,9 +16,11 @@ from typer.testing import CliRunner
 
 from host.cli.plan import plan as cli_plan
 from host.navigation import PlanRequest, plan, planner, shape
-from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, winding_number
+from host.navigation.loaded_shape import aimed, pressed, through_hole
+from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, to_line_m, winding_number
 from host.navigation.request import joints_at, with_tuples
 from host.navigation.timing import ACCELERATION_SHARE, SPEED_SHARE
+from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from protocol.requests import validate
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
@@ -195,3 +197,63 @@ def test_the_answer_is_json(rig: Rig, reach: shape.Reach) -> None:
     assert answer is not None
     told = json.loads(json.dumps(plain(answer.as_json()), allow_nan=False))
     assert told["found"] and len(told["time_s"]) == len(told["tip_m"]) == len(told["stage"]["knob_rad"])
+
+
+# The catheter under load
+
+
+HOLE: dict[str, Any] = {"point_m": [0.0, 0.0, 0.030], "radius_m": 0.0005, "largest_force_N": 0.2}
+THROUGH = {"insertion_m": -0.060, "roll_rad": 0.0, "curvature_per_m": 2.0}
+
+
+def test_a_hole_that_bends_the_catheter_is_passed_by_its_loaded_shape(rig: Rig, reach: shape.Reach) -> None:
+    """(2.19): every point of the path has the hole on the catheter, and the tip is where the bent catheter puts it."""
+    free = tip_at(reach, -0.045, 0.0, 6.0)
+    answer = plan(request(free, puncture=HOLE, start=THROUGH, samples=400), rig)
+    assert answer is not None and 0.005 < answer.puncture_force_N <= 0.2
+    assert np.allclose(answer.tip_m[-1], free, atol=2e-4)
+    # Without the hole the same joints put the tip elsewhere: the path is not that of the unloaded shape.
+    assert np.linalg.norm(shape.tip(reach, answer.joint[-1]) - free) > 1e-3
+    catheter = load_catheter(rig.catheter.name)
+    for joint in answer.joint[:: max(len(answer.joint) // 8, 1)]:
+        unloaded = to_line_m(np.array(HOLE["point_m"]), shape.centre_line(reach, joint, 60))
+        if unloaded > HOLE["radius_m"]:
+            line = through_hole(catheter, reach, joint, np.array(HOLE["point_m"]), HOLE["radius_m"], 120)
+            assert line is not None and to_line_m(np.array(HOLE["point_m"]), line.points_m) < HOLE["radius_m"] + 2e-4
+
+
+def test_a_hole_that_would_have_to_press_too_hard_is_refused(rig: Rig, reach: shape.Reach) -> None:
+    goal = tip_at(reach, -0.045, 0.0, 30.0)
+    weak = HOLE | {"largest_force_N": 0.01}
+    with pytest.raises(InputError, match=r"^goal_m.*(bends it with|travel)"):
+        plan(request(goal, puncture=weak, start=THROUGH), rig)
+
+
+def test_the_pressed_shape_at_the_goal_is_checked(rig: Rig, reach: shape.Reach) -> None:
+    """An obstacle that the unloaded catheter clears, and the pressed one does not."""
+    goal = tip_at(reach, -0.050, 0.0, 14.0)
+    force = np.array([0.0, 0.0, 0.1])
+    free_joint = np.array([-0.050, 0.0, 14.0])
+    catheter = load_catheter(rig.catheter.name)
+    unloaded = shape.centre_line(reach, free_joint, 60)
+
+    def tip(at: np.ndarray) -> np.ndarray:
+        line = pressed(catheter, reach, at, force, 16)
+        return np.full(3, np.nan) if line is None else line.points_m[-1]
+
+    at = aimed(tip, free_joint, goal, reach.scale_m)
+    assert at is not None
+    line = pressed(catheter, reach, at, force, 60)
+    assert line is not None and np.linalg.norm(line.points_m[-1] - goal) < 1e-4
+    off = [to_line_m(point, unloaded) for point in line.points_m]
+    worst = int(np.argmax(off))
+    assert off[worst] > 0.5e-3
+    away = line.points_m[worst] - unloaded[int(np.argmin(np.linalg.norm(unloaded - line.points_m[worst], axis=1)))]
+    radius = 0.002
+    clear = 0.4 * off[worst]
+    centre = line.points_m[worst] + away / np.linalg.norm(away) * (radius + reach.radius_m - off[worst] + clear)
+    ball = {"type": "sphere", "centre_m": centre.tolist(), "radius_m": radius}
+    start = {"insertion_m": -0.052, "roll_rad": 0.0, "curvature_per_m": 13.0}
+    assert plan(request(goal, [ball], start=start, clearance_m=0.0), rig) is not None
+    with pytest.raises(InputError, match=r"^goal_m.*presses"):
+        plan(request(goal, [ball], start=start, clearance_m=0.0, contact_force_N=force.tolist()), rig)

@@ -71,7 +71,7 @@ def run(rig: Rig, seed: int, case: ObstacleCase | None, seconds: float) -> Obsta
         if isinstance(message, RigState) and "body touches" in message.cause:
             warned = True
 
-    effects = ()
+    effects: tuple[PlantedEffect, ...] = ()
     if case is not None:
         place = {"place_m": case.place_m, "clearance_m": case.clearance_m}
         effects = (PlantedEffect("second_contact", "shape", place, 0.0),)
