@@ -27,6 +27,10 @@ class InputError(ValueError):
         ValueError.__init__(error, sentence)
         return error
 
+    def in_file(self, path: object) -> InputError:
+        """The same error with the name of the file that holds the key."""
+        return self if str(path) in self.key else InputError.from_sentence(f"{path}: {self}")
+
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return InputError.from_sentence, (str(self),)
 

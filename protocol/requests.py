@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from protocol.errors import Description, InputError, reason
+from protocol.unit_slips import hint_of
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -22,16 +24,19 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def read_json(source: str) -> Any:
-    """The JSON value in file `source`, or on standard input if it is `-`. Raises InputError."""
+def read_json(source: str) -> dict[str, Any]:
+    """The JSON object in file `source`, or on standard input if it is `-`. Raises InputError."""
     try:
         text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(source, reason(error), "a readable JSON file, or - for standard input") from None
     try:
-        return json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:  # also a whole number of more digits than Python converts
         raise InputError(source, Description(error), "one JSON object") from None
+    if not isinstance(value, dict):
+        raise InputError(source, value, "one JSON object")
+    return value
 
 
 # Type of a pydantic error -> what is wanted, with the names of its context.
@@ -70,12 +75,43 @@ def validate(model: type[Model], data: Any) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = first_of(error.errors())
         key = ".".join(str(part) for part in first["loc"]) or "request"
         if first["type"] == "extra_forbidden":
-            raise InputError(key, first["input"], "no such key; known keys: " + ", ".join(model.model_fields)) from None
+            known = known_keys(model, first["loc"])
+            raise InputError(key, first["input"], unknown_key(str(first["loc"][-1]), known)) from None
         found = Description("nothing") if first["type"] == "missing" else first["input"]
-        raise InputError(key, found, wanted_of(first)) from None
+        raise InputError(key, found, wanted_of(first) + hint_of(first)) from None
+
+
+def first_of(errors: Sequence[Any]) -> Any:
+    """The error to report: an unknown key before the rest, because a misspelt key is unknown and missing at once."""
+    return next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
+
+
+def unknown_key(key: str, known: Collection[str]) -> str:
+    """Say what is wanted instead of a key that is not known: the one that it resembles, or all."""
+    near = difflib.get_close_matches(key, known, 1) or [name for name in known if name.lower() == key.lower()]
+    if near:
+        return f"no such key; did you mean {near[0]}?"
+    return "no such key" + (f"; known keys: {', '.join(known)}" if known else "")
+
+
+def known_keys(model: Any, place: tuple[Any, ...]) -> list[str]:
+    """The keys of the section of `model` that `place` (keys from the top to the unknown key) lies in; [] where unclear."""
+    sections = [model]
+    for part in place[:-1]:
+        named = [section.model_fields[part].annotation for section in sections if part in section.model_fields]
+        # A number is a place in a list, and a text that no section has the tag of one of several forms.
+        sections = [inner for annotation in named for inner in _sections_in(annotation)] or sections
+    return sorted({name for section in sections for name in section.model_fields})
+
+
+def _sections_in(annotation: Any) -> list[Any]:
+    """The sections that a field's type names, also within lists, dicts and alternatives."""
+    if hasattr(annotation, "model_fields"):
+        return [annotation]
+    return [inner for part in get_args(annotation) for inner in _sections_in(part)]
 
 
 def plain(value: Any) -> Any:

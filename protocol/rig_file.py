@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import ipaddress
 import math
 import re
@@ -13,10 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from protocol import board_pins, loop_margin
+from protocol.catheter import load_catheter
 from protocol.errors import InputError, reason
 from protocol.local_paths import LocalPaths, local_paths
-from protocol.requests import wanted_of
+from protocol.requests import first_of, known_keys, unknown_key, wanted_of
 from protocol.topics import check_name
+from protocol.unit_slips import hint_of
 from protocol.zenoh_access import Network, check_network_endpoint
 
 AXES = ("insertion", "roll", "knob")
@@ -25,22 +26,32 @@ SIMULATED_RIG = Path(__file__).parent / "rigs" / "simulated.toml"
 # Bounds that no rig file can widen (a safety limit cannot be configured away).
 HARD_MAX_FORCE_N = 0.5
 HARD_STOP_AFTER_S = 0.150
+# Measured and tabulated lengths of a distal shaft differ by less than this.
+DISTAL_TOLERANCE_M = 0.005
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=False, allow_inf_nan=False, frozen=True)
+    # Strict: a text is no number, and 1 is not true. Lists of TOML become tuples.
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 Positive = Annotated[float, Field(gt=0)]
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
+# Of points in the rig's frames: further away is a mistaken unit.
+Coordinate = Annotated[float, Field(ge=-3.0, le=3.0)]
+Vector3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+
+
+# Of a device's driver (docs/devices.md), and the keys that only a plug-in knows.
+Kind = Annotated[str, Field(pattern=r"^[a-z0-9_]{1,40}$")]
+Options = dict[str, str | bool | int | float]
 
 
 class StageSection(_Section):
-    """One stepper axis. `unit` is m for insertion and rad for roll and knob."""
+    """One stepper axis; insertion and the rotating ones have bounds of their own."""
 
-    steps_per_unit: Annotated[float, Field(gt=0, le=1e7)]
-    encoder_counts_per_step: Positive = 1.0
+    steps_per_unit: Positive
+    encoder_counts_per_step: Annotated[float, Field(ge=0.01, le=1000)] = 1.0
     max_speed_unit_per_s: Positive
     max_accel_unit_per_s2: Positive
     min_unit: float
@@ -62,12 +73,34 @@ class StageSection(_Section):
         return self
 
 
+class InsertionStage(StageSection):
+    """The linear stage; `unit` is m. A step of 0.1 um to 0.1 mm: beyond, steps/mm or a speed in mm/s was meant."""
+
+    steps_per_unit: Annotated[float, Field(ge=1e4, le=1e7)]
+    max_speed_unit_per_s: Annotated[float, Field(gt=0, le=2)]
+    max_accel_unit_per_s2: Annotated[float, Field(gt=0, le=50)]
+    min_unit: Annotated[float, Field(ge=-1, le=1)]
+    max_unit: Annotated[float, Field(ge=-1, le=1)]
+    home_unit: Annotated[float, Field(ge=-1, le=1)] = 0.0
+
+
+class RotaryStage(StageSection):
+    """Roll or knob; `unit` is rad. From 188 steps a turn, no gear, to a microstepped gear of 1 to 100."""
+
+    steps_per_unit: Annotated[float, Field(ge=30, le=3e5)]
+    max_speed_unit_per_s: Annotated[float, Field(gt=0, le=100)]
+    max_accel_unit_per_s2: Annotated[float, Field(gt=0, le=1e4)]
+    min_unit: Annotated[float, Field(ge=-50, le=50)]
+    max_unit: Annotated[float, Field(ge=-50, le=50)]
+    home_unit: Annotated[float, Field(ge=-50, le=50)] = 0.0
+
+
 class StagesSection(_Section):
     """The three stepper axes."""
 
-    insertion: StageSection
-    roll: StageSection
-    knob: StageSection
+    insertion: InsertionStage
+    roll: RotaryStage
+    knob: RotaryStage
 
 
 class CatheterSection(_Section):
@@ -82,12 +115,12 @@ class TransmissionSection(_Section):
     """Handle to distal end, as characterized on this rig (thesis 6.2)."""
 
     catheter: str
-    insertion_at_home_m: float
+    insertion_at_home_m: Annotated[float, Field(ge=-0.5, le=0.5)]
     insertion_backlash_m: Annotated[float, Field(ge=0, le=0.02)]
     insertion_slope: Annotated[float, Field(gt=0.2, le=2)]
     roll_slope: Annotated[float, Field(gt=0.05, le=2)]
-    knob_rad: list[float]
-    curvature_per_m: list[float]
+    knob_rad: list[Annotated[float, Field(ge=-50, le=50)]]
+    curvature_per_m: list[Annotated[float, Field(ge=-200, le=200)]]
 
     @model_validator(mode="after")
     def _monotone_curve(self) -> TransmissionSection:
@@ -97,20 +130,28 @@ class TransmissionSection(_Section):
             raise ValueError("knob_rad strictly increasing")
         if any(b < a for a, b in zip(self.curvature_per_m, self.curvature_per_m[1:], strict=False)):
             raise ValueError("curvature_per_m never decreasing along knob_rad")
+        if self.curvature_per_m[-1] <= self.curvature_per_m[0]:
+            raise ValueError("curvature_per_m that rises somewhere: a knob that bends the catheter")
         return self
 
 
 class Tracker(_Section):
-    """NDI Aurora. `base_from_tracker_*` registers the tracker's frame to the base frame at the sheath's exit."""
+    """The tracker. `base_from_tracker_*` registers its frame to the base frame at the sheath's exit.
 
+    kind: "aurora" (NDI, serial port), "openigtlink" (a server, `port` is HOST:PORT, handles are names of transforms), or the
+    name of a plug-in; `options` are the plug-in's own keys (docs/devices.md).
+    """
+
+    kind: Kind = "aurora"
+    options: Options = {}
     port: str
     rate_hz: Annotated[float, Field(gt=1, le=200)]
     latency_s: Annotated[float, Field(ge=0, le=0.2)]
     tip_handle: str = "0A"
     shaft_handle: str = "0B"
     shaft_sensor_offset_m: Annotated[float, Field(gt=0, le=0.2)]
-    position_noise_m: Positive
-    orientation_noise_rad: Positive
+    position_noise_m: Annotated[float, Field(gt=0, le=0.01)]
+    orientation_noise_rad: Annotated[float, Field(gt=0, le=0.3)]
     base_from_tracker_m: Vector3
     base_from_tracker_wxyz: Quaternion
 
@@ -122,15 +163,28 @@ class Tracker(_Section):
 
 
 class ForceSensorSection(_Section):
-    """ATI Nano17 behind a Net F/T box; `base_from_sensor_wxyz` turns its reading into the force on the tissue."""
+    """The force sensor; `base_from_sensor_wxyz` turns its reading into the force on the tissue.
 
+    kind: "net_ft" (ATI box, `address` of the box), "nano17" (data acquisition card, `address` is its name,
+    options.calibration the transducer's .cal file), or the name of a plug-in. Counts are those of a box; the other kinds need none.
+    """
+
+    kind: Kind = "net_ft"
+    options: Options = {}
     address: str
-    counts_per_newton: Positive
-    counts_per_newton_metre: Positive
+    counts_per_newton: Annotated[float, Field(ge=1, le=1e9)]
+    counts_per_newton_metre: Annotated[float, Field(ge=1, le=1e12)]
     rate_hz: Annotated[float, Field(gt=1, le=7000)]
-    noise_N: Positive
-    range_N: Positive
+    noise_N: Annotated[float, Field(gt=0, le=0.2)]
+    range_N: Annotated[float, Field(ge=0.5, le=1000)]
     base_from_sensor_wxyz: Quaternion
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_counts(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("kind", "net_ft") != "net_ft":
+            return {"counts_per_newton": 1.0, "counts_per_newton_metre": 1.0, **data}
+        return data
 
     @model_validator(mode="after")
     def _unit(self) -> ForceSensorSection:
@@ -152,7 +206,7 @@ class Pins(_Section):
     encoders: str
     switches: str
     enable_active: Literal["low", "high"] = "low"
-    normally_open: tuple[str, ...] = ()
+    normally_open: Annotated[tuple[str, ...], Field(strict=False)] = ()
     keep_enabled: bool = False
 
     @model_validator(mode="before")
@@ -198,7 +252,7 @@ class ControlSection(_Section):
     approach_speed_m_per_s: Annotated[float, Field(gt=0, le=0.02)]
     contact_force_N: Annotated[float, Field(gt=0.005, le=0.1)]
     reversal_threshold_m: Annotated[float, Field(ge=0, le=0.002)]
-    acceleration_noise_m_per_s2: Positive
+    acceleration_noise_m_per_s2: Annotated[float, Field(gt=0, le=100)]
     law: Literal["thesis", "predictive"] = "predictive"
     form: Literal["pi", "incremental"] = "pi"
     pi_position_gain: Annotated[float, Field(ge=0, le=2)] = 0.083
@@ -217,7 +271,7 @@ class ControlSection(_Section):
     stiffness_sd: Annotated[float, Field(ge=0, le=0.5)] = 0.05
     reversal_share: Annotated[float, Field(ge=0, le=2)] = 0.75
     reversal_depth_m: Annotated[float, Field(ge=0, le=0.002)] = 0.0001
-    play_noise_m: Positive = 0.00003
+    play_noise_m: Annotated[float, Field(gt=0, le=0.01)] = 0.00003
     blind_approach_share: Annotated[float, Field(gt=0, le=1)] = 0.5
     play_caution_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
     play_sd_m: Annotated[float, Field(ge=0, le=0.001)] = 0.0003
@@ -387,6 +441,29 @@ class Rig(_Section):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _rates_fit(self) -> Rig:
+        """A rate at which every sample, or every set-point, would be late is refused before anything starts."""
+        pose_s = 1.0 / self.tracker.rate_hz + self.tracker.latency_s
+        for key, found_s, wanted_s, why in (
+            ("safety.hold_after_s", self.safety.hold_after_s, pose_s, "the oldest that a good pose gets (tracker)"),
+            (
+                "safety.force_timeout_s",
+                self.safety.force_timeout_s,
+                1.0 / self.force_sensor.rate_hz,
+                "a period of force_sensor",
+            ),
+            (
+                "board.setpoint_expiry_s",
+                self.board.setpoint_expiry_s,
+                1.0 / self.control.loop_hz,
+                "a period of control.loop_hz",
+            ),
+        ):
+            if not found_s >= wanted_s:
+                raise ValueError(f"{key}: found {found_s:g}, wanted at least {wanted_s:.4g}, {why}")
+        return self
+
     def stage(self, axis: int) -> StageSection:
         """The stage of axis 0 insertion, 1 roll or 2 knob."""
         return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
@@ -424,34 +501,28 @@ def _bounds(error: Any) -> str:
         for key, word in (("gt", "above"), ("ge", "at least"), ("lt", "below"), ("le", "at most"))
         if key in context
     ]
-    return " and ".join(limits) or wanted_of(error)
+    return (" and ".join(limits) or wanted_of(error)) + hint_of(error)
 
 
-def _known_keys(path: tuple[Any, ...]) -> list[str]:
-    """The keys of the section that `path` (keys from the top) lies in."""
-    section: Any = Rig
-    for part in path[:-1]:
-        field = section.model_fields.get(str(part)) if hasattr(section, "model_fields") else None
-        if field is None:
-            return []
-        section = field.annotation
-    return list(section.model_fields) if hasattr(section, "model_fields") else []
+def _shown(value: object) -> str:
+    return repr(value)[:80]
 
 
 def _describe(error: Any) -> str:
     """One of pydantic's errors as key, what was found, what is wanted."""
     key = ".".join(str(part) for part in error["loc"]) or "rig"
     if error["type"] == "extra_forbidden":
-        known = _known_keys(error["loc"])
-        near = difflib.get_close_matches(str(error["loc"][-1]), known, 1)
-        hint = f"; did you mean {near[0]}?" if near else f": {', '.join(known)}" if known else ""
-        return f"{key}: found an unknown key, wanted one that the rig file knows{hint}"
+        wanted = unknown_key(str(error["loc"][-1]), known_keys(Rig, error["loc"]))
+        return f"{key}: found {_shown(error['input'])}, wanted {wanted}"
     if error["type"] == "missing":
         return f"{key}: found nothing, wanted a value (see protocol/rigs/simulated.toml for what it means)"
     said = error["msg"].removeprefix("Value error, ")
     if ": found " in said:
         return said if not error["loc"] or said.startswith(f"{error['loc'][0]}") else f"{key}: {said}"
-    return f"{key}: found {repr(error['input'])[:80]}, wanted {_bounds(error)}"
+    if isinstance(error["input"], dict) and error["loc"]:  # a check of a whole section: show the keys that it names
+        named = [f"{name} = {value}" for name, value in error["input"].items() if re.search(rf"\b{name}\b", said)]
+        return f"{key}: found {', '.join(named) or 'this section'}, wanted {said}"
+    return f"{key}: found {_shown(error['input'])}, wanted {_bounds(error)}"
 
 
 def problems_of(data: dict[str, Any]) -> list[str]:
@@ -468,7 +539,7 @@ def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
     try:
         return Rig.model_validate(data)
     except ValidationError as problem:
-        raise InputError.from_sentence(f"{name}: {_describe(problem.errors()[0])}") from None
+        raise InputError.from_sentence(f"{name}: {_describe(first_of(problem.errors()))}") from None
 
 
 def read_rig_data(path: str | Path) -> dict[str, Any]:
@@ -479,6 +550,26 @@ def read_rig_data(path: str | Path) -> dict[str, Any]:
         raise InputError.from_sentence(f"{path}: found {reason(error)}, wanted a readable TOML file") from None
 
 
+def catheter_problems(rig: Rig) -> list[str]:
+    """A line where the named catheter is unknown, or its length is not the one in the rig file."""
+    try:
+        length_m = load_catheter(rig.catheter.name).distal_length_m
+    except (ValueError, OSError) as error:
+        return [f"catheter.name: found {rig.catheter.name!r}, wanted a catheter that ships or its file ({error})"]
+    if abs(length_m - rig.catheter.distal_length_m) <= DISTAL_TOLERANCE_M:
+        return []
+    return [
+        f"catheter.distal_length_m: found {rig.catheter.distal_length_m}, wanted about {length_m}, which "
+        f"{rig.catheter.name} has"
+    ]
+
+
 def load_rig(path: str | Path) -> Rig:
-    """The rig in TOML file `path`. Raises InputError (unreadable file, unknown key, value out of its bounds)."""
-    return parse_rig(read_rig_data(path), str(path))
+    """The rig in TOML file `path`, checked as `seldinger rig check` does.
+
+    Raises InputError (unreadable file, unknown key, value out of its bounds, another catheter).
+    """
+    rig = parse_rig(read_rig_data(path), str(path))
+    for problem in catheter_problems(rig):
+        raise InputError.from_sentence(f"{path}: {problem}")
+    return rig

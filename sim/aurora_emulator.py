@@ -207,6 +207,10 @@ class AuroraEmulator:
                 return frame
         return None
 
+    def frames_until(self, now_ns: int) -> list[AuroraFrame]:
+        """The frames that are kept and were ready by `now_ns`, oldest first: for a server that sends them unasked."""
+        return [frame for frame in self._frames if frame.available_ns <= now_ns]
+
     def _send(self, reply: str | bytes, from_ns: int) -> None:
         if isinstance(reply, str):
             body = reply.encode("ascii")

@@ -14,10 +14,12 @@ import tty
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from protocol.rig_file import load_rig
+from realtime.drivers.openigtlink import address_of
 from realtime.loop.service_notify import ServiceNotifier
 from sim.board import SimulatedBoard
 from sim.effects import parse
@@ -25,6 +27,9 @@ from sim.plant import Plant, PlantConfig
 from sim.sensor_servers import AuroraPty, NetFtUdp
 from sim.tissue import TissueConfig
 from sim.world import World
+
+if TYPE_CHECKING:
+    from sim.plus_server import PlusServer
 
 SLICE_NS = 1_000_000
 # After a stall the world catches up at most this much in one go, then looks at its lines again.
@@ -58,7 +63,7 @@ class RigServer:
         self._board_line, self._board_end = pty.openpty()
         tty.setraw(self._board_end)
         os.set_blocking(self._board_line, False)
-        self.tracker, self.force_box = AuroraPty(world.tracker), NetFtUdp(world.force_box)
+        self.tracker, self.force_box = _tracker_server(world), NetFtUdp(world.force_box)
         self._running = True
         self.longest_stall_ns, self.longest_stall_at_ns = 0, 0
         self.last_byte_ns, self.last_edge_ns = 0, 0
@@ -169,6 +174,16 @@ class RigServer:
         self.tracker.close()
         self.force_box.close()
         self.unplug_board()
+
+
+def _tracker_server(world: World) -> AuroraPty | PlusServer:
+    """The simulated tracker as the rig file has it: an Aurora on a pty, or an OpenIGTLink server at the file's port."""
+    tracker = world.rig.tracker
+    if tracker.kind != "openigtlink":
+        return AuroraPty(world.tracker)
+    from sim.plus_server import PlusServer
+
+    return PlusServer(world.tracker, address_of(tracker.port))
 
 
 def _ask_for_priority() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, writable_file
+from host.cli.options import Json, writable_file, writable_folder
+from host.cli.progress import Working
 from protocol.errors import InputError
 
 
@@ -18,8 +20,8 @@ def calibrate(
         typer.Argument(help="Recorded shapes: .csv, .json, or - (JSON); format: host/identification/recorded_shapes.py."),
     ],
     catheter: Annotated[str, typer.Option(help="Where the search starts: a shipped catheter or a .toml file.")],
-    out: Annotated[Path | None, typer.Option(help="Write the calibrated catheter into this .toml file.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the calibrated catheter.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the calibrated catheter, NAME.toml.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the calibrated catheter: a-z, 0-9 and _.")] = "calibrated",
     model: Annotated[str, typer.Option(help="pcar (planar) or cosserat (spatial).")] = "pcar",
     fit: Annotated[str, typer.Option(help="Some of stiffness, lengths, curvature, comma separated.")] = "stiffness,lengths",
     loss: Annotated[str, typer.Option(help="squares, huber, cauchy, or distance (the thesis' sum).")] = "huber",
@@ -36,16 +38,16 @@ def calibrate(
     from host.identification.catheter_calibration import calibrate as run
     from host.identification.catheter_calibration import calibrated_toml, calibration_report
 
-    if out is not None:
-        if out.suffix != ".toml":
-            raise InputError("out", str(out), "a .toml file in a folder that exists")
-        writable_file("out", out)
+    if not re.fullmatch(r"[a-z0-9_]{1,64}", name):
+        raise InputError("--name", name, "1 to 64 of a-z, 0-9 and _")
+    written = None if out is None else writable_file("--out", writable_folder("--out", out) / f"{name}.toml")
     groups = tuple(part.strip() for part in fit.split(",") if part.strip())
-    found = run(shapes, catheter, model=model, fit=groups, loss=loss, method=method, leave_one_out=leave_one_out)
+    with Working("calibration"):
+        found = run(shapes, catheter, model=model, fit=groups, loss=loss, method=method, leave_one_out=leave_one_out)
     report = calibration_report(found)
-    if out is not None:
-        out.write_text(calibrated_toml(found, name or out.stem), encoding="utf-8")
-        report["written"] = str(out)
+    if written is not None:
+        written.write_text(calibrated_toml(found, name), encoding="utf-8")
+        report["written"] = str(written)
     if json:
         write_json(report)
     else:

@@ -11,7 +11,8 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, within, writable_folder
 from host.cli.progress import share_bar
-from protocol.errors import InputError
+from host.cli.recordings import open_recording
+from protocol.errors import Description, InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def characterize(
     yes: Annotated[bool, typer.Option("--yes", help="With --real: the tip hangs free, do not ask.")] = False,
     board_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
     tracker_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
-    force_port: Annotated[int, typer.Option(help="With --real: UDP port of the force box.")] = 49152,
+    force_port: Annotated[int, typer.Option(help="With --real: UDP port of the force box.", hidden=True)] = 49152,
 ) -> None:
     """Characterize a rig in free space: backlash, slopes, dead zones, curves; write its calibration."""
     from host.commissioning.calibration_files import write_calibration
@@ -46,13 +47,18 @@ def characterize(
     if real and recording is not None:
         raise InputError("--real", "with --recording", "one of them: a recording moves nothing")
     loaded = load_rig(rig)
-    writable_folder("--dir", directory)
+    if real and not (yes or sys.stdin.isatty()):
+        raise InputError(
+            "--yes", Description("nothing"), "a terminal to ask in, or --yes once the tip hangs free: the catheter will move"
+        )
+    opened = None if recording is None else open_recording(recording)
+    writable_folder("--out", directory)
     try:
         if real:
             source = _record_on_rig(loaded, repeats, PortNames(board_port, tracker_port, force_port), yes, directory)
         else:
             source = recording or _record_simulated(loaded, repeats, seed, board, directory)
-        found = identify(RecordingFile(source), loaded)
+        found = identify(opened or RecordingFile(source), loaded)
     except (BoardUnavailable, RuntimeError, OSError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -84,10 +90,6 @@ def _record_on_rig(rig: Rig, repeats: int, ports: PortNames, yes: bool, director
 
     sweeps = standard_sweeps(rig, repeats)
     print(f"seldinger: {describe(sweeps)}", file=sys.stderr)
-    if not yes and not sys.stdin.isatty():
-        raise InputError(
-            "--yes", "missing", "a terminal to ask in, or --yes once the tip hangs free: the catheter will move"
-        )
     if not (yes or typer.confirm("Does the catheter's tip hang free, nothing within its reach?", err=True)):
         print("seldinger: nothing was moved", file=sys.stderr)
         raise typer.Exit(1)

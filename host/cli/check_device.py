@@ -9,6 +9,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile, one_of, within
+from host.cli.progress import Working
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 if TYPE_CHECKING:
@@ -22,8 +23,8 @@ def check_device(
     rig: RigFile = SIMULATED_RIG,
     seconds: Annotated[float, typer.Option(help="How long to read it.")] = 5.0,
     port: Annotated[str, typer.Option(help="Serial port, or the box's address, instead of the rig file's.")] = "",
-    udp_port: Annotated[int, typer.Option(help="RDT port of the force box.")] = 49152,
-    web_port: Annotated[int, typer.Option(help="Port of the force box's page.")] = 80,
+    udp_port: Annotated[int, typer.Option(help="RDT port of the force box.", hidden=True)] = 49152,
+    web_port: Annotated[int, typer.Option(help="Port of the force box's page.", hidden=True)] = 80,
     json: Json = False,
 ) -> None:
     """Read a device for some seconds; nothing moves. Exit status 1 when it is not fit."""
@@ -31,11 +32,14 @@ def check_device(
 
     one_of("device", device, DEVICES)
     within("--seconds", seconds, 0.1, 3600.0, "s")
+    within("--udp-port", udp_port, 1, 65535)
+    within("--web-port", web_port, 1, 65535)
     settings = load_rig(rig)
-    if device == "force":
-        report = check_force_box(settings, port, seconds, udp_port, web_port)
-    else:
-        report = (check_tracker if device == "tracker" else check_board)(settings, port, seconds)
+    with Working(f"reading {device}"):
+        if device == "force":
+            report = check_force_box(settings, port, seconds, udp_port, web_port)
+        else:
+            report = (check_tracker if device == "tracker" else check_board)(settings, port, seconds)
     _print_table(report)
     if json:
         write_json({"device": report.device, "good": report.good, "figures": report.figures, "problems": report.problems})

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, within, writable_folder
+from host.cli.options import (
+    BOARDS,
+    Board,
+    Folder,
+    Json,
+    RigFile,
+    Seed,
+    checked_effects,
+    checked_seed,
+    one_of,
+    within,
+    writable_folder,
+)
 from host.cli.progress import Progress
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -41,22 +53,16 @@ def demo(
     from host.report.run_report import write_report
     from host.run.demo import DemoSettings, exit_status
     from sim.board import BoardUnavailable
-    from sim.effects import parse
 
     one_of("--board", board, BOARDS)
     one_of("--force-source", force_source, ("sensor", "estimate"))
     checked_seed(seed)
-    for text in effect or ():
-        try:
-            parse(text)
-        except ValueError as error:
-            found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
-            raise InputError(f"--effect {text}", found, wanted) from None
+    effects = checked_effects(effect)
     limit_N = load_rig(rig).safety.over_force_N
     if not 0.02 <= force < limit_N:
         raise InputError("--force", force, f"at least 0.02 and below safety.over_force_N {limit_N} (N)")
     within("--hold", hold, 1.0, 3600.0, "s")
-    writable_folder("--dir", directory)
+    writable_folder("--out", directory)
     settings = DemoSettings(
         board=board,
         seed=seed,
@@ -66,7 +72,7 @@ def demo(
         force_source=force_source,
         rig_file=rig,
         directory=directory,
-        effects=tuple(effect or ()),
+        effects=effects,
     )
     try:
         run = _with_progress(settings, wall_clock)

@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, writable_folder
+from host.cli.options import Json, RigFile, writable_folder
 from host.cli.progress import Progress
 from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG
 
 
 def diagnose(
@@ -33,7 +34,7 @@ def diagnose(
     ] = None,
     quiet: Annotated[bool, typer.Option(help="No progress on standard error.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Compare a running rig with its twin, and raise alarms.")] = False,
-    rig: Annotated[str | None, typer.Option(help="With --live: the rig's file (default: the simulated rig).")] = None,
+    rig: RigFile = SIMULATED_RIG,
     effect: Annotated[
         list[str] | None,
         typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as the report gives it."),
@@ -57,6 +58,8 @@ def diagnose(
 
     if not nominal:
         raise InputError("--nominal", "nothing", "a TOML file")
+    if data is not None and not Path(data).is_dir():
+        raise InputError("--data", data, "a folder that exists")
     if out is not None:
         writable_folder("--out", out)
     if export is not None:
@@ -105,7 +108,7 @@ def _say_what_runs(nominal: str, trust: bool) -> None:
     print(f"seldinger diagnose: {path} runs {what} with your rights", file=sys.stderr)
 
 
-def _watch(rig: str | None, json: bool) -> None:
+def _watch(rig: Path, json: bool) -> None:
     """Watch a running rig until it is stopped; with `json`, one JSON object a line for each alarm."""
     from host.diagnosis.live.attach import attach
     from protocol.messages import body_of

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, writable_folder
+from host.cli.options import (
+    BOARDS,
+    Board,
+    Folder,
+    Json,
+    RigFile,
+    Seed,
+    checked_effects,
+    checked_seed,
+    one_of,
+    writable_folder,
+)
 from host.cli.progress import share_bar
 from protocol.errors import InputError
 from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
@@ -37,6 +48,7 @@ def experiment(
         raise InputError("--go", "both --go and --simulated", "one of them")
     one_of("--board", board, BOARDS)
     checked_seed(seed)
+    effects = checked_effects(effect)
     loaded, wanted = load_rig(rig), read_script(script)
     path = check_script(wanted, loaded)
     show(wanted, path, loaded)
@@ -44,11 +56,11 @@ def experiment(
     if not (go or simulated):
         print("nothing was moved: --go commands the running rig, --simulated runs it in virtual time", file=sys.stderr)
     if simulated:
-        writable_folder("--dir", directory)
+        writable_folder("--out", directory)
     try:
         with share_bar("experiment") as progress:
             if simulated:
-                recording = run_simulated(wanted, loaded, directory, board, seed, tuple(effect or ()), progress)
+                recording = run_simulated(wanted, loaded, directory, board, seed, effects, progress)
                 result["recording"] = str(recording)
             elif go:
                 run_live(wanted, loaded, progress)

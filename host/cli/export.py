@@ -8,29 +8,31 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, one_of, writable_folder
+from host.cli.options import Folder, Json, one_of, writable_folder
+from host.cli.progress import Working
 from host.cli.recordings import UnpackLimit, open_recording
 from protocol.errors import InputError
 
 
 def export(
     recording: Annotated[Path, typer.Argument(help="The recording (MCAP).")],
-    folder: Annotated[Path, typer.Argument(help="Folder for the tables; made if it does not exist.")],
+    out: Folder = Path("tables"),
     to: Annotated[str, typer.Option(help="parquet or csv.")] = "parquet",
     json: Json = False,
     unpack_limit: UnpackLimit = None,
 ) -> None:
-    """Write one table for each topic: `seldinger export REC.mcap --to parquet DIR`."""
+    """Write one table for each topic: `seldinger export REC.mcap --to csv --out DIR`."""
     from host.recordings.export import FORMATS
     from host.recordings.export import export as export_tables
 
     one_of("--to", to, FORMATS)
     opened = open_recording(recording, unpack_limit)
-    writable_folder("folder", folder)
+    writable_folder("--out", out)
     try:
-        written = export_tables(opened, to, folder)
+        with Working(f"tables of {recording.name}"):
+            written = export_tables(opened, to, out)
     except OSError as error:
-        raise InputError(str(folder), error.strerror or str(error), "a folder that can be written to") from None
+        raise InputError(str(out), error.strerror or str(error), "a folder that can be written to") from None
     if json:
         write_json(
             {
@@ -42,4 +44,4 @@ def export(
         return
     for topic, rows in sorted(opened.topics.items()):
         print(f"{rows:9d} rows  {topic}")
-    print(f"{len(written)} files in {folder}")
+    print(f"{len(written)} files in {out}")

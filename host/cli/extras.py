@@ -19,6 +19,8 @@ EXTRAS: dict[str, tuple[str, str]] = {
     "fmpy": ("fmpy", "fmu"),
     "pysindy": ("pysindy", "baselines"),
     "nidaqmx": ("nidaqmx", "daq"),
+    "pyigtl": ("pyigtl", "guidance"),
+    "rosbags": ("rosbags", "guidance"),
 }
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Docs, Json, Seed, checked_seed, one_of, within, writable_file
+from host.cli.options import BOARDS, Board, Docs, Jobs, Json, Seed, checked_jobs, checked_seed, one_of, within, writable_file
 from host.cli.progress import Progress
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ def faults(
     runs: Annotated[int, typer.Option(help="Number of runs.")] = 100,
     seed: Seed = 1,
     json: Json = False,
-    jobs: Annotated[int, typer.Option(help="Processes at a time.")] = min(os.cpu_count() or 1, 2),
+    jobs: Jobs = 0,
     board: Board = "native",
     fault: Annotated[list[str] | None, typer.Option(help="Only this one; may be given several times.")] = None,
     docs: Docs = None,
@@ -33,7 +32,7 @@ def faults(
     from sim.fault_table import FAULTS
 
     within("--runs", runs, 1, 100_000)
-    within("--jobs", jobs, 1, 64)
+    processes = checked_jobs(jobs)
     checked_seed(seed)
     one_of("--board", board, BOARDS)
     for name in fault or ():
@@ -46,7 +45,7 @@ def faults(
             def progress(done: int, total: int) -> None:
                 bar("faults", done / total, f"{done}/{total}")
 
-            results = run_campaign(runs, seed, jobs, board, tuple(fault or ()), progress)
+            results = run_campaign(runs, seed, processes, board, tuple(fault or ()), progress)
     except (BoardUnavailable, RuntimeError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

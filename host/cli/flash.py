@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
-from host.cli.options import RigFile
+from host.cli.contract_io import write_json
+from host.cli.options import Json, RigFile
+from host.cli.progress import Working
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
@@ -20,6 +22,7 @@ def flash(
     baud: Annotated[int, typer.Option(help="Of the boot loader; 0: the usual one of this board.")] = 0,
     image: Annotated[Path | None, typer.Option(help="ELF file to write, instead of building one.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Build, and show the command only.")] = False,
+    json: Json = False,
 ) -> None:
     """Build the firmware and write it to the board. The board resets: make sure that the stages may stop."""
     from host.commissioning.firmware_flash import avrdude_command, built, check_avrdude, check_port, pins_of, write_firmware
@@ -32,11 +35,16 @@ def flash(
         raise InputError("--image", str(image), "an ELF file of the firmware")
     command = avrdude_command(pins.mcu, port, image or built(pins), baud)
     print("seldinger: " + " ".join(command), file=sys.stderr)
+    if json and dry_run:
+        write_json({"command": command, "written": False})
     if dry_run:
         return
     try:
-        write_firmware(command, port, pins.mcu)
+        with Working(f"writing {pins.mcu}"):
+            write_firmware(command, port, pins.mcu)
     except RuntimeError as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     print("seldinger: written and verified; next: `seldinger check-device board`", file=sys.stderr)
+    if json:
+        write_json({"command": command, "written": True})

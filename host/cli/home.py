@@ -9,6 +9,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile, one_of
+from host.cli.progress import Working
 from protocol.rig_file import AXES, load_rig
 
 
@@ -34,7 +35,8 @@ def home(
             err=True,
         )
     try:
-        homing = home_stage(settings, wanted, port or settings.board.port)
+        with Working(f"{axis} creeps to its switch"):
+            homing = home_stage(settings, wanted, port or settings.board.port)
     except (OSError, HomingFailed) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

@@ -11,7 +11,8 @@ from typing import Annotated
 
 import typer
 
-from host.cli.options import RigFile
+from host.cli.contract_io import write_json
+from host.cli.options import Json, RigFile, within
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
@@ -22,8 +23,11 @@ def install_services(
     rig: RigFile = SIMULATED_RIG,
     simulated: Annotated[bool, typer.Option("--simulated", help="Add the simulated rig as a service.")] = False,
     cpu: Annotated[int, typer.Option(help="Processor of the control loop; -1: the last.")] = -1,
-    root: Annotated[Path, typer.Option(help="Write below this directory, without calling systemd.")] = Path("/"),
+    root: Annotated[Path, typer.Option(help="Write below this directory, without calling systemd.", hidden=True)] = Path(
+        "/"
+    ),
     take_away: Annotated[bool, typer.Option("--undo", help="Stop the services and remove what was installed.")] = False,
+    json: Json = False,
 ) -> None:
     """Write unit files and the service user, and reload systemd. Nothing is started; the command for that is printed."""
     from host.run.installation_check import check_installation
@@ -33,11 +37,12 @@ def install_services(
     if system and os.geteuid() != 0:
         raise InputError("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
     if take_away:
-        _undo(root, system)
+        removed = _undo(root, system)
+        if json:
+            write_json({"removed": removed})
         return
     count = os.cpu_count() or 1
-    if not -1 <= cpu < count:
-        raise InputError("--cpu", cpu, f"-1 to {count - 1}")
+    within("--cpu", cpu, -1, count - 1)
     settings = UnitSettings(rig.resolve(), count - 1 if cpu < 0 else cpu, simulated)
     try:
         check_installation(settings.python, Path(__file__).parents[2], rig)
@@ -57,9 +62,12 @@ def install_services(
         _call("systemd-sysusers", "seldinger.conf")
         _call("systemctl", "daemon-reload")
     print(f"seldinger: now `systemctl enable --now {' '.join(settings.names)}`; the loop starts disarmed", file=sys.stderr)
+    if json:
+        write_json({"written": list(written), "services": list(settings.names)})
 
 
-def _undo(root: Path, system: bool) -> None:
+def _undo(root: Path, system: bool) -> list[str]:
+    """Remove what was installed. Returns the paths of the removed files."""
     from host.run.service_units import undo
 
     managed = system and _MANAGER.is_dir()
@@ -76,6 +84,7 @@ def _undo(root: Path, system: bool) -> None:
         else "seldinger: nothing was installed here",
         file=sys.stderr,
     )
+    return [str(path) for path in removed]
 
 
 def _call(*command: str) -> None:

@@ -31,6 +31,7 @@ def init(
     laboratory: Annotated[str, typer.Option(help="Name of the laboratory, for the authority's certificate.")] = "laboratory",
     passphrase: Annotated[bool, typer.Option("--passphrase", help="Ask for a passphrase that protects the key.")] = False,
     passphrase_file: PassphraseFile = None,
+    json: Json = False,
 ) -> None:
     """Make the laboratory's authority. Refused where there is one: all its certificates would become invalid."""
     from host.security.keys import make_authority
@@ -43,6 +44,8 @@ def init(
         f"authority in {folder}; its key.pem gives command over every rig: keep it off the rigs, and back it up",
         file=sys.stderr,
     )
+    if json:
+        write_json({"authority": str(folder)})
 
 
 @keys.command()
@@ -54,6 +57,7 @@ def issue(
     connect: Annotated[str, typer.Option(help="Of a reader or commander: the rig, as tls/ADDRESS:PORT.")] = "",
     days: Annotated[int, typer.Option(help="How long it is valid.")] = 365,
     passphrase_file: PassphraseFile = None,
+    json: Json = False,
 ) -> None:
     """Issue a key and a certificate, in a folder to be copied to that machine; print the lines that the rig file needs."""
     from host.security.keys import CLIENT_FILE, has_passphrase, network_lines
@@ -76,7 +80,11 @@ def issue(
         )
     print("lines for the rig file, for all certificates issued here:", file=sys.stderr)
     port = connect or (f"tls/{_bracketed(addresses[0])}:7448" if addresses else "")
-    print(network_lines(directory, port), end="")
+    lines = network_lines(directory, port)
+    if json:
+        write_json({"folder": str(one.folder), "rig_file_lines": lines})
+    else:
+        print(lines, end="")
 
 
 def _read_passphrase(path: Path) -> str:

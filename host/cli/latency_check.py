@@ -10,6 +10,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, one_of, within, writable_file
+from host.cli.progress import Working
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
@@ -30,10 +31,11 @@ def latency_check(
             "--with",
             help="Subscribers to run during the measurement, comma separated: frozen, flooding, "
             "leaving, view, or all; runs the simulated rig.",
+            hidden=True,
         ),
     ] = "",
     docs: Annotated[
-        Path | None, typer.Option(help="With --with: page whose section on subscribers is written again.")
+        Path | None, typer.Option(help="With --with: page whose section on subscribers is written again.", hidden=True)
     ] = None,
 ) -> None:
     """Run the wall-clock loop with the real tick; report how late it woke and how long it worked."""
@@ -55,7 +57,8 @@ def latency_check(
 
     params = tick_parameters(load_rig(SIMULATED_RIG))
     params[0].period_s = 1.0 / hz
-    result = check_latency(tick, params, hz, seconds, RealtimeSettings(), run=run)
+    with Working("the loop runs", seconds):
+        result = check_latency(tick, params, hz, seconds, RealtimeSettings(), run=run)
     if result.granted.warning:
         print(f"seldinger: {result.granted.warning}", file=sys.stderr)
     if result.cyclictest_failed:
@@ -75,7 +78,8 @@ def _with_subscribers(names: str, seconds: float, json: bool, docs: Path | None)
     for kind in kinds:
         one_of("--with", kind, KINDS)
     try:
-        found = study(kinds, seconds)
+        with Working("study of subscribers"):
+            found = study(kinds, seconds)
     except OSError as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

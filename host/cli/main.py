@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import signal
@@ -40,6 +41,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "plan": ("host.cli.plan", "plan", "Plan a path of the tip past obstacles, from a JSON request."),
     "faults": ("host.cli.faults", "faults", "Inject faults in every phase on the simulated rig; report their detection."),
     "run": ("host.cli.run", "run", "Run a protocol, a scripted experiment, with a report per point."),
+    "bridge": ("host.cli.bridge", "bridge", "Serve the running rig over OpenIGTLink or ROS 2."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
     "stop": ("host.cli.stop", "stop", "Stop the rig over every path; say whether its own state confirms it."),
     "check-device": (
@@ -78,6 +80,9 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 # Commands whose arguments may begin with a minus, such as -2mm.
 NEGATIVE_VALUES = ("jog", "goto", "touch", "force")
 
+# What typer raises for an option or argument that a command does not take; its click is a copy of its own, or the package.
+Refused = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
 COMPILES = (
     "seldinger: compiling kernels, which takes up to some minutes; `seldinger warm` compiles all of them once, on all cores"
 )
@@ -95,7 +100,12 @@ def build(argv: list[str]) -> typer.Typer:
     )
     app.callback()(_options)
     called = next((word for word in argv if not word.startswith("-")), None)
-    if called not in COMMANDS:
+    if called is not None and called not in COMMANDS:
+        near = difflib.get_close_matches(called, COMMANDS, 1)
+        raise InputError(
+            "command", called, f"one that exists; did you mean {near[0]}?" if near else f"one of {', '.join(COMMANDS)}"
+        )
+    if called is None:
         for name, (_, _, line) in COMMANDS.items():
             app.command(name, help=line, short_help=line)(_only_listed)
         return app
@@ -151,7 +161,10 @@ def _keep_traceback(error: Exception, argv: list[str]) -> str:
 def _report(error: Exception, argv: list[str]) -> int:
     """Print one line about `error`. Return the exit status: 2 for bad input, 1 for anything else."""
     if isinstance(error, InputError):
-        print(f"seldinger: {error}", file=sys.stderr)
+        print(f"seldinger: {_one_line(str(error))}", file=sys.stderr)
+        return 2
+    if isinstance(error, Refused):
+        print(f"seldinger: {_one_line(error.format_message())}", file=sys.stderr)  # type: ignore[attr-defined]
         return 2
     command = " ".join(["seldinger", *(word for word in argv[:1] if not word.startswith("-"))])
     missing = missing_extra(error, command) if isinstance(error, ModuleNotFoundError) else None
@@ -162,6 +175,19 @@ def _report(error: Exception, argv: list[str]) -> int:
     what = f"{type(error).__name__}: {said}" if said else type(error).__name__
     print(f"seldinger: unexpected error, {what}; {_keep_traceback(error, argv)}", file=sys.stderr)
     return 1
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _run(argv: list[str]) -> int:
+    """Run the command that `argv` names. Returns its exit status."""
+    try:
+        return int(typer.main.get_command(build(argv)).main(argv, "seldinger", standalone_mode=False) or 0)
+    except typer.Abort:  # Ctrl-C, or "no" to a question
+        print("seldinger: ended before it was done", file=sys.stderr)
+        return 1
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -180,7 +206,9 @@ def main() -> None:
     argv = sys.argv[1:]
     compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
-        build(argv)()
+        status = _run(argv)
+        sys.stdout.flush()
+        sys.exit(status)
     except SystemExit as ending:
         _leave_stalled_stop(ending)
         raise

@@ -1,9 +1,14 @@
-"""Options that several commands share, checks of their values, and a try of the places for output before the work."""
+"""Options that several commands share, checks of their values, and a try of the places for output before the work.
+
+One name means one thing in all commands: --json prints one JSON object on standard output; --out is the folder for what the
+command writes; --jobs is the number of processes at a time; --seed decides all random numbers; --rig is the rig's file.
+"""
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +17,16 @@ import typer
 from protocol.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
-RigFile = Annotated[Path, typer.Option(help="Rig file (TOML).")]
+RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (TOML).")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Board = Annotated[str, typer.Option(help="avr (the firmware's ELF in simavr), native, or auto.")]
-Folder = Annotated[Path, typer.Option("--dir", help="Folder for recording and report.")]
+Folder = Annotated[Path, typer.Option("--out", help="Folder for recording, report and other results; made where missing.")]
+Jobs = Annotated[int, typer.Option("--jobs", help="Processes at a time; 0: one for each core.")]
 RequestFile = Annotated[str, typer.Argument(help="The request: a JSON file, or - for standard input.")]
-Docs = Annotated[Path | None, typer.Option(help="Page of the documentation whose section is to be written again.")]
+# For developers: the help does not list it.
+Docs = Annotated[
+    Path | None, typer.Option(help="Page of the documentation whose section is to be written again.", hidden=True)
+]
 
 SEEDS = (0, 2**31 - 1)
 BOARDS = ("avr", "native", "auto")  # sim.board.KINDS, which takes the simulator's modules to import
@@ -42,14 +51,32 @@ def checked_seed(value: int) -> int:
     return int(within("--seed", value, *SEEDS))
 
 
+def checked_effects(effects: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the effects to plant in the simulated rig. Raises InputError for one that `sim.effects` does not know."""
+    from sim.effects import parse
+
+    for text in effects or ():
+        try:
+            parse(text)
+        except ValueError as error:
+            found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
+            raise InputError(f"--effect {text}", found, wanted) from None
+    return tuple(effects or ())
+
+
+def checked_jobs(value: int) -> int:
+    """Return the number of processes that `--jobs` asks for, at least 1. Raises InputError."""
+    return int(within("--jobs", value, 0, 1024)) or os.cpu_count() or 1
+
+
 def writable_file(key: str, path: Path) -> Path:
     """Return `path` if a file can be written there; its folder must exist. An existing file keeps its content.
 
     Raises:
         InputError: named `key`, with the system's reason.
     """
-    existed = path.exists()
     try:
+        existed = path.exists()
         with path.open("ab"):
             pass
         if not existed:

@@ -10,6 +10,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RequestFile, RigFile
+from host.cli.progress import Working
 from protocol.rig_file import SIMULATED_RIG
 
 
@@ -26,7 +27,8 @@ def plan(
 
     loaded = load_calibrated_rig(rig, calibration)
     checked = read_plan_request(request)
-    answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
+    with Working("search for a path"):
+        answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:
         print(
             f"seldinger: no path found in {checked.samples} samples; more samples or less clearance_m may find one",

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from host.cli.contract_io import write_json
+from host.cli.options import Json, within
 from host.cli.recordings import UnpackLimit, open_recording
 
 
@@ -17,9 +19,15 @@ def play(
     diagnosis: Annotated[str | None, typer.Option(help="JSON of `seldinger diagnose`: its windows are marked.")] = None,
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page, on 127.0.0.1.")] = 8448,
     unpack_limit: UnpackLimit = None,
+    json: Json = False,
 ) -> None:
     """Show a recording in a browser: play, pause, seek."""
-    from host.view.serve import serve_recording
+    from host.view.serve import check_port, page_address, serve_recording
 
+    within("--speed", speed, 0.05, 50.0)
+    check_port(port)
     opened = open_recording(recording, unpack_limit)
+    if json:
+        write_json({"url": page_address(port)})
+        sys.stdout.flush()
     serve_recording(opened, speed, diagnosis, port, lambda line: print(line, file=sys.stderr))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
 _WIDTH = 28
-_REDRAW_S, _LINE_EVERY_S = 0.1, 10.0
+_REDRAW_S, _LINE_EVERY_S, _FIRST_LINE_S = 0.1, 10.0, 5.0
 
 
 class Progress:
@@ -49,6 +50,40 @@ class Progress:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class Working:
+    """Say that a step goes on which cannot tell how much of it is done: how long it has taken, and of how long at most.
+
+    The first line comes after five seconds, then one every ten; on a terminal every second. A step that ends before
+    says nothing.
+    """
+
+    def __init__(self, stage: str, at_most_s: float | None = None) -> None:
+        self._stage, self._at_most_s = stage, at_most_s
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
+
+    def __enter__(self) -> Working:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _tell(self) -> None:
+        live, printed = sys.stderr.isatty(), False
+        of = "" if self._at_most_s is None else f" of {self._at_most_s:g} s"
+        began_s, wait_s = time.monotonic(), _FIRST_LINE_S
+        while not self._done.wait(wait_s):
+            text = f"seldinger: {self._stage}: {time.monotonic() - began_s:.0f} s{of}"
+            sys.stderr.write(f"\r{text[:110]:<110}" if live else f"{text}\n")
+            sys.stderr.flush()
+            wait_s, printed = 1.0 if live else _LINE_EVERY_S, True
+        if live and printed:
+            sys.stderr.write("\r" + " " * 110 + "\r")
+            sys.stderr.flush()
 
 
 @contextlib.contextmanager

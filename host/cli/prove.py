@@ -3,63 +3,66 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, Seed, checked_seed, within, writable_folder
+from host.cli.options import Jobs, Json, Seed, checked_jobs, checked_seed, within, writable_folder
 from host.cli.progress import Progress
-from protocol.errors import InputError
+from protocol.errors import Description, InputError, reason
 
 
 def prove(
     cases: Annotated[int, typer.Option(help="Number of cases.")] = 200,
     seed: Seed = 1,
     json: Json = False,
-    jobs: Annotated[int, typer.Option(help="Processes on this machine.")] = 2,
+    jobs: Jobs = 0,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, whose workers then make the verdicts.")
+        str | None, typer.Option(help="Address of a Dask scheduler, whose workers then make the verdicts.", hidden=True)
     ] = None,
     resume: Annotated[Path | None, typer.Option(help="Folder of a run to continue.")] = None,
-    dir: Annotated[
-        Path | None, typer.Option(help="Folder for everything that is made (default: runs/prove_SEED_CASES).")
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for everything that is made (default: runs/prove_SEED_CASES).")
     ] = None,
     finder: Annotated[str | None, typer.Option(help="Another command to score, called as `seldinger diagnose` is.")] = None,
-    limit_s: Annotated[float, typer.Option(help="Longest time for one case (s).")] = 900.0,
+    limit_s: Annotated[float, typer.Option(help="Longest time for one case (s).", hidden=True)] = 900.0,
     baselines: Annotated[bool, typer.Option(help="Run the baselines too, on the project's own world.")] = True,
     world: Annotated[
         str, typer.Option(help="own, mujoco, ode, contact, several joined by commas, or all; --cases of each.")
     ] = "own",
     calibration: Annotated[
-        Path | None, typer.Option(help="Table of host.studies.proof.calibrate to apply to the raw probabilities.")
+        Path | None,
+        typer.Option(help="Table of host.studies.proof.calibrate to apply to the raw probabilities.", hidden=True),
     ] = None,
 ) -> None:
     """Score the mismatch finder on concealed cases."""
     from host.studies.proof import workers
-    from host.studies.proof.calibration import as_stated, read
     from host.studies.proof.runner import Settings, is_spent
     from host.studies.proof.runner import prove as run
     from host.studies.proof.table import markdown, worlds_markdown
 
     within("--cases", cases, 1, 1_000_000)
-    within("--jobs", jobs, 1, 1024)
+    processes = checked_jobs(jobs)
     within("--limit-s", limit_s, 1.0, 1e6, "s")
     checked_seed(seed)
     if resume is not None and not (resume / "suite.json").exists():
         raise InputError("--resume", str(resume), "a folder that an earlier run made")
     chosen = _worlds(world)
     named = "" if chosen == ("own",) else "_" + "_".join(chosen)
-    folder = writable_folder("--dir", resume or dir or Path("runs") / f"prove_{seed}_{cases}{named}")
+    calibrate = _calibration(calibration)
     command = tuple(shlex.split(finder)) if finder else workers.FINDER
+    if finder and shutil.which(command[0]) is None:
+        raise InputError("--finder", finder, "a command whose program can be run")
+    folder = writable_folder("--out", resume or out or Path("runs") / f"prove_{seed}_{cases}{named}")
     if is_spent(seed):
         print(f"seed {seed} was used while the finder was built: its figures prove nothing", file=sys.stderr)
-    calibrate = read(calibration) if calibration else as_stated
     with Progress() as bar:
         result = run(
-            Settings(cases, seed, folder, jobs, scheduler, command, limit_s, baselines, chosen, calibrate),
+            Settings(cases, seed, folder, processes, scheduler, command, limit_s, baselines, chosen, calibrate),
             lambda stage, done, total: bar(stage, done / max(total, 1), f"{done}/{total}"),
             lambda digest: print(f"labels sha256 {digest}", file=sys.stderr, flush=True),
         )
@@ -73,6 +76,16 @@ def prove(
         print(markdown(result["table"], result["baselines"]))
     else:
         print(worlds_markdown({name: each["table"] for name, each in result["worlds"].items()}, "own"))
+
+
+def _calibration(path: Path | None) -> Any:
+    """How raw probabilities are stated: as they are, or by the table in a file. Raises InputError."""
+    from host.studies.proof.calibration import as_stated, read
+
+    try:
+        return as_stated if path is None else read(path)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError("--calibration", Description(f"{path}: {reason(error)}"), "a table of proof.calibrate") from None
 
 
 def _worlds(text: str) -> tuple[str, ...]:

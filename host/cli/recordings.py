@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from protocol.errors import Description, InputError
+
 if TYPE_CHECKING:
     from host.recordings.recording import RecordingFile
 
@@ -23,6 +25,8 @@ def open_recording(path: Path, unpack_limit_MiB: int | None = None) -> Recording
     from host.recordings.recording import RecordingFile
 
     recording = RecordingFile(path, None if unpack_limit_MiB is None else unpack_limit_MiB * 2**20)
+    if not recording.topics:
+        raise InputError(str(path), Description("no message that is intact"), "a recording with messages of the rig")
     if recording.truncated or recording.damaged_chunks:
         print(
             f"seldinger: {path} is {'cut short' if recording.truncated else 'damaged'} "

@@ -26,7 +26,7 @@ def reproduce(
     from host.report.figure_page import WORDS, as_json
 
     one_of("part", part, PARTS)
-    writable_folder("--dir", directory)
+    writable_folder("--out", directory)
 
     def progress(text: str) -> None:
         print(f"reproduce {part}: {text}", file=sys.stderr)

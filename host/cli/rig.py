@@ -10,7 +10,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json
-from protocol.rig_file import Rig, parse_rig, problems_of, read_rig_data
+from protocol.rig_file import Rig, catheter_problems, parse_rig, problems_of, read_rig_data
 
 rig = typer.Typer(help="Check a rig file; show the effective configuration.", no_args_is_help=True)
 
@@ -27,8 +27,6 @@ def check(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only what is wrong.")] = False,
 ) -> None:
     """Check FILE and show its effective configuration. Exit status 2 and a line for each mistake."""
-    from host.commissioning.rig_check import catheter_problems
-
     data = read_rig_data(file)
     problems = problems_of(data)
     if not problems:

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, writable_folder
+from host.cli.options import (
+    BOARDS,
+    Board,
+    Folder,
+    Json,
+    RigFile,
+    Seed,
+    checked_effects,
+    checked_seed,
+    one_of,
+    writable_file,
+    writable_folder,
+)
 from host.cli.progress import Progress
 from protocol.errors import Description, InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
@@ -38,21 +50,27 @@ def run(
 
     one_of("--board", board, BOARDS)
     checked_seed(seed)
+    effects = checked_effects(effect)
+    if not (dry_run or simulated or yes or sys.stdin.isatty()):
+        raise InputError("--yes", Description("nothing"), "--yes without a terminal: the protocol moves the catheter")
     loaded = load_rig(rig)
     steps = protocol_file.read_protocol(protocol, loaded)
     checked = protocol_file.dry_run(steps, loaded)
+    earlier = () if resume is None else protocol_run.read_result(resume, steps)
+    if not dry_run:
+        writable_folder("--out", directory)
+        if resume is not None:
+            writable_file("--resume", resume)
     _show(steps, checked, loaded)
     if dry_run:
         if json:
             planned = {"actions": len(steps.actions), "seconds": checked.seconds}
             write_json({"protocol": steps.file.name, "good": True, **planned})
         return
-    earlier = () if resume is None else protocol_run.read_result(resume, steps)
-    writable_folder("--dir", directory)
     target = resume or protocol_run.new_result_path(directory)
     job = protocol_run.Job(steps, loaded, target, earlier)
     try:
-        result = _carry_out(job, simulated, yes, directory, board, seed, tuple(effect or ()))
+        result = _carry_out(job, simulated, yes, directory, board, seed, effects)
     except RuntimeError as error:
         print(f"seldinger: run: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
@@ -76,8 +94,6 @@ def _carry_out(
 
             estimator = EstimationService(load_estimator(DemoSettings().estimator, job.rig))
             return protocol_run.run_simulated(job, directory, board, seed, effects, estimator, bar)
-        if not (yes or sys.stdin.isatty()):
-            raise InputError("--yes", Description("nothing"), "--yes without a terminal: the protocol moves the catheter")
         if not yes:
             typer.confirm("The catheter will move. Is a hand at the emergency stop?", abort=True, err=True)
         return protocol_run.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Go on?", err=True), bar)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, RigFile, Seed, checked_seed, within
+from host.cli.options import Jobs, Json, RigFile, Seed, checked_jobs, checked_seed, within
 from protocol.rig_file import SIMULATED_RIG
 
 
@@ -20,7 +20,7 @@ def tune(
     calibration: Annotated[Path | None, typer.Option(help="Calibration file, as `characterize` writes it.")] = None,
     gains: Annotated[str, typer.Option(help="Keys of [control] to tune, comma separated; default: all four.")] = "",
     evaluations: Annotated[int, typer.Option(help="Evaluations of (7.4) for each method.")] = 100,
-    processes: Annotated[int, typer.Option(help="Processes at a time.")] = 2,
+    jobs: Jobs = 0,
     seed: Seed = 1,
     check: Annotated[bool, typer.Option("--check", help="Only the margin of the rig's present gains.")] = False,
 ) -> None:
@@ -30,7 +30,7 @@ def tune(
     from host.commissioning.tuning import tune as search
 
     within("--evaluations", evaluations, 8, 5000)
-    within("--processes", processes, 1, 64)
+    processes = checked_jobs(jobs)
     checked_seed(seed)
     loaded = load_calibrated_rig(rig, calibration)
     names = [name.strip() for name in gains.split(",") if name.strip()] or list(GAINS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.extras import missing_extra
-from host.cli.options import Json, one_of, within
+from host.cli.options import Jobs, Json, checked_jobs, one_of
 from host.cli.progress import Progress
 from host.cli.warm_workloads import WORKLOADS
 
@@ -25,7 +24,7 @@ POLL_S = 0.2
 
 def warm(
     json: Json = False,
-    jobs: Annotated[int, typer.Option(help="Processes at a time; 0: one for each core.")] = 0,
+    jobs: Jobs = 0,
     only: Annotated[
         list[str] | None, typer.Option(help="Only this part and those it needs; may be given several times.")
     ] = None,
@@ -33,11 +32,11 @@ def warm(
     """Compile every kernel that a command needs. Exit status 1 when a part failed; the others are compiled then."""
     from protocol.kernel_cache import base
 
-    within("--jobs", jobs, 0, 1024)
+    processes = checked_jobs(jobs)
     for name in only or ():
         one_of("--only", name, WORKLOADS)
     began_s = time.monotonic()
-    failed = _run_all(_with_needed(only or list(WORKLOADS)), jobs or os.cpu_count() or 1)
+    failed = _run_all(_with_needed(only or list(WORKLOADS)), processes)
     for name, reason in failed.items():
         print(f"seldinger: warm: {WORKLOADS[name].title}: {reason}", file=sys.stderr)
     size_bytes = sum(path.stat().st_size for path in base().rglob("*") if path.is_file()) if base().is_dir() else 0

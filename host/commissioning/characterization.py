@@ -328,10 +328,17 @@ def load_calibrated_rig(rig_file: str | Path, calibration_file: str | Path | Non
         raise InputError.from_sentence(
             f"{calibration_file}: found sections {', '.join(found) or 'none'}, wanted [transmission] alone"
         )
-    of, wanted = found["transmission"].get("catheter"), data["catheter"]["name"]
+    rig = parse_rig({**data, **found, "catheter": {**data["catheter"], **_named(found)}}, str(calibration_file))
+    of, wanted = rig.transmission.catheter, data["catheter"]["name"]
     if of != wanted:
         raise InputError.from_sentence(
             f"{calibration_file}: transmission.catheter: found {of!r}, wanted {wanted!r}, the rig's: "
             "it was calibrated with another catheter"
         )
-    return parse_rig({**data, **found}, str(calibration_file))
+    return rig
+
+
+def _named(calibration: dict[str, Any]) -> dict[str, Any]:
+    """The catheter of a calibration, so that its keys are checked before its catheter is compared."""
+    section = calibration["transmission"]
+    return {"name": section["catheter"]} if isinstance(section, dict) and "catheter" in section else {}

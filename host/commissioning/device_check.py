@@ -8,8 +8,9 @@ from host.commissioning.board_inputs import input_lines, input_problems
 from protocol.rig_file import Pins, Rig
 from protocol.serial_frames import Fault, Mcu
 from realtime.core.board_intake import axis_limits
+from realtime.core.device_sources import AURORA, NET_FT, force_thread, tracker_thread
 from realtime.drivers.aurora import AuroraConfig
-from realtime.drivers.check_device import DeviceReport, check_aurora, check_net_ft
+from realtime.drivers.check_device import DeviceReport, check_aurora, check_forces, check_net_ft, check_poses
 from realtime.drivers.stepper_board import FAULT_ADVICE, BoardEventKind, BoardStatus, LinkPhase, StepperBoardLink
 from realtime.drivers.transport import Transport, open_serial
 
@@ -17,15 +18,30 @@ STATUS_HZ, BRING_UP_S = 200.0, 5.0
 
 
 def check_tracker(rig: Rig, port: str, seconds: float) -> DeviceReport:
-    """Read the tracker at serial port `port` (empty: the rig file's) for `seconds`; report its rate, gaps and noise."""
+    """Read the tracker at `port` (empty: the rig file's) for `seconds`; report its rate, gaps and noise."""
     tracker = rig.tracker
     tools = (tracker.tip_handle, tracker.shaft_handle)
+    if tracker.kind != AURORA:
+        return check_poses(
+            lambda sample, event: tracker_thread(rig, port or None, sample, event),
+            tools,
+            tracker.rate_hz,
+            seconds,
+            tracker.kind,
+        )
     config = AuroraConfig(tools=tools, rate_hz=tracker.rate_hz, latency_s=tracker.latency_s)
     return check_aurora(lambda: open_serial(port or tracker.port, 9600), config, seconds)
 
 
 def check_force_box(rig: Rig, address: str, seconds: float, udp_port: int, web_port: int) -> DeviceReport:
     """Read the force box at `address` (empty: the rig file's) for `seconds`; report its rate, lost records and noise."""
+    if rig.force_sensor.kind != NET_FT:
+        return check_forces(
+            lambda sample, event: force_thread(rig, udp_port, sample, event),
+            rig.force_sensor.rate_hz,
+            seconds,
+            rig.force_sensor.kind,
+        )
     return check_net_ft(address or rig.force_sensor.address, seconds, udp_port, web_port)
 
 

@@ -69,7 +69,10 @@ def read_script(path: Path) -> Script:
     rows = content.get("rows")
     if isinstance(rows, list):
         content["rows"] = [_floats(row) if isinstance(row, list) else row for row in rows]
-    script = validate(Script, content)
+    try:
+        script = validate(Script, content)
+    except InputError as error:
+        raise error.in_file(path) from None
     width = 4 if script.motion == "free" else 2
     for number, row in enumerate(script.rows):
         if len(row) != width:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,6 +121,9 @@ def _table(source: str, dimensions: int) -> dict[str, Any]:
 
 def _number(text: str | None, key: str) -> float:
     try:
-        return float(text or "")
+        value = float(text or "")
     except ValueError:
         raise InputError(key, text, "a number") from None
+    if not math.isfinite(value):
+        raise InputError(key, text, "a finite number")
+    return value

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from protocol.catheter import Catheter, load_catheter
 from protocol.errors import InputError
-from protocol.requests import Request, read_json, validate
+from protocol.requests import Request, read_json, unknown_key, validate
 
 # Far beyond any catheter: a value outside is a mistaken unit, and must not reach a kernel.
 Insertion = Annotated[float, Field(ge=-0.5, le=0.5)]
@@ -67,7 +67,7 @@ def read_request(source: str, planar: type[Planar], spatial: type[Spatial]) -> P
     wanted = planar if model == "pcar" else spatial
     unknown = [key for key in data if key not in wanted.model_fields] if isinstance(data, dict) else []
     if unknown:  # before missing keys: a misspelt key is both
-        raise InputError(unknown[0], data[unknown[0]], "no such key; known keys: " + ", ".join(wanted.model_fields))
+        raise InputError(unknown[0], data[unknown[0]], unknown_key(unknown[0], list(wanted.model_fields)))
     return validate(wanted, data)
 
 

@@ -104,9 +104,9 @@ def _table(result: dict[str, Any], summary: RunSummary) -> Table:
         (
             "mean force",
             quantity(result["force_mean_N"], "N", 3),
-            f"after 3 s of settling; set-point {quantity(result['target_force_N'], 'N', 2)}",
+            f"{summary.judged_over}; set-point {quantity(result['target_force_N'], 'N', 2)}",
         ),
-        ("RMS force error", quantity(result["force_rms_error_N"], "N", 3), "after 3 s of settling"),
+        ("RMS force error", quantity(result["force_rms_error_N"], "N", 3), summary.judged_over),
         ("peak force", quantity(result["force_peak_N"], "N", 3), f"limit {quantity(summary.force_limit_N, 'N', 2)}"),
         ("tip error across the normal", quantity(result["tip_rms_error_m"] * 1e3, "mm", 2), "RMS, tracker noise included"),
         ("in contact", quantity(result["contact_seconds"], "s", 1), ""),

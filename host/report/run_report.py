@@ -160,9 +160,9 @@ def lines_of(summary: RunSummary) -> list[TableRow]:
         TableRow(
             "Mean force",
             quantity(summary.force_mean_N, "N", 3),
-            f"set-point {quantity(summary.target_force_N, 'N', 2)}",
+            f"{summary.judged_over}; set-point {quantity(summary.target_force_N, 'N', 2)}",
         ),
-        TableRow("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), "after 3 s of settling"),
+        TableRow("RMS force error", quantity(summary.force_rms_error_N * 1e3, "mN", 0), summary.judged_over),
         TableRow("Peak force", quantity(summary.force_peak_N, "N", 3), f"limit {limit}"),
         TableRow(
             "Tip error across the normal", quantity(summary.tip_rms_error_m * 1e3, "mm", 2), "RMS, tracker noise included"

@@ -108,6 +108,12 @@ class RunSummary:
         return max((span.name for span in self.safety), key=SafetyAction.labels().index, default="none")
 
     @property
+    def judged_over(self) -> str:
+        """Over which part of the contact mean force and RMS errors are: the same for all of them."""
+        settled = self.contact is not None and self.contact.seconds > SETTLE_S
+        return f"after {SETTLE_S:g} s of settling" if settled else f"whole contact, not longer than {SETTLE_S:g} s"
+
+    @property
     def force_kept(self) -> bool:
         """The mean after settling is within a tenth of the target."""
         return abs(self.force_mean_N - self.target_force_N) <= 0.1 * self.target_force_N

@@ -15,10 +15,12 @@ from protocol.errors import InputError
 from protocol.jog_limits import fastest_jog
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import TOPICS, Message
+from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from protocol.zenoh_session import Latest, Session
 
 READABLE = tuple(name for name, topic in TOPICS.items() if topic.kind != "query")
 POLL_S = 0.002
+KEY_FILES = (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
 class CommandRefused(RuntimeError):
@@ -253,6 +255,11 @@ def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[
         raise InputError("keys" if keys is None else "endpoint", "nothing", "endpoint and keys together, or neither")
     try:
         if endpoint is not None and keys is not None:
+            missing = [name for name in KEY_FILES if not (Path(keys) / name).is_file()]
+            if missing:
+                raise InputError(
+                    "keys", os.fspath(keys), f"a folder that `seldinger keys issue` made; {missing[0]} is missing"
+                )
             return Session.remote(rig.name, endpoint, Path(keys))
         return Session.of_rig(rig)
     except ValueError as error:

@@ -167,7 +167,10 @@ def read_protocol(path: Path, rig: Rig) -> ScriptedProtocol:
         content = tomllib.loads(text)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError("protocol", Description(f"{path}: {reason(error)}"), "a readable TOML file") from None
-    file = validate(ProtocolFile, _with_floats(content))
+    try:
+        file = validate(ProtocolFile, _with_floats(content))
+    except InputError as error:
+        raise error.in_file(path) from None
     actions = list(
         itertools.chain.from_iterable(
             _actions_of(str(number), step, file, rig, path.parent) for number, step in enumerate(file.steps, 1)

@@ -69,7 +69,10 @@ def make_authority(directory: Path, laboratory: str = "laboratory", passphrase: 
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
     certificate = builder.sign(key, hashes.SHA256())
-    directory.mkdir(parents=True, exist_ok=True)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("directory", str(directory), f"a folder that can be made ({error.strerror})") from None
     _make_private(folder)
     _write(folder / KEY_FILE, _key_pem(key, passphrase), 0o600)
     _write(folder / CA_FILE, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
@@ -135,6 +138,8 @@ def issue(
 
 def issued(directory: Path) -> list[Issued]:
     """All certificates in `directory`, by name. Raises InputError where one cannot be read."""
+    if not directory.is_dir():
+        raise InputError("directory", str(directory), "a folder that `seldinger keys init` made")
     found = []
     for path in sorted(directory.glob(f"*/{CERTIFICATE_FILE}")):
         try:

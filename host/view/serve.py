@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,12 +24,28 @@ Report = Callable[[str], None]
 
 def serve(source: Source, port: int, title: str, report: Report) -> None:
     """Serve `source` on 127.0.0.1 until SIGINT. Raises InputError for a port that is in use."""
+    check_port(port)
     server = ViewServer(source, port)
-    report(f"{title}: http://{ADDRESS}:{port}/  (Ctrl-C ends it)")
+    report(f"{title}: {page_address(port)}  (Ctrl-C ends it)")
     try:
         server.serve()
     except SystemExit:
         raise InputError("--port", port, "a port that is free") from None
+
+
+def page_address(port: int) -> str:
+    """The page's address for a browser of this machine."""
+    return f"http://{ADDRESS}:{port}/"
+
+
+def check_port(port: int) -> None:
+    """Raise InputError where the page's port is in use: said before a rig is started for it."""
+    with socket.socket() as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((ADDRESS, port))
+        except OSError as error:
+            raise InputError("--port", port, f"a free port ({error.strerror})") from None
 
 
 def serve_rig(rig_file: Path, port: int, report: Report) -> None:

@@ -19,7 +19,6 @@ from protocol.topics import Command, Reply
 from realtime.core.reach import TargetReach
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
-FORCE_BOX = "net_ft"  # as the driver names it in its events
 _KINDS = {kind.label: kind for kind in CommandKind}
 _JOG_PHASES = (Phase.HOLD, Phase.POSITION, Phase.JOG)
 _ZERO_PHASES = (Phase.DISARMED, Phase.HOLD, Phase.STOPPED)
@@ -102,7 +101,7 @@ class OperatorCommands:
         A force sensor that the estimate has replaced in contact does not disarm: the loop never lost the force, and uses
         the sensor again when both agree (`force_source.py`). force_source and phase are those of the newest tick.
         """
-        replaced = device == FORCE_BOX and force_source is ForceSource.ESTIMATE and phase is Phase.CONTACT
+        replaced = device == self._rig.force_sensor.kind and force_source is ForceSource.ESTIMATE and phase is Phase.CONTACT
         if not self._record.armed or replaced:
             return ""
         self.disarm()

@@ -12,15 +12,14 @@ from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
 from realtime.core import control_loop, telemetry
-from realtime.core.lines import force_config, tracker_config
+from realtime.core.device_sources import force_thread, tracker_thread
 from realtime.core.rig_core import Arrived, CommandRequest, RigCore
 from realtime.core.shared_core import SharedCore
 from realtime.core.stop_listener import StopListener
 from realtime.core.stop_path import StopPath
 from realtime.drivers.board_port import BoardPort
 from realtime.drivers.board_thread import BoardThread
-from realtime.drivers.sensor_threads import AuroraThread, NetFtThread
-from realtime.drivers.transport import open_serial
+from realtime.drivers.device_events import DeviceEvent
 from realtime.loop.clock import Clock
 from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.scheduling import RealtimeSettings
@@ -49,6 +48,11 @@ class RealtimeProcess:
         open_timeout_s: float = 10.0,
     ) -> None:
         self.rig, self.clock = rig, Clock.monotonic()
+        # A kind that no package offers is refused before anything is opened.
+        tracker = tracker_thread(
+            rig, tracker_port, lambda sample: self.shared.step(Arrived(poses=[sample])), self._take_event
+        )
+        force = force_thread(rig, force_port, lambda sample: self.shared.step(Arrived(forces=[sample])), self._take_event)
         mailboxes = input_mailboxes(INPUTS, numbered=False)
         records = {name: box.record[0] for name, box in mailboxes.items()}
         self.core = RigCore(rig, records, self._timing, force_source)
@@ -74,19 +78,7 @@ class RealtimeProcess:
         self.shared = SharedCore(
             self.core, self.loop, mailboxes, self.clock.now_ns, lambda topic, message: publishers[topic].put(message)
         )
-        self._tracker = AuroraThread(
-            lambda: open_serial(tracker_port or rig.tracker.port, 9600),
-            lambda sample: self.shared.step(Arrived(poses=[sample])),
-            tracker_config(rig),
-            lambda event: self.shared.step(Arrived(device_events=[event])),
-        )
-        self._force = NetFtThread(
-            rig.force_sensor.address,
-            lambda sample: self.shared.step(Arrived(forces=[sample])),
-            force_config(rig),
-            lambda event: self.shared.step(Arrived(device_events=[event])),
-            force_port,
-        )
+        self._tracker, self._force = tracker, force
         self._board = BoardThread(
             self._port,
             self._read_board,
@@ -145,6 +137,9 @@ class RealtimeProcess:
     def log(self, level: str, text: str) -> None:
         """Publish a log line of the process itself."""
         self.shared.step(Arrived(log_lines=[Log(stamp_ns=self.clock.now_ns(), level=level, source="realtime", text=text)]))
+
+    def _take_event(self, event: DeviceEvent) -> None:
+        self.shared.step(Arrived(device_events=[event]))
 
     def _read_board(self, data: bytes) -> None:
         estimate: Any = self._estimates.take()

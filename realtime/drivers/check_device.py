@@ -20,7 +20,8 @@ from realtime.drivers.transport import Transport
 # Below this share of the nominal rate, above these shares of missing or damaged, a device is not fit.
 MIN_RATE, MAX_MISSING, MAX_DAMAGED, MAX_LOST = 0.98, 0.01, 0.001, 0.001
 MAX_POSITION_NOISE_M = 0.001
-START_UP_S = 30.0
+# Longest time to the first sample: an Aurora resets and starts its tools, a force box only streams.
+AURORA_START_UP_S, NET_FT_START_UP_S, SOURCE_START_UP_S = 30.0, 3.0, 5.0
 
 
 @dataclass
@@ -47,7 +48,7 @@ def check_aurora(
     config = config or AuroraConfig()
     report, samples = DeviceReport("aurora"), list[PoseSample]()
     thread = AuroraThread(open_transport, samples.append, config, report.events.append)
-    if not _run(thread, samples, seconds, report):
+    if not _run(thread, samples, seconds, report, AURORA_START_UP_S):
         return report
     counters, client = thread.client.counters, thread.client
     report.figures |= {
@@ -63,6 +64,50 @@ def check_aurora(
     report.figures |= {"age_median_s": float(np.median(ages_s)), "age_p99_s": float(np.quantile(ages_s, 0.99))}
     for handle in config.tools or tuple(client.tools):
         _check_tool(report, handle, [sample for sample in samples if sample.tool == handle], config.rate_hz)
+    return report
+
+
+def check_poses(
+    make_thread: Callable[[Callable[[PoseSample], object], Callable[[DeviceEvent], object]], SensorThread],
+    tools: tuple[str, ...],
+    rate_hz: float,
+    seconds: float,
+    device: str,
+) -> DeviceReport:
+    """Read any tracker for `seconds`; the tools should lie still in the volume.
+
+    Args:
+        make_thread: makes its thread, not started, of a callback for samples and one for events.
+        tools: names that its samples bear. rate_hz: of each tool. device: kind of the tracker, for the report.
+    """
+    report, samples = DeviceReport(device), list[PoseSample]()
+    if not _run(make_thread(samples.append, report.events.append), samples, seconds, report, SOURCE_START_UP_S):
+        return report
+    for tool in tools:
+        _check_tool(report, tool, [sample for sample in samples if sample.tool == tool], rate_hz)
+    return report
+
+
+def check_forces(
+    make_thread: Callable[[Callable[[ForceSample], object], Callable[[DeviceEvent], object]], SensorThread],
+    rate_hz: float,
+    seconds: float,
+    device: str,
+) -> DeviceReport:
+    """Read any force sensor for `seconds`; nothing should touch it. Arguments as of `check_poses`."""
+    report, samples = DeviceReport(device), list[ForceSample]()
+    if not _run(make_thread(samples.append, report.events.append), samples, seconds, report, SOURCE_START_UP_S):
+        return report
+    rate = (len(samples) - 1) / max((samples[-1].stamp_ns - samples[0].stamp_ns) * 1e-9, 1e-9)
+    force_N = np.array([sample.force_N for sample in samples])
+    report.figures["rate_hz"] = rate
+    for axis, name in enumerate("xyz"):
+        report.figures |= {
+            f"mean_{name}_N": float(np.mean(force_N[:, axis])),
+            f"noise_{name}_N": float(np.std(force_N[:, axis])),
+        }
+    if rate < MIN_RATE * rate_hz:
+        report.problems.append(f"{rate:.0f} samples a second, wanted {rate_hz:g}")
     return report
 
 
@@ -99,7 +144,7 @@ def check_net_ft(host: str, seconds: float = 5.0, port: int = RDT_PORT, web_port
         "counts_per_Nm": calibration.counts_per_Nm,
     }
     thread = NetFtThread(host, samples.append, NetFtConfig(calibration), report.events.append, port)
-    if not _run(thread, samples, seconds, report):
+    if not _run(thread, samples, seconds, report, NET_FT_START_UP_S):
         return report
     counters = thread.client.counters
     force_N = np.array([sample.force_N for sample in samples])
@@ -122,16 +167,24 @@ def check_net_ft(host: str, seconds: float = 5.0, port: int = RDT_PORT, web_port
     return report
 
 
-def _run(thread: SensorThread, samples: list[Any], seconds: float, report: DeviceReport) -> bool:
-    """Let the thread collect for `seconds` after its first sample; False when none came."""
+def _run(thread: SensorThread, samples: list[Any], seconds: float, report: DeviceReport, start_up_s: float) -> bool:
+    """Let the thread collect for `seconds` after its first sample; False when none came.
+
+    It ends at once where the port or address is not there, or where bringing the device up has failed.
+    """
     thread.start()
-    deadline_s = time.monotonic() + START_UP_S
-    while not samples and time.monotonic() < deadline_s and thread.is_alive():
+    deadline_s = time.monotonic() + start_up_s
+    while not samples and time.monotonic() < deadline_s and thread.is_alive() and not _absent(thread):
         time.sleep(0.01)
     if samples:
         time.sleep(seconds)
     thread.stop()
     report.problems += [event.text for event in report.events if event.kind is DeviceEventKind.ERROR]
-    if not samples:
-        report.problems.append(f"no sample within {START_UP_S:g} s")
+    if not samples and not report.problems:
+        report.problems.append(f"no sample within {start_up_s:g} s")
     return bool(samples)
+
+
+def _absent(thread: SensorThread) -> bool:
+    """The device could not be opened, or its first session has failed."""
+    return thread.failures > 0 or (isinstance(thread, AuroraThread) and thread.client.phase == "waiting")

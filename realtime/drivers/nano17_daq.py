@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from protocol.errors import Description, InputError, reason
+from protocol.rig_file import ForceSensorSection
 from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import ForceSample
 from realtime.drivers.net_ft_calibration import NEWTON_METRES_PER, NEWTONS_PER
@@ -20,7 +22,7 @@ GAUGES = 6
 MAX_FILE_BYTES = 65536
 # A gauge amplifier gives +-10 V. A reading this near to the rail is invalid.
 RAIL_V = 9.9
-BLOCK_S, SILENT_S, RETRY_S = 0.002, 0.1, 0.5
+BLOCK_S, SILENT_S = 0.002, 0.1
 
 
 class GaugeReader(Protocol):
@@ -226,54 +228,53 @@ class NidaqmxReader:
         self._task.close()
 
 
-class Nano17Thread(threading.Thread):
-    """Reads the card every 2 ms and hands samples on; reports a card that is gone, and opens it again."""
+class Nano17Source:
+    """The card as a source of the loop: a block of samples every 2 ms.
+
+    `read` raises OSError when the card is gone or gives nothing for 0.1 s.
+    """
 
     def __init__(
-        self,
-        open_reader: Callable[[], GaugeReader],
-        callback: Callable[[ForceSample], None],
-        calibration: Nano17Calibration,
-        on_event: Callable[[DeviceEvent], None] = lambda event: None,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        self, reader: GaugeReader, calibration: Nano17Calibration, now_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        super().__init__(name="nano17", daemon=True)
         self.client = Nano17Client(calibration)
-        self._open, self._callback, self._on_event, self._now_ns = open_reader, callback, on_event, now_ns
-        self._halt = threading.Event()
+        self._reader, self._now_ns = reader, now_ns
+        self._received_ns = now_ns()
 
-    def run(self) -> None:
-        """Read the card until `stop`; open it again after an error."""
-        reported = ""
-        while not self._halt.is_set():
-            try:
-                reader = self._open()
-                try:
-                    self._serve(reader)
-                finally:
-                    reader.close()
-            except OSError as error:
-                if str(error) != reported:
-                    self._on_event(DeviceEvent(self._now_ns(), "nano17", DeviceEventKind.LOST, str(error)))
-                reported = str(error)
-                self._halt.wait(RETRY_S)
+    def read(self) -> list[ForceSample]:
+        """Return the samples of the last 2 ms. Raises OSError."""
+        time.sleep(BLOCK_S)
+        volts, rate_hz = self._reader.read()
+        now_ns = self._now_ns()
+        if len(volts):
+            self._received_ns = now_ns
+        elif now_ns - self._received_ns > SILENT_S * 1e9:
+            raise OSError(f"nano17: no sample for {SILENT_S} s")
+        return self.client.feed(volts, rate_hz, now_ns)
 
-    def _serve(self, reader: GaugeReader) -> None:
-        received_ns = self._now_ns()
-        while not self._halt.wait(BLOCK_S):
-            volts, rate_hz = reader.read()
-            now_ns = self._now_ns()
-            if len(volts):
-                received_ns = now_ns
-            elif now_ns - received_ns > SILENT_S * 1e9:
-                raise OSError(f"nano17: no sample for {SILENT_S} s")
-            for sample in self.client.feed(volts, rate_hz, now_ns):
-                self._callback(sample)
-            for event in self.client.take_events():
-                self._on_event(event)
+    def take_events(self) -> list[DeviceEvent]:
+        """Return what the readings' checks have found since the last call."""
+        return self.client.take_events()
 
-    def stop(self) -> None:
-        """End the thread and wait up to 2 s for it."""
-        self._halt.set()
-        if self.is_alive():
-            self.join(2.0)
+    def close(self) -> None:
+        """Release the card."""
+        self._reader.close()
+
+
+def open_force_sensor(sensor: ForceSensorSection) -> Nano17Source:
+    """Open the card that `force_sensor.address` names, with the transducer's file `options.calibration`.
+
+    Raises:
+        OSError: the extra `daq` is not installed, or the card is not there. InputError: no good calibration file.
+    """
+    path = sensor.options.get("calibration")
+    key = "force_sensor.options.calibration"
+    if unknown := [name for name in sensor.options if name != "calibration"]:
+        raise InputError(f"force_sensor.options.{unknown[0]}", sensor.options[unknown[0]], "calibration alone")
+    if not isinstance(path, str):
+        raise InputError(key, path, "the path of the transducer's .cal file")
+    try:
+        calibration = parse_calibration_file(Path(path).read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(key, Description(f"{path}: {reason(error)}"), "a readable .cal file") from None
+    return Nano17Source(NidaqmxReader(sensor.address, sensor.rate_hz), calibration)

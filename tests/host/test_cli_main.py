@@ -118,14 +118,14 @@ def test_extras_are_those_of_the_package() -> None:
         (("characterize", "--seed", "-1"), "--seed"),
         (("demo", "--hold", "nan"), "--hold"),
         (("demo", "--force", "nan"), "--force"),
-        (("demo", "--dir", "/dev/null/runs"), "--dir"),
+        (("demo", "--out", "/dev/null/runs"), "--out"),
         (("demo", "--rig", "/nowhere.toml"), "/nowhere.toml"),
-        (("characterize", "--dir", "/dev/null/runs"), "--dir"),
-        (("reproduce", "control", "--dir", "/dev/null/runs"), "--dir"),
-        (("prove", "--dir", "/dev/null/runs"), "--dir"),
+        (("characterize", "--out", "/dev/null/runs"), "--out"),
+        (("reproduce", "control", "--out", "/dev/null/runs"), "--out"),
+        (("prove", "--out", "/dev/null/runs"), "--out"),
         (("soak", "--docs", "/dev/null/page.md"), "--docs"),
         (("play", "/nowhere.mcap"), "/nowhere.mcap"),
-        (("export", "/nowhere.mcap", "/tmp"), "/nowhere.mcap"),
+        (("export", "/nowhere.mcap", "--out", "/tmp"), "/nowhere.mcap"),
         (("diagnose", "--nominal", "/nowhere.toml"), "nominal"),
         (("experiment", "/nowhere.toml"), "/nowhere.toml"),
         (("plan", "/nowhere.json"), "/nowhere.json"),
@@ -150,5 +150,5 @@ def test_a_place_for_output_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kept.html"]
     with pytest.raises(InputError, match="--report"):
         writable_file("--report", tmp_path / "no" / "folder.html")
-    with pytest.raises(InputError, match="--dir"):
-        writable_folder("--dir", kept)
+    with pytest.raises(InputError, match="--out"):
+        writable_folder("--out", kept)

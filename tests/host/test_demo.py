@@ -13,7 +13,7 @@ from tests.small_disk import fill_up
 
 def test_a_disk_that_fills_up_is_told_and_the_job_is_still_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill_up(monkeypatch, 200_000)
-    words = ["demo", "--fast", "--board", "native", "--hold", "3", "--json", "--dir", str(tmp_path)]
+    words = ["demo", "--fast", "--board", "native", "--hold", "3", "--json", "--out", str(tmp_path)]
     told = CliRunner().invoke(build(words), words)
     monkeypatch.undo()
     assert told.exit_code == 1 and "the disk is full" in told.stderr

@@ -42,8 +42,8 @@ def test_what_needs_no_rig_runs_as_written(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_line_of_six_touches_ends_with_a_report(tmp_path: Path) -> None:
     (words,) = [words for words in commands() if words[0] == "run" and "--simulated" in words]
-    at = words.index("--dir")
-    words = [*words[:at], "--dir", str(tmp_path), *words[at + 2 :], "--board", "native", "--json"]
+    at = words.index("--out")
+    words = [*words[:at], "--out", str(tmp_path), *words[at + 2 :], "--board", "native", "--json"]
     done = called(words, tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)

@@ -237,7 +237,7 @@ def test_markers_behind_the_sheath_are_refused() -> None:
 def test_the_command_writes_a_catheter_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.json").write_text(json.dumps(as_json(shapes(8, 1e-4))))
     (tmp_path / "start.toml").write_text((CATHETER_FOLDER / "thermocool_sf.toml").read_text().replace("1.490e-3", "0.9e-3"))
-    calibrate(str(tmp_path / "a.json"), str(tmp_path / "start.toml"), tmp_path / "made.toml", method="both", json=True)
+    calibrate(str(tmp_path / "a.json"), str(tmp_path / "start.toml"), tmp_path, name="made", method="both", json=True)
     report = json.loads(capsys.readouterr().out)
     made = load_catheter(tmp_path / "made.toml")
     assert isinstance(made, Catheter) and made.name == "made" and made.pcar is not None
@@ -258,8 +258,8 @@ def test_the_command_writes_a_catheter_that_loads(tmp_path: Path, capsys: pytest
         {"loss": "cubes"},
         {"method": "guess"},
         {"model": "rod"},
-        {"out": Path("/nowhere/at/all.toml")},
-        {"out": Path("x.json")},
+        {"out": Path("/dev/null/at/all")},
+        {"name": "x.json"},
         {"catheter": "none"},
     ],
 )

@@ -185,7 +185,7 @@ def test_a_port_that_is_held_is_refused(rig: Rig, lines: tuple[str, str]) -> Non
 )
 def test_bad_requests_for_a_real_rig(arguments: list[str], status: int, words: str, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "host.cli.main", "characterize", "--dir", str(tmp_path), *arguments],
+        [sys.executable, "-m", "host.cli.main", "characterize", "--out", str(tmp_path), *arguments],
         capture_output=True,
         text=True,
         stdin=subprocess.DEVNULL,

@@ -65,7 +65,7 @@ def children_of(parent: int) -> list[int]:
 @pytest.mark.slow
 def test_sigterm_ends_what_view_has_started(tmp_path: Path) -> None:
     child = subprocess.Popen(
-        [sys.executable, "-m", "host.cli.main", "view", "--simulated", "--dir", str(tmp_path), "--port", str(free_port())],
+        [sys.executable, "-m", "host.cli.main", "view", "--simulated", "--out", str(tmp_path), "--port", str(free_port())],
         stderr=subprocess.PIPE,
         text=True,
         cwd=ROOT,

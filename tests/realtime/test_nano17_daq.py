@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from realtime.core.device_sources import SourceThread
 from realtime.drivers.device_events import DeviceEventKind
 from realtime.drivers.nano17_daq import (
     Nano17Calibration,
     Nano17Client,
-    Nano17Thread,
+    Nano17Source,
     NidaqmxReader,
     parse_calibration_file,
 )
@@ -167,11 +168,11 @@ def test_the_thread_opens_a_card_that_was_gone_again() -> None:
         emulator.sample(MS, np.array([0.0, 0.0, 0.1]), np.zeros(3))
         return emulator
 
-    thread = Nano17Thread(open_reader, samples.append, client.calibration, told.append)
+    thread = SourceThread("nano17", lambda: Nano17Source(open_reader(), client.calibration), samples.append, told.append)
     thread.start()
     for _ in range(1000):
         if samples:
             break
         thread.join(0.01)
     thread.stop()
-    assert samples and len(opened) >= 2 and told[0].kind is DeviceEventKind.LOST
+    assert samples and len(opened) >= 2 and told[0].kind is DeviceEventKind.ERROR

@@ -34,7 +34,11 @@ def test_the_shipped_rig_is_good() -> None:
         ("safety.over_force_N", float("nan"), ["safety.over_force_N", "nan"]),
         ("stages.insertion.max_speed_unit_per_s", -1.0, ["stages.insertion.max_speed_unit_per_s", "-1.0", "above 0"]),
         ("stages.insertion.max_speed_unit_per_s", 1.0, ["stages.insertion", "20000 steps/s"]),
-        ("control.position_gian_per_s", 1.0, ["control.position_gian_per_s", "unknown key"]),
+        (
+            "control.position_gian_per_s",
+            1.0,
+            ["control.position_gian_per_s", "no such key; did you mean position_gain_per_s?"],
+        ),
         ("control.loop_hz", None, ["control.loop_hz", "nothing"]),
         ("transmission.catheter", "livewire", ["transmission.catheter", "livewire", "another catheter"]),
         ("tracker.base_from_tracker_wxyz", [1.0, 1.0, 0.0, 0.0], ["tracker", "unit length"]),

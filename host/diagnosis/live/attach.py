@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from host.diagnosis.live.watch import warm_up, watch
-from protocol.rig_file import SIMULATED_RIG, load_rig
+from protocol.rig_file import load_rig
 from protocol.topics import Alarm
 from protocol.zenoh_session import Session
 
@@ -21,14 +21,14 @@ STATES = {
 }
 
 
-def attach(rig_file: str | None, report: Callable[[str], None], on_alarm: Callable[[Alarm], None]) -> None:
-    """Watch the rig of `rig_file` (None: the simulated rig) until SIGINT or SIGTERM.
+def attach(rig_file: Path, report: Callable[[str], None], on_alarm: Callable[[Alarm], None]) -> None:
+    """Watch the rig of `rig_file` until SIGINT or SIGTERM.
 
     Arguments: `report` gets a line for each change of state and each alarm; `on_alarm` gets each alarm once it is published.
     Raises: InputError for a bad rig file.
     """
     os.nice(10)  # below the rig's own processes
-    rig = load_rig(Path(rig_file) if rig_file else SIMULATED_RIG)
+    rig = load_rig(rig_file)
     stopped = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -397,7 +397,10 @@ def read_nominal(path: Path | str) -> NominalSpec:
         ) from None
     except tomllib.TOMLDecodeError as error:
         raise InputError("nominal", Description(f"{path}: {error}"), "valid TOML") from None
-    return nominal_of(content, path.parent)
+    try:
+        return nominal_of(content, path.parent)
+    except InputError as error:
+        raise error.in_file(path) from None
 
 
 def nominal_of(content: dict[str, Any], folder: Path | str = ".") -> NominalSpec:

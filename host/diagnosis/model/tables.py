@@ -127,7 +127,28 @@ def _read_csv(path: Path, limit: int) -> Any:
         if len(content) > limit:
             raise _TooLarge
         source = pyarrow.BufferReader(content)
-    return pyarrow.csv.read_csv(source, convert_options=options)
+    table = pyarrow.csv.read_csv(source, convert_options=options)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if pyarrow.types.is_string(column.type):
+            _refuse_text_among_numbers(path.name, name, column.to_pylist())
+    return table
+
+
+def _refuse_text_among_numbers(file: str, column: str, cells: list[str | None]) -> None:
+    """Raise InputError for the first text in a column of numbers; a column of texts, such as notes, is left out later."""
+    texts = [(line, cell) for line, cell in enumerate(cells, start=2) if cell is not None and not _is_number(cell)]
+    given = sum(cell is not None for cell in cells)
+    if texts and len(texts) < 0.5 * given:
+        line, cell = texts[0]
+        raise InputError(f"{file}: line {line}: {column}", cell, f"a number, as in the other {given - len(texts)} cells")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _read_parquet(path: Path, limit: int) -> Any:

@@ -119,7 +119,7 @@ def _claim(settings: Settings) -> None:
     if note.exists():
         found = json.loads(note.read_text(encoding="utf-8"))
         if found != mine:
-            raise InputError("--dir", found, f"a folder of the suite {mine}, or an empty one")
+            raise InputError("--out", found, f"a folder of the suite {mine}, or an empty one")
     note.write_text(json.dumps(mine), encoding="utf-8")
 
 

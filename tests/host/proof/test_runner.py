@@ -117,7 +117,7 @@ def test_a_stopped_run_goes_on_where_it_was(fresh: Fresh, tmp_path: Path) -> Non
 def test_a_folder_of_another_suite_is_refused(fresh: Fresh) -> None:
     folder = fresh()
     (folder / "suite.json").write_text(json.dumps({"seed": 1, "cases": 5}))
-    with pytest.raises(InputError, match="--dir"):
+    with pytest.raises(InputError, match="--out"):
         outcome(folder, "false")
 
 

@@ -1,0 +1,67 @@
+"""`seldinger bridge igtl|ros2`: the running rig for other systems, until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from host.cli.contract_io import write_json
+from host.cli.options import Json, RigFile
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
+
+bridge = typer.Typer(help="Serve the running rig to other systems: OpenIGTLink, ROS 2.", no_args_is_help=True)
+
+
+@bridge.callback()
+def _group() -> None:
+    """Group the bridges."""
+
+
+@bridge.command()
+def igtl(
+    rig: RigFile = SIMULATED_RIG,
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="TCP port.")] = 18944,
+    address: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 lets other machines read.")] = "127.0.0.1",
+    json: Json = False,
+) -> None:
+    """Serve poses (TRANSFORM), forces (NDARRAY, STRING) and state (STRING) over OpenIGTLink. Nothing is commanded."""
+    from host.run.igtl_bridge import IgtlBridge
+    from protocol.zenoh_session import Session
+
+    read = load_rig(rig)
+    with Session.of_rig(read) as session:
+        try:
+            served = IgtlBridge(session, (address, port))
+        except OSError as error:
+            raise InputError(
+                "--port", f"{address}:{port}", f"an address and a free port ({error.strerror or error})"
+            ) from None
+        with contextlib.closing(served):
+            _say(f"rig {read.name} over OpenIGTLink at {address}:{port}  (Ctrl-C ends it)")
+            if json:
+                write_json({"address": address, "port": port})
+                sys.stdout.flush()
+            served.serve(_until_signal(), _say)
+
+
+def _say(text: str) -> None:
+    print(f"seldinger bridge: {text}", file=sys.stderr, flush=True)
+
+
+def _until_signal() -> threading.Event:
+    """An event that Ctrl-C and SIGTERM set."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    return stop

@@ -1,0 +1,135 @@
+"""The plug-in of docs/devices.md as printed there, found by its entry point and read by the thread of the loop."""
+
+from __future__ import annotations
+
+import re
+import socket
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, parse_rig, read_rig_data
+from realtime.core.device_sources import FORCE_SENSORS, TRACKERS, force_thread, tracker_thread
+from realtime.drivers.device_events import DeviceEventKind
+from realtime.drivers.nano17_daq import Nano17Source, open_force_sensor
+from tests.waiting import until
+
+PAGE = (Path(__file__).parents[2] / "docs" / "devices.md").read_text(encoding="utf-8")
+CODE = re.search(r"```python\n(\"\"\"lab_devices.*?)```", PAGE, re.DOTALL)
+
+
+def rig_with(section: str, **changes: object) -> Rig:
+    data = read_rig_data(SIMULATED_RIG)
+    data[section] |= changes
+    return parse_rig(data)
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        trial.bind(("127.0.0.1", 0))
+        return int(trial.getsockname()[1])
+
+
+@pytest.fixture
+def lab_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's package, as `pip install .` leaves it: a module and its entry points."""
+    assert CODE is not None
+    (tmp_path / "lab_devices.py").write_text(CODE[1], encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "lab_devices", raising=False)
+    points = {
+        TRACKERS: [metadata.EntryPoint("udp_text", "lab_devices:open_tracker", TRACKERS)],
+        FORCE_SENSORS: [metadata.EntryPoint("udp_text", "lab_devices:open_force_sensor", FORCE_SENSORS)],
+    }
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points[group])
+
+
+def test_the_page_keeps_its_promise_of_60_lines() -> None:
+    assert CODE is not None and len(CODE[1].splitlines()) <= 62
+    assert 'udp_text = "lab_devices:open_tracker"' in PAGE and 'udp_text = "lab_devices:open_force_sensor"' in PAGE
+
+
+@pytest.mark.usefixtures("lab_devices")
+def test_the_tracker_of_the_page_gives_poses() -> None:
+    port, samples, events = free_udp_port(), [], []
+    thread = tracker_thread(rig_with("tracker", kind="udp_text", port=str(port)), None, samples.append, events.append)
+    thread.start()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def sent() -> bool:
+            for line in ("0A 0.01 0.02 0.03 1 0 0 0", "0A nan 0 0 1 0 0 0", "0A 1 2", "0A 0 0 0 1 1 0 0", ""):
+                sender.sendto(line.encode(), ("127.0.0.1", port))
+            return len(samples) > 2
+
+        assert until(sent)
+    thread.stop()
+    assert {sample.tool for sample in samples} == {"0A"} and events[0].kind is DeviceEventKind.TRACKING
+    np.testing.assert_allclose(samples[0].position_m, (0.01, 0.02, 0.03))
+    assert all(sample.arrival_ns - sample.stamp_ns == 25_000_000 for sample in samples)  # tracker.latency_s
+
+
+@pytest.mark.usefixtures("lab_devices")
+def test_the_force_sensor_of_the_page_gives_forces() -> None:
+    port, samples = free_udp_port(), []
+    rig = rig_with("force_sensor", kind="udp_text", options={"port": port})
+    thread = force_thread(rig, callback=samples.append)
+    thread.start()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def sent() -> bool:
+            sender.sendto(b"f 0.1 0.2 0.3 0 0 0", ("127.0.0.1", port))
+            return bool(samples)
+
+        assert until(sent)
+    thread.stop()
+    np.testing.assert_allclose(samples[0].force_N, (0.1, 0.2, 0.3))
+
+
+def test_a_plug_in_that_does_not_load_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = [metadata.EntryPoint("broken", "no_such_module:open", TRACKERS)]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: broken)
+    with pytest.raises(InputError, match=r"tracker\.kind: found broken, which does not load"):
+        tracker_thread(rig_with("tracker", kind="broken"), None, print)
+
+
+def test_the_nano17_on_a_card_is_chosen_in_the_rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = read_rig_data(SIMULATED_RIG)
+    data["force_sensor"] |= {"kind": "nano17", "address": "Dev1", "options": {"calibration": str(tmp_path / "FT1.cal")}}
+    for key in ("counts_per_newton", "counts_per_newton_metre"):  # those of a box
+        del data["force_sensor"][key]
+    sensor = parse_rig(data).force_sensor
+    with pytest.raises(InputError, match=r"options.calibration: found .*FT1.cal: No such file"):
+        open_force_sensor(sensor)
+    axes = "".join(
+        f'<UserAxis Name="{name}" values="{" ".join("1" if i == j else "0" for i in range(6))}" max="10" scale="1"/>'
+        for j, name in enumerate(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"))
+    )
+    (tmp_path / "FT1.cal").write_text(
+        f'<FTSensor><Calibration ForceUnits="N" TorqueUnits="N-m">{axes}</Calibration></FTSensor>'
+    )
+
+    class Card:
+        def __init__(self, device: str, rate_hz: float) -> None:
+            assert (device, rate_hz) == ("Dev1", 1000.0)
+
+        def read(self) -> tuple[np.ndarray, float]:
+            return np.array([[0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0]]), 1000.0
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr("realtime.drivers.nano17_daq.NidaqmxReader", Card)
+    source = open_force_sensor(sensor)
+    assert isinstance(source, Nano17Source)
+    np.testing.assert_allclose(source.read()[0].force_N, (0.0, 0.0, 0.5))
+
+
+def test_a_box_without_its_counts_is_refused() -> None:
+    data = read_rig_data(SIMULATED_RIG)
+    del data["force_sensor"]["counts_per_newton"]
+    with pytest.raises(InputError, match=r"force_sensor\.counts_per_newton"):
+        parse_rig(data)
