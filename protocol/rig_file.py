@@ -166,7 +166,7 @@ class ForceSensorSection(_Section):
     """The force sensor; `base_from_sensor_wxyz` turns its reading into the force on the tissue.
 
     kind: "net_ft" (ATI box, `address` of the box), "nano17" (data acquisition card, `address` is its name,
-    options.calibration the transducer's .cal file), or the name of a plug-in. Counts are those of a box; the other kinds need none.
+    options.calibration the transducer's .cal file), or the name of a plug-in. Only a box needs the counts.
     """
 
     kind: Kind = "net_ft"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import signal
 import sys
 import threading
@@ -47,6 +48,33 @@ def igtl(
             _say(f"rig {read.name} over OpenIGTLink at {address}:{port}  (Ctrl-C ends it)")
             if json:
                 write_json({"address": address, "port": port})
+                sys.stdout.flush()
+            served.serve(_until_signal(), _say)
+
+
+@bridge.command()
+def ros2(
+    rig: RigFile = SIMULATED_RIG,
+    router: Annotated[str, typer.Option(help="Zenoh endpoint of rmw_zenohd.")] = "tcp/127.0.0.1:7447",
+    namespace: Annotated[str, typer.Option(help="ROS namespace of the topics.")] = "seldinger",
+    domain: Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
+    commands: Annotated[bool, typer.Option("--commands", help="Take force commands (servo_cf) during a touch.")] = False,
+    json: Json = False,
+) -> None:
+    """Publish measured_cp, measured_cf and operating_state (CRTK) to ROS 2 over rmw_zenoh."""
+    from host.run.connection import connect
+    from host.run.ros_bridge import PUBLISHED, RosBridge
+
+    if not re.fullmatch(r"[a-z][a-z0-9_]*(/[a-z][a-z0-9_]*)*", namespace):
+        raise InputError("--namespace", namespace, "names of a-z, 0-9 and _, joined by /, without a first /")
+    with connect(load_rig(rig), "ros2") as connection:
+        with contextlib.closing(
+            RosBridge(connection, router, namespace=namespace, domain=domain, commands=commands)
+        ) as served:
+            names = [f"/{namespace}/{topic.name}" for topic in PUBLISHED.values()]
+            _say(f"rig {connection.rig.name} to ROS 2 by {router}: {', '.join(names)}  (Ctrl-C ends it)")
+            if json:
+                write_json({"topics": names, "commands": commands})
                 sys.stdout.flush()
             served.serve(_until_signal(), _say)
 
