@@ -180,7 +180,7 @@ class RosBridge:
         self._publishers = {name: self._session.declare_publisher(self._keys[topic]) for name, topic in PUBLISHED.items()}
         self._command: Any = None
         if commands:
-            ring = zenoh.handlers.RingChannel(1)  # the newest command counts
+            ring: Any = zenoh.handlers.RingChannel(1)  # the newest command counts
             self._command = self._session.declare_subscriber(self._keys[SERVO_FORCE], ring)
 
     def step(self) -> None:

@@ -33,7 +33,7 @@ AURORA, NET_FT = "aurora", "net_ft"
 # A source from which nothing comes for so long is lost; it is closed and opened again.
 SILENT_S = 1.0
 
-Sample = TypeVar("Sample", covariant=True)
+Sample = TypeVar("Sample")
 
 
 class Source(Protocol[Sample]):

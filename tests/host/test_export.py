@@ -91,7 +91,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def test_command_says_what_it_wrote(recording: RecordingFile, tmp_path: Path) -> None:
-    status, output = run(str(recording.path), "--to", "parquet", str(tmp_path), "--json")
+    status, output = run(str(recording.path), "--to", "parquet", "--out", str(tmp_path), "--json")
     said = json.loads(output)
     assert status == 0 and said["tables"] == {"pose/tip": 40, "state": 40} and not said["truncated"]
     assert all(Path(name).exists() for name in said["files"])
@@ -100,19 +100,19 @@ def test_command_says_what_it_wrote(recording: RecordingFile, tmp_path: Path) ->
 def test_command_takes_a_recording_that_was_cut(recording: RecordingFile, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(recording.path.read_bytes()[:-20])
-    status, output = run(str(cut), str(tmp_path / "tables"), "--json")
+    status, output = run(str(cut), "--out", str(tmp_path / "tables"), "--json")
     assert status == 0 and json.loads(output)["truncated"] is True
 
 
 @pytest.mark.parametrize(("to", "says"), [("xlsx", "to: found"), ("parquet", "wanted a readable recording")])
 def test_command_refuses_in_one_line(tmp_path: Path, to: str, says: str) -> None:
-    status, output = run(str(tmp_path / "none.mcap"), "--to", to, str(tmp_path / "tables"))
+    status, output = run(str(tmp_path / "none.mcap"), "--to", to, "--out", str(tmp_path / "tables"))
     assert status == 2 and says in output and "\n" not in output
 
 
 def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("no recording")
-    status, output = run(str(tmp_path / "a.mcap"), str(tmp_path / "tables"))
+    status, output = run(str(tmp_path / "a.mcap"), "--out", str(tmp_path / "tables"))
     assert status == 2 and "wanted an MCAP recording" in output
 
 

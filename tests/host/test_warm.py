@@ -20,6 +20,7 @@ NOT_WARMED = {"bench", "check-device", "control-study", "export", "faults", "fla
 NOT_WARMED |= {"prove", "reproduce", "rig", "soak", "warm"}
 NOT_WARMED |= {
     "arm",
+    "bridge",
     "clear",
     "disarm",
     "force",
