@@ -36,7 +36,7 @@ SILENT_S = 1.0
 Sample = TypeVar("Sample")
 
 
-class Source(Protocol[Sample]):
+class DeviceSource(Protocol[Sample]):
     """A device that is open. Samples have times of CLOCK_MONOTONIC, ns, and are in the tracker's or the sensor's frame."""
 
     def read(self) -> list[Sample]:
@@ -46,11 +46,11 @@ class Source(Protocol[Sample]):
         """Release the device."""
 
 
-OpenTracker = Callable[[Tracker], Source[PoseSample]]
-OpenForceSensor = Callable[[ForceSensorSection], Source[ForceSample]]
+OpenTracker = Callable[[Tracker], DeviceSource[PoseSample]]
+OpenForceSensor = Callable[[ForceSensorSection], DeviceSource[ForceSample]]
 
 
-def source_of(group: str, kind: str) -> Callable[[Any], Source[Any]]:
+def source_of(group: str, kind: str) -> Callable[[Any], DeviceSource[Any]]:
     """Return the function that opens a source, called with the section of the rig file.
 
     Args:
@@ -67,7 +67,7 @@ def source_of(group: str, kind: str) -> Callable[[Any], Source[Any]]:
         raise InputError(key, kind, f"one of {', '.join(sorted({usual, *found}))}; a package adds one in group {group}")
     module, _, name = found[kind].partition(":")
     try:
-        return cast(Callable[[Any], Source[Any]], getattr(importlib.import_module(module), name))
+        return cast(Callable[[Any], DeviceSource[Any]], getattr(importlib.import_module(module), name))
     except (ImportError, AttributeError) as error:
         raise InputError(
             key, Description(f"{kind}, which does not load ({error})"), "a package that is installed whole"
@@ -80,7 +80,7 @@ class SourceThread(SensorThread, Generic[Sample]):
     def __init__(
         self,
         kind: str,
-        open_source: Callable[[], Source[Sample]],
+        open_source: Callable[[], DeviceSource[Sample]],
         callback: Callable[[Sample], object],
         on_event: OnEvent | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
