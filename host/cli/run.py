@@ -54,13 +54,13 @@ def run(
     if not (dry_run or simulated or yes or sys.stdin.isatty()):
         raise InputError("--yes", Description("nothing"), "--yes without a terminal: the protocol moves the catheter")
     loaded = load_rig(rig)
+    if not dry_run:
+        writable_folder("--out", directory)
     steps = protocol_file.read_protocol(protocol, loaded)
     checked = protocol_file.dry_run(steps, loaded)
     earlier = () if resume is None else protocol_run.read_result(resume, steps)
-    if not dry_run:
-        writable_folder("--out", directory)
-        if resume is not None:
-            writable_file("--resume", resume)
+    if resume is not None and not dry_run:
+        writable_file("--resume", resume)
     _show(steps, checked, loaded)
     if dry_run:
         if json:
