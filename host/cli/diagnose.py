@@ -64,8 +64,9 @@ def diagnose(
         writable_folder("--out", out)
     if export is not None:
         from host.diagnosis.export.write import check_target
+        from host.diagnosis.model.nominal import nominal_path, read_nominal
 
-        check_target(export)
+        check_target(export, read_nominal(nominal_path(nominal)).kind)  # before the search, which may take minutes
     _say_what_runs(nominal, trust)
     with Progress(quiet) as progress:
         verdict = run(

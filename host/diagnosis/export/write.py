@@ -14,7 +14,7 @@ from host.diagnosis.export.module import module_of
 from host.diagnosis.export.parameters import parameters_of, ssv_of
 from host.diagnosis.export.rig import rig_patch, rig_text
 from host.diagnosis.pipeline import Diagnosis
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 
 __all__ = ["check_target", "export"]
 Content = tuple[str, list[str]]  # text, and sentences about what the format cannot hold
@@ -34,10 +34,24 @@ WRITERS: dict[str, Callable[[Diagnosis, Path], Content]] = {
 }
 
 
-def check_target(path: Path) -> None:
-    """Raise InputError where `path` has no suffix that can be written, or its folder does not exist."""
+# Kinds of nominal models that each suffix can hold.
+KINDS = {
+    ".py": ("transmission", "axis", "callable", "linear"),
+    ".json": ("callable", "linear", "mujoco", "fmu"),
+    ".xml": ("mujoco",),
+    ".ssv": ("fmu",),
+    ".toml": ("rig",),
+}
+
+
+def check_target(path: Path, kind: str | None = None) -> None:
+    """Raise InputError where `path` has no suffix that can be written (for `kind`), or its folder does not exist."""
     if path.suffix not in WRITERS:
         raise InputError("--export", str(path), "a file ending in " + ", ".join(WRITERS))
+    if kind is not None and kind not in KINDS[path.suffix]:
+        possible = [suffix for suffix, kinds in KINDS.items() if kind in kinds]
+        wanted = "a file ending in " + " or ".join(possible) if possible else f"no --export: kind {kind} has no file"
+        raise InputError("--export", Description(f"{path} for a nominal model of kind {kind}"), wanted)
     if not path.parent.is_dir():
         raise InputError("--export", str(path), "a file in a folder that exists")
 
@@ -57,7 +71,7 @@ def export(result: Diagnosis, path: Path) -> list[str]:
         InputError: a suffix or a model that cannot be written so; names the effects that stand in the way.
         OSError: the file cannot be written.
     """
-    check_target(path)
+    check_target(path, result.model.inner.kind)
     text, left_out = WRITERS[path.suffix](result, path)
     path.write_text(text, encoding="utf-8")
     return left_out

@@ -18,7 +18,7 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.export.module import module_of
 from host.diagnosis.export.parameters import parameters_of
-from host.diagnosis.export.write import check_target
+from host.diagnosis.export.write import WRITERS, check_target
 from host.diagnosis.model.model import scale_of
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
@@ -124,6 +124,16 @@ def test_a_module_imports_nothing_of_the_project(tmp_path: Path) -> None:
 def test_a_target_that_cannot_be_is_bad_input(tmp_path: Path, name: str, wanted: str) -> None:
     with pytest.raises(InputError, match=wanted):
         check_target(tmp_path / name)
+
+
+def test_a_file_that_the_kind_does_not_have_is_refused_before_the_search(tmp_path: Path) -> None:
+    for kind, suffixes in (("axis", {".py"}), ("mujoco", {".json", ".xml"}), ("rig", {".toml"}), ("impedance", set())):
+        for suffix in WRITERS:
+            if suffix in suffixes:
+                check_target(tmp_path / f"model{suffix}", kind)
+                continue
+            with pytest.raises(InputError, match=kind):
+                check_target(tmp_path / f"model{suffix}", kind)
 
 
 def test_an_effect_outside_the_simulator_is_no_parameter_of_it(tmp_path: Path) -> None:
