@@ -141,7 +141,8 @@ def probability_none(result: Diagnosis) -> float:
     if result.verdict == "missing_physics":
         strongest = max(result.standings, key=lambda standing: standing.gain.log_likelihood)
         found = posterior_of(result, strongest, raw=True)
-        return found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)
+        equation = 0.0 if strongest.candidate.effect.listed else found.effect  # an equation is physics in no list
+        return equation + found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)
     last = next((step.trials for step in reversed(result.found.steps) if step.trials), [])
     if not result.standings:
         return 1.0 - of_refused(last)

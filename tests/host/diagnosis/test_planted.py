@@ -73,6 +73,7 @@ def test_physics_of_no_list_is_told_by_an_equation(tmp_path: Path) -> None:
     verdict = as_json(result, 0.0)
     (effect,) = verdict["effects"]
     assert verdict["verdict"] == "missing_physics" and effect["id"] == "unlisted"
+    assert verdict["probability_none_raw"] > effect["probability_raw"] - 1e-9  # none of the vocabulary is what is missing
     assert "motor" in effect["equation"] and "load" in effect["equation"]
     assert verdict["fit"]["rmse_after"] < 1.2 * 2e-3 < 0.2 * verdict["fit"]["rmse_before"]
 
