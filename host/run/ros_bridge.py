@@ -28,7 +28,7 @@ POSE, WRENCH = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/WrenchStamped
 OPERATING_STATE = "crtk_msgs/msg/OperatingState"
 # crtk_msgs is not among ROS 2's own packages; its definition: github.com/collaborative-robotics/crtk_msgs.
 _OPERATING_STATE = "std_msgs/Header header\nstring state\nbool is_homed\nbool is_busy\n"
-# reliability best effort, durability volatile, keep last 10, as numbers of rmw/types.h; nothing else is asked for.
+# reliability best effort, durability volatile, keep last 10, as numbers of rmw/types.h; nothing else is requested.
 _QOS = "2:2:1,10:,:,:,,"
 # A force command across the normal by more than this is not what the rig can do.
 ACROSS_N = 0.02
