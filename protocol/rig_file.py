@@ -255,6 +255,7 @@ class ControlSection(_Section):
     acceleration_noise_m_per_s2: Annotated[float, Field(gt=0, le=100)]
     law: Literal["thesis", "predictive"] = "predictive"
     form: Literal["pi", "incremental"] = "pi"
+    force_added_to: Literal["desired", "tip"] = "desired"
     pi_position_gain: Annotated[float, Field(ge=0, le=2)] = 0.083
     pi_position_integral_per_s: Annotated[float, Field(ge=0, le=50)] = 0.24
     pi_force_gain_m_per_N: Annotated[float, Field(ge=0, le=0.5)] = 0.1

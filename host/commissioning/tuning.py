@@ -82,7 +82,7 @@ def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
 def with_gains(rig: Rig, gains: dict[str, float]) -> Rig:
     """`rig` under the thesis' law with these gains. Raises InputError for a gain out of its bounds or not known."""
     data = rig.effective()
-    data["control"] = {**data["control"], "law": "thesis", "form": "incremental", **gains}
+    data["control"] = {**data["control"], "law": "thesis", "form": "incremental", "force_added_to": "tip", **gains}
     return parse_rig(data, "gains")
 
 
@@ -178,7 +178,11 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
 def _unchecked(rig: Rig, gains: dict[str, float]) -> Rig:
     """As `with_gains` with gains that may be out of bounds: only for the simulated search of a margin."""
     return rig.model_copy(
-        update={"control": rig.control.model_copy(update={"law": "thesis", "form": "incremental", **gains})}
+        update={
+            "control": rig.control.model_copy(
+                update={"law": "thesis", "form": "incremental", "force_added_to": "tip", **gains}
+            )
+        }
     )
 
 

@@ -116,6 +116,7 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
     )
     _fill(
         p.hybrid,
+        from_desired=control.force_added_to == "desired",
         pi_form=control.form == "pi",
         position_gain_per_s=control.position_gain_per_s,
         position_integral_per_s2=control.position_integral_per_s2,
@@ -136,6 +137,11 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
         gate_sigma=5.0,
         workspace_min_m=limits.workspace_min_m,
         workspace_max_m=limits.workspace_max_m,
+    )
+    _fill(
+        p.force_predictor,
+        acceleration_noise_N_per_s2=control.acceleration_noise_m_per_s2 / control.tip_compliance_m_per_N,
+        rate_sd_N_per_s=control.approach_speed_m_per_s / control.tip_compliance_m_per_N,
     )
     _fill_predictive(p, rig)
     force_timeout_s = limits.force_timeout_s if force_source == "sensor" else limits.hold_after_s

@@ -1,10 +1,11 @@
 """External hybrid position/force control (thesis Fig. 7.1): PI loops in joint space around the inverse kinematics.
 
 The thesis can be read in two ways, and both are here:
-- PI form (chapter 7): q = q_0 + K_p e + K_i sum(e). The force loop's displacement is added to the *desired* position,
-  as in Fig. 7.1. For the gains of the experiments, (7.6).
-- Incremental form (chapter 6 moves the joints by K_I e, 6.4.1): each tick adds K_p e + K_i sum(e) to the joints. The
-  force loop's displacement is added to the present tip. For the gains of the simulations, K_pp = 1.37.
+- PI form (chapter 7): q = q_0 + K_p e + K_i sum(e). For the gains of the experiments, (7.6).
+- Incremental form (chapter 6 moves the joints by K_I e, 6.4.1): each tick adds K_p e + K_i sum(e) to the joints. For the
+  gains of the simulations, K_pp = 1.37.
+In both, the force loop's displacement is added to the *desired* position, as in Fig. 7.1 (external hybrid control), or to
+the present tip, where no desired position at the wall is known.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ def tip_error(
 ) -> Point:
     """Return the requested displacement of the tip (m), from its position (3,) and the measured compression (N).
 
-    delta = K_pf e + K_if integral(e) along the normal comes from the force loop. PI form: it is added to the desired
-    position, whose distance from the tip along the normal remains (external hybrid control). Incremental form: the
-    selection matrix S = normal normal^T takes the normal direction from the position loop.
+    delta = K_pf e + K_if integral(e) along the normal comes from the force loop. External hybrid control (`from_desired`):
+    it is added to the desired position, whose distance from the tip along the normal remains. Otherwise it is added to the
+    present tip: the selection matrix S = normal normal^T takes the normal direction from the position loop.
     """
     target_m, normal = aim.target_m, aim.normal
     error_m = (target_m[0] - tip_m[0], target_m[1] - tip_m[1], target_m[2] - tip_m[2])
@@ -65,7 +66,7 @@ def tip_error(
     integral = state.force_integral_N_s + error_N * period_s
     state.force_integral_N_s = min(max(integral, -_FORCE_INTEGRAL_LIMIT_N_s), _FORCE_INTEGRAL_LIMIT_N_s)
     delta_m = config.force_gain_m_per_N * error_N + config.force_integral_m_per_N_s * state.force_integral_N_s
-    change_m = -delta_m if config.pi_form != 0 else -delta_m - along
+    change_m = -delta_m if config.from_desired != 0 else -delta_m - along
     return (
         error_m[0] + change_m * normal[0],
         error_m[1] + change_m * normal[1],

@@ -194,6 +194,25 @@ class TargetState:
     angle: Matrix = real("", "cosine and sine by which each harmonic turned; scratch", HEART_HARMONICS + BREATH_HARMONICS, 2)
 
 
+class ForcePredictorParams:
+    """Prediction of the force for the thesis' law (`force_predictor`)."""
+
+    acceleration_noise_N_per_s2: float = real("N/s^2", "white second derivative of the force, per square root of Hz")
+    rate_sd_N_per_s: float = real("N/s", "rate of the force at the first reading, standard deviation")
+
+
+class ForcePredictorState:
+    """Prediction of the force for the thesis' law (`force_predictor`)."""
+
+    started: int = whole("", "1 after the first reading")
+    stamp_ns: int = whole("ns", "when the newest reading was measured")
+    force_N: float = real("N", "filtered compression at stamp_ns")
+    rate_N_per_s: float = real("N/s", "its rate")
+    p00: float = real("N^2", "variance of the force")
+    p01: float = real("N^2/s", "covariance of force and rate")
+    p11: float = real("N^2/s^2", "variance of the rate")
+
+
 class StageParams:
     """Stages (`stage_limiter`); units are m or rad, by axis."""
 
@@ -250,6 +269,7 @@ class HybridParams:
     force_integral_m_per_N_s: float = real("m/(N s)", "integral gain of the force loop")
     approach_speed_m_per_s: float = real("m/s", "speed of the goal without contact")
     contact_force_N: float = real("N", "force that counts as contact")
+    from_desired: int = whole("", "1: the force loop's displacement is added to the desired position; 0: to the present tip")
     pi_form: int = whole("", "1: joints follow K_p e + K_i sum(e); 0: they are moved by it (incremental form)")
     joint_gain: float = real("", "K_p of the PI form")
     joint_integral_per_s: float = real("1/s", "K_i of the PI form")
@@ -426,6 +446,7 @@ class Params:
     kinematics: KinematicsParams = part(KinematicsParams, "unloaded catheter")
     hybrid: HybridParams = part(HybridParams, "the thesis' law")
     predictor: PredictorParams = part(PredictorParams, "tip predictor")
+    force_predictor: ForcePredictorParams = part(ForcePredictorParams, "prediction of the force, thesis' law")
     safety: SafetyParams = part(SafetyParams, "failsafe")
     force_source: int = whole("", "a ForceSource: which force closes the loop, if it is good")
     force_noise_N: float = real("N", "noise of the force sensor, standard deviation")
@@ -450,6 +471,7 @@ class State:
     backlash: BacklashState = part(BacklashState, "backlash")
     hybrid: HybridState = part(HybridState, "joint command, goal, the thesis' law")
     force: ForceSourceState = part(ForceSourceState, "force sensor and estimate")
+    force_predictor: ForcePredictorState = part(ForcePredictorState, "prediction of the force, thesis' law")
     force_seen: int = whole("", "readings of the source so far")
     force_rejected: int = whole("", "readings rejected so far")
     command_seen: int = whole("", "count of the newest command that was acted on")
@@ -506,6 +528,7 @@ BANK, BEAT = dtype_of(Bank), dtype_of(Beat)
 TARGET_PARAMS, TARGET_STATE = dtype_of(TargetParams), dtype_of(TargetState)
 STAGE_PARAMS, STAGE_STATE = dtype_of(StageParams), dtype_of(StageState)
 BACKLASH_PARAMS, BACKLASH_STATE = dtype_of(BacklashParams), dtype_of(BacklashState)
+FORCE_PREDICTOR_STATE, FORCE_SOURCE_STATE = dtype_of(ForcePredictorState), dtype_of(ForceSourceState)
 HYBRID_PARAMS, HYBRID_STATE = dtype_of(HybridParams), dtype_of(HybridState)
 HISTORY = dtype_of(History)
 PARAMS, STATE, OUTPUTS = dtype_of(Params), dtype_of(State), dtype_of(Outputs)

@@ -10,6 +10,7 @@ from numba import njit
 from realtime.control import (
     backlash,
     constraint_frame,
+    force_predictor,
     force_source,
     free_tip,
     hybrid,
@@ -93,6 +94,11 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
         params, force, inputs, state.predictor.quaternion_wxyz, state.normal, touching
     )
     state.force_seen = force.seen[force.source]
+    if params.law != LAW_PREDICTIVE:
+        if force.changed != 0:
+            force_predictor.forget(state.force_predictor)
+        if force.fresh != 0:
+            force_predictor.apply(params.force_predictor, state.force_predictor, force)
     witnesses.take_forces(state.witness, force, params.period_s)
     if force.fresh == 0 or state.phase != PHASE_CONTACT or params.law != LAW_PREDICTIVE:
         return
@@ -571,7 +577,13 @@ def _predict_tip(params: Params, state: State, now_ns: int, touching: bool, tip_
 
 @njit(cache=True)
 def _compression_N(params: Params, state: State, now_ns: int, touching: bool) -> float:
-    """Return the compression (N) now: the sensor's reading, or the estimate, in contact brought up to date."""
+    """Return the compression (N) now.
+
+    Thesis' law: predicted by its own filter. Predictive law: the sensor's reading, or the estimate, in contact brought up
+    to date by the wall's predicted motion.
+    """
+    if params.law != LAW_PREDICTIVE:
+        return force_predictor.predict(state.force_predictor, now_ns)
     if state.force.source != SOURCE_ESTIMATE:
         return state.force.value_N
     if touching and state.wall.force.started != 0:

@@ -9,9 +9,16 @@ from hypothesis import strategies as st
 
 from protocol.enums import CommandKind, Phase
 from protocol.rig_file import Rig, parse_rig
-from realtime.control import backlash, constraint_frame, free_tip, hybrid, inverse_kinematics
+from realtime.control import backlash, constraint_frame, force_predictor, free_tip, hybrid, inverse_kinematics
 from realtime.control.configure import tick_parameters
-from realtime.control.records import BACKLASH_STATE, HISTORY, HYBRID_STATE, new
+from realtime.control.records import (
+    BACKLASH_STATE,
+    FORCE_PREDICTOR_STATE,
+    FORCE_SOURCE_STATE,
+    HISTORY,
+    HYBRID_STATE,
+    new,
+)
 from realtime.core.intake import rotation
 from sim.heart import HeartConfig
 from sim.ideal_rig import IdealRig, IdealTrace
@@ -216,18 +223,20 @@ def test_a_learned_normal_is_unit_and_near_the_commanded_one(force: np.ndarray, 
 
 
 @pytest.mark.parametrize("form", ["pi", "incremental"])
+@pytest.mark.parametrize("added_to", ["desired", "tip"])
 @given(tip=vector, target=vector, force=st.floats(-1, 1))
 def test_the_force_loop_acts_along_the_normal_and_the_position_loop_across(
-    rig: Rig, form: str, tip: np.ndarray, target: np.ndarray, force: float
+    rig: Rig, form: str, added_to: str, tip: np.ndarray, target: np.ndarray, force: float
 ) -> None:
-    """Across the normal only the position error. Along it the force loop: alone, or added to the desired position (PI)."""
-    config, normal = tick_parameters(changed(rig, law="thesis", form=form))[0].hybrid, np.array([0.0, 0.6, -0.8])
+    """Across the normal only the position error. Along it the force loop: alone, or added to the desired position."""
+    thesis = changed(rig, law="thesis", form=form, force_added_to=added_to)
+    config, normal = tick_parameters(thesis)[0].hybrid, np.array([0.0, 0.6, -0.8])
     across = np.eye(3) - np.outer(normal, normal)
     aim = hybrid.Aim(target, normal, WANTED_N, True)
     out = np.array(hybrid.tip_error(config, new(HYBRID_STATE)[0], tip, aim, force, 1e-3))
     assert across @ out == pytest.approx(across @ (target - tip), abs=1e-9)
     error = WANTED_N - force
-    off_m = (target - tip) @ normal if form == "pi" else 0.0
+    off_m = (target - tip) @ normal if added_to == "desired" else 0.0
     assert off_m - out @ normal == pytest.approx(
         config.force_gain_m_per_N * error + config.force_integral_m_per_N_s * 1e-3 * error, abs=1e-9
     )
@@ -251,6 +260,38 @@ def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_
         trace = bench(thesis, STILL).press(0.1, WALL_m - (0.0, 0.0, 0.003), 18.0).since_contact()
         error_N.append(0.1 - float(trace.force_N[trace.time_s > 12.0].mean()))
     assert error_N[0] > 0.02 and abs(error_N[1]) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_incremental_form_from_the_desired_position_needs_ten_times_the_force_integral(rig: Rig) -> None:
+    """Fig. 7.12 in the other reading: without K_if the force gain alone carries the 3 mm.
+
+    The integral is limited (0.5 N s), so K_if of the rig file carries 1.5 of the 3 mm.
+    """
+    error_N = []
+    for factor in (0.0, 1.0, 10.0):
+        gains = {"force_gain_m_per_N": 0.03, "force_integral_m_per_N_s": 0.003 * factor}
+        thesis = changed(rig, law="thesis", form="incremental", force_added_to="desired", **gains)
+        trace = bench(thesis, STILL).press(0.1, WALL_m - (0.0, 0.0, 0.003), 18.0).since_contact()
+        error_N.append(0.1 - float(trace.force_N[trace.time_s > 12.0].mean()))
+    assert error_N[0] > error_N[1] + 0.01 and error_N[1] > 0.01 and abs(error_N[2]) < 2e-3
+
+
+def test_the_thesis_law_acts_on_a_predicted_force(rig: Rig) -> None:
+    """A force that rises steadily, read at 40 Hz, 25 ms late: a tenth of the error of holding the last reading."""
+    config, state = tick_parameters(changed(rig, law="thesis"))[0].force_predictor, new(FORCE_PREDICTOR_STATE)[0]
+    reading, misses, held = new(FORCE_SOURCE_STATE)[0], [], []
+    rate_N_per_s = 0.5
+    for now_ms in range(1000):
+        if now_ms % 25 == 0:
+            reading.stamp_ns = (now_ms - 25) * 1_000_000
+            reading.value_N, reading.spread_N2 = rate_N_per_s * (now_ms - 25) * 1e-3, 0.003**2
+            force_predictor.apply(config, state, reading)
+        if now_ms > 300:
+            true_N = rate_N_per_s * now_ms * 1e-3
+            misses.append(force_predictor.predict(state, now_ms * 1_000_000) - true_N)
+            held.append(reading.value_N - true_N)
+    assert np.abs(misses).max() < 0.1 * np.abs(held).mean()
 
 
 @pytest.mark.slow

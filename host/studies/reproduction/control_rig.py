@@ -78,7 +78,7 @@ class RigRun(NamedTuple):
 def thesis_rig() -> Rig:
     """The simulated rig under the thesis' own law, with the gains of its experiments."""
     data = load_rig(SIMULATED_RIG).effective()
-    data["control"].update(law="thesis", form="incremental", **GAINS)
+    data["control"].update(law="thesis", form="incremental", force_added_to="tip", **GAINS)
     return parse_rig(data, "thesis rig")
 
 

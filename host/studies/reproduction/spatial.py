@@ -415,9 +415,10 @@ def table_3_3(quick: bool) -> Section:
     return section(
         "table_3.3",
         "Table 3.3, Figs. 3.9 to 3.11 - shapes under 21 loads",
-        mean <= 1.97,
+        None,
         "mean tip error 1.97 mm, 3.5 % of the length",
         f"mean tip error {mean:.2f} mm, {np.mean(share):.1%} of the length",
+        "the recordings are not published; on a substitute "
         f"a rod of even stiffness stays within {mean:.2f} mm of a catheter with stiff electrodes, on the mean",
         "The thesis' recordings are not published. In their place a rod integrated at 1e-9, its tip 30 % stiffer over 8 mm "
         "(electrodes), its "
