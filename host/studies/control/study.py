@@ -76,7 +76,7 @@ class _Runs:
         self._held: dict[tuple[str, str, int], Held] = {}
 
     def held(self, kind: str, beat: str) -> list[Held]:
-        """Holding with `kind` (predictive, pose, or one of `_LAWS`) on a `beat` (regular, irregular, still), a run a seed."""
+        """Holding with `kind` (predictive, pose or one of _LAWS) on a `beat` (regular, irregular, still), one a seed."""
         heart = {"regular": REGULAR, "irregular": IRREGULAR, "still": STILL}[beat]
         rig = with_control(self.rig, **_LAWS.get(kind, {"law": "predictive"}))
         seconds = 6.0 if beat == "still" else self.settings.hold_s
