@@ -147,7 +147,7 @@ def token_of(topic: RosTopic, namespace: str, domain: int, zid: str, number: int
 
 
 class RosBridge:
-    """Publishes a rig's topics to ROS 2 and, where asked, takes force commands from it."""
+    """Publishes a rig's topics to ROS 2 and, where requested, takes force commands from it."""
 
     def __init__(
         self, rig: RigConnection, router: str, *, namespace: str = "seldinger", domain: int = 0, commands: bool = False

@@ -103,7 +103,7 @@ def test_a_force_the_rig_must_not_hold_is_bad_input(change: dict[str, Any], key:
 
 def test_a_file_that_is_no_script_is_bad_input(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
-    for text, key in (("rows = [", "script"), ('says = "x"', "rig")):
+    for text, key in (("rows = [", "script"), ('says = "x"', f"{path}: rig")):
         path.write_text(text)
         with pytest.raises(InputError) as error:
             read_script(path)
