@@ -445,9 +445,8 @@ class Rig(_Section):
     @model_validator(mode="after")
     def _rates_fit(self) -> Rig:
         """A rate at which every sample, or every set-point, would be late is refused before anything starts."""
-        pose_s = 1.0 / self.tracker.rate_hz + self.tracker.latency_s
         for key, found_s, wanted_s, why in (
-            ("safety.hold_after_s", self.safety.hold_after_s, pose_s, "the oldest that a good pose gets (tracker)"),
+            ("safety.hold_after_s", self.safety.hold_after_s, 1.0 / self.tracker.rate_hz, "a period of tracker.rate_hz"),
             (
                 "safety.force_timeout_s",
                 self.safety.force_timeout_s,

@@ -225,7 +225,7 @@ def without(request: dict, key: str) -> dict:
         (estimate, {**SENSORS, "sensors": [{**SENSOR, "quaternion_wxyz": [1.0, 0.0, 0.0]}]}, "sensors.0.quaternion_wxyz"),
         (estimate, {**SENSORS, "sensors": [{**SENSOR, "offset_m": -0.01}]}, "sensors.0.offset_m"),
         (estimate, {**SENSORS, "sensors": [{**SENSOR, "position_m": [0.0, float("inf"), 0.0]}]}, "sensors.0.position_m.1"),
-        (solve, [1, 2], "request"),
+        (solve, [1, 2], "request.json"),
         (estimate, "{", "request.json"),
         (estimate, "", "request.json"),
     ],

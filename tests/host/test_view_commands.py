@@ -105,4 +105,4 @@ def test_a_port_that_is_taken_is_named(recording: Path) -> None:  # noqa: F811
         taken.listen()
         port = taken.getsockname()[1]
         done = seldinger("play", str(recording), "--port", str(port))
-    assert done.returncode == 2 and f"--port: found {port}, wanted a port that is free" in done.stderr
+    assert done.returncode == 2 and f"--port: found {port}, wanted a free port" in done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 import shutil
 import time
@@ -253,6 +254,34 @@ def test_a_typed_point_is_confirmed_and_sent_in_metres(browser: Any) -> None:
         page.click("#mark button")
         open_page.wait(lambda: len(fake.asked) == 2)
         assert fake.asked[1] == {"button": "mark", "note": "sheath moved"}
+
+
+def test_a_point_is_picked_on_the_tissue_and_moves_nothing_by_itself(browser: Any, tmp_path: Path) -> None:
+    fake = Fake()
+    with running(ViewServer(fake, port := free_port())), OpenPage(browser, port, WIDTHS[0]) as open_page:
+        page = open_page.page
+        open_page.wait(lambda: open_page.text("#action") == "Retracting")
+        open_page.wait(lambda: page.evaluate("window.seldinger.scene.newest !== undefined"))
+        across, down = page.evaluate(
+            "() => { const s = window.seldinger.scene, v = s.target.position.clone().project(s.camera);"
+            " const b = s.renderer.domElement.getBoundingClientRect();"
+            " return [b.left + (v.x + 1) / 2 * b.width, b.top + (1 - v.y) / 2 * b.height]; }"
+        )
+        picked = []
+        for aside in (-12, 12):
+            page.mouse.dblclick(across + aside, down)
+            open_page.wait(lambda: open_page.text("#answer").startswith("Picked"))
+            picked.append([float(page.input_value(f"#{field}")) for field in ("x-mm", "y-mm", "z-mm")])
+        page.screenshot(path=str(tmp_path / "picked.png"))
+        # The tissue of this rig is the plane through its target, z = 25 mm: picks differ along it and stay on it.
+        assert [point[2] for point in picked] == [25.0, 25.0] and math.dist(*picked) > 1.0
+        assert fake.asked == []
+        page.evaluate("() => { const b = document.querySelector('[data-do=\"goto\"]'); b.click(); b.click(); }")
+        open_page.wait(lambda: len(fake.asked) == 1)
+        assert fake.asked[0]["point_m"] == pytest.approx([mm / 1000 for mm in picked[1]])
+        page.mouse.dblclick(across, down - 90)  # above the tissue, where the ray meets its plane far away or never
+        open_page.wait(lambda: "No tissue" in open_page.text("#answer"))
+        assert open_page.complaints == []
 
 
 def contrast(page: Any) -> float:

@@ -99,6 +99,17 @@ export class Drive {
     return name === "force" ? {force_N: force} : {};
   }
 
+  // Fill in a point that was picked in the scene; nothing moves before its button is confirmed.
+  picked(found) {
+    if (!found) return this.controls.say("No tissue is known there. Type the point, or touch once.", "bad");
+    const values = [...found.point.map(mm => mm.toFixed(1)), ...found.normal.map(part => String(Number(part.toFixed(4))))];
+    ["x-mm", "y-mm", "z-mm", "n1", "n2", "n3"].forEach((id, index) => {
+      this.holder.querySelector(`#${id}`).value = values[index];
+    });
+    this.controls.say(`Picked ${values.slice(0, 3).join(", ")} mm. Go to or Touch, twice, moves there.`, "");
+    return undefined;
+  }
+
   #mark() {
     const note = this.holder.querySelector("#note");
     if (!note.value.trim()) return this.controls.say("Mark: the note is empty.", "bad");

@@ -3,6 +3,8 @@
 import {OrbitControls, THREE} from "./vendor/three.js";
 
 const MM = 1000, MM_PER_N = 50, SMALLEST_N = 0.015, BANDS_MM = [3.2, 6.4, 9.6], HOME = [74, -39, 36], LOOK = [0, -5, 15];
+// The drawn tissue has this radius; a point further away is not on it.
+const PICK_MM = 20;
 
 const vector = m => new THREE.Vector3(m[0] * MM, m[1] * MM, m[2] * MM);
 
@@ -151,6 +153,10 @@ export class Scene {
     this.ring = new THREE.Mesh(new THREE.TorusGeometry(2.2, 0.22, 10, 48), material);
     this.target.add(this.ring);
     world.add(this.target);
+    this.picked = new THREE.Mesh(new THREE.SphereGeometry(0.9, 20, 14),
+      new THREE.MeshStandardMaterial({color: this.color("target"), transparent: true, opacity: 0.5}));
+    this.picked.visible = false;
+    world.add(this.picked);
   }
 
   #tube(points) {
@@ -201,6 +207,25 @@ export class Scene {
       axes.quaternion.set(pose[4], pose[5], pose[6], pose[3]);
     }
     this.render();
+  }
+
+  // The point of the tissue under a place of the page (CSS pixels), where the tip's centre would touch: {point, normal},
+  // millimetres and unit vector. The tissue is the plane through the wall or the target; null while neither is known.
+  pick(clientX, clientY) {
+    const drawn = this.newest?.[0], pressing = this.newest?.[1] === "contact";
+    if (!drawn || drawn.into.length !== 3) return null;
+    const on = pressing && drawn.tip.length === 3 ? drawn.tip : drawn.target;
+    if (on.length !== 3) return null;
+    const box = this.renderer.domElement.getBoundingClientRect();
+    const place = new THREE.Vector2(2 * (clientX - box.left) / box.width - 1, 1 - 2 * (clientY - box.top) / box.height);
+    const ray = new THREE.Raycaster(), normal = new THREE.Vector3(...drawn.into).normalize();
+    ray.setFromCamera(place, this.camera);
+    const point = ray.ray.intersectPlane(new THREE.Plane().setFromNormalAndCoplanarPoint(normal, vector(on)), new THREE.Vector3());
+    if (!point || point.distanceTo(vector(on)) > PICK_MM) return null;
+    this.picked.position.copy(point);
+    this.picked.visible = true;
+    this.render();
+    return {point: point.toArray(), normal: normal.toArray()};
   }
 
   render() {

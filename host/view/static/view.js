@@ -59,6 +59,9 @@ async function begin(hello) {
       const {Scene} = await import("/static/scene.js");
       page.scene = new Scene(element("scene"), hello.radius_m);
       element("home").addEventListener("click", () => page.scene.home());
+      element("scene").addEventListener("dblclick", event => {
+        if (hello.kind === "live") drive.picked(page.scene.pick(event.clientX, event.clientY));
+      });
     } catch (error) {
       element("scene-note").textContent = `No 3-D view in this browser: ${error.message}`;
       page.scene = {show() {}, broken: true};
