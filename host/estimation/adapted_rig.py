@@ -53,6 +53,7 @@ class AdaptedRigEstimator:
         self._used: StiffnessState | None = None
         self._curvature_per_m: float | None = None
         self._since_report = 0
+        self.held = ""  # why the stiffness is to be held, empty where nothing speaks against learning
         self._reports: deque[tuple[str, Message]] = deque(maxlen=REPORTS_KEPT)
 
     @classmethod
@@ -89,7 +90,9 @@ class AdaptedRigEstimator:
         curvature, last = actuation.curvature_per_m, self._curvature_per_m
         self._curvature_per_m = curvature
         shape: FreeShape | None = None
-        if actuation.mode not in FREE_PHASES:
+        if self.held:
+            why = f"{self.held}: the stiffness is held"
+        elif actuation.mode not in FREE_PHASES:
             why = f"phase {actuation.mode or 'not known'}: the stiffness is held"
         elif last is None or abs(curvature - last) > STEADY_per_m:
             why = "the knob turns"

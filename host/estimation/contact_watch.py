@@ -1,9 +1,10 @@
 """Contact away from the tip while the rig runs: whether a force on the tip explains the poses, else where the body touches.
 
-Half a second of frames is averaged, a beat of the heart: the tracker's noise falls, and the mean of the poses is the pose at
-the mean force to first order (FLOOR_m and FLOOR_rad are for what is not). The best force on the tip, with what is known of
-the actuation, leaves a chi square. When that exceeds its limit in two windows in a row, a force on the body is tried, alone
-and with one on the tip (`several_contacts`). That takes tens of milliseconds, so it is done in parts, one at each frame.
+A quarter of a second of frames is averaged: the tracker's noise falls, and the mean of the poses is the pose at the mean
+force to first order (FLOOR_m and FLOOR_rad are for what is not). The best force on the tip, with what is known of the
+actuation, leaves a chi square. When that exceeds its limit in three windows in a row, the body touches, and a force on it is
+looked for, alone and then with one on the tip (`several_contacts`). That takes a second of computing, so it is done in
+parts, one at each frame.
 
 With two sensors a contact of the body looks like a force on the tip and a shaft of another curvature. It is found as far as
 the unloaded curvature is known, from free moments (`adaptation`).
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.actuation_errors import INSERTION, ROLL, ActuationKnowledge
+from host.estimation.adapted_rig import AdaptedRigEstimator
 from host.estimation.interface import Actuation, Estimator, PoseReading, Reporting, TipForce
 from host.estimation.sensor_noise import PoseSensor, chi_square_limit
 from host.estimation.several_contacts import ActuationPrior, ContactsEstimate, search_contacts
@@ -32,19 +34,21 @@ from protocol.topics import BodyContact, Message
 
 Array = NDArray[np.float64]
 
-FRAMES = 20  # averaged: a beat of the heart at the tracker's 40 Hz
-EVERY = 10  # a window begins every so many frames
-WINDOWS = 2  # in a row that no force on the tip explains, before the body is said to touch
-CLEAR_WINDOWS = 2  # in a row that one explains, before it is said to be free again
+# Frames that are averaged: a quarter of a second at the tracker's 40 Hz. Shorter than what a free pose waits for before the
+# adaptation uses it (0.4 s), so that the curvature which a contact of the body pretends is never learned as free.
+FRAMES = 10
+EVERY = 5  # a window begins every so many frames
+WINDOWS = 3  # in a row that no force on the tip explains, before the body is said to touch
+CLEAR_WINDOWS = 4  # in a row that one explains, before it is said to be free again
 # Of the mean pose: the models' own error, and what a mean of bent shapes differs from a bent mean.
-FLOOR_m, FLOOR_rad = 0.15e-3, 0.003
-ODD_DEVIATIONS = 5.0
+FLOOR_m, FLOOR_rad = 0.03e-3, 0.0006
+ODD_DEVIATIONS = 4.0
 # A window in which the joints moved further is not one static shape.
 STEADY_m, STEADY_per_m, STEADY_rad = 0.008, 6.0, 0.1
 FORCE_SD_N, LARGEST_FORCE_N = 1.0, 1.0
-# A contact of the body alone is preferred to one with the tip unless the latter explains so much more (chi square).
+# A contact of the body with the tip is preferred to one of the body alone where it explains so much more (chi square).
 SIMPLER_BY = 15.0
-STARTS = (0.25, 0.5, 0.75)  # of the search for the place, shares of the exposed length
+STARTS = (0.35, 0.65)  # of the search for the place, shares of the exposed length
 WATCHED = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.CONTACT, Phase.JOG))
 REPORTS_KEPT = 64
 
@@ -90,6 +94,11 @@ class ContactWatch:
         self._found: ContactsEstimate | None = None  # the best explanation of it so far
         self.touched = False
 
+    @property
+    def suspects(self) -> bool:
+        """Whether the newest window, or what was found before, says that the body may touch."""
+        return self._odd > 0 or self.touched
+
     def take(self, sensors: list[tuple[float, PoseReading]], actuation: Actuation) -> BodyContact | None:
         """Take in the poses of one frame, each with its sensor's offset, from the tip backwards; return a report when due.
 
@@ -132,6 +141,7 @@ class ContactWatch:
             )
         self._odd, self._clear = self._odd + 1, 0
         if self._odd >= WINDOWS:
+            self.touched = True  # warned of at once; the place follows
             self._window, self._examination = window, self._examine(window)
         return None
 
@@ -163,9 +173,9 @@ class ContactWatch:
         found = FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((k, 6)))
         found.x[3:] = prior.mean
         settled, cost = fit(frame, LARGEST_FORCE_N, found)
-        if not np.isfinite(cost) or not settled:
-            return None
-        return _Window(mean, prior, cost / chi_square_limit(6 * k - 3, ODD_DEVIATIONS))
+        excess = cost / chi_square_limit(6 * k - 3, ODD_DEVIATIONS)
+        # A fit that did not settle, and explains nothing, is no better than one that did.
+        return _Window(mean, prior, excess) if np.isfinite(excess) and (settled or excess > 1.0) else None
 
     def _examine(self, window: _Window) -> Iterator[None]:
         """Set `_found` to the better of a contact of the body alone and one with the tip; one part a step."""
@@ -193,6 +203,8 @@ class ContactWatch:
                 continue
             if self._found is None or found.chi_square < self._found.chi_square - SIMPLER_BY:
                 self._found = found
+            if self._found.converged:
+                return  # nothing more is needed to explain the poses
 
     def _go_on(self, stamp_ns: int) -> BodyContact | None:
         """One more part of the examination; the report when it is over."""
@@ -205,7 +217,6 @@ class ContactWatch:
         else:
             return None
         self._examination = None
-        self.touched = True
         sensors = len(window.frame.offsets)
         if found is None or not found.converged:
             text = (
@@ -255,12 +266,17 @@ def _mean(frames: list[_Frame]) -> _Frame:
 class WatchedEstimator:
     """Implements `Estimator` and `Reporting`: another estimator, with its poses watched for a contact of the body."""
 
-    def __init__(self, estimator: Estimator, watch: ContactWatch, shaft_offset_m: float) -> None:
-        self._estimator, self._watch, self._shaft_offset_m = estimator, watch, shaft_offset_m
+    def __init__(
+        self, estimator: Estimator, watch: ContactWatch, shaft_offset_m: float, adapted: AdaptedRigEstimator | None = None
+    ) -> None:
+        """`adapted`: holds its stiffness while the watch suspects a contact."""
+        self._estimator, self._watch, self._shaft_offset_m, self._adapted = estimator, watch, shaft_offset_m, adapted
         self._reports: deque[tuple[str, Message]] = deque(maxlen=REPORTS_KEPT)
 
     def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
         """The force by the estimator, marked while the body touches. Raises: InputError (bad input)."""
+        if self._adapted is not None:
+            self._adapted.held = "the catheter's body may touch something" if self._watch.suspects else ""
         answer = self._estimator.estimate(pose_tip, pose_shaft, actuation)
         if pose_shaft is not None:
             report = self._watch.take([(0.0, pose_tip), (self._shaft_offset_m, pose_shaft)], actuation)
