@@ -20,8 +20,8 @@ PLAY_OFF_m = 0.0006  # the thesis knows the backlash to this
 TRACKER_NOISE_m = 0.0004  # of one axis, for positioning
 # The thesis' law with gains raised for a beating wall, as far as it does not ring on a still one.
 RETUNED = {"force_gain_m_per_N": 0.06, "force_integral_m_per_N_s": 0.03}
-# The same in the PI form, from (7.6).
-RETUNED_PI = {"pi_force_gain_m_per_N": 0.1, "pi_force_integral_m_per_N_s": 0.12}
+# The same in the PI form: (7.6) with 25 times its position integral; at 33 times it rings (sd 60 mN on a still wall).
+RETUNED_PI = {"pi_position_integral_per_s": 6.0}
 SECTIONS = ("force", "touch", "kept", "prediction", "positions", "tick", "latency", "limits")
 Progress = Callable[[str], None]
 
