@@ -22,7 +22,9 @@ def calibrate(
     catheter: Annotated[str, typer.Option(help="Where the search starts: a shipped catheter or a .toml file.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the calibrated catheter, NAME.toml.")] = None,
     name: Annotated[str, typer.Option(help="Name of the calibrated catheter: a-z, 0-9 and _.")] = "calibrated",
-    model: Annotated[str, typer.Option(help="pcar (planar) or cosserat (spatial).")] = "pcar",
+    model: Annotated[
+        str, typer.Option(help="pcar (planar), cosserat (spatial), or wire (friction of the pull-wire, from a loop).")
+    ] = "pcar",
     fit: Annotated[str, typer.Option(help="Some of stiffness, lengths, curvature, comma separated.")] = "stiffness,lengths",
     loss: Annotated[str, typer.Option(help="squares, huber, cauchy, or distance (the thesis' sum).")] = "huber",
     method: Annotated[str, typer.Option(help="gauss-newton, nelder-mead, or both to compare them.")] = "gauss-newton",
@@ -34,6 +36,8 @@ def calibrate(
     The shapes: {"recordings": [{"insertion_m": 0.0485, "curvature_per_m": 15.7, "force_N": [0.0, -0.1197], "markers":
     [{"offset_m": 0.0, "position_m": [0.1145, -0.0283]}, ...]}, ...]}, offset_m back from the tip, SI; or a CSV of one row a
     marker headed recording,insertion_m,curvature_per_m,force_x_N,force_y_N,offset_m,x_m,y_m (spatial: and force_z_N, z_m).
+    For --model wire a CSV headed curvature_per_m,bend_rad: what the knob's curve gives, and the bend of the free tip, while
+    the knob goes up and comes back.
     """
     from host.identification.catheter_calibration import calibrate as run
     from host.identification.catheter_calibration import calibrated_toml, calibration_report
@@ -41,6 +45,9 @@ def calibrate(
     if not re.fullmatch(r"[a-z0-9_]{1,64}", name):
         raise InputError("--name", name, "1 to 64 of a-z, 0-9 and _")
     written = None if out is None else writable_file("--out", writable_folder("--out", out) / f"{name}.toml")
+    if model == "wire":
+        _calibrate_wire(shapes, catheter, written, name, json)
+        return
     groups = tuple(part.strip() for part in fit.split(",") if part.strip())
     with Working("calibration"):
         found = run(shapes, catheter, model=model, fit=groups, loss=loss, method=method, leave_one_out=leave_one_out)
@@ -52,6 +59,26 @@ def calibrate(
         write_json(report)
     else:
         _print_table(report)
+
+
+def _calibrate_wire(loop: str, catheter: str, written: Path | None, name: str, json: bool) -> None:
+    """Friction of the pull-wire from a loading-unloading loop."""
+    from host.identification.wire_loop import identify_wire_friction, read_wire_loop, with_friction
+    from protocol.catheter import load_catheter
+
+    start = load_catheter(catheter)
+    found = identify_wire_friction(start, read_wire_loop(loop))
+    report: dict[str, Any] = dict(vars(found))
+    if written is not None:
+        written.write_text(with_friction(start, found, name), encoding="utf-8")
+        report["written"] = str(written)
+    if json:
+        write_json(report)
+        return
+    low, high = found.friction_ci95
+    print(f"friction coefficient {found.friction_coefficient:.4g}   95 %: {low:.4g} to {high:.4g}")
+    print(f"gain of the knob's curve {found.gain:.4g}   95 %: {found.gain_ci95[0]:.4g} to {found.gain_ci95[1]:.4g}")
+    print(f"error of the bend: {found.rms_rad:.4g} rad, {found.rms_without_rad:.4g} rad without friction")
 
 
 def _print_table(report: dict[str, Any]) -> None:

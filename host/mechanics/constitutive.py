@@ -14,7 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from host.mechanics.cosserat import CosseratSolution, solve_cosserat
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, solve
+from host.mechanics.rotations import rotation_matrix
 from protocol.catheter import Catheter
 
 Array = NDArray[np.float64]
@@ -122,3 +124,58 @@ def hysteresis_loop(
             raise ValueError(f"tension_N: found {value} N at step {k} without an equilibrium, wanted a smaller load")
         angle[k], tension[k] = step.equilibrium.tip_angle_rad, step.tension_N[-1]
     return angle, tension
+
+
+class FrictionalRod:
+    """The spatial counterpart of `FrictionalWire`: the rod of chapter 3 with a pull-wire that rubs in its sheath.
+
+    The rod has one unloaded curvature along the distal shaft. Here that is the mean of what the tensions along the wire
+    give, kappa0 = mean(T) e / EI1 (3.2.3), which is right to first order in the friction.
+    """
+
+    def __init__(self, catheter: Catheter, insertion_m: float, body_turning_rad: float = 0.0, elements: int = 10) -> None:
+        """`body_turning_rad` as in `FrictionalWire`; `elements` of the distal shaft that have a tension of their own.
+
+        Raises: ValueError where the catheter has no [constitutive] or no [cosserat] parameters.
+        """
+        if catheter.constitutive is None or catheter.cosserat is None:
+            raise ValueError(f"catheter: found {catheter.name} without friction, wanted [constitutive] and [cosserat]")
+        if not 0.0 <= body_turning_rad < math.inf:
+            raise ValueError(f"body_turning_rad: found {body_turning_rad}, wanted 0 or more")
+        self._catheter, self._insertion_m = catheter, insertion_m
+        self._friction, self._body_turning_rad = catheter.constitutive.friction_coefficient, body_turning_rad
+        self._gain = catheter.pull_wire_offset_m / catheter.cosserat.EI1
+        self._exposed_m = catheter.distal_length_m + min(insertion_m, 0.0)
+        self._places = self._exposed_m * (1.0 - (np.arange(elements) + 0.5) / elements)  # middles, back from the tip
+        self._tension_N = np.zeros(elements)
+
+    def step(self, tension_N: float, force_N: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[CosseratSolution, Array]:
+        """The shape and the tensions (n,) after handle tension and tip force (3,), base frame, went to these values.
+
+        Raises: ValueError. Where the statics do not converge the wire keeps its former tensions.
+        """
+        if not 0.0 <= tension_N < math.inf:
+            raise ValueError(f"tension_N: found {tension_N}, wanted 0 or more")
+        tensions, last = self._tension_N, np.full(self._tension_N.size, math.inf)
+        for _ in range(ROUNDS):
+            curvature = float(np.mean(tensions)) * self._gain
+            found = solve_cosserat(
+                self._catheter, self._insertion_m, curvature, force_N, stations_m=[self._exposed_m, *self._places]
+            )
+            if not found.converged:
+                return found, self._tension_N
+            tensions = np.empty_like(self._tension_N)
+            stick_or_slip(tension_N, self._turning(found), self._friction, self._tension_N, tensions)
+            if float(np.abs(tensions - last).max()) <= TOLERANCE * max(tension_N, 1e-3):
+                break
+            last = tensions
+        self._tension_N = tensions
+        return found, tensions
+
+    def _turning(self, found: CosseratSolution) -> Array:
+        """Angle between the shaft's directions at neighbouring places; the first has the body's bend before it."""
+        directions = np.array([rotation_matrix(q)[:, 2] for q in found.station_quaternions_wxyz])
+        cosines = np.sum(directions[1:] * directions[:-1], axis=1)
+        turning = np.arccos(np.clip(cosines, -1.0, 1.0))
+        turning[0] += self._body_turning_rad
+        return turning
