@@ -19,7 +19,7 @@ DEBIAN_BOARD  := gcc libc6-dev make gcc-avr avr-libc binutils-avr simavr libsima
 # Prints, on standard error, which step of the set-up begins.
 step = echo "seldinger: set-up, step $(1)" >&2
 
-.PHONY: demo test quick setup board-tools packages warm format-check lint types lock lock-check audit nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof chaos soak clean
+.PHONY: demo test quick long setup board-tools packages warm format-check lint types lock lock-check audit nojit bench prove prove-small prove-worlds live-study faults fuzz fuzz-files proof chaos soak clean
 
 demo: setup
 	@$(BIN)/seldinger demo --board $(BOARD) $(DEMO_ARGS)
@@ -29,7 +29,7 @@ test: setup
 
 # What a change needs before it is committed: no test that takes long, or needs the AVR tool chain, recordings or a browser.
 quick: setup
-	@$(BIN)/python -m pytest $(TEST_ARGS) -m "not slow and not avr and not data and not browser"
+	@$(BIN)/python -m pytest $(TEST_ARGS) -m "not slow and not long and not avr and not data and not browser"
 
 setup: packages board-tools $(VENV)/.warm
 
@@ -72,6 +72,10 @@ board-tools: | $(VENV)/.ready
 	elif command -v avr-gcc >/dev/null && command -v gcc >/dev/null && [ -e /usr/include/simavr/sim_avr.h ] && [ -e /usr/include/libelf.h ]; then :; \
 	else $(call apt_install,$(DEBIAN_BOARD)) || { command -v gcc >/dev/null && [ "$(BOARD)" != avr ] \
 	  && echo "seldinger: no AVR tool chain: the firmware runs compiled for this machine (BOARD=native)" >&2; }; fi
+
+# Tests that take minutes each.
+long: setup
+	@$(BIN)/python -m pytest -m long
 
 # The same kernels as plain Python, so that a debugger works in them.
 nojit: setup

@@ -22,6 +22,7 @@ def test_the_real_arm_differs_from_its_model_file_by_what_is_concealed(tmp_path:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_patched_file_predicts_to_the_noise(tmp_path: Path) -> None:
     circle = full_circle.run(tmp_path, seed=1)
     assert {effect["port"] for effect in circle.verdict["effects"]} >= set(full_circle.CONCEALED)
