@@ -184,3 +184,55 @@ def _gap(x: Array, half_width: float) -> Array:
     for k in range(1, x.size):
         out[k] = np.clip(out[k - 1], x[k] - half_width, x[k] + half_width)
     return out
+
+
+PRESSED: dict[str, Any] = {
+    "name": "pad",
+    "kind": "impedance",
+    "data": {"time": "t"},
+    "channels": {
+        "motion": {"column": "x", "unit": "m"},
+        "force": {"column": "f", "unit": "N"},
+        "normal": {"column": "n", "unit": "N"},
+    },
+    "impedance": {
+        "subsystem": "pad",
+        "input": "motion",
+        "output": "force",
+        "others": ["normal"],
+        "terms": ["damping", "stiffness", "offset"],
+    },
+}
+
+
+def pressed(seed: int, seconds: float, extra: Callable[[Array, Array, Array], Array]) -> dict[str, Array]:
+    """A pad of 3000 N/m, moved by millimetres under a changing normal force; extra(t, x, normal) is added to its force."""
+    t, rng = np.arange(0.0, seconds, 1e-3), np.random.default_rng(seed)
+    x = 2e-3 * motion(seed, (0.4, 0.9, 1.7))(t)
+    normal = 2.0 + np.sin(2.0 * np.pi * 0.3 * t + seed)
+    force = 3000.0 * x + 20.0 * np.gradient(x, 1e-3) + extra(t, x, normal) + 0.02 * rng.normal(size=t.size)
+    return {"t": t, "x": x, "f": force, "n": normal}
+
+
+def test_creep_in_recordings_of_three_seconds() -> None:
+    def relaxing(t: Array, x: Array, normal: Array) -> Array:
+        out = np.zeros(t.size)
+        for k in range(1, t.size):  # spring and damper in series: time constant 0.25 s
+            out[k] = out[k - 1] * np.exp(-1e-3 / 0.25) + 120.0 * (x[k] - x[k - 1])
+        return out
+
+    verdict = diagnose([pressed(seed, 3.0, relaxing) for seed in (1, 2)], PRESSED).as_dict()
+    assert [effect["id"] for effect in verdict["effects"]] == ["creep_relaxation"]
+
+
+def test_friction_depends_on_a_force_that_the_nominal_model_does_not_call_a_load() -> None:
+    def rubbing(t: Array, x: Array, normal: Array) -> Array:
+        return 0.05 * normal * np.sign(np.gradient(x, 1e-3))
+
+    verdict = diagnose([pressed(seed, 8.0, rubbing) for seed in (1, 2)], PRESSED).as_dict()
+    effect = verdict["effects"][
+        0
+    ]  # a second one, of the smoothed speed at reversals, is named too: docs/history/diagnosis.md
+    assert effect["id"] == "load_dependent_friction"
+    low, high = effect["parameters"]["coefficient"]["ci95"]
+    assert low < 0.05 < high
