@@ -60,16 +60,26 @@ def test_both_forces_and_the_place_from_three_poses() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_the_place_is_found_in_noise(seed: int) -> None:
+    seen = sensors([0.0, 0.022, 0.045], TIP_N, BODY_N, seed)
+    found = estimate_contacts(STEEROCATH, INSERTION_m, CURVATURE_per_m, seen, actuation=PRIOR)
+    assert found.converged and found.observable and abs(found.body_offset_m - PLACE_m) < 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True, reason="covariance of the linearized model: normalized squared error 13.6, expected 7"
+)
 def test_the_covariance_covers_the_errors_in_noise() -> None:
     squares = []
     for seed in range(6):
         seen = sensors([0.0, 0.022, 0.045], TIP_N, BODY_N, seed)
         found = estimate_contacts(STEEROCATH, INSERTION_m, CURVATURE_per_m, seen, actuation=PRIOR)
-        assert found.converged and found.observable and abs(found.body_offset_m - PLACE_m) < 0.005
         error = np.array([*(found.tip_force_N - TIP_N), *(found.body_force_N - BODY_N), found.body_offset_m - PLACE_m])
         squares.append(float(error @ np.linalg.solve(found.covariance, error)))
-    # 7 expected; the place is nonlinear, and the covariance is that of the linearized model: measured 13.6
-    assert 0.5 < np.mean(squares) < 15.0
+    # The sum of six seeds has 42 degrees of freedom: 95 % of its values lie between 26 and 62.
+    assert 26.0 < sum(squares) < 62.0
 
 
 def test_what_is_not_observable_is_said() -> None:
