@@ -93,17 +93,20 @@ class NothingToCompare(Exception):
 
 
 def inspected(spec: NominalSpec, sources: Sequence[Path | Table]) -> Inspected:
-    """Recordings as they can be compared, and what is wrong with them. Raises InputError."""
+    """Recordings as they can be compared, and what is wrong with them. Raises InputError, NothingToCompare."""
     if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
         raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
     needed, optional = channels_of(spec)
-    return inspect(spec, load(spec, tables, needed, optional), optional)
+    data = inspect(spec, load(spec, tables, needed, optional), optional)
+    if not data.recordings:
+        raise NothingToCompare(data.findings)
+    return data
 
 
 def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
-    """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError."""
+    """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError, NothingToCompare."""
     return problems(spec, inspected(spec, sources).recordings)
 
 
@@ -183,8 +186,6 @@ def _diagnosed(
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
     data = inspected(spec, sources)
-    if not data.recordings:
-        raise NothingToCompare(data.findings)
     model, problem, full = problems(spec, data.recordings, rules)
     problem.budget = budget
     held = hold_between_samples(problem, [full] if full is not problem else [])

@@ -154,7 +154,7 @@ def test_the_section_on_fuzzing_has_the_figures_of_the_run() -> None:
 
 
 def test_bad_options_are_refused() -> None:
-    for arguments in ({"runs": 0}, {"jobs": 0}, {"seed": -1}, {"board": "paper"}, {"fault": ["gremlins"]}):
+    for arguments in ({"runs": 0}, {"jobs": -1}, {"seed": -1}, {"board": "paper"}, {"fault": ["gremlins"]}):
         with pytest.raises(InputError):
             command(**arguments)  # type: ignore[arg-type]
 

@@ -68,9 +68,7 @@ def test_the_place_is_found_in_noise(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="covariance of the linearized model: normalized squared error 13.6, expected 7"
-)
+@pytest.mark.xfail(strict=True, reason="covariance of the linearized model: normalized squared error 13.6, expected 7")
 def test_the_covariance_covers_the_errors_in_noise() -> None:
     squares = []
     for seed in range(6):

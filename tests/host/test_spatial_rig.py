@@ -160,7 +160,8 @@ def test_what_cannot_be_is_refused_by_both_models() -> None:
 def test_the_rig_file_chooses_the_model() -> None:
     data = load_rig(SIMULATED_RIG).effective()
     for name, kind in (("planar", PlanarRigEstimator), ("spatial", SpatialRigEstimator)):
-        rig = parse_rig({**data, "estimation": {**data["estimation"], "model": name}})
+        bare = {"model": name, "adaptation": False, "contact_watch": False}
+        rig = parse_rig({**data, "estimation": {**data["estimation"], **bare}})
         assert isinstance(make_estimator(rig), kind)
 
 

@@ -218,7 +218,9 @@ def command():
     stop_over({{"stalled": wait, "prompt": lambda: PathAnswer("prompt", True, True, "done")}}, others_s=0.0)
     print("said")
     raise SystemExit({status})
-main.build = lambda argv: command
+app = typer.Typer(add_completion=False)
+app.command()(command)
+main.build = lambda argv: app
 main.main()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -16,9 +16,10 @@ _PAGE = """## Faults
 
 `seldinger faults --runs {runs} --seed {seed} --board {board} --docs docs/reliability.md`
 
-{runs} runs in lock step, each with a rig that reached its phase without a fault (approach: on the way to the beating wall;
-contact: up to {touch_s:g} s after first contact; hold: from {hold_s:g} s after it). Force and motion are those of the plant,
-not readings of a sensor.
+{reached} runs in lock step, each with a rig that reached its phase without a fault. (Approach: on the way to the beating
+wall; contact: up to {touch_s:g} s after first contact; hold: from {hold_s:g} s after it.) Force and motion are those of the
+plant, not readings of a sensor. In {not_reached} further runs the rig did not reach the phase: its drawn catheter or wall is
+so far from its file that it retracted before, without a fault.
 
 Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {limit_N} N). Unhandled exceptions:
 {unhandled}. Recordings that could not be read: {unreadable}. Motion without a command after a stop: {rearmed}.
@@ -51,8 +52,11 @@ backlash ({crossing_ms:.0f} ms). A motor with a torque reserve slips more slowly
 def page_section(results: list[RunResult], seed: int, board: str) -> str:
     """The section as Markdown: what was done, a table with a row per fault, every kind of violation, what is missing."""
     bad = [result for result in results if result.violations]
+    missing = summary_of(results)["not_reached"]
     return _PAGE.format(
         runs=len(results),
+        reached=len(results) - missing,
+        not_reached=missing,
         seed=seed,
         board=board,
         touch_s=DELAYS_S["contact"],

@@ -58,7 +58,10 @@ def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
 @pytest.mark.parametrize(("shown_in", "rests_on"), [((0,), "r0"), ((0, 2), ""), ((0, 1, 2), "")])
 def test_evidence_that_one_recording_carries_is_named(shown_in: tuple[int, ...], rests_on: str) -> None:
     rng, t = np.random.default_rng(1), np.arange(600) * 0.01
-    tables = [Table(f"r{k}", {"t": t, "u": np.sin(t), "y": np.sin(t), "w": np.cos(t)}) for k in range(3)]
+    tables = [
+        Table(f"r{k}", {"t": t, "u": np.sin(t), "y": np.sin(t) + 1e-3 * rng.standard_normal(600), "w": np.cos(t)})
+        for k in range(3)
+    ]
     _, problem, _ = prepare(nominal_of({**COMMON, "kind": "transmission", **KINDS["transmission"]}), tables)
     noise = [1e-3 * rng.standard_normal((1, 600)) for _ in range(3)]
     removed = [np.sin(8.0 * t)[None, :] * (5e-3 if k in shown_in else 0.0) for k in range(3)]
