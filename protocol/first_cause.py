@@ -89,7 +89,7 @@ RULES: dict[str, Rule] = {
         ("loop_late", "force_rejected", "force_stale"),
     ),
     "force_handover": Rule(
-        "The force sensor sends nothing, is frozen or disagrees: the estimate closes the loop.",
+        "The force sensor sends nothing or is frozen: the estimate closes the loop.",
         "Check the force sensor.",
         ("force_rejected", "force_stale", "force_lost"),
     ),

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from protocol.topics import ForceEstimate
+from realtime.control.codes import SOURCE_ESTIMATE
 from sim.fault_run import MS, FaultyScenario
 from sim.sensor_faults import SensorFault
 
@@ -117,14 +118,27 @@ def _sensor_off(run: FaultyScenario) -> bool:
     return abs(truth_N - witness.sensor_N) > max(3.0 * witness.estimate_sd_N, 0.15)
 
 
+def _estimate_off(run: FaultyScenario) -> bool:
+    """Whether the estimate that may close the loop is wrong by more than four of its standard deviations."""
+    truth_N, force = float(np.linalg.norm(run.world.plant.contact_force_N)), run.loop.state[0].force
+    sd_N = math.sqrt(max(force.noise_N2, force.nominal_noise_N2))
+    return abs(truth_N - force.normal_N[SOURCE_ESTIMATE]) > max(4.0 * sd_N, 0.2)
+
+
 def _estimate_scaled(run: FaultyScenario, size: float, seconds: float) -> None:
     def wrong(estimate: ForceEstimate) -> ForceEstimate:
-        if estimate.force_N is None:
-            return estimate
-        x, y, z = estimate.force_N
-        return msgspec.structs.replace(estimate, force_N=(size * x, size * y, size * z))
+        force_N, nominal_N = _scaled(estimate.force_N, size), _scaled(estimate.nominal_force_N, size)
+        return msgspec.structs.replace(estimate, force_N=force_N, nominal_force_N=nominal_N)
 
     run.wrong = wrong
+
+
+def _adapted_scaled(run: FaultyScenario, size: float, seconds: float) -> None:
+    run.wrong = lambda estimate: msgspec.structs.replace(estimate, force_N=_scaled(estimate.force_N, size))
+
+
+def _scaled(force_N: tuple[float, ...] | None, size: float) -> tuple[float, ...] | None:
+    return None if force_N is None else tuple(size * component for component in force_N)
 
 
 def _host(state: str) -> Inject:
@@ -331,6 +345,18 @@ FAULTS: tuple[FaultKind, ...] = (
         seconds=(1.5, 1.5),
         within_s=0.6,
         must_detect=_never,
+        large=_estimate_off,
+    ),
+    FaultKind(
+        "adapted_scaled",
+        "the same, of the force by the adapted stiffness alone",
+        _adapted_scaled,
+        (-1.0, 0.3),
+        "times",
+        seconds=(1.5, 1.5),
+        within_s=0.6,
+        must_detect=_never,
+        large=_estimate_off,
     ),
     FaultKind("force_saturated", "the gauges at their limit", _on_force("saturated")),
     FaultKind("force_unplugged", "no record of the force sensor", _on_force("silent")),

@@ -113,9 +113,10 @@ def _compare(state: ForceSourceState, difference_N: float) -> None:
 
 @njit(cache=True)
 def unusual_difference(state: ForceSourceState) -> bool:
-    """Whether sensor and estimate differ by more than usual in contact, so that the sensor is replaced.
+    """Whether sensor and estimate differ by more than usual in contact, so that nothing is learned from the pair.
 
-    It is relative to the learned offset and noise. `witnesses.disagree` asks whether the difference is harmful.
+    It is relative to the learned offset and noise. It does not say which of them is wrong, so it replaces neither:
+    `witnesses.disagree` asks whether the difference is harmful, and then the loop holds.
     """
     return state.pairs > _LEARNED and state.difference_N2 > max(_DISAGREE * state.usual_difference_N2, _LEAST_N**2)
 
@@ -128,8 +129,8 @@ def _choose(params: Params, state: ForceSourceState, now_ns: int, touching: bool
         state.source = params.force_source
         return changed
     overdue = now_ns - state.arrival_ns[SOURCE_SENSOR] > params.safety.force_timeout_ns // 2
-    bad = overdue or state.equal >= _FROZEN or unusual_difference(state)
-    state.good_s = 0.0 if bad else state.good_s + params.period_s
+    bad = overdue or state.equal >= _FROZEN  # what a sensor shows of its own failure
+    state.good_s = 0.0 if bad or unusual_difference(state) else state.good_s + params.period_s
     usable = now_ns - state.arrival_ns[SOURCE_ESTIMATE] <= _ESTIMATE_LIFE_NS and state.pairs > _LEARNED
     if state.source == SOURCE_SENSOR and bad and usable:
         state.source = SOURCE_ESTIMATE

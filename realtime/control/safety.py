@@ -30,7 +30,7 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         "force_handover",
         ACTION_WARN,
         False,
-        "the force sensor sends nothing, is frozen or disagrees with the estimate: the estimate closes the loop",
+        "the force sensor sends nothing or is frozen: the estimate closes the loop",
     ),
     ("force_undecided", ACTION_HOLD, False, "force sensor and estimate disagree: holding until it is clear which is wrong"),
     ("host_silent", ACTION_HOLD, False, "the model process does not answer: holding; see that it runs"),

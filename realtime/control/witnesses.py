@@ -69,14 +69,16 @@ def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -
         return
     dt_s = min(max((force.estimate_stamp_ns - state.estimate_ns) * 1e-9, 0.0), 0.1)
     state.estimate_ns = force.estimate_stamp_ns
-    # An adapted stiffness may be wrong: it is not let lower what the estimate says of too much force, nor take part in the
-    # comparison with the sensor, which adapts nothing.
+    # An adapted stiffness may be wrong: it is not let lower what the estimate says of too much force, and of the forces by
+    # both stiffnesses the one that is further from the sensor is compared with it.
     state.estimate_sd_N = math.sqrt(force.nominal_noise_N2)
     greatest_N = max(force.normal_N[SOURCE_ESTIMATE], force.nominal_N)
     state.estimate_N += _share(dt_s, _ESTIMATE_S) * (greatest_N - state.estimate_N)
     if force.sensor_then == force.sensor_then:  # a reading of the sensor at the estimate's time, else NaN
         state.pairs += 1
-        difference_N = force.nominal_N - force.sensor_then
+        difference_N, adapted_N = force.nominal_N - force.sensor_then, force.normal_N[SOURCE_ESTIMATE] - force.sensor_then
+        if abs(adapted_N) > abs(difference_N):
+            difference_N = adapted_N
         share = max(_share(dt_s, _DIFFERENCE_S), 1.0 / state.pairs)
         state.difference_N += share * (difference_N - state.difference_N)
 

@@ -10,6 +10,7 @@ import pytest
 
 from sim.board import BUILD_DIR, FIRMWARE_DIR
 
+pytestmark = pytest.mark.slow  # gcc with the sanitizers
 TESTS = sorted(path.stem for path in (FIRMWARE_DIR / "tests").glob("test_*.c"))
 
 

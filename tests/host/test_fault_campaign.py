@@ -79,6 +79,16 @@ def test_each_rule_is_judged(fault: str, outcome: dict[str, object], says: str) 
 
 
 @pytest.mark.parametrize(
+    ("stiffness", "peak_force_N", "false"), [(1.0, 0.2, True), (1.05, 0.2, True), (1.65, 0.2, False), (1.0, 0.52, False)]
+)
+def test_an_alarm_without_a_fault_is_right_with_a_wrong_catheter_or_too_much_force(
+    stiffness: float, peak_force_N: float, false: bool
+) -> None:
+    one = result("none", stiffness=stiffness, peak_force_N=peak_force_N)
+    assert any("false alarm" in words for words in violations(one)) == false
+
+
+@pytest.mark.parametrize(
     ("large_s", "detected_s", "says"),
     [
         (None, None, ""),

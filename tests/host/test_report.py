@@ -254,6 +254,7 @@ def starved(tmp_path: Path) -> RecordingFile:
     return Story(action="stop", cause=words, fault=1, fault_from_ms=10_000, gap_ns=180 * MS).write(tmp_path / "starved.mcap")
 
 
+@pytest.mark.slow
 def test_a_starved_computer_is_the_headline_and_its_symptoms_are_folded(tmp_path: Path) -> None:
     recording = starved(tmp_path)
     verdict = verdict_of(summarize(recording))
@@ -336,10 +337,12 @@ def test_ticks_beyond_the_period_are_not_passed_over(good: RecordingFile) -> Non
     assert lateness_of(replace(summarize(good), virtual=False)) == "0 late"
 
 
+@pytest.mark.slow
 def test_same_recording_same_report(good: RecordingFile) -> None:
     assert render(good) == render(RecordingFile(good.path))
 
 
+@pytest.mark.slow
 def test_words_of_others_are_shown_and_not_run(tmp_path: Path) -> None:
     story = Story(log="<script>alert(1)</script> & more", action="warn", cause="<img src=x onerror=alert(1)>")
     page = render(story.write(tmp_path / "a.mcap"))

@@ -92,6 +92,13 @@ def test_an_adapted_stiffness_hides_nothing_from_the_witnesses(adapted: float) -
             assert found
 
 
+@pytest.mark.parametrize("adapted", [-1.0, 0.0, 0.3])
+def test_a_wrong_adapted_force_is_compared_with_the_sensor_too(adapted: float) -> None:
+    rig = Witnesses()
+    rig.run(1.0, 0.2, 0.2)
+    assert rig.run(0.75, 0.2, 0.2, adapted) == 2
+
+
 def test_what_is_below_the_limit_is_not_too_much() -> None:
     rig = Witnesses()
     rig.run(5.0, 0.45, 0.45)
