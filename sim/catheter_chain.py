@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from protocol.catheter import load_catheter
 from sim.rotation import exponential, multiply
 
 Array = np.ndarray
@@ -23,25 +24,40 @@ SHORTEST_M = 0.004  # the sheath holds the last millimetres of tip electrode
 
 @dataclass(frozen=True)
 class CatheterConfig:
-    """Rigidities (EI about d1, EI about d2, GJ) in N m^2 of the distal shaft and of the body behind it."""
+    """Geometry (m), and rigidities (EI about d1, EI about d2, GJ) in N m^2 of the distal shaft and of the body behind it.
+
+    wire_offset_m: pull wire to centre line; curvature * EI1 / offset is the wire's tension.
+    """
 
     name: str
     distal_length_m: float
+    diameter_m: float
+    wire_offset_m: float
     distal_Nm2: tuple[float, float, float]
     body_Nm2: tuple[float, float, float]
-    diameter_m: float = 0.00233
     retardation_s: float = 0.004
     distal_cells: int = 55
-    wire_offset_m: float = 0.0008  # pull wire to centre line: curvature * EI1 / offset is its tension
+
+
+def _simulated(
+    name: str, distal_Nm2: tuple[float, float, float], body_Nm2: tuple[float, float, float], distal_cells: int
+) -> CatheterConfig:
+    """Return the simulated catheter: geometry as in the catheter's file, rigidities and cells of its own.
+
+    What a ruler measures has one home, `protocol/catheters/`; the judged models read the same file. The rigidities are
+    written apart, so that a wrong stiffness in a catheter's file does not change the simulated truth with it.
+    """
+    file = load_catheter(name)
+    lengths = (file.distal_length_m, file.diameter_m, file.pull_wire_offset_m)
+    return CatheterConfig(name, *lengths, distal_Nm2, body_Nm2, distal_cells=distal_cells)
 
 
 _STEEROCATH = ((0.1902e-3, 0.4168e-3, 0.2692e-3), (0.6163e-3, 0.8052e-3, 0.5384e-3))
+_LIVEWIRE = ((0.0239e-3, 0.1961e-3, 0.0846e-3), (0.0195e-3, 0.7044e-3, 0.2784e-3))
 CATHETERS = {  # thesis table 3.2; the rigidity of blazer_prime_xp is not published: assumed like steerocath_t
-    "livewire": CatheterConfig(
-        "livewire", 0.070, (0.0239e-3, 0.1961e-3, 0.0846e-3), (0.0195e-3, 0.7044e-3, 0.2784e-3), distal_cells=35
-    ),
-    "steerocath_t": CatheterConfig("steerocath_t", 0.070, *_STEEROCATH, distal_cells=35),
-    "blazer_prime_xp": CatheterConfig("blazer_prime_xp", 0.110, *_STEEROCATH),
+    "livewire": _simulated("livewire", *_LIVEWIRE, 35),
+    "steerocath_t": _simulated("steerocath_t", *_STEEROCATH, 35),
+    "blazer_prime_xp": _simulated("blazer_prime_xp", *_STEEROCATH, 55),
 }
 
 CHAIN_PARAMETERS = np.dtype(

@@ -32,6 +32,8 @@ CHANNELS = tuple(f"{tool}_{part}" for tool in ("tip", "shaft") for part in ("x",
 )
 STEPS_PER_UNIT = np.array([320000.0, 12800.0 / (2.0 * np.pi), 12800.0 / (2.0 * np.pi)])
 _TICK = np.array([0.02, 3.0, 3.0]) * FRAME_S  # fastest command change a frame
+# The concealed catheter is none of those that ship, so its geometry is its own.
+_DIAMETER_M, _WIRE_OFFSET_M = 0.00233, 0.0008
 _UNIT = np.array([1e-3, 0.1, 0.07])  # a middling correction of each axis
 Distortion = Callable[[Array, float], Array]  # (handle (3,), dt_s) -> what reaches the rig (3,)
 
@@ -135,7 +137,16 @@ def plant(case: RigCase, effects: Sequence[PlantedEffect]) -> Plant:
     first = case.reference[0][0]
     return Plant(
         PlantConfig(
-            catheter=CatheterConfig("concealed", nominal.DISTAL_M, rigidity, rigidity, distal_cells=44, retardation_s=1e-4),
+            catheter=CatheterConfig(
+                "concealed",
+                nominal.DISTAL_M,
+                _DIAMETER_M,
+                _WIRE_OFFSET_M,
+                rigidity,
+                rigidity,
+                distal_cells=44,
+                retardation_s=1e-4,
+            ),
             vessel=VesselConfig(
                 home_insertion_m=float(p[1]),
                 play_width_m=0.0,

@@ -27,6 +27,7 @@ from sim.world import World, simulated_plant
 
 Array = NDArray[np.float64]
 JOB = ContactJob(target_m=TARGET_M)
+WANTED_N = JOB.force_N
 FAR_AWAY_M = (0.0, 0.0, 0.5)
 REGULAR, STILL = HeartConfig(), HeartConfig(beat_m=0.0, respiration_m=0.0)
 IRREGULAR = HeartConfig(irregularity=0.1, premature_share=0.05)
@@ -50,6 +51,19 @@ class Held(NamedTuple):
     def spread_N(self) -> float:
         """RMS force about its mean once settled."""
         return float(np.std(self.force_N[self.time_s > SETTLED_S]))
+
+    def mean_N(self) -> float:
+        """Mean force once settled."""
+        return float(np.mean(self.force_N[self.time_s > SETTLED_S]))
+
+    def longest_loss_s(self) -> float:
+        """Longest time without contact after the first touch; infinite if there was none."""
+        if not self.reached:
+            return float("inf")
+        touching = (self.force_N > 0.0) & (self.phase == Phase.CONTACT)
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], ~touching, [False])).astype(np.int8)))
+        period_s = float(self.time_s[1] - self.time_s[0])
+        return float(np.max(edges[1::2] - edges[::2], initial=0)) * period_s
 
     def overshoot_N(self, wanted_N: float) -> float:
         """Greatest force of the touch above the wanted one."""
@@ -90,27 +104,27 @@ def hold(
     beat: HeartConfig,
     seconds: float,
     source: str = "sensor",
-    force_N: float = 0.2,
+    job: ContactJob = JOB,
     still_after_s: float = np.inf,
     publish: Publish = _silent,
     **plant: Any,
 ) -> Held:
     """Approach and press for `seconds`; from `still_after_s` after contact on, the catheter is held still.
 
-    plant: parts of `sim.plant.PlantConfig` that are not the default ones.
+    job: where, in which direction, with what force. plant: parts of `sim.plant.PlantConfig` that are not the default ones.
     """
     run = _scenario(rig, seed, source, publish=publish, heart=beat, **plant)
     rows: list[tuple[float, float, int]] = []
     if not run.arm():
         return Held(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), False)
-    run._shape(JOB)
-    run.command("target", "contact", target_m=JOB.target_m, normal=JOB.into, force_N=force_N)
+    run._shape(job)
+    run.command("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
 
     def watch() -> bool:
-        rows.append((run.now_ns * 1e-9, float(run.world.plant.contact_force_N @ JOB.into), run.phase))
+        rows.append((run.now_ns * 1e-9, float(run.world.plant.contact_force_N @ job.into), run.phase))
         return False
 
-    reached = run.run(JOB.approach_s, lambda: run.phase == Phase.CONTACT)
+    reached = run.run(job.approach_s, lambda: run.phase == Phase.CONTACT)
     if reached:
         run.run(min(seconds, still_after_s), watch)
         if still_after_s < seconds:
@@ -121,9 +135,9 @@ def hold(
     return Held(time_s, table[:, 1], table[:, 2].astype(np.int64), reached)
 
 
-def still(rig: Rig, seed: int, seconds: float) -> float:
+def still(rig: Rig, seed: int, seconds: float, beat: HeartConfig = REGULAR, job: ContactJob = JOB, **plant: Any) -> float:
     """RMS force (N) of a catheter held still in the beating wall, about its own mean: the most favourable for it."""
-    held = hold(rig, seed, REGULAR, SETTLED_S + seconds, still_after_s=SETTLED_S)
+    held = hold(rig, seed, beat, SETTLED_S + seconds, still_after_s=SETTLED_S, job=job, **plant)
     return held.spread_N()
 
 

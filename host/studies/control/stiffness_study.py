@@ -2,7 +2,7 @@
 
     python -m host.studies.control.stiffness_study --scales 0.8 1.0 1.2 --seeds 301 302
 
-The simulated rig's wire stretches (2700 N/m: with the shaft's 110 mm and the wire's 0.8 mm offset the free curvature goes
+The simulated rig's wire stretches (3500 N/m: with the shaft's 110 mm and the wire's 0.7 mm offset the free curvature goes
 with the stiffness to the power -0.5). The catheter in it is softer or stiffer than its file. Virtual time; the force is the
 simulator's, from 5 s after contact on.
 """
@@ -14,14 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from host.studies.control.runs import REGULAR, Held, hold, with_control
+from host.studies.control.runs import REGULAR, WANTED_N, Held, hold, with_control
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message, Stiffness
 from sim.catheter_chain import CATHETERS, CatheterConfig
 from sim.knob import KnobConfig
 
-WANTED_N = 0.2
-WIRE = KnobConfig(wire_stiffness_N_per_m=2700.0)
+WIRE = KnobConfig(wire_stiffness_N_per_m=3500.0)
 
 
 def of_stiffness(rig: Rig, scale: float) -> CatheterConfig:
@@ -46,7 +45,6 @@ def run(rig: Rig, seed: int, scale: float, adaptation: bool, seconds: float) -> 
         REGULAR,
         seconds,
         "estimate",
-        WANTED_N,
         publish=publish,
         catheter=of_stiffness(rig, scale),
         knob=WIRE,

@@ -12,10 +12,9 @@ import numpy as np
 from host.studies.control import oracle as control_oracle
 from host.studies.control import runs as control_runs
 from host.studies.control import timing as control_timing
-from host.studies.control.runs import IRREGULAR, REGULAR, STILL, Held, with_control
+from host.studies.control.runs import IRREGULAR, REGULAR, STILL, WANTED_N, Held, with_control
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
-WANTED_N = 0.2
 PLAY_OFF_m = 0.0006  # the thesis knows the backlash to this
 TRACKER_NOISE_m = 0.0004  # of one axis, for positioning
 # The thesis' law with gains raised for a beating wall, as far as it does not ring on a still one.
@@ -84,7 +83,7 @@ class _Runs:
             if (kind, beat, seed) not in self._held:
                 self.progress(f"{kind}, {beat} beat, seed {seed}: {seconds:g} s")
                 self._held[kind, beat, seed] = control_runs.hold(
-                    rig, seed, heart, seconds, "estimate" if kind == "pose" else "sensor", WANTED_N
+                    rig, seed, heart, seconds, "estimate" if kind == "pose" else "sensor"
                 )
         return [self._held[kind, beat, seed] for seed in self.settings.seeds]
 
@@ -194,7 +193,7 @@ def _limits(runs: _Runs) -> dict[str, Any]:
         rig = with_control(runs.rig, "transmission", insertion_backlash_m=play_m + off_m)
         for source in ("sensor", "estimate"):
             runs.progress(f"configured backlash off by {off_m * 1e3:+.1f} mm {name}, {source}")
-            run = control_runs.hold(rig, seed, REGULAR, min(runs.settings.hold_s, 20.0), source, WANTED_N)
+            run = control_runs.hold(rig, seed, REGULAR, min(runs.settings.hold_s, 20.0), source)
             table[f"backlash_configured_{name}_{source}_rms_N"] = run.rms_N(WANTED_N)
     return table
 
