@@ -126,6 +126,10 @@ class CommandSender:
         """Make the force sensor's present load its zero; the tip has to hang free."""
         return self.give("zero")
 
+    def home(self, axis: str) -> Acknowledgement:
+        """Move one axis of a disarmed rig to its switch. axis: insertion, roll or knob. The rig's log says how it ends."""
+        return self.give("home", axis=axis)
+
     def mark(self, note: str) -> Acknowledgement:
         """Put a note into log and recording. Needs no lease."""
         return self.give("mark", note=note)

@@ -25,7 +25,7 @@ class Code(enum.IntEnum):
 
 
 class Phase(Code):
-    """What the control loop is doing."""
+    """What the rig is doing: the control loop's phase, or homing, which the loop takes no part in."""
 
     DISARMED = 0
     HOLD = 1
@@ -35,6 +35,8 @@ class Phase(Code):
     RETRACT = 5
     STOPPED = 6
     JOG = 7
+    # The loop is disarmed and the realtime core moves one axis to its switch.
+    HOMING = 8
 
 
 class SafetyAction(Code):

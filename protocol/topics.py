@@ -62,7 +62,8 @@ CONTACT_PLACES = ("tip", "body", "tip and body", "not observable")
 ADAPTATIONS = ("learning", "frozen", "limited", "not observable")
 LOG_LEVELS = ("info", "warning", "error")
 ACTIONS = (
-    "clock", "take", "release", "arm", "disarm", "target", "force", "hold", "jog", "zero", "mark", "stop", "clear_fault"
+    "clock", "take", "release", "arm", "disarm", "target", "force", "hold", "jog", "zero", "home", "mark", "stop",
+    "clear_fault",
 )  # fmt: skip
 TARGETS = tuple(kind.label for kind in CommandKind if kind not in (CommandKind.STOP, CommandKind.JOG))
 JOG_AXES = ("none", *JogAxis.labels())
@@ -367,7 +368,7 @@ class Command(Message, frozen=True, kw_only=True):
     ) = None
     force_N: Annotated[AllowedForce_N | None, doc("force to hold along the normal")] = None
     fault: Annotated[U8, doc("fault code that clear_fault clears, 0 for all")] = 0
-    axis: Annotated[str, choice("what a jog moves; none unless action is jog", JOG_AXES)] = "none"
+    axis: Annotated[str, choice("what a jog moves, or the axis to be homed; none for other actions", JOG_AXES)] = "none"
     direction: (
         Annotated[
             tuple[UnitPart, ...], columns_of("unit vector along which a jog moves the tip, base frame", _triple("along"))
@@ -400,13 +401,20 @@ class Command(Message, frozen=True, kw_only=True):
             self.force_N is None or self.normal is None or abs(math.hypot(*self.normal) - 1) > 1e-3
         ):
             raise ValueError("Command: found no force_N or no unit normal, wanted both for contact")
-        if (self.action == "jog") == (self.axis == "none"):
+        if (self.action in ("jog", "home")) == (self.axis == "none"):
             raise ValueError(
-                f"Command.axis: found {self.axis} with action {self.action}, wanted an axis with action jog, none without"
+                f"Command.axis: found {self.axis} with action {self.action}, "
+                "wanted an axis with actions jog and home, none with others"
             )
+        if self.action == "home" and self.axis == "tip":
+            raise ValueError("Command.axis: found tip with action home, wanted insertion, roll or knob")
         if self.action == "jog" and (self.travel_unit is None or self.speed_unit_per_s is None):
             raise ValueError("Command: found no travel_unit or no speed_unit_per_s, wanted both for jog")
-        if self.axis == "tip" and (self.direction is None or abs(math.hypot(*self.direction) - 1) > 1e-3):
+        if (
+            self.action == "jog"
+            and self.axis == "tip"
+            and (self.direction is None or abs(math.hypot(*self.direction) - 1) > 1e-3)
+        ):
             raise ValueError("Command.direction: found no unit vector, wanted one for a jog of the tip")
         if self.action == "mark" and not self.note.strip():
             raise ValueError("Command.note: found an empty text, wanted a note for mark")

@@ -69,6 +69,11 @@ class World:
             ),
             plant.config.effects,
         )
+        self._switches = {
+            axis: (1 if stage.home_end == "max" else -1, round(stage.home_unit * stage.steps_per_unit))
+            for axis, stage in ((axis, rig.stage(axis)) for axis in range(3))
+            if stage.home_end
+        }
         turn = np.array(tracker.base_from_tracker_wxyz)
         self._tracker_from_base = rotation(turn).T
         self._tracker_turn = turn * (1.0, -1.0, -1.0, -1.0)
@@ -112,7 +117,8 @@ class World:
 
     def advance(self, until_ns: int, to_board: bytes) -> bytes:
         """Let time run to `until_ns` (at most a few ms on) with bytes for the board; returns what the board sent."""
-        part = self.board.exchange(until_ns // 1000, to_board, self.limit_bits, self.estop, self.stages.encoder_counts)
+        limit_bits = self.limit_bits | self._home_switches()
+        part = self.board.exchange(until_ns // 1000, to_board, limit_bits, self.estop, self.stages.encoder_counts)
         self.slice = part
         np.add.at(self.edges, part.edge_axis, 1)
         np.add.at(self.edge_phases, part.edge_cycle % STEP_TIMER_CYCLES, 1)
@@ -125,6 +131,14 @@ class World:
             self._digest.update(np.ascontiguousarray(column).tobytes())
         self._digest.update(np.ascontiguousarray(self.plant.sensor_pose(0.0)[0]).tobytes())
         return part.uart_out
+
+    def _home_switches(self) -> int:
+        """Limit bits of the axes with a home switch: open at and beyond its place, counted from where the stages began."""
+        bits = 0
+        for axis, (end, place) in self._switches.items():
+            if end * (int(self.stages.step_counts[axis]) - place) >= 0:
+                bits |= 1 << (2 * axis + (end > 0))
+        return bits
 
     def _sample(self, until_ns: int) -> None:
         """Let the sensors measure what falls due. Their sampling is placed at the end of the 1 ms slice it is in."""

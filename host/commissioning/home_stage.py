@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import time
 
-from protocol.errors import InputError
 from protocol.rig_file import Rig
-from protocol.serial_frames import AXES
 from realtime.core.board_intake import axis_limits
+from realtime.core.home_run import home_of
 from realtime.drivers.homing import Home, Homing, homing_limits
 from realtime.drivers.stepper_board import StepperBoardLink
 from realtime.drivers.transport import Transport, open_serial
 
 _POLL_S = 0.001
-
-
-def home_of(rig: Rig, axis: int) -> Home:
-    """Read the home of `axis` from the rig file, in steps. Raises InputError where the axis has no switch."""
-    stage = rig.stage(axis)
-    if not stage.home_end:
-        raise InputError(f"stages.{AXES[axis]}.home_end", stage.home_end, "min or max, of an axis with a switch")
-    return Home(
-        axis,
-        -1 if stage.home_end == "min" else 1,
-        round(stage.home_unit * stage.steps_per_unit),
-        round((stage.max_unit - stage.min_unit) * stage.steps_per_unit),
-        stage.home_speed_unit_per_s * stage.steps_per_unit,
-    )
 
 
 def home_stage(rig: Rig, wanted: Home, port: str) -> Homing:
@@ -53,3 +38,6 @@ def home_stage(rig: Rig, wanted: Home, port: str) -> Homing:
 def _send(transport: Transport, data: bytes) -> None:
     if data:
         transport.write(data)
+
+
+__all__ = ["home_of", "home_stage"]

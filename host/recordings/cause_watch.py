@@ -46,7 +46,7 @@ class CauseWatch:
         self._observed.setdefault(cause, Observation(cause, at_ns, words))
 
     def _take_state(self, body: Body) -> None:
-        armed = body.get("mode") != "disarmed"
+        armed = body.get("mode") not in ("disarmed", "homing")
         if armed and not self._armed:
             self._observed.clear()
         self._armed = armed

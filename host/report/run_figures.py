@@ -149,7 +149,7 @@ class RunFigures:
         truth, normal = table_or_none(self.recording, "sim/truth"), self.summary.direction
         tip_m = stack(pose, "x_m", "y_m", "z_m")
         target_m = stack(state, "target_x_m", "target_y_m", "target_z_m")
-        aimed = np.isfinite(target_m).all(axis=1) & (state["mode"] != "disarmed")
+        aimed = np.isfinite(target_m).all(axis=1) & ~np.isin(state["mode"], ("disarmed", "homing"))
         target_m = np.where(aimed[:, None], target_m, np.nan)
         at = np.maximum(np.searchsorted(state["stamp_ns"], pose["stamp_ns"], side="right") - 1, 0)
         off_m = tip_m - target_m[at]

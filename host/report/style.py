@@ -26,6 +26,7 @@ MODE_COLOURS = {
     "approach": "#fbe6c6",
     "contact": "#d3ead9",
     "jog": "#d5e3f1",
+    "homing": "#d5e3f1",
     "retract": "#f6d9cf",
     "stopped": "#e8b9b3",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -9,12 +10,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import zenoh
+
 from host.run.commander import Acknowledgement, Commander
 from protocol.enums import JogAxis
 from protocol.errors import InputError
 from protocol.jog_limits import fastest_jog
-from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
-from protocol.topics import TOPICS, Message
+from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
+from protocol.topics import TOPICS, Log, Message, decode, key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from protocol.zenoh_session import Latest, Session
 
@@ -35,8 +38,8 @@ class RigConnection:
     """A connection to one rig; use it as a context.
 
     Reading needs nothing. `take` takes the lease, which is kept until `release` or the end of the context; with it `arm`,
-    `goto`, `touch`, `force`, `jog`, `retract`, `zero`, `disarm` and `clear_fault` command the rig. `hold`, `mark` and
-    `stop` need no lease.
+    `goto`, `touch`, `force`, `jog`, `retract`, `zero`, `home`, `disarm` and `clear_fault` command the rig. `hold`, `mark`
+    and `stop` need no lease.
     A command that the rig refuses raises CommandRefused with the rig's reason.
     """
 
@@ -47,6 +50,7 @@ class RigConnection:
         self._commander = Commander(session, name)
         self._latest: dict[str, Latest] = {}
         self._newest: dict[str, Message] = {}
+        self._log: Any = None
         for topic in ("state", "commander", "board"):
             self._reader(topic)
 
@@ -177,6 +181,33 @@ class RigConnection:
     def zero(self) -> None:
         """Make the force sensor's present load its zero; the tip has to hang free. Raises CommandRefused."""
         self._said("zero", self._commander.zero())
+
+    def home(self, axis: str) -> None:
+        """Move one axis of the disarmed rig to its home switch. Returns at once; `logged("home")` says how it ended.
+
+        Parameters:
+            axis: "insertion", "roll" or "knob", of an axis with `home_end` in the rig file.
+
+        Raises:
+            InputError: no such axis.
+            CommandRefused: the rig says why.
+        """
+        if axis not in AXES:
+            raise InputError("axis", axis, "one of " + ", ".join(AXES))
+        self.logged("home")
+        self._said("home", self._commander.home(axis))
+
+    def logged(self, source: str) -> list[str]:
+        """Return the lines of `source` in the rig's log since the last call, oldest first; at most the newest 64 lines."""
+        if self._log is None:
+            keyed = key(self._session.rig, "log")
+            self._log = self._session.zenoh.declare_subscriber(keyed, zenoh.handlers.RingChannel(64))
+        lines: list[str] = []
+        while (sample := self._log.try_recv()) is not None:
+            with contextlib.suppress(ValueError):
+                line = decode(Log, bytes(sample.payload))
+                lines += [line.text] if line.source == source else []
+        return lines
 
     def mark(self, note: str) -> None:
         """Put a note (at most 500 characters) into log and recording. Needs no lease. Raises CommandRefused."""

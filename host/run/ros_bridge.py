@@ -114,7 +114,11 @@ class RosMessages:
 
     def _state(self, state: RigState, time_ns: int) -> bytes:
         made = self._make(
-            OPERATING_STATE, self._header(time_ns), operating_state(state), state.mode != "disarmed", state.mode in _BUSY
+            OPERATING_STATE,
+            self._header(time_ns),
+            operating_state(state),
+            state.mode not in ("disarmed", "homing"),
+            state.mode in _BUSY,
         )
         return bytes(self._store.serialize_cdr(made, OPERATING_STATE))
 

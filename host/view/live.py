@@ -18,7 +18,7 @@ from protocol.catheter import load_catheter
 from protocol.enums import JogAxis
 from protocol.jog_limits import fastest_jog
 from protocol.requests import Request, wanted_of
-from protocol.rig_file import Rig
+from protocol.rig_file import AXES, Rig
 from protocol.topics import TOPICS, decode, key
 from protocol.zenoh_session import Session
 
@@ -50,10 +50,13 @@ Vector3 = tuple[float, float, float]
 class ButtonPress(Request):
     """A button pressed on the page. All but UNCONFIRMED must have been confirmed there.
 
-    axis, direction, forwards, share (of the greatest speed): of a jog. point_m, normal, force_N: of goto, touch, force.
+    axis, direction, forwards, share (of the greatest speed): of a jog; axis: of home, too. point_m, normal, force_N: of
+    goto, touch, force.
     """
 
-    button: Literal["arm", "hold", "stop", "disarm", "clear", "jog", "goto", "touch", "force", "retract", "zero", "mark"]
+    button: Literal[
+        "arm", "hold", "stop", "disarm", "clear", "jog", "goto", "touch", "force", "retract", "zero", "home", "mark"
+    ]
     confirmed: bool = Field(default=False)
     axis: Literal["tip", "insertion", "roll", "knob"] = "tip"
     direction: Vector3 | None = None
@@ -87,6 +90,7 @@ class LiveRig:
             "catheter": self._rig.catheter.name,
             "over_force_N": self._rig.safety.over_force_N,
             "radius_m": _radius_m(self._rig.catheter.name),
+            "homes": [axis for number, axis in enumerate(AXES) if self._rig.stage(number).home_end],
             "past": self._picture.past(),
         }
 
@@ -122,6 +126,8 @@ class LiveRig:
         text = answer.reason.removeprefix(f"{answer.result}: ")
         if press.button == "stop" and answer.accepted:
             text = "confirmed by " + ", ".join(f"{path.path} ({path.text})" for path in answer.paths if path.confirmed)
+        if press.button == "home" and answer.accepted:
+            text = f"{press.axis} creeps to its switch; the log says how it ends. Stop, Hold and Disarm end it"
         if answer.result == "unanswered" and self._received_s is None:
             text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}
@@ -145,7 +151,7 @@ class LiveRig:
             if not taken.accepted:
                 return taken
         answer = self._under_lease(press)
-        keeps = button not in ("disarm", "clear") and (held or (answer.accepted and button != "zero"))
+        keeps = button not in ("disarm", "clear") and (held or (answer.accepted and button not in ("zero", "home")))
         if not keeps:
             commander.release()
         return answer
@@ -160,6 +166,8 @@ class LiveRig:
             return commander.give("target", "position", target_m=press.point_m)
         if press.button == "touch":
             return commander.give("target", "contact", target_m=press.point_m, normal=press.normal, force_N=press.force_N)
+        if press.button == "home":
+            return commander.home(press.axis)
         if press.button == "force":
             return commander.give("force", force_N=press.force_N)
         simple = {

@@ -13,7 +13,7 @@ from protocol.enums import BoardState, CommandKind, ControlLaw, ForceSource, Jog
     PHASE_RETRACT,
     PHASE_STOPPED,
     PHASE_JOG,
-) = (int(phase) for phase in Phase)
+) = (int(phase) for phase in Phase if phase is not Phase.HOMING)  # in a homing the loop is disarmed
 ACTION_NONE, ACTION_WARN, ACTION_HOLD, ACTION_RETRACT, ACTION_STOP = (int(action) for action in SafetyAction)
 (
     COMMAND_NONE,

@@ -12,10 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.enums import CommandKind, ForceSource, JogAxis, Phase
+from protocol.errors import InputError
 from protocol.jog_limits import LONGEST_JOG, fastest_jog, unit_of
-from protocol.rig_file import Rig
+from protocol.rig_file import AXES, Rig
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
+from realtime.core.home_run import HomeRun
 from realtime.core.reach import TargetReach
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
@@ -61,6 +63,7 @@ class OperatorCommands:
         self._rig, self._record, self._link, self._silent_sensors = rig, record, link, silent_sensors
         self._standing, self._zero_force = standing, zero_force
         self._frames: list[bytes] = []
+        self.homing: HomeRun | None = None
         self._reach = TargetReach(rig)
         record.normal[:] = (0.0, 0.0, -1.0)
 
@@ -90,6 +93,7 @@ class OperatorCommands:
             "force": self._force,
             "jog": self._jog,
             "zero": self._zero,
+            "home": self._home,
             "mark": lambda command: "",  # it is in the log; nothing else happens
         }
         problem = actions[command.action](command)
@@ -112,7 +116,8 @@ class OperatorCommands:
         self._record.count += 1
 
     def disarm(self) -> None:
-        """Disarm the loop and the board."""
+        """Disarm the loop and the board; a homing ends."""
+        self._end_homing()
         self._record.armed = 0
         self._set(CommandKind.HOLD)
         self._frames.append(self._link.disarm())
@@ -124,6 +129,8 @@ class OperatorCommands:
             return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
         if self._record.armed:
             return "arm: found the rig armed, wanted disarmed"
+        if self.homing is not None:
+            return f"arm: found {self.homing.axis} being homed, wanted the rig disarmed and at rest"
         silent = self._silent_sensors()
         if silent:
             return f"arm: found nothing from {silent}, wanted fresh readings"
@@ -137,6 +144,7 @@ class OperatorCommands:
         return ""
 
     def _stop(self, command: Command) -> str:
+        self._end_homing()
         self._set(CommandKind.STOP)
         return ""
 
@@ -151,6 +159,9 @@ class OperatorCommands:
         return ""
 
     def _hold(self, command: Command) -> str:
+        if self.homing is not None:
+            self._end_homing()
+            return ""
         if not self._record.armed:
             return "hold: found the rig disarmed, wanted armed"
         self._set(CommandKind.HOLD)
@@ -246,6 +257,34 @@ class OperatorCommands:
                 f"zero: found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
             )
         return self._zero_force()
+
+    def _home(self, command: Command) -> str:
+        """Start to move an axis to its switch, or say why not. Stop, hold and disarm end it."""
+        axis = AXES.index(command.axis)
+        if self._record.armed:
+            return "home: found the rig armed, wanted disarmed"
+        if self.homing is not None:
+            return f"home: found {self.homing.axis} being homed, wanted one axis at a time"
+        if self._link.phase is not LinkPhase.READY:
+            return f"home: found the board link in phase {self._link.phase.value}, wanted ready"
+        if self._link.status is None or self._link.status.fault != Fault.NONE:
+            fault = "no status" if self._link.status is None else f"fault {Fault(self._link.status.fault).name}"
+            return f"home: found {fault} of the board, wanted none of its faults; clear it first"
+        force_N = float(np.linalg.norm(self._standing().force_N))
+        if force_N > self._rig.control.contact_force_N:
+            return (
+                f"home: found a force of {force_N:.3f} N on the tip, wanted less than control.contact_force_N "
+                f"{self._rig.control.contact_force_N}; zero the sensor if the tip hangs free"
+            )
+        try:
+            self.homing = HomeRun(self._rig, self._link, axis)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    def _end_homing(self) -> None:
+        if self.homing is not None:
+            self.homing.end("ended by the operator")
 
     def _too_much(self, command: Command) -> str:
         limit_N = self._rig.safety.over_force_N

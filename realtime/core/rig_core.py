@@ -179,7 +179,24 @@ class RigCore:
         bring_up = self.link.advance(now_ns)
         if bring_up:
             leaving.frames.append(bring_up)
+        self._advance_homing()
         return leaving
+
+    @property
+    def _homes(self) -> bool:
+        return self.commands.homing is not None
+
+    def _advance_homing(self) -> None:
+        """Move the axis that is being homed a step further, and log how it ended."""
+        homing = self.commands.homing
+        if homing is None:
+            return
+        frame = homing.advance(self.now_ns, float(np.linalg.norm(self._records["sensor"].force_N)))
+        if frame:
+            self._leaving.frames.append(frame)
+        if homing.done:
+            self.commands.homing = None
+            self._log("error" if homing.problem else "info", "home", homing.text)
 
     def shut_down(self) -> Leaving:
         """Disarm the loop and the board, for the end of the process."""
@@ -201,13 +218,16 @@ class RigCore:
         self._outputs = outputs
         self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
         self.action = SafetyAction(int(outputs.action))
+        if self.commands.homing is not None:
+            self.phase = Phase.HOMING
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
         self._log_new_causes(outputs, tick_ns)
         if number % telemetry.STAGE_EVERY == 0:
             self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs, self._located))
         if number % telemetry.STATE_EVERY == 0:
-            self._publish("state", telemetry.state_message(self._records["command"], outputs, self._located))
+            homing = self._homes
+            self._publish("state", telemetry.state_message(self._records["command"], outputs, self._located, homing))
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self._publish("board", board_message(self.link, tick_ns))
         if number % telemetry.LOOP_EVERY == 0:
@@ -253,12 +273,14 @@ class RigCore:
             if event.kind is BoardEventKind.STATUS:
                 take_status(board, self.link, self.now_ns)
                 self._leaving.changed.add("board")
-                if self.phase is not Phase.DISARMED and board.ready:
+                if self.phase not in (Phase.DISARMED, Phase.HOMING) and board.ready:
                     self._report(self.supervision.status(board.position_steps, board.encoder_counts))
                 continue
-            if event.kind in _BOARD_ERRORS:
+            # A homing moves onto the switch: that fault is what it looks for.
+            is_error = event.kind in _BOARD_ERRORS and not (self._homes and event.kind is BoardEventKind.FAULT)
+            if is_error:
                 self.board_errors.append(event.message)
-            self._log("error" if event.kind in _BOARD_ERRORS else "info", "board", event.message)
+            self._log("error" if is_error else "info", "board", event.message)
         if lost:
             self._log("error", "board", lost)
             self._disarm_after_return("board")

@@ -70,10 +70,10 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
     )
 
 
-def state_message(command: np.record, outputs: np.record, located: bool) -> RigState:
+def state_message(command: np.record, outputs: np.record, located: bool, homing: bool = False) -> RigState:
     """Return phase, safety action, messages of its causes, target (COMMAND record) and tip.
 
-    located: whether a pose has been accepted; without one the tip is not known.
+    located: whether a pose has been accepted; without one the tip is not known. homing: whether an axis is being homed.
     """
     pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
     # The wall of a contact stays where it is while the rig holds or retracts; a new position leaves it.
@@ -81,7 +81,7 @@ def state_message(command: np.record, outputs: np.record, located: bool) -> RigS
     tip_m, velocity_m_per_s = outputs.tip_m, outputs.tip_velocity_m_per_s
     return RigState(
         stamp_ns=int(outputs.now_ns),
-        mode=Phase(int(outputs.phase)).label,
+        mode=(Phase.HOMING if homing else Phase(int(outputs.phase))).label,
         safety_action=SafetyAction(int(outputs.action)).label,
         cause="; ".join(safety.messages(int(outputs.cause)))[:500],
         target_m=tuple(map(float, command.target_m)) if command.kind != CommandKind.NONE else None,

@@ -175,6 +175,14 @@ class StepperBoardLink:
         self._fault = Fault.NONE
         self.clock.restart()
 
+    def reconfigure(self, axes: Sequence[AxisLimits]) -> None:
+        """Use other limits from now on: `advance` sends them as soon as the board is disarmed, then phase is READY again."""
+        self.axes = tuple(axes)
+        self._configured.clear()
+        self._sent_ns = None
+        if self.phase is LinkPhase.READY:
+            self.phase = LinkPhase.CONFIGURE
+
     def unplugged(self) -> None:
         """Start the bring-up again after the cable was unplugged; the boot count is kept, so that a reset is detected."""
         if self.phase not in (LinkPhase.RESET, LinkPhase.MISMATCH):

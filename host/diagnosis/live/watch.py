@@ -88,7 +88,7 @@ class Watch:
     def receive(self, topic: str, message: Message) -> None:
         """Take in one message of the rig."""
         if isinstance(message, RigState):
-            armed = message.mode not in ("disarmed", "stopped")
+            armed = message.mode not in ("disarmed", "homing", "stopped")
             if not armed:
                 self._armed_at_ns = None
             elif self._armed_at_ns is None:

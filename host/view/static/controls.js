@@ -2,7 +2,7 @@
 
 const ASKS_MS = 4000;
 const NAMES = {arm: "Arm", hold: "Hold", stop: "Stop", disarm: "Disarm", clear: "Clear fault", goto: "Go to", touch: "Touch",
-  force: "Set force", retract: "Retract", zero: "Zero force", jog: "Jog", mark: "Mark"};
+  force: "Set force", retract: "Retract", zero: "Zero force", home: "Home", jog: "Jog", mark: "Mark"};
 
 export class Controls {
   constructor(holder, send) {
@@ -24,32 +24,41 @@ export class Controls {
     if (!button.classList.contains("asks")) {
       if (fields() === null) return;
       button.classList.add("asks");
-      button.textContent = `Confirm ${NAMES[name].toLowerCase()}`;
-      const question = `${NAMES[name]}: press again to confirm.`;
+      button.label = button.textContent;
+      button.textContent = `Confirm ${button.label.toLowerCase()}`;
+      const question = `${button.label}: press again to confirm.`;
       this.say(question, "");
       button.timer = setTimeout(() => {
-        this.#calm(button, name);
-        if (this.answer.textContent === question) this.say(`${NAMES[name]}: not confirmed, nothing was sent.`, "");
+        this.#calm(button);
+        if (this.answer.textContent === question) this.say(`${button.label}: not confirmed, nothing was sent.`, "");
       }, ASKS_MS);
       return;
     }
-    this.#calm(button, name);
+    this.#calm(button);
     const values = fields();
     if (values !== null) this.#ask(name, values);
   }
 
-  #calm(button, name) {
+  #calm(button) {
     clearTimeout(button.timer);
     button.classList.remove("asks");
-    button.textContent = NAMES[name];
+    button.textContent = button.label;
   }
 
   #ask(name, fields) {
     const sent = this.send({button: name, confirmed: true, ...fields});
+    this.waiting = sent ? NAMES[name] : "";
     this.say(sent ? `${NAMES[name]}: sent, waiting for the answer.` : `${NAMES[name]}: not sent, the page has lost its server.`, sent ? "" : "bad");
   }
 
+  // The connection is gone: what was sent and not answered has no answer any more.
+  lost() {
+    if (this.waiting) this.say(`${this.waiting}: no answer, the page has lost its server. It may or may not have been carried out.`, "bad");
+    this.waiting = "";
+  }
+
   answered(answer) {
+    this.waiting = "";
     const name = NAMES[answer.action] || "Command";
     this.say(`${name}: ${answer.result}${answer.text ? `. ${answer.text}` : "."}`, answer.result === "accepted" ? "accepted" : "bad");
   }

@@ -13,11 +13,34 @@ export class Drive {
     for (const button of holder.querySelectorAll("[data-jog]")) this.#jogButton(button);
     for (const button of holder.querySelectorAll("[data-do]"))
       button.addEventListener("click", () => controls.confirmed(button, button.dataset.do, () => this.#fields(button.dataset.do)));
+    this.homes = [];
+    for (const button of holder.querySelectorAll("[data-home]"))
+      button.addEventListener("click", () => controls.confirmed(button, "home", () => ({axis: button.dataset.home})));
     holder.querySelector("#mark").addEventListener("submit", event => { event.preventDefault(); this.#mark(); });
     document.addEventListener("keydown", event => this.#key(event, true));
     document.addEventListener("keyup", event => this.#key(event, false));
     for (const lost of ["blur", "pagehide"]) window.addEventListener(lost, () => this.release());
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.release(); });
+  }
+
+  // Only axes with a home switch in the rig file have a button.
+  begin(hello) {
+    this.homes = [...this.holder.querySelectorAll("[data-home]")].filter(button => {
+      button.hidden = !hello.homes.includes(button.dataset.home);
+      return !button.hidden;
+    });
+    this.holder.querySelector("#homes").hidden = !this.homes.length;
+    this.holder.querySelector("#homes-note").textContent = this.homes.length ? "Home moves an axis of the disarmed rig to its switch."
+      : "No axis has a home switch (home_end in the rig file).";
+  }
+
+  // An axis is homed while the rig is disarmed and shows fresh data.
+  show(frame) {
+    const may = frame.mode === "disarmed" && frame.silent_s !== null && frame.silent_s <= 1;
+    for (const button of this.homes) if (button.disabled === may) {
+      button.disabled = !may;
+      button.title = may ? "" : "Disarm the rig first";
+    }
   }
 
   #jogButton(button) {

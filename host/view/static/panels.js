@@ -2,9 +2,10 @@
 
 const ACTIONS = {none: "No fault", warn: "Warning", hold: "Holding", retract: "Retracting", stop: "Stopped"};
 const MODES = {disarmed: "Disarmed", hold: "Holding", position: "Moving", approach: "Approach", contact: "Contact",
-  retract: "Retract", stopped: "Stopped", jog: "Jog"};
+  retract: "Retract", stopped: "Stopped", jog: "Jog", homing: "Homing"};
 const IDLE = {disarmed: "The stages do not move until the rig is armed.",
-  hold: "Armed and holding."};
+  hold: "Armed and holding.",
+  homing: "An axis moves to its home switch. Stop, Hold and Disarm end it."};
 
 const element = id => document.getElementById(id);
 

@@ -68,7 +68,7 @@ export class Scene {
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
     this.controls.enableDamping = false;
     this.renderer.domElement.style.touchAction = "pan-y";
-    this.home();
+    this.resetView();
     this.#build();
     new ResizeObserver(() => this.#resize()).observe(holder);
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => { this.#build(); this.render(); });
@@ -76,7 +76,7 @@ export class Scene {
     this.#resize();
   }
 
-  home() {
+  resetView() {
     this.camera.position.set(...HOME);
     this.controls.target.set(...LOOK);
     this.controls.update();
@@ -184,7 +184,7 @@ export class Scene {
     this.catheter.visible = Boolean(drawn.shape);
     const tip = drawn.tip.length ? vector(drawn.tip) : null;
     const pressing = mode === "contact" || mode === "approach";
-    this.target.visible = drawn.target.length === 3 && mode !== "disarmed";
+    this.target.visible = drawn.target.length === 3 && mode !== "disarmed" && mode !== "homing";
     if (this.target.visible) this.target.position.copy(vector(drawn.target));
     // Where the wall is, is known only while the tip is on it; before, it is where it was said to be.
     const place = mode === "contact" ? tip : drawn.target.length === 3 ? vector(drawn.target) : null;

@@ -44,6 +44,7 @@ async function begin(hello) {
   document.title = `seldinger ${hello.kind}: ${hello.rig}`;
   element("rig").textContent = [hello.rig, hello.catheter, hello.file].filter(Boolean).join(" · ");
   element("controls").hidden = element("drive").hidden = hello.kind !== "live";
+  if (hello.kind === "live") drive.begin(hello);
   force.lanes[0].limit = hello.over_force_N;
   if (hello.kind === "play" && !page.player) {
     page.player = new Player(hello, send);
@@ -58,7 +59,7 @@ async function begin(hello) {
     try {
       const {Scene} = await import("/static/scene.js");
       page.scene = new Scene(element("scene"), hello.radius_m);
-      element("home").addEventListener("click", () => page.scene.home());
+      element("reset-view").addEventListener("click", () => page.scene.resetView());
       element("scene").addEventListener("dblclick", event => {
         if (hello.kind === "live") drive.picked(page.scene.pick(event.clientX, event.clientY));
       });
@@ -75,7 +76,7 @@ function addRows(rows, estimates, mode) {
     force.add("wanted", t, wanted);
     for (let axis = 0; axis < 3; axis++) {
       pose.add(`tip${axis}`, t, places[axis]);
-      pose.add(`target${axis}`, t, mode === "disarmed" ? null : places[3 + axis]);
+      pose.add(`target${axis}`, t, mode === "disarmed" || mode === "homing" ? null : places[3 + axis]);
     }
   }
   for (const [t, value, deviation] of estimates) force.add("estimate", t, value, value === null ? null : 2 * deviation);
@@ -102,6 +103,7 @@ function draw() {
   page.waiting = false;
   const frame = page.newest, live = page.hello.kind === "live";
   showSafety(frame, live);
+  if (live) drive.show(frame);
   showLoop(frame.loop, frame);
   showBoard(frame.board);
   showModel(frame.model);
@@ -133,6 +135,7 @@ function connect() {
   const telling = setInterval(present, PRESENT_MS);
   socket.addEventListener("close", event => {
     drive.release(false);
+    controls.lost();
     clearInterval(telling);
     link(event.reason || "no server", "bad");
     if (event.code !== REPLACED) setTimeout(connect, RETRY_MS);
