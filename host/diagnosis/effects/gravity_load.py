@@ -31,6 +31,56 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"moment_sine": p[0], "moment_cosine": p[1]}
 
 
+LENGTHS_M = (0.1, 0.4)  # of links, tried first: those of arms on a bench
+SHORTEST_M, LONGEST_M = 5e-3, 5.0
+GRAVITY_M_PER_S2 = 9.81
+
+
+def payload(links: int) -> Effect:
+    """Return the effect of a mass at the end of a chain of `links` revolute joints with parallel axes.
+
+    Each joint's angle is relative to the link before. The torques that the mass adds are those of its weight and its
+    inertia (Lagrange's equations of a point mass).
+    """
+
+    def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+        size = s.need / (GRAVITY_M_PER_S2 * LENGTHS_M[-1])
+        lengths = (Parameter(f"length_{k + 1}", "m", LENGTHS_M, SHORTEST_M, LONGEST_M, log=True) for k in range(links))
+        quarters = tuple(0.5 * np.pi * k for k in range(4))
+        zero = Parameter("zero_angle", "rad", quarters, -2.0 * np.pi, 2.0 * np.pi, step=0.1)
+        return (Parameter("mass", "kg", (size,), 0.0, np.inf, linear=True, step=size), *lengths, zero)
+
+    return Effect(
+        "gravity_load",
+        "chain",
+        16,
+        parameters,
+        "A further mass of {mass} hangs on the last link; its weight and inertia add to every joint's torque.",
+        "torque_j = d/dt(dT/dq_j') - dT/dq_j + dV/dq_j of a point mass at the last link's end",
+        payload_torques,
+    )
+
+
+def payload_torques(moved: Array, c: Context | None, p: Array, form: str) -> Array:
+    """Return the torques (links, n) that a mass at the chain's end needs.
+
+    moved: (links, 3, n) angle, rate and acceleration of every joint, relative to the link before. p: mass, length of each
+    link, and the absolute angle at which the first joint reads zero, from hanging down. Equation: with absolute angles th,
+    tau_j = m sum_{k>=j} l_k (g sin th_k + sum_i l_i (cos(th_k - th_i) th_i'' + sin(th_k - th_i) th_i'^2)).
+    """
+    angle, rate, acceleration = np.cumsum(moved, axis=0).transpose(1, 0, 2)
+    angle = angle + p[-1]
+    links = angle.shape[0]
+    at = np.zeros_like(angle)
+    for k in range(links):
+        pull = GRAVITY_M_PER_S2 * np.sin(angle[k])
+        for i in range(links):
+            between = angle[k] - angle[i]
+            pull = pull + p[1 + i] * (np.cos(between) * acceleration[i] + np.sin(between) * rate[i] ** 2)
+        at[k] = p[0] * p[1 + k] * pull
+    return np.asarray(np.cumsum(at[::-1], axis=0)[::-1])
+
+
 EFFECTS = (
     Effect(
         "gravity_load",

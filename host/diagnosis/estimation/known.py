@@ -28,7 +28,7 @@ class Known(Model):
         self.screen_samples, self.scan_points = inner.screen_samples, inner.scan_points
         self.fit_samples, self.coarsest_s = inner.fit_samples, inner.coarsest_s
         self.travel, self.moves, self.unlisted_at = inner.travel, inner.moves, inner.unlisted_at
-        self.pointwise = inner.pointwise
+        self.pointwise, self.either_sign = inner.pointwise, inner.either_sign
         self.holds, self.hold, self.hold_stated = inner.holds, inner.hold, inner.hold_stated
         segments = [inner.prepare(recording) for recording in recordings]
         self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []

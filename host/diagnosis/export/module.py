@@ -94,8 +94,12 @@ def _law(model: Any, theta: Array, active: list[ActiveEffect], gathered: Gathere
         return _links(model, theta, gathered), "none"
     if isinstance(model, AxisModel) and model.free_run and model.spec.controller is None:
         return _axis(model, theta, active, gathered), "position and speed"
+    along = [c.key for c, _ in active if c.port.kind in ("force", "chain")]
+    if along:
+        wanted = "effects at inputs and outputs, or a parameter that the simulator offers ([[offer]])"
+        raise InputError("--export", f"{along[0]}, a force along a motion", wanted)
     values = {p.name: float(value) for p, value in zip(model.parameters, theta, strict=True)}
-    values |= {c.port.name: float(its[0]) for c, its in active if c.port.offers}
+    values |= {c.port.name: float(its[0]) for c, its in active if c.port.kind == "offered"}
     if isinstance(model, ExternalModel):
         return _function(model, {**model.offs, **values}, gathered), "as the function takes it"
     if isinstance(model, LinearModel) and model.spec.feedback is None:

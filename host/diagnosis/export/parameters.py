@@ -22,7 +22,7 @@ def parameter_values(result: Diagnosis) -> dict[str, float]:
     model = result.model.inner
     if not isinstance(model, SimulatedModel):
         raise InputError("--export", f"kind {model.kind}", "a kind that runs a simulator, or a file ending in .py")
-    outside = [candidate.key for candidate, _ in active if not candidate.port.offers]
+    outside = [candidate.key for candidate, _ in active if candidate.port.kind != "offered"]
     if outside:
         wanted = "effects that the simulator offers; a file ending in .py holds every effect"
         raise InputError("--export", f"{outside[0]}, which no parameter of the simulator stands for", wanted)

@@ -97,6 +97,7 @@ class Model(ABC):
     holds: tuple[str, ...] = ()  # ways in which the input may run between its samples, where the model has a choice,
     hold: str = ""  # the one that it takes,
     hold_stated: bool = False  # and whether its file states it
+    either_sign: bool = False  # whether a force that is read may count against the motion as well as with it
     pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined
 
     @abstractmethod

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
-from host.diagnosis.model.force_kernel import along, slot_array
 from host.diagnosis.model.model import (
     ActiveEffect,
     Model,
@@ -20,31 +18,27 @@ from host.diagnosis.model.model import (
     filled,
     forces_among,
     stack,
-    tolerance_of,
 )
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
+from host.diagnosis.models.moved import Moved, force_along
 
 Array = npt.NDArray[np.float64]
-SMOOTHING_S = 0.03
-DEGREE = 5  # of the local polynomial that is differentiated,
-WIDER = 1.45  # and its window over that of a cubic that passes as much noise
-CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
+
+NOWHERE = Moved(np.zeros(0), np.zeros(0), np.zeros(0), 0.0)
 
 
 @dataclass
 class MovedSegment(Segment):
-    """A recording with the derivatives (n,) of its motion."""
+    """A recording with its motion and the derivatives of that."""
 
-    x: Array = field(default_factory=lambda: np.zeros(0))
-    v: Array = field(default_factory=lambda: np.zeros(0))
-    a: Array = field(default_factory=lambda: np.zeros(0))
+    moved: Moved = NOWHERE
 
 
 class ImpedanceModel(Model):
     """Nominal model of kind `impedance`."""
 
     kind = "impedance"
+    either_sign = True
     fit_samples = 24000
     coarsest_s = 0.02
     screen_samples = 24000
@@ -99,18 +93,9 @@ class ImpedanceModel(Model):
             filled(recording, [self.spec.input, *self.spec.load, *self.spec.others]),
         )
         motion = segment.inputs[self.spec.input]
-        noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
-        window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
-        tolerance = tolerance_of(motion, float(np.ptp(motion)))
-        clean = noise < CLEAN * tolerance
-        if not clean:
-            window = round(WIDER * window) | 1
-        x, v, a = smooth_derivatives(motion, recording.dt_s, window, DEGREE)
+        segment.moved = Moved.of(motion, recording)
         segment.inputs[f"motion:{self.spec.subsystem}"] = motion
-        if clean:
-            x = motion  # smoothing would round its reversals, and friction with them
-        segment.x, segment.v, segment.a = x, v, a
-        segment.tolerances[self.spec.subsystem] = tolerance
+        segment.tolerances[self.spec.subsystem] = segment.moved.tolerance
         name, force, unit = self.spec.subsystem, self.units[self.spec.output], self.units[self.spec.input]
         segment.units = {**self.units, name: force, f"motion:{name}": unit, f"{name}_reading": force}
         return segment
@@ -123,31 +108,15 @@ class ImpedanceModel(Model):
         """Force along the measured motion. Shape (1, n)."""
         assert isinstance(segment, MovedSegment)
         force = np.zeros(segment.n)
-        given = {"mass": segment.a, "damping": segment.v, "stiffness": segment.x, "offset": 1.0}
+        moved = segment.moved
+        given = {"mass": moved.a, "damping": moved.v, "stiffness": moved.x, "offset": 1.0}
         stiffness = 0.0
         for (term, source), value in zip(self.terms, theta, strict=True):
             force = force + value * (segment.inputs[source] if term == "load" else given[term])
             stiffness = value if term == "stiffness" else stiffness
-        here = [(candidate, values) for candidate, values in active if candidate.effect.slots is not None]
-        for source in dict.fromkeys(candidate.source for candidate, _ in here):
-            filled_slots = [
-                candidate.effect.slots(values, candidate.form)
-                for candidate, values in here
-                if candidate.source == source and candidate.effect.slots is not None
-            ]
-            load = segment.inputs[source] if source else np.zeros(segment.n)
-            p = slot_array([*filled_slots, {"stiffness": float(stiffness)}])
-            force = force + along(
-                segment.x,
-                segment.v,
-                segment.a,
-                load,
-                segment.recording.time_s,
-                segment.recording.dt_s,
-                segment.tolerances[self.spec.subsystem],
-                segment.start.get(self.spec.subsystem, 0.0),
-                p,
-            )
+        port = self.spec.subsystem
+        here = [effect for effect in active if effect[0].port.name == port]
+        force = force + force_along(segment.moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
 
     def motion(self, segment: Segment, port: Port) -> Array:

@@ -12,7 +12,7 @@ import time
 from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from host.diagnosis.effects import library
+from host.diagnosis.effects.gravity_load import payload
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Effect, Parameter, Port, Scale, spread
 from host.diagnosis.model.model import (
@@ -35,6 +36,7 @@ from host.diagnosis.model.model import (
 )
 from host.diagnosis.model.nominal import NominalSpec, OfferSpec, SimulatorSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives
+from host.diagnosis.models.moved import Moved, force_along
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -45,6 +47,10 @@ STEP = 0.01  # of an input's span: step by which it is linearized
 TRUSTED = 0.25  # error of a linearized input relative to a simulation, up to which candidates are screened with it
 FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in full; printed beforehand
 FITS = 10  # candidates that are fitted in full, about
+FORCE_OF = {"rad": "N m", "m": "N"}  # unit of the force that does work along a motion
+CHAIN = "payload"  # port of what hangs on an arm
+MOST_LINKS = 4
+MOST_FORCED = 4  # pairs of a force and a motion up to which each force may act along each motion
 MOST_DYNAMIC = 4096  # samples of a step response that are used
 
 
@@ -92,10 +98,18 @@ class SimulatorRun:
         return digest.digest()
 
 
+@dataclass
+class ForcedSegment(Segment):
+    """A recording with the motion that each force acts along, by channel; filled where one is first needed."""
+
+    moved: dict[str, Moved] = field(default_factory=dict)
+
+
 class SimulatedModel(Model):
     """Base of the kinds `callable`, `linear`, `mujoco` and `fmu`."""
 
     scan_points = 24
+    either_sign = True
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
 
     def __init__(self, spec: NominalSpec, section: SimulatorSpec, offers: list[OfferSpec]) -> None:
@@ -103,6 +117,7 @@ class SimulatedModel(Model):
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         self.session_offsets = [name for name in (*section.inputs, *section.outputs) if spec.channels[name].session_offset]
         inputs, outputs = section.inputs, section.outputs
+        self.forced, self.chain = self._forced(), self._chain()
         self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
         self.ports = (*self._signal_ports(), *self._offered_ports(offers))
         parameters = []
@@ -142,7 +157,39 @@ class SimulatedModel(Model):
         for channel in section.outputs:
             kind, subsystem = "drift+timing+limit+mix", self.subsystem_of(channel)
             found.append(Port(f"{channel}_reading", kind, subsystem, (channel,), loads, tuple(section.inputs)))
+        for name, (force, motion) in self.forced.items():
+            others = tuple(other for other in section.inputs if other != motion)
+            found.append(Port(name, "force", self.subsystem_of(force), (force,), loads, others))
+        if self.chain:
+            torques = tuple(dict.fromkeys(force for force, _ in self.chain))
+            found.append(Port(CHAIN, "chain", self.subsystem_of(torques[-1]), torques, offers=(payload(len(self.chain)),)))
         return found
+
+    def _chain(self) -> list[tuple[str, str]]:
+        """Torque and angle of each joint, where angles go in and as many torques come out: an arm, in the order given."""
+        angles = [name for name in self.section.inputs if self.units[name] == "rad"]
+        torques = [name for name in self.section.outputs if _dimension(self.units[name]) == "N m"]
+        alike = len(torques) == len(self.section.outputs) and len({self.units[name] for name in torques}) == 1
+        return list(zip(torques, angles, strict=True)) if alike and 1 < len(angles) == len(torques) <= MOST_LINKS else []
+
+    def _forced(self) -> dict[str, tuple[str, str]]:
+        """Ports of forces that the simulator may lack, each with the output that reads it and the input it acts along.
+
+        A simulator that is given motions and predicts forces (inverse dynamics) cannot show friction at its inputs: that is
+        a force along a motion. Where channels have subsystems of their own, a force belongs to the motion of its own.
+        """
+        pairs = [
+            (force, motion)
+            for force in self.section.outputs
+            for motion in self.section.inputs
+            if FORCE_OF.get(self.units[motion]) == _dimension(self.units[force])
+        ]
+        declared = [(a, b) for a, b in pairs if a in self.section.ports and b in self.section.ports]
+        own = [pair for pair in declared if self.subsystem_of(pair[0]) == self.subsystem_of(pair[1])]
+        if len(pairs) > MOST_FORCED and not own:  # each force with the motion of its own place in the list
+            forces, motions = (list(dict.fromkeys(names)) for names in zip(*pairs, strict=True))
+            own = [pair for pair in zip(forces, motions, strict=False) if pair in pairs]
+        return {f"{force}_along_{motion}": (force, motion) for force, motion in own or pairs}
 
     def _offered_ports(self, offers: list[OfferSpec]) -> list[Port]:
         """A port for every offered parameter, with its one effect."""
@@ -160,7 +207,7 @@ class SimulatedModel(Model):
     def prepare(self, recording: Recording) -> Segment:
         """Inputs bridged, outputs stacked, the state at the first sample read off the outputs."""
         section = self.section
-        segment = Segment(
+        segment = ForcedSegment(
             recording,
             stack(recording, section.outputs),
             recording.fit,
@@ -173,8 +220,15 @@ class SimulatedModel(Model):
             segment.tolerances[channel] = tolerance_of(values, float(np.ptp(values)))
             segment.units[f"output:{channel}"] = self.units[channel]
         for port in self.ports:
-            if port.offers:
+            if port.kind == "offered":
                 segment.units[port.name] = ""
+            elif port.kind == "chain":
+                segment.units[port.name] = self.units[port.channels[0]]
+            elif port.name in self.forced:
+                motion = segment.inputs[self.forced[port.name][1]]
+                segment.tolerances[port.name] = tolerance_of(motion, float(np.ptp(motion)))
+                segment.units[port.name] = self.units[port.channels[0]]
+                segment.units[f"motion:{port.name}"] = self.units[self.forced[port.name][1]]
             elif port.name not in self.inside and port.name.endswith("_reading"):
                 segment.units[port.name] = self.units[port.channels[0]]
         segment.begin = self._begin(segment)
@@ -220,11 +274,37 @@ class SimulatedModel(Model):
             whole = wholes[run.key] if run.key in wholes else self._kept[run.key]
             self._keep(run.key, whole)
             rows = []
-            for row, name in zip(whole, self.section.outputs, strict=True):
-                moved = row + self._begin_of(segment).get(f"offset:{name}", 0.0)
+            for row, name in zip(whole + self._payload(segment, active), self.section.outputs, strict=True):
+                moved = row + self._begin_of(segment).get(f"offset:{name}", 0.0) + self._force(segment, name, active)
                 rows.append(apply_effects(moved, active, f"{name}_reading", segment, None))
             out.append(np.vstack(rows))
         return out
+
+    def _force(self, segment: Segment, output: str, active: list[ActiveEffect]) -> Array | float:
+        """What the effects along motions add to `output`, which reads a force."""
+        total: Array | float = 0.0
+        for name, (force, motion) in self.forced.items():
+            here = [effect for effect in active if effect[0].port.name == name]
+            if force == output and here:
+                total = total + force_along(self._moved_of(segment, motion), here, segment, name)
+        return total
+
+    def _payload(self, segment: Segment, active: list[ActiveEffect]) -> Array | float:
+        """What a mass at the end of the arm adds to every torque (outputs, n)."""
+        total: Array | float = 0.0
+        for candidate, values in active:
+            if candidate.port.kind == "chain" and candidate.effect.apply is not None:
+                joints = [self._moved_of(segment, angle) for _, angle in self.chain]
+                moved = np.array([[joint.x, joint.v, joint.a] for joint in joints])
+                total = total + candidate.effect.apply(moved, None, values, candidate.form)
+        return total
+
+    @staticmethod
+    def _moved_of(segment: Segment, motion: str) -> Moved:
+        assert isinstance(segment, ForcedSegment)
+        if motion not in segment.moved:
+            segment.moved[motion] = Moved.of(filled(segment.recording, [motion])[motion], segment.recording)
+        return segment.moved[motion]
 
     def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
         """Outputs (outputs, n) of each of `runs`."""
@@ -244,7 +324,7 @@ class SimulatedModel(Model):
             given[name] = apply_effects(signal, active, name, segment, None)
         values = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
         for candidate, its in active:
-            if candidate.port.offers:
+            if candidate.port.kind == "offered":
                 values[candidate.port.name] = float(its[0])
         # A reading with an offset of its own begins that much away from the state.
         initial = {
@@ -289,7 +369,12 @@ class SimulatedModel(Model):
         before, spent = (self.calls, self.call_s) if len(used) > 1 else (0, 0.0)
         self.simulate_all(used, theta, [])
         each = (self.call_s - spent) / max(self.calls - before, 1)
-        offers = sum(len(effect.parameters(UNSCALED, "")[0].grid) for port in self.ports for effect in port.offers)
+        offers = sum(
+            len(effect.parameters(UNSCALED, "")[0].grid)
+            for port in self.ports
+            if port.kind == "offered"
+            for effect in port.offers
+        )
         screening = len(used) * (2 * len(self.section.inputs) + offers + len(self.parameters))
         fits = len(used) * FITS * (FIT_CALLS + 10 * len(self.parameters))
         return (
@@ -337,7 +422,11 @@ class SimulatedModel(Model):
         return slope.to(moved)
 
     def motion(self, segment: Segment, port: Port) -> Array:
-        """The input at its port, or the measured output."""
+        """The input at its port, the motion that a force acts along, or the measured output."""
+        if port.name in self.forced:
+            return segment.inputs[self.forced[port.name][1]]
+        if port.kind == "chain":
+            return segment.inputs[self.chain[-1][1]]
         if port.name in segment.inputs:
             return segment.inputs[port.name]
         row = segment.y[self.section.outputs.index(port.channels[0])]
@@ -360,6 +449,11 @@ class SimulatedModel(Model):
 
 
 UNSCALED = Scale("", 1.0, 0.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True)
+
+
+def _dimension(unit: str) -> str:
+    """A unit of force without its scale, "" for others."""
+    return {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}.get(unit, "")
 
 
 def offered(offer: OfferSpec) -> Effect:

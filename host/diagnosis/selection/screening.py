@@ -33,7 +33,7 @@ def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
     rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
     scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
     parameters = candidate.effect.parameters(scale, candidate.form)
-    if problem.model.kind == "impedance":
+    if problem.model.either_sign and candidate.effect.slots is not None:
         parameters = tuple(replace(p, low=-np.inf) if p.linear and p.low == 0.0 else p for p in parameters)
     return Term(candidate, parameters)
 

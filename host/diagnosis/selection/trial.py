@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
@@ -35,11 +36,13 @@ def at_bound(fit: Fit) -> bool:
 
 
 def bound_by(fit: Fit, term: Term) -> bool:
-    """As `at_bound`, of any of its terms."""
+    """As `at_bound`, of any of its terms; friction whose parts have both signs has left what is physical too."""
     place = next(index for index, other in enumerate(fit.terms) if other is term)
     after = sum(len(other.parameters) for other in fit.terms[place:])
     first = len(fit.values) - after
     values = fit.values[first : first + len(term.parameters)]
+    if _drives(term, values):
+        return True
     return (
         any(
             p.high > p.low
@@ -51,6 +54,15 @@ def bound_by(fit: Fit, term: Term) -> bool:
         )
         and not term.candidate.effect.natural_bounds
     )
+
+
+def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
+    """Whether a friction's linear parts have both signs: at some speed it would push along with the motion.
+
+    Where an output may count a force either way, their bounds allow both signs, but only to all of them alike.
+    """
+    parts = [float(value) for p, value in zip(term.parameters, values, strict=True) if p.linear]
+    return term.candidate.effect.dissipates and len(parts) > 1 and min(parts) < 0.0 < max(parts)
 
 
 def rank(trials: list[Trial], base: Fit) -> None:

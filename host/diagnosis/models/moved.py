@@ -1,0 +1,57 @@
+"""Force terms of the vocabulary along a measured motion: where a model predicts the force that a motion needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.noise import estimate, quiescent
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.force_kernel import along, slot_array
+from host.diagnosis.model.model import ActiveEffect, Segment, tolerance_of
+from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
+
+Array = npt.NDArray[np.float64]
+SMOOTHING_S = 0.03
+DEGREE = 5  # of the local polynomial that is differentiated,
+WIDER = 1.45  # and its window over that of a cubic that passes as much noise
+CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A measured motion with its derivatives, each (n,), and the movement below which nothing has moved."""
+
+    x: Array
+    v: Array
+    a: Array
+    tolerance: float
+
+    @classmethod
+    def of(cls, motion: Array, recording: Recording) -> Moved:
+        """Smooth `motion` (n,) to velocity and acceleration without phase."""
+        noise = estimate([motion], [quiescent([motion], recording.dt_s, recording.timed)]).sigma
+        window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
+        tolerance = tolerance_of(motion, float(np.ptp(motion)))
+        clean = noise < CLEAN * tolerance
+        if not clean:
+            window = round(WIDER * window) | 1
+        x, v, a = smooth_derivatives(motion, recording.dt_s, window, DEGREE)
+        # smoothing a clean motion would round its reversals, and friction with them
+        return cls(motion if clean else x, v, a, tolerance)
+
+
+def force_along(moved: Moved, here: list[ActiveEffect], segment: Segment, port: str, stiffness: float = 0.0) -> Array:
+    """Force (n,) of the effects `here`, all of them at `port`, along its motion. stiffness: of the nominal model."""
+    force = np.zeros(segment.n)
+    terms = [(candidate, values) for candidate, values in here if candidate.effect.slots is not None]
+    for source in dict.fromkeys(candidate.source for candidate, _ in terms):
+        filled = [c.effect.slots(values, c.form) for c, values in terms if c.source == source and c.effect.slots is not None]
+        load = segment.inputs[source] if source else np.zeros(segment.n)
+        p = slot_array([*filled, {"stiffness": stiffness}])
+        time_s, dt_s = segment.recording.time_s, segment.recording.dt_s
+        start = segment.start.get(port, 0.0)
+        force = force + along(moved.x, moved.v, moved.a, load, time_s, dt_s, moved.tolerance, start, p)
+    return force
