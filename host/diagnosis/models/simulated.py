@@ -22,7 +22,7 @@ from scipy.signal import fftconvolve
 from host.diagnosis.effects import library
 from host.diagnosis.effects.gravity_load import payload
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Effect, Parameter, Port, Scale, spread
+from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale, spread
 from host.diagnosis.model.model import (
     ActiveEffect,
     Begin,
@@ -296,7 +296,8 @@ class SimulatedModel(Model):
             if candidate.port.kind == "chain" and candidate.effect.apply is not None:
                 joints = [self._moved_of(segment, angle) for _, angle in self.chain]
                 moved = np.array([[joint.x, joint.v, joint.a] for joint in joints])
-                total = total + candidate.effect.apply(moved, None, values, candidate.form)
+                context = Context(segment.recording.time_s, segment.recording.dt_s, joints[-1].x, joints[-1].tolerance)
+                total = total + candidate.effect.apply(moved, context, values, candidate.form)
         return total
 
     @staticmethod
