@@ -39,6 +39,7 @@ __all__ = [
     "Log",
     "LoopTiming",
     "Message",
+    "PlannedStep",
     "Pose",
     "Reply",
     "RigState",
@@ -67,6 +68,8 @@ ACTIONS = (
 )  # fmt: skip
 TARGETS = tuple(kind.label for kind in CommandKind if kind not in (CommandKind.STOP, CommandKind.JOG))
 JOG_AXES = ("none", *JogAxis.labels())
+# A step of a plan: computed, being executed; or the plan has ended, whether its goal was reached or not.
+STEP_STATUS = ("planned", "executing", "ended")
 RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
 _XYZ_m = ("x_m", "y_m", "z_m")
@@ -83,6 +86,9 @@ _COVARIANCE = tuple(f"c{row}{column}_N2" for row in "xyz" for column in "xyz")
 # Time histograms: bucket k holds times from 2^(k / 4) to 2^((k + 1) / 4) us; the first and the last are open.
 HISTOGRAM_BUCKETS = 64
 HISTOGRAM_EDGES_US = tuple(2.0 ** (edge / 4) for edge in range(HISTOGRAM_BUCKETS + 1))
+# Points of a planned shape, from the sheath's exit to the tip.
+SHAPE_POINTS = 12
+_SHAPE = tuple(f"shape_{point:02d}_{axis}_m" for point in range(SHAPE_POINTS) for axis in "xyz")
 _BUCKETS = tuple(f"tick_bucket_{bucket:02d}" for bucket in range(HISTOGRAM_BUCKETS))
 
 
@@ -125,6 +131,7 @@ Share = Annotated[float, bounds("", 0.0, 1.0)]
 Ratio = Annotated[float, bounds("", 0.0, 100.0)]
 Duration_us = Annotated[float, bounds("us", 0.0, 1e12)]
 Duration_ms = Annotated[float, bounds("ms", 0.0, 1e9)]
+Duration_s = Annotated[float, bounds("s", 0.0, 1e6)]
 Rate_hz = Annotated[float, bounds("Hz", 1.0, 1e5)]
 U8 = Annotated[int, bounds("", 0, 2**8 - 1)]
 U16 = Annotated[int, bounds("", 0, 2**16 - 1)]
@@ -445,6 +452,25 @@ class CommandCounts(Message, frozen=True, kw_only=True):
     flooded: Annotated[Count, doc("not read, because their sender sends too many")]
 
 
+class PlannedStep(Message, frozen=True, kw_only=True):
+    """One step of a plan that is carried out: the shape that the model gives the catheter there, as loaded on the way."""
+
+    plan: Annotated[Text, doc("which plan: the number of the protocol's step")]
+    step: Annotated[Count, doc("number of the step, from 0")]
+    steps: Annotated[Count, doc("how many steps are drawn of this plan")]
+    status: Annotated[str, choice("what the step is; ended closes the plan", STEP_STATUS)]
+    time_s: Annotated[Duration_s, doc("planned time of the step, from the start of the plan")]
+    load_N: Annotated[AllowedForce_N, doc("force with which a puncture bends the catheter there")] = 0.0
+    shape_m: Annotated[
+        tuple[Place_m, ...], columns_of("planned centre line from the sheath's exit to the tip, base frame", _SHAPE)
+    ]
+
+    def check(self) -> None:
+        """Check that the step is one of the plan's."""
+        if not self.step < self.steps:
+            raise ValueError(f"PlannedStep.step: found {self.step}, wanted below steps {self.steps}")
+
+
 class Alarm(Message, frozen=True, kw_only=True):
     """Rig and twin disagree: subsystem and probable cause."""
 
@@ -497,6 +523,7 @@ _TABLE = (
     Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as received, for the recording"),
     Topic("reply", Reply, 0, "event", "realtime -> host, tools", "results of the commands"),
     Topic("commander", CommandCounts, 2, "state", "realtime -> host, tools", "holder of the lease; counts of commands"),
+    Topic("plan", PlannedStep, 0, "event", "protocol -> host, tools", "steps of a plan that is carried out"),
     Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin disagree: subsystem and probable cause"),
     Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
 )

@@ -18,6 +18,7 @@ from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from protocol.requests import Request, read_json, validate
 from protocol.rig_file import Rig
+from protocol.topics import SHAPE_POINTS
 from realtime.control import inverse_kinematics as ik
 from realtime.control.configure import tick_parameters
 
@@ -28,6 +29,7 @@ LINE_POINTS = 16
 SPACING_M = 0.003
 # The tip's last piece lies on the tissue when it presses.
 TISSUE_m = 0.005
+DRAWN_SHAPES = 16
 
 
 class SphereRequest(Request):
@@ -92,11 +94,19 @@ class PlanRequest(Request):
     period_s: Annotated[float, Field(gt=0, le=1)] = 0.02
 
 
+class PlannedShape(NamedTuple):
+    """The catheter at row `row` of a plan: centre line (SHAPE_POINTS, 3) m, and the force (N) of the puncture on it."""
+
+    row: int
+    points_m: Array
+    load_N: float
+
+
 class PlanAnswer(NamedTuple):
     """A plan: one row for each period, at rest at both ends.
 
     `clearance_m` is the smallest on the path, measured from the catheter's surface. `puncture_force_N` is the greatest with
-    which the puncture bends the catheter on the path.
+    which the puncture bends the catheter on the path. `shapes` are some rows as pictures draw them, evenly spaced in time.
     """
 
     time_s: Array
@@ -107,6 +117,7 @@ class PlanAnswer(NamedTuple):
     checks: int
     waypoints: int
     puncture_force_N: float
+    shapes: tuple[PlannedShape, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan as JSON: samples by column name, SI units."""
@@ -273,7 +284,20 @@ def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> PlanAns
     lines = [world.line(row) for row in joint]
     tips = np.array([np.full(3, np.nan) if line is None else line.points_m[-1] for line in lines])
     force_N = max((line.force_N for line in lines if line is not None), default=0.0)
-    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), world.surroundings.questions, len(way), force_N)
+    asked = world.surroundings.questions
+    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), asked, len(way), force_N, _shapes(lines))
+
+
+def _shapes(lines: list[LoadedLine | None]) -> tuple[PlannedShape, ...]:
+    """At most DRAWN_SHAPES of the plan's lines, the first and the last among them, with SHAPE_POINTS points each."""
+    shapes = []
+    for row in np.unique(np.linspace(0, len(lines) - 1, DRAWN_SHAPES).round().astype(int)):
+        line = lines[row]
+        if line is not None:
+            at = np.linspace(0, len(line.points_m) - 1, SHAPE_POINTS)
+            points = [np.interp(at, np.arange(len(line.points_m)), line.points_m[:, axis]) for axis in range(3)]
+            shapes.append(PlannedShape(int(row), np.column_stack(points), line.force_N))
+    return tuple(shapes)
 
 
 def joints_at(rig: Rig, stage: Array) -> Array:

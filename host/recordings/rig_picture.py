@@ -22,6 +22,8 @@ KEPT, KEEP_EVERY = 1000, 3
 ESTIMATE_LASTS_NS = 200_000_000
 # A pose this old is not drawn as where the sensor is.
 POSE_LASTS_NS = 500_000_000
+# A plan of which nothing was published for so long is no longer carried out: its program was ended.
+PLAN_LASTS_NS = 30_000_000_000
 Body = Mapping[str, Any]
 
 
@@ -41,6 +43,7 @@ class Picture:
         self._kept: dict[str, deque[list[float | None]]] = {name: deque(maxlen=KEPT) for name in ("rows", "estimates")}
         self._received = 0
         self._causes = CauseWatch()
+        self._plan: dict[str, Any] | None = None
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._log_new = False
         self.now_ns = 0
@@ -48,6 +51,7 @@ class Picture:
     def clear(self) -> None:
         """Forget all messages, for a jump in time."""
         self._newest.clear()
+        self._plan = None
         self._causes = CauseWatch()
         self._log.clear()
         for rows in (self._force_rows, self._estimate_rows, *self._kept.values()):
@@ -79,9 +83,30 @@ class Picture:
         elif topic == "force/estimate":
             self._estimate_rows.append([_seconds(body["stamp_ns"]), *self._along(body)])
             self._kept["estimates"].append(self._estimate_rows[-1])
+        elif topic == "plan":
+            self._take_planned(body)
         elif topic == "log":
             self._log.append({"t": _seconds(body["stamp_ns"]), **{key: body[key] for key in ("level", "source", "text")}})
             self._log_new = True
+
+    def _take_planned(self, body: Body) -> None:
+        """Keep the steps of the plan that is carried out, until it ends."""
+        if body["status"] == "ended":
+            self._plan = None
+            return
+        if self._plan is None or (self._plan["id"], len(self._plan["shapes"])) != (body["plan"], body["steps"]):
+            self._plan = {"id": body["plan"], "step": -1, "shapes": [None] * body["steps"], "loads": [0.0] * body["steps"]}
+        self._plan["stamp_ns"] = body["stamp_ns"]
+        self._plan["shapes"][body["step"]] = np.round(np.reshape(body["shape_m"], (-1, 3)), 4).tolist()
+        self._plan["loads"][body["step"]] = _rounded(body["load_N"], 3)
+        if body["status"] == "executing":
+            self._plan["step"] = body["step"]
+
+    def _planned(self) -> dict[str, Any] | None:
+        """The plan that is carried out: its id, the step now (-1 before the first), shapes (m) and loads (N) by step."""
+        if self._plan is None or self.now_ns - self._plan["stamp_ns"] > PLAN_LASTS_NS:
+            return None
+        return {name: value for name, value in self._plan.items() if name != "stamp_ns"}
 
     def past(self) -> dict[str, Any]:
         """Samples and log of the last half minute, for a page that has just been opened."""
@@ -147,6 +172,7 @@ class Picture:
             "rows": list(self._force_rows),
             "estimates": list(self._estimate_rows),
             "scene": self._drawn(),
+            "plan": self._planned(),
             "loop": self._loop(),
             "board": self._board(),
             "model": self._model(),

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import zenoh
 
+from host.navigation.request import PlanAnswer
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from host.run.commander import Commander
@@ -23,7 +24,7 @@ from protocol.errors import Description, InputError, reason
 from protocol.messages import MessageType
 from protocol.requests import plain
 from protocol.rig_file import Rig
-from protocol.topics import Message, Pose, RigState, decode, key
+from protocol.topics import Message, PlannedStep, Pose, RigState, decode, key
 from protocol.zenoh_session import Session
 from sim.board import SimulatedBoard
 from sim.effects import parse
@@ -63,6 +64,10 @@ class DrivenRig(Protocol):
 
     def operator(self, message: str) -> bool:
         """Show `message` and wait for the operator; false where the protocol is to end."""
+        ...
+
+    def publish_step(self, step: PlannedStep) -> None:
+        """Publish a step of a plan, for pages and recording."""
         ...
 
 
@@ -253,12 +258,49 @@ class _Run:
 
     def _plan(self, action: Action) -> ActionResult:
         assert action.path is not None
-        tips, times = action.path.tip_m, action.path.time_s
+        try:
+            return self._follow(action, action.path)
+        finally:
+            if action.path.shapes:
+                self._show_step(action, len(action.path.shapes) - 1, "ended")
+
+    def _show_step(self, action: Action, number: int, status: str) -> None:
+        """Publish step `number` of the plan's drawn steps."""
+        assert action.path is not None
+        shape = action.path.shapes[number]
+        self._driven.publish_step(
+            PlannedStep(
+                stamp_ns=self._now.stamp_ns,
+                plan=action.id,
+                step=number,
+                steps=len(action.path.shapes),
+                status=status,
+                time_s=float(action.path.time_s[shape.row]),
+                load_N=min(shape.load_N, 1.0),
+                shape_m=tuple(float(value) for value in shape.points_m.ravel()),
+            )
+        )
+
+    def _follow(self, action: Action, path: PlanAnswer) -> ActionResult:
+        """Follow a plan; its steps are published before it begins, and the one being executed as it changes."""
+        tips, times = path.tip_m, path.time_s
+        for number in range(len(path.shapes)):
+            self._show_step(action, number, "planned")
+        if path.shapes:
+            self._show_step(action, 0, "executing")
+        step, step_times = 0, np.array([times[shape.row] for shape in path.shapes])
         self._go([float(value) for value in tips[0]], self._file.tolerance.tip_m)
         for at_s in np.arange(1.0 / PLAN_HZ, float(times[-1]), 1.0 / PLAN_HZ):
             place = [float(np.interp(at_s, times, tips[:, axis])) for axis in range(3)]
+            # The step that the tip is on its way to.
+            ahead = min(int(np.searchsorted(step_times, at_s)), len(path.shapes) - 1)
+            if ahead > step:
+                step = ahead
+                self._show_step(action, step, "executing")
             self.ask("target", "position", target_m=tuple(place))
             self.wait(1.0 / PLAN_HZ)
+        if step < len(path.shapes) - 1:
+            self._show_step(action, len(path.shapes) - 1, "executing")
         off_m = self._go([float(value) for value in tips[-1]], self._file.tolerance.tip_m)
         walked = [state.tip_m for state in self._kept if state.tip_m is not None]
         aside_m = max((float(np.min(np.linalg.norm(tips - np.array(tip), axis=1))) for tip in walked[10:]), default=0.0)
@@ -464,8 +506,8 @@ def blank_result(job: Job, simulated: bool, recording: str = "") -> ProtocolResu
 class SimulatedDrive:
     """A simulated rig in lock step (`sim.scenario.Scenario`). The operator of a simulation always goes on."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
+    def __init__(self, scenario: Scenario, publish: Callable[[str, Message], None]) -> None:
+        self._scenario, self._publish = scenario, publish
         self._states: list[RigState] = []
         self._poses: list[Pose] = []
 
@@ -499,6 +541,10 @@ class SimulatedDrive:
         self._scenario.commander.mark(f"operator: {message}"[:500])
         return True
 
+    def publish_step(self, step: PlannedStep) -> None:
+        """As DrivenRig.publish_step."""
+        self._publish("plan", step)
+
 
 def run_simulated(
     job: Job,
@@ -527,7 +573,7 @@ def run_simulated(
                     listener(message)
 
         scenario = Scenario(job.rig, world, publish, estimator=estimator)
-        driven = SimulatedDrive(scenario)
+        driven = SimulatedDrive(scenario, publish)
         listeners.append(driven.take)
         if not scenario.arm():
             raise RuntimeError("devices not ready")
@@ -542,6 +588,7 @@ class LiveDrive:
 
     def __init__(self, session: Session, commander: Commander, ask_operator: Callable[[str], bool]) -> None:
         self._commander, self._ask = commander, ask_operator
+        self._steps = session.publisher("plan")
         self._subscriber = session.zenoh.declare_subscriber(key(session.rig, "state"), zenoh.handlers.RingChannel(1024))
         self._pose_subscriber = session.zenoh.declare_subscriber(
             key(session.rig, "pose/tip"), zenoh.handlers.RingChannel(512)
@@ -574,6 +621,10 @@ class LiveDrive:
     def operator(self, message: str) -> bool:
         """As DrivenRig.operator."""
         return self._ask(message)
+
+    def publish_step(self, step: PlannedStep) -> None:
+        """As DrivenRig.publish_step."""
+        self._steps.put(step)
 
 
 def _taken(subscriber: Any, kind: type[MessageType]) -> list[MessageType]:

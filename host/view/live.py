@@ -35,6 +35,7 @@ DEPTHS = {
     "state": 64,
     "force/estimate": 64,
     "log": 32,
+    "plan": 64,
 }
 
 

@@ -18,7 +18,7 @@ from protocol.errors import InputError
 from protocol.requests import Request, read_json
 
 # Topics whose every message is shown, and those of which only the newest counts.
-EVERY = ("state", "force/estimate", "log")
+EVERY = ("state", "force/estimate", "log", "plan")
 NEWEST = ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "loop", "stiffness", "contact")
 # Of the others the last few: a tool that was not seen leaves the pose before it standing.
 LAST = 3
@@ -181,7 +181,7 @@ class Replay:
         self._picture.clear()
         self._jumps += 1
         for topic, times in self._times.items():
-            since_ns = self._at_ns - HISTORY_S * 1e9 if topic in EVERY and topic != "log" else self._begin_ns
+            since_ns = self._at_ns - HISTORY_S * 1e9 if topic in EVERY and topic not in ("log", "plan") else self._begin_ns
             self._next[topic] = int(np.searchsorted(times, since_ns))
 
     def act(self, text: str) -> dict[str, Any]:

@@ -18,12 +18,13 @@ from host.cli.plan import plan as cli_plan
 from host.navigation import PlanRequest, plan, planner, shape
 from host.navigation.loaded_shape import aimed, pressed, through_hole
 from host.navigation.obstacles import Capsule, Mesh, Sphere, Surroundings, load_mesh, to_line_m, winding_number
-from host.navigation.request import joints_at, with_tuples
+from host.navigation.request import DRAWN_SHAPES, joints_at, with_tuples
 from host.navigation.timing import ACCELERATION_SHARE, SPEED_SHARE
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from protocol.requests import validate
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+from protocol.topics import SHAPE_POINTS
 
 START = {"insertion_m": -0.080, "roll_rad": 0.0, "curvature_per_m": 2.0}
 
@@ -220,6 +221,13 @@ def test_a_hole_that_bends_the_catheter_is_passed_by_its_loaded_shape(rig: Rig, 
         if unloaded > HOLE["radius_m"]:
             line = through_hole(catheter, reach, joint, np.array(HOLE["point_m"]), HOLE["radius_m"], 120)
             assert line is not None and to_line_m(np.array(HOLE["point_m"]), line.points_m) < HOLE["radius_m"] + 2e-4
+    # What is drawn of the plan: from its first to its last row, the loaded shapes with their load, each ending at the tip.
+    drawn = answer.shapes
+    assert (drawn[0].row, drawn[-1].row) == (0, len(answer.time_s) - 1) and len(drawn) <= DRAWN_SHAPES
+    assert max(one.load_N for one in drawn) == pytest.approx(answer.puncture_force_N, rel=0.2)
+    for one in drawn:
+        assert one.points_m.shape == (SHAPE_POINTS, 3)
+        np.testing.assert_allclose(one.points_m[-1], answer.tip_m[one.row], atol=1e-9)
 
 
 def test_a_hole_that_would_have_to_press_too_hard_is_refused(rig: Rig, reach: shape.Reach) -> None:

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from host.recordings.rig_picture import Picture
 from host.report.protocol_report import write_protocol_report
 from host.run import protocol_run
 from host.run.protocol_file import ScriptedProtocol, dry_run, read_protocol
@@ -17,7 +19,7 @@ from host.run.protocol_run import Job, ProtocolResult, blank_result, carry_out, 
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
-from protocol.topics import Pose, RigState
+from protocol.topics import STEP_STATUS, PlannedStep, Pose, RigState
 
 ROOT = Path(__file__).parents[2]
 SIX_POINTS = ROOT / "docs" / "examples" / "six_points.toml"
@@ -100,6 +102,7 @@ class ScriptedRig:
         self.refuse, self.goes_on, self.touched_s = "", True, 0.0
         self._states: list[RigState] = []
         self._poses: list[Pose] = []
+        self.published: list[PlannedStep] = []
         self.off_m, self.tracked = 0.0, True  # of the tracker's tip from the predicted one, along e1
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
@@ -157,10 +160,48 @@ class ScriptedRig:
     def operator(self, message: str) -> bool:
         return self.goes_on
 
+    def publish_step(self, step: PlannedStep) -> None:
+        self.published.append(step)
+
 
 def performed(folder: Path, text: str, rig: ScriptedRig, earlier: Any = ()) -> ProtocolResult:
     job = Job(written(folder, text), RIG, folder / "result.json", tuple(earlier))
     return carry_out(job, rig, blank_result(job, True), lambda step, share: None)
+
+
+PLAN = '[[steps]]\ndo = "plan"\nrequest = "way.json"\n'
+WAY = {"goal_m": [0.0, -0.0107, 0.020], "start": {"insertion_m": -0.070, "roll_rad": 0.0, "curvature_per_m": 8.0}}
+
+
+def test_the_steps_of_a_plan_are_published_and_the_one_being_executed_is_named(tmp_path: Path) -> None:
+    (tmp_path / "way.json").write_text(json.dumps(WAY), encoding="utf-8")
+    rig = ScriptedRig()
+    result = performed(tmp_path, HEAD + PLAN, rig)
+    assert result.good, result.results
+    count = rig.published[0].steps
+    by_status = {status: [step for step in rig.published if step.status == status] for status in STEP_STATUS}
+    assert 8 < count <= 16 and [step.step for step in by_status["planned"]] == list(range(count))
+    executed = [step.step for step in by_status["executing"]]
+    assert executed == sorted(set(executed)) and executed[0] == 0 and executed[-1] == count - 1
+    assert [step.status for step in rig.published][-1] == "ended" and len(by_status["ended"]) == 1
+    # Each drawn shape ends where the tip is told to be at the step's time.
+    assert by_status["planned"][-1].shape_m[-3:] == pytest.approx(WAY["goal_m"], abs=2e-4)
+    # The page shows them, marks the step, and forgets them at the end.
+    picture = Picture({}, {})
+    for step in rig.published[:-1]:
+        picture.take("plan", msgspec.to_builtins(step))
+    shown = picture.frame()["plan"]
+    assert shown["id"] == "1" and shown["step"] == count - 1 and all(len(shape) == 12 for shape in shown["shapes"])
+    picture.take("plan", msgspec.to_builtins(rig.published[-1]))
+    assert picture.frame()["plan"] is None
+
+
+def test_a_plan_that_fails_on_the_way_is_closed_too(tmp_path: Path) -> None:
+    (tmp_path / "way.json").write_text(json.dumps(WAY), encoding="utf-8")
+    rig = ScriptedRig()
+    rig.refuse = "position"
+    assert not performed(tmp_path, HEAD + PLAN, rig).good
+    assert rig.published[-1].status == "ended"
 
 
 def test_a_touch_has_the_figures_of_its_force(tmp_path: Path) -> None:

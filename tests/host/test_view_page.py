@@ -172,6 +172,7 @@ class State:
     first: dict[str, Any] | None = None
     force_N: float | None = 0.01
     body: bool = False
+    plan: dict[str, Any] | None = None
     silent_s: float | None = 0.01
     says: tuple[str, str, str] = ("", "", "")  # safety, phase, a part of the cause
 
@@ -213,6 +214,7 @@ class State:
             | {"age_ms": 4.0, "queue_depth": 2, "deadman_age_ms": 1.0, "underruns": 0, "crc_errors": 0, "host_crc_errors": 0}
             | {"rejected": 0, "last_reject": "", "boot_count": 1},
             "model": model,
+            "plan": self.plan,
             "silent_s": self.silent_s,
             "malformed": 0,
             "scene": {
@@ -355,6 +357,43 @@ def test_each_state_is_named_readable_and_fits_the_screen(shown: tuple[Fake, Ope
     assert ("31 ± 4 mm behind the tip" in model) == (name == "body contact")
     disabled = page.locator('[data-home="insertion"]').is_disabled()
     assert disabled == (name != "disarmed"), "an axis is homed while the rig is disarmed"
+    assert open_page.complaints == []
+
+
+def planned(step: int) -> dict[str, Any]:
+    """A plan of eight steps from right to left; the hole of the puncture bends the last three."""
+    shapes = []
+    for number in range(8):
+        bend_m = 0.014 - 0.004 * number
+        shapes.append([[0.0, bend_m * (i / 11) ** 2, (0.021 + 0.0008 * number) * i / 11] for i in range(12)])
+    return {"id": "2", "step": step, "shapes": shapes, "loads": [0.0] * 5 + [0.02, 0.05, 0.08]}
+
+
+def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake, OpenPage], tmp_path: Path) -> None:
+    fake, open_page = rig
+    page = open_page.page
+    fake.state = replace(STATES["hold"], mode="position", says=("No fault", "Moving", ""))
+    open_page.look_as(1280, "light")
+    open_page.wait(lambda: open_page.text("#mode") == "Moving")
+    assert page.locator("#legend-plan").is_hidden() and "Plan" not in open_page.text("#scene-note")
+    free = near(open_page.picture_of("#scene-card"), "#0b7285")
+    pictures = []
+    for step in (2, 6):
+        fake.state = replace(fake.state, plan=planned(step))
+        open_page.wait(lambda step=step: open_page.text("#scene-note").startswith(f"Plan, step {step + 1} of 8."))
+        open_page.wait(lambda: page.evaluate("seldinger.scene.plan.children.length") == 16)
+        page.wait_for_timeout(100)
+        pictures.append(open_page.picture_of("#scene-card"))
+        page.screenshot(path=str(tmp_path / f"plan-{step}.png"))
+    assert page.locator("#legend-plan").is_visible()
+    assert near(pictures[0], "#0b7285") > free + 300, "the plan's steps"
+    assert int((abs(pictures[1] - pictures[0]).max(axis=-1) > 20).sum()) > 300, "another step is marked"
+    thickness = page.evaluate(
+        "seldinger.scene.plan.children.filter((m, i) => i % 2 === 0).map(m => m.geometry.parameters.radius)"
+    )
+    assert [number for number, radius in enumerate(thickness) if radius == max(thickness)] == [6]
+    fake.state = replace(fake.state, plan=None)
+    open_page.wait(lambda: page.evaluate("seldinger.scene.plan.children.length") == 0)
     assert open_page.complaints == []
 
 

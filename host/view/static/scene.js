@@ -110,6 +110,9 @@ export class Scene {
     world.add(sheath);
     this.catheter = new THREE.Group();
     world.add(this.catheter);
+    this.plan = new THREE.Group();
+    this.drawnPlan = "";
+    world.add(this.plan);
     this.#wall(world);
     this.#target(world);
     this.force = new Arrow(color("force"), 1);
@@ -178,8 +181,30 @@ export class Scene {
     }
   }
 
-  show(drawn, mode) {
-    this.newest = [drawn, mode];
+  // The plan that is carried out: a thin line for each step, fainter where it is done, thick with a ball for the step now.
+  // A step that a puncture bends is in the force's colour.
+  #planned(plan) {
+    const key = plan ? JSON.stringify([plan.id, plan.step, plan.shapes.map(Boolean)]) : "";
+    if (key === this.drawnPlan) return;
+    this.drawnPlan = key;
+    for (const part of this.plan.children) { part.geometry.dispose(); part.material.dispose(); }
+    this.plan.clear();
+    (plan?.shapes || []).forEach((shape, step) => {
+      if (!shape) return;
+      const now = step === plan.step, color = this.color(plan.loads[step] > 0 ? "force" : "plan");
+      const opacity = now ? 1 : step < plan.step ? 0.18 : 0.5;
+      const material = new THREE.MeshStandardMaterial({color, transparent: !now, opacity, roughness: 0.6});
+      const points = shape.map(vector), curve = new THREE.CatmullRomCurve3(points);
+      this.plan.add(new THREE.Mesh(new THREE.TubeGeometry(curve, 24, this.radius * (now ? 0.45 : 0.16), 8), material));
+      const ball = new THREE.Mesh(new THREE.SphereGeometry(this.radius * (now ? 0.9 : 0.4), 16, 12), material);
+      ball.position.copy(points[points.length - 1]);
+      this.plan.add(ball);
+    });
+  }
+
+  show(drawn, mode, plan = null) {
+    this.newest = [drawn, mode, plan];
+    this.#planned(plan);
     if (drawn.shape && drawn.shape.length > 2) this.#tube(drawn.shape.map(vector));
     this.catheter.visible = Boolean(drawn.shape);
     const tip = drawn.tip.length ? vector(drawn.tip) : null;

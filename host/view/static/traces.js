@@ -1,6 +1,6 @@
 // Traces over time on a canvas: lanes one above the other, each with its own scale, lines, a band and marked windows.
 
-const KEEP_S = 30, SHOW_S = 20, LEFT = 46, RIGHT = 10, BOTTOM = 20, GAP = 20;
+const KEEP_S = 30, SHOW_S = 20, LEFT = 46, RIGHT = 10, BOTTOM = 20, GAP = 23;
 
 function niceStep(span, count) {
   const raw = span / count, power = 10 ** Math.floor(Math.log10(raw));
@@ -74,12 +74,19 @@ export class Traces {
       }
     }
     if (low > high) [low, high] = [0, 0];
-    const span = Math.max((high - low) * 1.15, lane.least), middle = (high + low) / 2;
+    const span = Math.max(high - low, lane.least), middle = (high + low) / 2;
     return [middle - span / 2, middle + span / 2];
   }
 
-  #lane(g, lane, a) {
+  // The range widened to whole steps, so that both ends of the axis bear a number: [low, high, step].
+  #axis(lane, a) {
     const [low, high] = this.#range(lane, a.from);
+    const step = niceStep((high - low) * lane.scale, Math.max(2, Math.floor((a.bottom - a.top) / 34))) / lane.scale;
+    return [Math.floor(low / step + 1e-6) * step, Math.ceil(high / step - 1e-6) * step, step * lane.scale];
+  }
+
+  #lane(g, lane, a) {
+    const [low, high, step] = this.#axis(lane, a);
     const y = value => a.bottom - (value - low) / (high - low) * (a.bottom - a.top);
     g.save();
     g.beginPath();
@@ -89,7 +96,7 @@ export class Traces {
     g.fillStyle = a.color("warn");
     for (const window of this.windows) g.fillRect(a.x(window.from), a.top, Math.max(a.x(window.to) - a.x(window.from), 1), a.bottom - a.top);
     g.restore();
-    this.#grid(g, lane, a, low, high, y);
+    this.#grid(g, lane, a, [low, high, step], y);
     g.save();
     g.beginPath();
     g.rect(a.left, a.top - 1, a.right - a.left, a.bottom - a.top + 2);
@@ -107,21 +114,22 @@ export class Traces {
     this.#legend(g, lane, a);
   }
 
-  #grid(g, lane, a, low, high, y) {
-    const step = niceStep((high - low) * lane.scale, Math.max(2, Math.floor((a.bottom - a.top) / 34)));
+  #grid(g, lane, a, [low, high, step], y) {
     g.strokeStyle = a.color("grid");
     g.fillStyle = a.color("muted");
     g.textAlign = "right";
     g.textBaseline = "middle";
     g.lineWidth = 1;
     g.setLineDash([]);
-    for (let tick = Math.ceil(low * lane.scale / step) * step; tick <= high * lane.scale; tick += step) {
+    const first = Math.round(low * lane.scale / step), last = Math.round(high * lane.scale / step);
+    for (let number = first; number <= last; number++) {
+      const tick = number * step;
       const at = Math.round(y(tick / lane.scale)) + 0.5;
       g.beginPath();
       g.moveTo(a.left, at);
       g.lineTo(a.right, at);
       g.stroke();
-      if (at > a.top + 5) g.fillText((Math.abs(tick) < step / 2 ? 0 : tick).toFixed(digitsOf(step)), a.left - 6, at);
+      g.fillText((Math.abs(tick) < step / 2 ? 0 : tick).toFixed(digitsOf(step)), a.left - 6, at);
     }
   }
 

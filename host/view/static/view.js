@@ -112,9 +112,11 @@ function draw() {
   force.draw(now);
   pose.draw(now);
   if (page.scene && !page.scene.broken) {
-    page.scene.show(frame.scene, frame.mode);
+    page.scene.show(frame.scene, frame.mode, frame.plan);
     const gap = frame.scene.gap_m;
-    write(element("scene-note"), "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Model and tracker differ by ${(gap * 1000).toFixed(1)} mm at the tip.`));
+    element("legend-plan").hidden = !frame.plan;
+    const step = frame.plan ? `Plan, step ${frame.plan.step + 1} of ${frame.plan.shapes.length}. ` : "";
+    write(element("scene-note"), step + "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Model and tracker differ by ${(gap * 1000).toFixed(1)} mm at the tip.`));
   }
   link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "no data") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
 }
