@@ -456,8 +456,8 @@ class PlannedStep(Message, frozen=True, kw_only=True):
     """One step of a plan that is carried out: the shape that the model gives the catheter there, as loaded on the way."""
 
     plan: Annotated[Text, doc("which plan: the number of the protocol's step")]
-    step: Annotated[Count, doc("number of the step, from 0")]
-    steps: Annotated[Count, doc("how many steps are drawn of this plan")]
+    step: Annotated[U8, doc("number of the step, from 0")]
+    steps: Annotated[U8, doc("how many steps are drawn of this plan")]
     status: Annotated[str, choice("what the step is; ended closes the plan", STEP_STATUS)]
     time_s: Annotated[Duration_s, doc("planned time of the step, from the start of the plan")]
     load_N: Annotated[AllowedForce_N, doc("force with which a puncture bends the catheter there")] = 0.0

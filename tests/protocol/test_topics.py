@@ -22,6 +22,7 @@ from protocol.topics import (
     ForceEstimate,
     Log,
     Message,
+    PlannedStep,
     Pose,
     Stage,
     as_markdown,
@@ -62,6 +63,8 @@ def consistent(cls: type[Message], values: dict[str, Any]) -> dict[str, Any]:
         return values | {"missing": True, "position_m": None, "quaternion_wxyz": None}
     if cls is ForceEstimate:
         return values | {"converged": False}
+    if cls is PlannedStep:
+        return values | {"steps": max(values["steps"], 1), "step": 0}
     if cls is Command:
         return values | {
             "id": "c1",
