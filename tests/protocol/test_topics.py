@@ -37,7 +37,7 @@ from protocol.topics import (
 )
 
 CLASSES = sorted({topic.message for topic in TOPICS.values()}, key=lambda cls: cls.__name__)
-UNIT_SUFFIXES = ("m", "rad", "N", "N2", "Nm", "ns", "us", "ms", "Hz", "hz", "per_m", "per_s", "steps", "counts")
+UNIT_SUFFIXES = ("m", "rad", "N", "N2", "Nm", "s", "ns", "us", "ms", "Hz", "hz", "per_m", "per_s", "steps", "counts")
 
 
 def scalar(spec: FieldSpec) -> st.SearchStrategy[Any]:
