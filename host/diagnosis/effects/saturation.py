@@ -17,7 +17,8 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
             Parameter(
                 "limit", s.unit, tuple(f * s.span for f in (0.47, 0.42, 0.35, 0.25, 0.15)), 0.0, s.span, step=0.05 * s.span
             ),
-            Parameter("knee", s.unit, (0.005 * s.span, 0.03 * s.span), 1e-3 * s.span, 0.2 * s.span, log=True),
+            # a wider knee bends the whole range: that is a curve, not a limit
+            Parameter("knee", s.unit, (0.005 * s.span, 0.03 * s.span), 1e-3 * s.span, 0.2 * s.span, log=True, shape=True),
         )
     share = (0.98, 0.93, 0.85, 0.75, 0.6, 0.4) if form == "upper" else (0.02, 0.07, 0.15, 0.25, 0.4, 0.6)
     return (Parameter("limit", s.unit, tuple(s.low + f * s.span for f in share), s.low, s.high, step=0.05 * s.span),)

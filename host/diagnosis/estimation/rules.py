@@ -51,6 +51,7 @@ class SelectionRules:
     swap_fits: int = 3
     most_refits: int = 2  # times that a step is judged again because a trial led to a better minimum without it
     simpler_fits: int = 3  # simpler shapes of the best candidate that are fitted after it
+    wider_fits: int = 4  # other forms that are fitted where one that the data call for ended at a bound
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 
     # Indistinguishable: rivals in an effect's place.

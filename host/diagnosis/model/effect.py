@@ -29,6 +29,7 @@ class Parameter:
     linear: bool = False
     step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
     vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
+    shape: bool = False  # its upper bound is a limit of the form, even where the effect's bounds are natural
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
     @property

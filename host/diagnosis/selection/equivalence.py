@@ -12,7 +12,7 @@ from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.posterior import coarse
-from host.diagnosis.selection.screening import term_of, without
+from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.search import Found
 from host.diagnosis.selection.trial import Trial, at_bound
 from host.diagnosis.selection.unlisted import Rest, equations_for
@@ -110,6 +110,8 @@ def _equals(
     for trial in _rivals(found, candidate, problem.rules)[: problem.rules.equals_fits]:
         if problem.budget.spent():
             break
+        if replaced_by(less, trial.candidate) != ():
+            continue  # it stands for another active effect too: both together would say one thing twice
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         other = finish(

@@ -28,7 +28,7 @@ from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.joint import best_pair
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, without
-from host.diagnosis.selection.trial import Trial, at_bound, good_enough, rank, related, weighty
+from host.diagnosis.selection.trial import Trial, at_bound, called_for, good_enough, rank, related, weighty, wider
 from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
@@ -221,6 +221,7 @@ def _grow(
             trials.append(try_fit(problem, best, item, noise_sd))
         rank(trials, best)
         trials = _with_simpler(problem, best, trials, ranked, noise_sd)
+        trials = with_wider(problem, best, trials, ranked, noise_sd)
         winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
         if winner is None:
             steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
@@ -304,6 +305,26 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     if not missing:
         return trials
     more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.simpler_fits])]
+    rank(more, best)
+    return more
+
+
+def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
+    """`trials`, and wider forms of those that the data call for but that ended at a bound of their form; ranked again.
+
+    A bound that is not nature's means that the form is wrong and what it stands for is near: other forms at its place are
+    worth a fit, however little their projection promised.
+    """
+    bounded = [trial for trial in trials if at_bound(trial.fit) and called_for(trial, best)]
+    fitted = {trial.candidate.key for trial in trials}
+    missing = [
+        item
+        for item in ranked
+        if item.candidate.key not in fitted and any(wider(item.candidate, trial.candidate) for trial in bounded)
+    ]
+    if not missing or problem.budget.spent():
+        return trials
+    more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.wider_fits])]
     rank(more, best)
     return more
 

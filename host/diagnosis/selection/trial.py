@@ -10,7 +10,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.effect import Candidate, Parameter
 
 
 @dataclass
@@ -43,17 +43,17 @@ def bound_by(fit: Fit, term: Term) -> bool:
     values = fit.values[first : first + len(term.parameters)]
     if _drives(term, values):
         return True
-    return (
-        any(
-            p.high > p.low
-            and (
-                (np.isfinite(p.low) and p.low != 0.0 and not p.vanishes and value <= p.low * (1.001 if p.low > 0 else 0.999))
-                or (np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high))
-            )
-            for p, value in zip(term.parameters, values, strict=True)
-        )
-        and not term.candidate.effect.natural_bounds
-    )
+    natural = term.candidate.effect.natural_bounds
+    return any(_reached(p, float(value), natural) for p, value in zip(term.parameters, values, strict=True))
+
+
+def _reached(p: Parameter, value: float, natural: bool) -> bool:
+    """Whether `value` is at a bound of `p` that is none of nature's. natural: whether the effect's bounds are."""
+    if p.high <= p.low:
+        return False
+    low = np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999)
+    high = np.isfinite(p.high) and value >= p.high - 1e-3 * abs(p.high)
+    return bool((low and not p.vanishes and not natural) or (high and (p.shape or not natural)))
 
 
 def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
@@ -118,15 +118,28 @@ def related(simple: Candidate, general: Candidate) -> bool:
     )
 
 
+def wider(general: Candidate, bounded: Candidate) -> bool:
+    """Whether `general` may fit where `bounded` ended at a bound of its form: another form of it, or one that holds it."""
+    a, b = bounded.effect, general.effect
+    if bounded.port.name != general.port.name or bounded.key == general.key:
+        return False
+    return (
+        a.id in b.contains or a.id == b.id or bool(a.family and a.family == b.family) or bool({*a.spans} & {b.id, *b.spans})
+    )
+
+
 def good_enough(trial: Trial, base: Fit) -> bool:
     """Whether a trial earns its place: likelihood, blocks, size, and agreement of fitted and held-out parts.
 
     Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
     samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
+    return not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
+
+
+def called_for(trial: Trial, base: Fit) -> bool:
+    """Whether the evidence of a trial is enough, wherever its parameters ended."""
     more = max(len(trial.fit.values) - len(base.values), 0)
-    if at_bound(trial.fit) or of_sampling(trial):
-        return False
     return _alone(trial, more) or (trial.apart and _together(trial, more)) or _plainly(trial, more)
 
 
