@@ -9,6 +9,7 @@ from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.rod import rod_record
 from host.report.figure_page import as_json
 from host.studies.reproduction import fine_spatial, mechanics, planar, spatial, spatial_experiments, spatial_force
+from host.studies.reproduction.admissible import Admissible, Tried
 from host.studies.reproduction.thesis_schemes import conventional, internal_loads, iterates
 from protocol.catheter import load_catheter
 
@@ -38,8 +39,40 @@ def test_every_section_comes_once_and_in_the_thesis_order() -> None:
     assert chapters == sorted(chapters) and set(chapters) == {2, 3, 4, 5}
 
 
-def test_a_statement_that_is_not_true_is_marked_so() -> None:
-    assert spatial.figure_3_4(True).verdict == "does_not_hold"
+def test_a_statement_that_is_not_true_is_marked_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spatial, "_OUTSIDE_m", (0.058, 0.058, 0.070))
+    found = spatial.figure_3_4(True)
+    assert found.verdict == "does_not_hold" and "at none of 12 admissible settings" in found.says
+
+
+def test_algorithm_3_1_settles_where_part_of_the_shaft_is_in_the_sheath() -> None:
+    found = spatial.figure_3_4(True)
+    assert found.verdict == "holds" and "28 mm, 45 1/m" in found.says and "whole shaft outside, 10 1/m: -" in found.ours
+    assert "F L2 / EI2 = 2.5 with the whole shaft outside" in found.says  # EI2: a force along e1 bends about d2
+    by_size = spatial.figure_3_5(True)
+    assert by_size.verdict == "holds" and "at 4 of 10 admissible settings: 20 mm; 24 mm; 28 mm; 32 mm" in by_size.says
+
+
+@pytest.mark.slow
+def test_table_3_1_is_solved_for_a_force_along_e1_with_the_shaft_half_inside() -> None:
+    tried = {one.setting: one for one in spatial._table_3_1_map().tried}
+    assert tried["e1, 32 mm"].holds and tried["e1, 32 mm"].found == "4, 6, 8, 12, 37"
+    assert not tried["e1, 45 mm"].holds and not tried["-e2, 24 mm"].holds
+
+
+def test_admissible_settings_say_where_a_statement_holds() -> None:
+    some = Admissible([Tried("a", "1", False), Tried("b", "2", True), Tried("c", "3", True)])
+    assert some.holds and some.where == "at 2 of 3 admissible settings: b; c"
+    assert some.rows()[0] == ("setting", "found", "holds") and some.rows()[2] == ("b", "2", "yes")
+    none, every = Admissible(some.tried[:1]), Admissible(some.tried[1:])
+    assert not none.holds and none.where == "at none of 1 admissible settings"
+    assert every.holds and every.where == "at all 2 admissible settings"
+
+
+@pytest.mark.slow
+def test_a_tenth_more_stiffness_costs_what_the_thesis_says_on_catheter_2() -> None:
+    found = spatial_force.figure_5_6(True)
+    assert found.verdict == "holds" and "catheter 2, 30 1/m, EI2 only" in found.says
 
 
 def test_a_wrong_model_turns_a_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
