@@ -37,6 +37,8 @@ LOOK_S = 0.02
 # A goal is reached when the tip has been near it for so long.
 THERE_S = 0.3
 ANSWERS_WITHIN_S = 3.0
+# A rig of this computer that has no socket does not run: that is said after this time instead.
+NOT_RUNNING_S = 0.2
 
 
 class Driver:
@@ -87,16 +89,17 @@ def driving(
     command: str, rig: Path, json: bool, name: str, endpoint: str | None, keys: Path | None, lease: bool = True
 ) -> Iterator[Driver]:
     """Connect, take the lease where it is needed, and give it back at the end. A refusal ends with exit status 1."""
-    from host.run.connection import CommandRefused, connect
+    from host.run.connection import CommandRefused, connect, may_run
 
     with connect(rig, name, endpoint=endpoint, keys=keys) as connection:
         driver = Driver(connection, command, json)
         try:
-            if not driver.wait(ANSWERS_WITHIN_S, lambda state: True) and lease:
+            patience_s = ANSWERS_WITHIN_S if endpoint is not None or may_run(connection.rig) else NOT_RUNNING_S
+            if not driver.wait(patience_s, lambda state: True) and lease:
                 where = endpoint or str(connection.rig.local.folder)
                 driver.result |= {"accepted": False, "text": f"no message from rig {connection.rig.name} at {where}"}
                 driver.say(
-                    f"no message from rig {connection.rig.name} at {where} within {ANSWERS_WITHIN_S:g} s; nothing was "
+                    f"no message from rig {connection.rig.name} at {where} within {patience_s:g} s; nothing was "
                     "commanded. Check that it runs, and that --rig is its rig file"
                 )
                 raise typer.Exit(1)
@@ -320,13 +323,14 @@ def mark(
 
 def status(rig: RigFile = SIMULATED_RIG, json: Json = False, endpoint: Endpoint = None, keys: Keys = None) -> None:
     """Show a running rig on one screen, the first cause of what holds it back first. Commands nothing."""
-    from host.run.connection import open_session
+    from host.run.connection import may_run, open_session
     from host.run.rig_status import read_status
     from protocol.rig_file import load_rig
 
     read = load_rig(rig)
     with open_session(read, endpoint, keys) as session:
-        found = read_status(session, read.name)
+        patience_s = ANSWERS_WITHIN_S if endpoint is not None or may_run(read) else NOT_RUNNING_S
+        found = read_status(session, read.name, wait_s=patience_s)
     if json:
         write_json(found.as_json())
     else:

@@ -280,6 +280,11 @@ def connect(
         raise InputError.from_sentence(str(error)) from None
 
 
+def may_run(rig: Rig) -> bool:
+    """Whether a rig of this computer may be running: one of its sockets is there, or its rig file connects elsewhere."""
+    return bool(rig.zenoh.connect) or rig.local.zenoh_socket.exists() or rig.local.stop_socket.exists()
+
+
 def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[str] | None = None) -> Session:
     """Open a session of `rig`, on this machine or, with `endpoint` and `keys`, on another. Raises as `connect` does."""
     if (endpoint is None) != (keys is None):

@@ -18,6 +18,7 @@ from host.navigation.request import PlanAnswer
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from host.run.commander import Commander
+from host.run.connection import may_run
 from host.run.protocol_file import Action, ProtocolFile, ScriptedProtocol, before
 from protocol.commander import Acknowledgement
 from protocol.errors import Description, InputError, reason
@@ -32,6 +33,8 @@ from sim.scenario import Estimator, Scenario
 from sim.world import World, simulated_plant
 
 ARM_WITHIN_S = 10.0
+# A rig that runs publishes its state 100 times a second; one of this computer without a socket does not run.
+STATES_WITHIN_S, NOT_RUNNING_S = 3.0, 0.2
 THERE_S = 0.3
 # Commands of a plan a second: half of what the rig lets through.
 PLAN_HZ = 20.0
@@ -650,8 +653,9 @@ def run_live(job: Job, ask_operator: Callable[[str], bool], progress: Progress =
             newest.extend(driven.states())
             return bool(newest)
 
-        if not driven.wait(3.0, came):
-            raise RuntimeError("no message of the topic state from the rig within 3 s; check that it runs")
+        patience_s = STATES_WITHIN_S if may_run(job.rig) else NOT_RUNNING_S
+        if not driven.wait(patience_s, came):
+            raise RuntimeError(f"no message of the topic state from the rig within {patience_s:g} s; check that it runs")
         taken = commander.take()
         if not taken.accepted:
             raise RuntimeError(f"lease: {taken.reason}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import Any
 
@@ -24,6 +25,7 @@ from realtime.loop.clock import Clock
 from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.scheduling import RealtimeSettings
 
+logger = logging.getLogger("seldinger.realtime")
 _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command reply commander".split()
 
 
@@ -57,7 +59,7 @@ class RealtimeProcess:
         records = {name: box.record[0] for name, box in mailboxes.items()}
         self.core = RigCore(rig, records, self._timing, force_source)
         paths = rig.local.prepare()
-        self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s)
+        self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s, logger.warning)
         self._session = Session.of_rig(rig)
         self._seal = ReplySeal(paths.reply_key)
         publishers = {name: self._session.publisher(name) for name in _TOPICS}

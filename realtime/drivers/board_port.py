@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import time
+from collections.abc import Callable
 
 from realtime.drivers.transport import Transport, open_serial
 
@@ -18,13 +19,14 @@ class BoardPort:
         path: the device.
         baud: its speed.
         timeout_s: how long to wait for the device (s).
+        missing: gets one line at once where the device is not there, before the wait.
 
     Raises OSError where the port does not open in time.
     """
 
-    def __init__(self, path: str, baud: int, timeout_s: float) -> None:
+    def __init__(self, path: str, baud: int, timeout_s: float, missing: Callable[[str], None] = lambda line: None) -> None:
         self._path, self._baud = path, baud
-        self._port = _opened(path, baud, timeout_s)
+        self._port = _opened(path, baud, timeout_s, missing)
         os.set_blocking(self._port.fileno(), False)
 
     def fileno(self) -> int:
@@ -61,12 +63,15 @@ class BoardPort:
         self._port.close()
 
 
-def _opened(path: str, baud: int, timeout_s: float) -> Transport:
-    give_up = time.monotonic() + timeout_s
+def _opened(path: str, baud: int, timeout_s: float, missing: Callable[[str], None]) -> Transport:
+    give_up, said = time.monotonic() + timeout_s, False
     while True:
         try:
             return open_serial(path, baud)
-        except OSError:
+        except OSError as error:
             if time.monotonic() > give_up:
                 raise
+            if not said:
+                said = True
+                missing(f"board: {error}; waits for it, at most {timeout_s:g} s")
             time.sleep(RETRY_S)

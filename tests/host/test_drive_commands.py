@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 import host.cli.drive as drive
 import host.run.connection as connection
+import host.run.rig_status as rig_status
 from host.cli.main import build
 from host.cli.quantities import direction, point, quantity
 from host.run.rig_status import RigStatus
@@ -129,6 +130,12 @@ class VirtualRig:
     def close(self) -> None:
         """The scenario goes on."""
 
+    def __enter__(self) -> VirtualRig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 @pytest.fixture(scope="module")
 def virtual() -> Iterator[VirtualRig]:
@@ -153,7 +160,21 @@ def rig(virtual: VirtualRig, monkeypatch: pytest.MonkeyPatch) -> VirtualRig:
     monkeypatch.setattr(connection, "open_session", lambda *arguments: virtual)
     monkeypatch.setattr(connection, "Commander", VirtualCommander)
     monkeypatch.setattr(drive, "time", virtual)
+    monkeypatch.setattr(rig_status, "time", virtual)
     return virtual
+
+
+@pytest.mark.parametrize(("words", "says"), [(("arm",), "nothing was commanded"), (("status",), "check that it runs")])
+def test_a_rig_that_does_not_run_is_not_waited_for(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
+    """A rig of this computer without a socket: the wait is the short one, and the line says what to look at."""
+    file = tmp_path / "rig.toml"
+    file.write_text(SIMULATED_RIG.read_text().replace('folder = ""', f'folder = "{tmp_path}"'), encoding="utf-8")
+    assert not connection.may_run(load_rig(file))
+    result = called(*words, "--rig", str(file))
+    assert result.exit_code == 1 and says in result.stderr and str(tmp_path) in result.stderr
+    assert "3 s" not in result.stderr
+    (tmp_path / "zenoh.sock").touch()
+    assert connection.may_run(load_rig(file)), "a rig that may run is given its time"
 
 
 def said(*words: str) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from host.run.igtl_bridge import IgtlBridge
 from host.run.wall_clock import Fleet
 from protocol.rig_file import load_rig
 from protocol.zenoh_session import Session
+from tests.host.test_drive_commands import VirtualRig, rig, virtual  # noqa: F401 - fixtures
+from tests.host.test_drive_commands import called as driven
 from tests.waiting import free_port, until
 
 PATIENCE_S = 300.0
@@ -50,6 +52,34 @@ def test_what_needs_no_rig_runs_as_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_rig_is_seen_and_driven_as_written(rig: VirtualRig) -> None:  # noqa: F811
+    """Steps 2 and 3: each command as the page has it, on a simulated rig whose time is virtual.
+
+    That `seldinger view --simulated` starts such a rig with its page is tests/host/test_view_commands.py.
+    """
+    written = commands()
+    order = [words[0] for words in written]
+    begin, end = order.index("status"), order.index("disarm") + 1
+    assert written[begin - 1] == ["view", "--simulated"]
+    phases = {"arm": "hold", "goto": "position", "jog": "hold", "zero": "hold", "touch": "stopped", "disarm": "disarmed"}
+    assert order[begin:end] == ["status", *phases]
+    for words in written[begin:end]:
+        done = driven(*words, "--json")
+        assert done.exit_code == 0, (words, done.stderr)
+        told = json.loads(done.stdout)
+        if words[0] == "status":
+            assert told["topics"]["state"]["mode"] == "disarmed" and {"pose/tip", "force/sensor", "board"} <= set(
+                told["topics"]
+            )
+            continue
+        assert told["accepted"], words
+        rig.sleep(0.2)
+        assert rig.newest["state"].mode == phases[words[0]], words  # type: ignore[attr-defined]
+        if words[0] == "touch":
+            assert abs(told["mean_force_N"] - 0.2) < 0.05
+
+
+@pytest.mark.slow
 def test_the_line_of_six_touches_ends_with_a_report(tmp_path: Path) -> None:
     (words,) = [words for words in commands() if words[0] == "run" and "--simulated" in words]
     at = words.index("--out")
@@ -76,17 +106,17 @@ def lab_toml(folder: Path) -> Path:
 
 def test_the_swapped_tracker_is_read_over_openigtlink(tmp_path: Path) -> None:
     """The simulated tracker as a server, and the page's commands that check it; no verdict here depends on a rate."""
-    rig = lab_toml(tmp_path)
-    assert called(["rig", "check", str(rig), "--quiet"], tmp_path).returncode == 0
-    missing = called(["check-device", "tracker", "--rig", str(rig), "--seconds", "0.2"], tmp_path)
+    lab = lab_toml(tmp_path)
+    assert called(["rig", "check", str(lab), "--quiet"], tmp_path).returncode == 0
+    missing = called(["check-device", "tracker", "--rig", str(lab), "--seconds", "0.2"], tmp_path)
     assert missing.returncode == 1 and "no server at" in missing.stderr
-    command = [sys.executable, "-m", "sim.rig_server", "--rig", str(rig), "--board", "native"]
+    command = [sys.executable, "-m", "sim.rig_server", "--rig", str(lab), "--board", "native"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=ROOT) as server:
         try:
             assert server.stdout is not None
             ports = json.loads(server.stdout.readline())
-            assert ports["tracker"] == load_rig(rig).tracker.port
-            done = called(["check-device", "tracker", "--rig", str(rig), "--seconds", "1", "--json"], tmp_path)
+            assert ports["tracker"] == load_rig(lab).tracker.port
+            done = called(["check-device", "tracker", "--rig", str(lab), "--seconds", "1", "--json"], tmp_path)
         finally:
             server.terminate()
     report = json.loads(done.stdout)
@@ -97,8 +127,8 @@ def test_the_swapped_tracker_is_read_over_openigtlink(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_loop_runs_on_the_swapped_tracker_and_slicer_sees_it(tmp_path: Path) -> None:
     """A whole rig on the wall clock: poses come in over OpenIGTLink, and go out over the bridge to pyigtl's client."""
-    rig = lab_toml(tmp_path)
-    with Fleet(DemoSettings(rig_file=rig, board="native"), tmp_path / "swap.mcap") as fleet:
+    lab = lab_toml(tmp_path)
+    with Fleet(DemoSettings(rig_file=lab, board="native"), tmp_path / "swap.mcap") as fleet:
         fleet.wait_for_state(PATIENCE_S)
         live = load_rig(fleet.rig_file)
         with Session.of_rig(live) as session:

@@ -4,6 +4,7 @@ import os
 
 import pytest
 
+from realtime.drivers.board_port import BoardPort
 from realtime.drivers.transport import PipeTransport, open_serial
 
 
@@ -18,6 +19,13 @@ def test_pipe_ends_read_what_the_other_wrote() -> None:
     a.write(b"left")
     b.close()
     assert b.read() == b""
+
+
+def test_a_board_that_is_missing_is_said_before_it_is_waited_for() -> None:
+    lines: list[str] = []
+    with pytest.raises(OSError, match="/dev/nowhere"):
+        BoardPort("/dev/nowhere", 500_000, 0.5, lines.append)
+    assert len(lines) == 1 and "/dev/nowhere" in lines[0] and "waits for it, at most 0.5 s" in lines[0]
 
 
 def test_serial_port_does_not_block() -> None:
