@@ -18,6 +18,7 @@ from host.cli.progress import Working
 from protocol.errors import InputError
 from protocol.rig_file import AXES, Rig, load_rig
 from protocol.stop_client import ask_socket
+from protocol.topics import check_name
 
 if TYPE_CHECKING:
     from realtime.drivers.homing import Home
@@ -42,6 +43,10 @@ def home(
     one_of("axis", axis, AXES)
     if port and endpoint:
         raise InputError("--port", port, "no --port with --endpoint: a running rig has opened its port itself")
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise InputError.from_sentence(str(error)) from None
     settings = load_rig(rig)
     wanted = home_of(settings, AXES.index(axis))
     if not yes:

@@ -10,10 +10,18 @@ import typer
 from typer.testing import CliRunner, Result
 
 import host.commissioning.home_stage as homing
-from host.cli.home import home
+from host.cli.drive import Driver
+from host.cli.home import _home_running, home
+from host.run.commander import Commander
+from host.run.connection import CommandRefused, RigConnection
+from protocol.errors import InputError
 from protocol.rig_file import load_rig
+from tests.host.test_view_live import loopback
+from tests.host.virtual_rig import VirtualRig
 from tests.realtime.conftest import RIG_FILE
 from tests.sim.board_rig import BoardRig
+from tests.sim.test_home_run import rig_with_a_switch
+from tests.waiting import PATIENCE_S, until
 
 SWITCH_STEPS = -120
 
@@ -85,3 +93,46 @@ def test_without_a_switch_or_without_a_yes_nothing_moves(port: Port, tmp_path: P
     assert none.exit_code != 0 and "stages.insertion.home_end" in str(none.exception)
     no = homed("--rig", str(file_with_a_switch(tmp_path)), answer="n\n")
     assert no.exit_code == 1 and not port.rig.position.any()
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (("elbow",), "axis"),
+        (("insertion", "--name", "BAD!"), "commander"),
+        (("insertion", "--port", "x", "--endpoint", "tls/1.2.3.4:5"), "--port"),
+        (("insertion", "--endpoint", "tls/1.2.3.4:5"), "keys"),
+    ],
+)
+def test_bad_input_is_named_and_nothing_moves(port: Port, words: tuple[str, ...], key: str, tmp_path: Path) -> None:
+    app = typer.Typer()
+    app.command()(home)
+    told = CliRunner().invoke(app, [*words, "--yes", "--rig", str(file_with_a_switch(tmp_path))])
+    assert isinstance(told.exception, InputError) and key in str(told.exception) and not port.rig.position.any()
+
+
+@pytest.mark.slow
+def test_a_rig_that_runs_homes_itself_and_its_log_says_how_it_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = rig_with_a_switch(tmp_path)
+    there, here = loopback(rig)
+    with there, VirtualRig(rig, there) as virtual, RigConnection(rig, here, "console") as connection:
+        connection._commander = Commander(here, "console", clock_ns=lambda: virtual.now_ns)
+        driver = Driver(connection, "home", json=False)
+        assert driver.wait(PATIENCE_S, lambda state: state.mode == "disarmed")
+        until(lambda: connection._commander.take().accepted, "the lease")
+
+        def homed() -> bool:
+            """A late answer of a busy machine is asked for again; a homing that goes on is left to end first."""
+            driver.wait(PATIENCE_S, lambda state: state.mode == "disarmed")
+            try:
+                _home_running(driver, "insertion")
+            except CommandRefused as refused:
+                assert refused.acknowledgement.result != "refused", refused
+                return False
+            return True
+
+        until(homed, "the axis to be homed")
+    assert driver.result["done"] and "two touches differ by" in driver.result["text"]
+    assert "insertion: switch found, its position is -0.002 m" in capsys.readouterr().err
