@@ -17,6 +17,7 @@ from host.estimation.spatial import ONE_TO_ONE, SpatialEstimate, checked_case, e
 from host.estimation.spatial_batch import BatchEstimate, estimate_batch
 from host.estimation.spatial_residuals import ROWS_OF_CASE
 from host.mechanics.pcar import arcs_of
+from host.mechanics.rod import checked_catheter, checked_workers, column, finite, number, one_of, real, yes_or_no
 from protocol.catheter import Catheter
 from protocol.errors import InputError
 
@@ -112,10 +113,15 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
     Examples:
         >>> estimate_force(catheter, 0.01, 10.0, [(0.0, r0, q0), (0.03, r1, q1)], case=4).force_N  # doctest: +SKIP
     """
+    one_of("model", model, ("cosserat", "pcar"))
+    checked_catheter(catheter)
+    _check_settings(sensors, prior, thorough, ordered)
+    workers = checked_workers(workers)
     if model == "cosserat":
         if case is None:
             raise InputError("case", "nothing", "1 to 6")
         if not _many(sensors):
+            number("insertion_m", insertion_m, "one finite length in m: the sensors have one sample")
             _check_sensors(catheter.distal_length_m, insertion_m, sensors[: checked_case(case)])
             return estimate_cosserat(
                 catheter,
@@ -131,23 +137,35 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
         _only_one(previous_force_N=previous_force_N, prior=prior, roll_rad=roll_rad or None, thorough=thorough or None)
         used = sensors[: checked_case(case)]
         poses = Poses(
-            [sensor[0] for sensor in used],
+            [number(f"sensors.{i}.offset_m", sensor[0], "an arc length in m") for i, sensor in enumerate(used)],
             _stacked("position_m", [sensor[1] for sensor in used], 3),
             _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
         )
-        _check_rows(poses.positions_m, poses.offsets_m, catheter.distal_length_m + np.asarray(insertion_m))
+        insertion_m = column("insertion_m", insertion_m, len(poses.positions_m), "a finite length in m")
+        _check_rows(poses.positions_m, poses.offsets_m, catheter.distal_length_m + insertion_m)
         found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
         if not ordered and case in ONE_TO_ONE:
             _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
         return found
-    if model != "pcar":
-        raise InputError("model", model, "cosserat or pcar")
     return _planar(catheter, insertion_m, curvature_per_m, sensors, prior, thorough, workers)
+
+
+def _check_settings(sensors: object, prior: object, thorough: object, ordered: object) -> None:
+    """Raise InputError where an argument is not of its kind; what it holds is checked where it is used."""
+    if not isinstance(sensors, list | tuple) or not all(isinstance(s, list | tuple) and len(s) >= 3 for s in sensors):
+        raise InputError(
+            "sensors", str(sensors), "a list of (offset_m, position_m, quaternion_wxyz), from the tip backwards"
+        )
+    if prior is not None and not isinstance(prior, SurfacePrior):
+        raise InputError("prior", type(prior).__name__, "a SurfacePrior or None")
+    yes_or_no("thorough", thorough)
+    yes_or_no("ordered", ordered)
 
 
 def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[Any]) -> None:
     """Raise InputError where the catheter cannot reach a sensor; what is no number is left to the estimator to name."""
     for index, sensor in enumerate(sensors):
+        number(f"sensors.{index}.offset_m", sensor[0], "an arc length in m")
         try:
             exposed_m = distal_length_m + insertion_m
             far = math.hypot(*sensor[1]) > exposed_m + REACH_MARGIN_M
@@ -212,10 +230,13 @@ def _only_one(**given: object) -> None:
 
 def _stacked(key: str, parts: list[Any], width: int) -> Array:
     """Arrays (n, width) of k sensors as one (n, k, width). Raises InputError."""
-    arrays = [np.asarray(part, dtype=np.float64) for part in parts]
+    arrays = [
+        real(f"sensors.{i}.{key}", part, f"numbers (n, {width}), a row for each sample") for i, part in enumerate(parts)
+    ]
+    rows = arrays[0].shape[0] if arrays[0].ndim else 1
     for index, array in enumerate(arrays):
-        if array.ndim != 2 or array.shape != (len(arrays[0]), width):
-            raise InputError(f"sensors.{index}.{key}", f"shape {array.shape}", f"({len(arrays[0])}, {width})")
+        if array.shape != (rows, width):
+            raise InputError(f"sensors.{index}.{key}", f"shape {array.shape}", f"({rows}, {width})")
     return np.stack(arrays, axis=1)
 
 
@@ -228,14 +249,21 @@ def _planar(
     thorough: bool,
     workers: int | None,
 ) -> PlanarEstimate | RecordingEstimate:
-    if len(sensors) != 1 or len(sensors[0]) != 3 or sensors[0][0] != 0.0:
+    if len(sensors) != 1 or len(sensors[0]) != 3 or number("sensors.0.offset_m", sensors[0][0], "0.0: the tip") != 0.0:
         raise InputError("sensors", str(sensors), "one (0.0, position_m, angle_rad): the planar model reads the tip's pose")
     _, position, angle = sensors[0]
     if not _many(sensors):
         arcs = arcs_of(catheter, insertion_m, curvature_per_m)
         _check_sensors(catheter.distal_length_m, insertion_m, sensors)
-        return planar.estimate(arcs, [*np.ravel(position), angle], prior=prior, thorough=thorough)
+        x, y = finite("sensors.0.position_m", position, (2,), "two finite numbers in m")
+        pose = (x, y, number("sensors.0.angle_rad", angle, "a finite angle in rad"))
+        return planar.estimate(arcs, pose, prior=prior, thorough=thorough)
     _only_one(prior=prior, thorough=thorough or None)
-    pose = np.column_stack([np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)])
-    _check_rows(pose[:, None, :2], [0.0], catheter.distal_length_m + np.asarray(insertion_m))
-    return planar.estimate_recording(catheter, insertion_m, curvature_per_m, pose, workers=workers)
+    places = real("sensors.0.position_m", position, "numbers (n, 2), in m")
+    angles = real("sensors.0.angle_rad", angle, "numbers (n,), in rad")
+    if places.ndim != 2 or places.shape[1] != 2 or angles.shape != places.shape[:1]:
+        raise InputError("sensors.0", f"shapes {places.shape} and {angles.shape}", "positions (n, 2) and angles (n,)")
+    insertion_m = column("insertion_m", insertion_m, len(places), "a finite length in m")
+    _check_rows(places[:, None, :], [0.0], catheter.distal_length_m + insertion_m)
+    poses = np.column_stack([places, angles])
+    return planar.estimate_recording(catheter, insertion_m, curvature_per_m, poses, workers=workers)

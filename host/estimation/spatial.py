@@ -232,8 +232,8 @@ class Limits(NamedTuple):
 def checked_case(case: int) -> int:
     """Number of sensors that the case uses. Raises InputError."""
     if type(case) is not int or not 1 <= case <= 6:
-        if isinstance(case, bool) or case not in range(1, 7):
-            raise InputError("case", case, "1 to 6")
+        if not isinstance(case, int | np.integer) or isinstance(case, bool) or not 1 <= case <= 6:
+            raise InputError("case", str(case), "1 to 6")
     return (1, 1, 2, 2, 2, 3)[case - 1]
 
 

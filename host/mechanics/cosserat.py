@@ -37,6 +37,7 @@ from host.mechanics.rod import (
     checked_stations,
     largest_force,
     number,
+    real,
     rod_record,
     rod_records,
 )
@@ -331,10 +332,7 @@ def solve_cosserat_cases(
 
 def _checked_forces(forces_N: ArrayLike, insertion_m: ArrayLike, curvature_per_m: ArrayLike) -> tuple[Array, int]:
     """Forces (n, 3) and n, from whichever of the three arguments has a row for each case."""
-    try:
-        forces = np.asarray(forces_N, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError("force_N", str(forces_N), "forces (n, 3) in N") from None
+    forces = real("force_N", forces_N, "forces (n, 3) in N")
     if forces.ndim not in (1, 2) or forces.shape[-1] != 3:
         raise InputError("force_N", f"shape {forces.shape}", "forces (n, 3) in N")
     if not np.isfinite(forces).all():

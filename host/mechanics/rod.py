@@ -7,7 +7,7 @@ Python, and only a bad one is looked at closely.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -21,15 +21,47 @@ Array = NDArray[np.float64]
 LARGEST_CURVATURE_per_m = 1000.0
 LARGEST_INSERTION_m = 2.0
 LARGEST_LOAD_NUMBER = 5000.0
+MOST_THREADS = 1024
 NO_STATIONS: Array = np.zeros(0)
+
+
+def real(key: str, value: ArrayLike, wanted: str) -> Array:
+    """Return `value` as floats, whatever its shape. Raises InputError naming `key` where it does not hold real numbers."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # rows of different lengths
+        raise InputError(key, str(value), wanted) from None
+    if array.dtype.kind not in "fiu" or np.ma.is_masked(value):
+        raise InputError(key, str(value), wanted)
+    return array.astype(np.float64, copy=False)
+
+
+def one_of(key: str, value: object, names: Iterable[str]) -> str:
+    """Return `value`, one of `names`. Raises InputError naming `key`."""
+    if not isinstance(value, str) or value not in names:
+        raise InputError(key, value if isinstance(value, str) else str(value), " or ".join(names))
+    return value
+
+
+def yes_or_no(key: str, value: object) -> bool:
+    """Return `value`, True or False. Raises InputError naming `key`."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(key, str(value), "True or False")
+    return bool(value)
+
+
+def checked_workers(workers: object) -> int | None:
+    """Return a number of threads, or None for one on each core. Raises InputError."""
+    if workers is None:
+        return None
+    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or not 1 <= workers <= MOST_THREADS:
+        raise InputError("workers", str(workers), f"a number of threads, 1 to {MOST_THREADS}, or None")
+    return int(workers)
 
 
 def finite(key: str, value: ArrayLike, shape: tuple[int, ...], wanted: str) -> Array:
     """`value` as floats of that shape. Raises InputError naming `key` where it is not, or where NaN or infinity is in it."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(key, str(value), wanted) from None
+    array = real(key, value, wanted)
     if array.shape != shape or not np.all(np.isfinite(array)):
         raise InputError(key, array.tolist(), wanted)
     return array
@@ -44,18 +76,25 @@ def number(key: str, value: object, wanted: str) -> float:
 
 def column(key: str, value: ArrayLike, count: int, wanted: str) -> Array:
     """`value`, one number or (count,), as finite floats (count,). Raises InputError naming `key`."""
+    numbers = real(key, value, f"{wanted}: one, or {count}, one for each case")
     try:
-        array = np.broadcast_to(np.asarray(value, dtype=np.float64), (count,))
-    except (TypeError, ValueError):
+        array = np.broadcast_to(numbers, (count,))
+    except ValueError:
         raise InputError(key, str(value), f"{wanted}: one, or {count}, one for each case") from None
     if not np.isfinite(array).all():
         raise InputError(key, "NaN or infinity", wanted)
     return array
 
 
-def _compliances(catheter: Catheter) -> tuple[float, ...]:
+def checked_catheter(catheter: object) -> Catheter:
+    """Return `catheter`. Raises InputError where it is none."""
     if not isinstance(catheter, Catheter):
         raise InputError("catheter", repr(catheter), "a Catheter, as load_catheter returns it")
+    return catheter
+
+
+def _compliances(catheter: Catheter) -> tuple[float, ...]:
+    checked_catheter(catheter)
     if catheter.cosserat is None:
         raise InputError("catheter", catheter.name, "a catheter with a [cosserat] table: its spatial stiffness is not known")
     return _inverse(catheter.cosserat)
@@ -121,10 +160,7 @@ def largest_force(rod: Array) -> float:
 
 def checked_force(key: str, force_N: ArrayLike, rod: Array) -> Array:
     """The force (3,) in N. Raises InputError where it is not three finite numbers, or so large that the rod would coil."""
-    try:
-        force: Array = np.array(force_N, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(key, str(force_N), "three finite numbers in N") from None
+    force = real(key, force_N, "three finite numbers in N").copy()
     if force.shape != (3,):
         raise InputError(key, force.tolist(), "three finite numbers in N")
     x, y, z = force.tolist()
@@ -137,9 +173,9 @@ def checked_force(key: str, force_N: ArrayLike, rod: Array) -> Array:
 
 def checked_stations(stations_m: Sequence[float] | Array) -> Array:
     """Arc lengths back from the tip (n,) in m. Raises InputError where one is negative or not finite."""
-    if len(stations_m) == 0:
+    if isinstance(stations_m, list | tuple) and not stations_m:
         return NO_STATIONS
-    stations = np.atleast_1d(np.asarray(stations_m, dtype=np.float64))
+    stations = np.atleast_1d(real("stations_m", stations_m, "a list of arc lengths back from the tip, 0 or more"))
     if stations.ndim != 1 or not np.all(np.isfinite(stations)) or np.any(stations < 0.0):
         raise InputError("stations_m", np.asarray(stations_m).tolist(), "a list of arc lengths back from the tip, 0 or more")
     return stations

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar
 from host.mechanics.cosserat import FRAMES, CosseratSolution, CosseratSolutions, solve_cosserat, solve_cosserat_cases
-from host.mechanics.rod import checked_stations, column
+from host.mechanics.rod import checked_catheter, checked_stations, checked_workers, column, number, one_of, real
 from host.mechanics.threads import in_threads
 from protocol.catheter import Catheter
 from protocol.errors import InputError
@@ -114,8 +114,16 @@ def solve(  # noqa: PLR0913 - keyword arguments of a public function, each docum
     Examples:
         >>> solve(load_catheter("livewire"), 0.01, 10.0, [0.0, 0.05, 0.0]).tip_position_m  # doctest: +SKIP
     """
-    if frame not in FRAMES:
-        raise InputError("frame", frame, "base or tip")
+    checked_catheter(catheter)
+    one_of("frame", frame, FRAMES)
+    one_of("model", model, MODELS)
+    if start is not None and not isinstance(start, CosseratSolution):
+        raise InputError("start", type(start).__name__, "a solution of this function for one case, or None")
+    workers = checked_workers(workers)
+    if not isinstance(insertion_m, float):
+        insertion_m = real("insertion_m", insertion_m, "a finite length in m, or one for each case")
+    if not isinstance(curvature_per_m, float):
+        curvature_per_m = real("curvature_per_m", curvature_per_m, "a finite curvature in 1/m, or one for each case")
     if model == "cosserat":
         force = (0.0, 0.0, 0.0) if force_N is None else force_N
         if not (_many(force) or _is_array(insertion_m) or _is_array(curvature_per_m)):
@@ -127,19 +135,20 @@ def solve(  # noqa: PLR0913 - keyword arguments of a public function, each docum
         return solve_cosserat_cases(
             catheter, insertion_m, curvature_per_m, force, frame, stations_m, roll_rad=roll_rad, workers=workers
         )
-    if model != "pcar":
-        raise InputError("model", model, "cosserat or pcar")
-    for key, value, usual in (("frame", frame, "base"), ("roll_rad", roll_rad, 0.0), ("start", start, None)):
-        if value != usual:
-            raise InputError(key, str(value), NOT_FOR_PCAR)
+    if frame != "base":
+        raise InputError("frame", frame, NOT_FOR_PCAR)
+    if number("roll_rad", roll_rad, "a finite angle in rad") != 0.0:
+        raise InputError("roll_rad", roll_rad, NOT_FOR_PCAR)
+    if start is not None:
+        raise InputError("start", "a solution", NOT_FOR_PCAR)
     force = (0.0, 0.0) if force_N is None else force_N
     if not (_many(force) or _is_array(insertion_m) or _is_array(curvature_per_m)):
         return _one_planar(catheter, insertion_m, curvature_per_m, force, checked_stations(stations_m))
     return _many_planar(catheter, insertion_m, curvature_per_m, force, checked_stations(stations_m), workers)
 
 
-def _is_array(value: Any) -> bool:
-    return not isinstance(value, float | int) and np.ndim(value) > 0
+def _is_array(value: float | Array) -> bool:
+    return not isinstance(value, float) and value.ndim > 0
 
 
 def _many(force: Any) -> bool:
@@ -189,11 +198,13 @@ def _planar_stations(arcs: pcar.Arcs, kappa: Array, stations: Array) -> tuple[Ar
 def _many_planar(
     catheter: Catheter, insertion_m: Any, curvature_per_m: Any, force_N: Any, stations: Array, workers: int | None
 ) -> PcarSolution:
-    forces = np.asarray(force_N, dtype=np.float64)
+    forces = real("force_N", force_N, "finite forces (n, 2) in N")
     if forces.ndim not in (1, 2) or forces.shape[-1] != 2 or not np.isfinite(forces).all():
         raise InputError("force_N", f"shape {forces.shape}", "finite forces (n, 2) in N")
     sizes = [np.size(value) for value in (insertion_m, curvature_per_m) if _is_array(value)]
     count = len(forces) if forces.ndim == 2 else max(sizes)
+    if count == 0:
+        raise InputError("force_N", "no case", "at least one")
     forces = np.ascontiguousarray(np.broadcast_to(forces, (count, 2)))
     insertion = column("insertion_m", insertion_m, count, "a finite length in m")
     curvature = column("curvature_per_m", curvature_per_m, count, "a finite curvature in 1/m")

@@ -19,6 +19,8 @@ class RecordingTables:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the MCAP file `path`. Raises InputError where it cannot be read or is no recording."""
+        if not isinstance(path, str | os.PathLike):
+            raise InputError("path", str(path), "the name of an MCAP file")
         self._recording = RecordingFile(os.fspath(path))
 
     @property

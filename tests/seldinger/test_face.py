@@ -7,7 +7,9 @@ import math
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,3 +213,52 @@ def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     for path in (tmp_path / "a.mcap", tmp_path / "none.mcap"):
         with pytest.raises(sd.InputError, match=path.name):
             sd.open_recording(path)
+
+
+# Arguments that are wrong in kind, shape or size; each stands in turn for every argument, and inside every list.
+WRONG: list[object] = [
+    None, "", "x", b"x", math.nan, math.inf, -1, 1e300, 10**400, True, [], {}, (), set(), [None], ["x"], [math.nan] * 3,
+    [1, 2], [1, 2, 3, 4], [[1, 2], [3]], np.zeros(0), np.zeros((4, 3, 2)), np.array(["a"]), np.array([None]), 1j,
+    np.array([1j]), object(), range(3), np.ma.masked, np.ma.masked_invalid([1.0, math.nan, 0.0]), float, "pcar",
+]  # fmt: skip
+
+
+def _calls() -> list[tuple[Any, dict[str, Any]]]:
+    rod = {"catheter": LIVEWIRE, "insertion_m": 0.01, "curvature_per_m": 10.0}
+    one = sensors()
+    many = [(offset, np.stack([place] * 3), np.stack([turn] * 3)) for offset, place, turn in one]
+    return [
+        (sd.solve, {**rod, "force_N": [0.05, 0.02, 0.0], "frame": "base", "stations_m": [0.0, 0.03], "roll_rad": 0.1}),
+        (sd.solve, {**rod, "force_N": np.zeros((3, 3)), "start": None, "workers": 1}),
+        (sd.solve, {**rod, "catheter": THERMOCOOL, "force_N": [0.05, 0.02], "model": "pcar"}),
+        (sd.estimate_force, {**rod, "sensors": one, "case": 4, "previous_force_N": FORCE_N, "roll_rad": 0.0}),
+        (sd.estimate_force, {**rod, "sensors": many, "case": 4, "ordered": True, "workers": 1}),
+        (sd.estimate_force, {**rod, "sensors": [(0.0, [0.07, 0.01], 0.2)], "model": "pcar", "prior": None}),
+        (sd.load_catheter, {"name_or_path": "livewire"}),
+        (sd.open_recording, {"path": "no.mcap"}),
+    ]
+
+
+def _replaced(value: object, wrong: object) -> list[object]:
+    """Return `value` with `wrong` in its place, and in the place of its first entries, three levels deep."""
+    made = [wrong]
+    if isinstance(value, list | tuple) and value:
+        for entry in _replaced(value[0], wrong):
+            made.append(type(value)([entry, *value[1:]]))
+        made += [[*value[:-1], entry] for entry in _replaced(value[-1], wrong)]
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(8))
+def test_whatever_is_wrong_with_an_argument_is_bad_input(number: int) -> None:
+    function, right = _calls()[number]
+    for key, value in right.items():
+        for wrong in WRONG:
+            for changed in _replaced(value, wrong):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                    try:
+                        function(**{**right, key: changed})
+                    except sd.InputError as error:
+                        assert "\n" not in str(error) and ": found " in str(error), (key, changed)
