@@ -433,6 +433,8 @@ def _exchange(
     for _ in range(problem.rules.exchange_rounds):
         before = found.best.names
         for term in found.best.terms:
+            if term not in found.best.terms:
+                continue  # it left with another of its name (several jumps at one port), which was exchanged
             if (len(found.best.terms) > 1 or _frequencies(found.best, term)) and not problem.budget.spent():
                 _in_place_of(problem, found, term, candidate_effects, noise_sd, progress)
         found.best = _prune(problem, found.best, noise_sd, found.steps)

@@ -12,6 +12,7 @@ from host.diagnosis.model.dataset import find_files
 from host.diagnosis.model.nominal import nominal_path, read_nominal
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from host.diagnosis.report.verdict import as_json
+from host.studies.proof import real
 
 FOLDER = Path(os.environ.get("SELDINGER_DATA", Path(__file__).parents[3] / ".." / "shared" / "data"))
 pytestmark = [pytest.mark.data, pytest.mark.slow]
@@ -53,3 +54,33 @@ def test_silverbox_spring() -> None:
         if p.heldout.any()
     }
     assert left["multisine_10"] < 0.363e-3 and left["arrow"] < 0.523e-3
+
+
+SETS = {one.name: one for one in real.SETS}
+
+
+def judged(name: str) -> real.SetResult:
+    """Diagnosis of one set that the README describes, held out as it says."""
+    if not (FOLDER / SETS[name].file).exists():
+        pytest.skip(f"{SETS[name].file} is not in {FOLDER}; set SELDINGER_DATA")
+    return real.judged(SETS[name], FOLDER)
+
+
+@pytest.mark.parametrize("seal", ["oring", "pk"])
+def test_friction_of_a_seal_grows_with_pressure(seal: str) -> None:
+    result = judged(f"pneumatic {seal}")
+    assert result.named[0] == "load_dependent_friction" and "stribeck_friction" not in result.named
+    assert result.after < result.hand
+
+
+def test_friction_of_the_smoothest_seal() -> None:
+    result = judged("pneumatic kdn")
+    assert result.right and "stribeck_friction" not in result.named
+    assert result.after < 0.75  # the fit by hand, with a spring and pressure, leaves 0.70 N
+
+
+@pytest.mark.parametrize(("volts", "largest"), [("0V", 8.8), ("0p88V", 25.7)])
+def test_damper_yields_before_it_flows(volts: str, largest: float) -> None:
+    result = judged(f"mr_damper {volts}")
+    assert result.right and set(result.named) <= {"coulomb_friction", "presliding_friction"}
+    assert result.after < largest  # at 0.88 V that of Dahl's friction by hand; tanh of speed and place leaves 22.5 N
