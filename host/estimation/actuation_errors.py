@@ -3,6 +3,10 @@
 The controller's joints are those of a transmission with backlash and windup. Their errors are unknown at the start and
 change when the joints move. Each pose tells about them as well as about the force. The filter keeps what the poses have
 told: mean and covariance of the three errors, and lets their uncertainty grow with the travel of the joints and with time.
+
+A backlash that is wider than assumed makes one part of the insertion's error alternate: it is -p while the body is pushed
+and +p while it is pulled, with p half of the missing width, and changes over while the body moves by 2 p after a reversal.
+This is a fourth state, p, which poses of several reversals determine; the other three would follow it only with a delay.
 """
 
 from __future__ import annotations
@@ -17,8 +21,10 @@ from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 
-INSERTION, CURVATURE, ROLL = 0, 1, 2
+INSERTION, CURVATURE, ROLL, FLANK = 0, 1, 2, 3
 GAP_NS = 1_000_000_000  # after so long without a pose nothing is remembered
+_FLANK_MEMORY_S = 60.0  # with a force sensor the controller corrects its width in contact
+_SHORTEST_CROSSING_m = 1e-4  # of the body, between the flanks: the side is seen at the tracker's rate
 
 
 @dataclass(frozen=True)
@@ -27,11 +33,15 @@ class ActuationKnowledge:
 
     start (3,): insertion (m), curvature (1/m), roll (rad). by_travel (3,): of each joint's error after one unit of its
     own travel (m, 1/m, rad), growing with the square root of the travel. by_time (3,): the same after one second.
+    flank_m: of half the backlash's width, which lasts; 0: known. flank_mean_m: by how much half the width that the
+    controller assumes is expected to be too small.
     """
 
     start: tuple[float, float, float]
     by_travel: tuple[float, float, float]
     by_time: tuple[float, float, float]
+    flank_m: float = 0.0
+    flank_mean_m: float = 0.0
 
     @classmethod
     def from_rig(cls, rig: Rig) -> ActuationKnowledge:
@@ -48,21 +58,48 @@ class ActuationKnowledge:
                 known.roll_sd_rad,
             ),
             (known.insertion_walk_m, known.curvature_walk_per_m, known.roll_walk_rad),
+            rig.control.play_sd_m,
+            # The predictive law takes the backlash for narrower than in the file until it is learned in contact.
+            0.5 * rig.control.play_caution_m if rig.control.law == "predictive" else 0.0,
         )
 
 
 class ActuationErrors:
-    """Mean (3,) and covariance (3, 3) of the joints' errors: true joint minus the controller's."""
+    """Errors of the joints, true joint minus the controller's: `mean` (3,) and `covariance` (3, 3) at the present pose."""
 
     def __init__(self, knowledge: ActuationKnowledge) -> None:
         self._known = knowledge
-        self.mean, self.covariance = np.zeros(3), np.diag(np.square(knowledge.start))
-        self._last: Actuation | None = None
+        self.forget()
 
     def forget(self) -> None:
         """Return to what is known at the start."""
-        self.mean, self.covariance = np.zeros(3), np.diag(np.square(self._known.start))
-        self._last = None
+        known = self._known
+        self._mean = np.array([0.0, 0.0, 0.0, known.flank_mean_m])
+        self._covariance = np.diag(np.square([*known.start, known.flank_m]))
+        self._last: Actuation | None = None
+        self._side = 0.0
+
+    @property
+    def mean(self) -> Array:
+        """Expected errors (3,) of insertion, curvature and roll."""
+        return self._now() @ self._mean
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (3, 3) of these errors."""
+        now = self._now()
+        return np.asarray(now @ self._covariance @ now.T)
+
+    @property
+    def missing_backlash(self) -> tuple[float, float]:
+        """By how much (m) the backlash is wider than the controller assumes, and the standard deviation of that."""
+        return 2.0 * float(self._mean[FLANK]), 2.0 * float(np.sqrt(self._covariance[FLANK, FLANK]))
+
+    def _now(self) -> Array:
+        """Matrix (3, 4) that makes the joints' errors of the four states."""
+        now = np.eye(3, 4)
+        now[INSERTION, FLANK] = -self._side
+        return now
 
     def move_to(self, actuation: Actuation) -> None:
         """Let the uncertainty grow by the travel and the time since the last call; never above that at the start."""
@@ -71,24 +108,41 @@ class ActuationErrors:
             self.forget()
             self._last = actuation
             return
-        travel = np.abs(
+        moved = np.array(
             [
                 actuation.insertion_m - last.insertion_m,
                 actuation.curvature_per_m - last.curvature_per_m,
                 actuation.roll_rad - last.roll_rad,
             ]
         )
+        self._change_side(moved[INSERTION])
         seconds = (actuation.stamp_ns - last.stamp_ns) * 1e-9
-        growth = np.square(self._known.by_travel) * travel + np.square(self._known.by_time) * seconds
-        grown = self.covariance + np.diag(growth)
-        shrink = np.minimum(1.0, np.array(self._known.start) / np.sqrt(np.diag(grown)))
-        self.covariance = grown * np.outer(shrink, shrink)
+        growth = np.square(self._known.by_travel) * np.abs(moved) + np.square(self._known.by_time) * seconds
+        grown = self._covariance.copy()
+        grown += np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
+        start = np.array([*self._known.start, self._known.flank_m])
+        shrink = np.minimum(1.0, start / np.maximum(np.sqrt(np.diag(grown)), 1e-12))
+        self._covariance = grown * np.outer(shrink, shrink)
+
+    def _change_side(self, moved_m: float) -> None:
+        """Follow the flank of the backlash: +1 pushed, -1 pulled, between them in proportion to the body's motion."""
+        crossing_m = max(2.0 * abs(self._mean[FLANK]), _SHORTEST_CROSSING_m)
+        self._side = min(max(self._side + 2.0 * moved_m / crossing_m, -1.0), 1.0)
 
     def learn(self, mean: Array, covariance: Array) -> None:
         """Take over what a pose has told: mean (3,) and covariance (3, 3) after it."""
-        self.mean, self.covariance = mean.copy(), 0.5 * (covariance + covariance.T)
+        self.learn_part([INSERTION, CURVATURE, ROLL], mean, covariance)
 
     def learn_part(self, which: list[int], mean: Array, covariance: Array) -> None:
-        """Take over what a pose has told about some of the errors, `which` (k) of them; the others keep theirs."""
-        self.mean[which] = mean
-        self.covariance[np.ix_(which, which)] = 0.5 * (covariance + covariance.T)
+        """Take over what a pose has told about some of the errors, `which` (k) of them: mean (k,), covariance (k, k).
+
+        The pose's answer replaces what was expected of these errors; the four states follow by their covariance with
+        them (Kalman filter, with the measurement already combined with its prior).
+        """
+        now = self._now()[which]
+        cross = self._covariance @ now.T
+        before = now @ cross
+        gain = np.linalg.solve(before, cross.T).T
+        self._mean = self._mean + gain @ (np.asarray(mean) - now @ self._mean)
+        after = self._covariance - gain @ (before - covariance) @ gain.T
+        self._covariance = 0.5 * (after + after.T)

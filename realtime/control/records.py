@@ -171,6 +171,7 @@ class TargetState:
     score_m2: Floats = real("m^2", "mean square error of each model's predictions", TARGET_MODELS)
     weight: Floats = real("", "weight of each model in the mean", TARGET_MODELS)
     noise_m2: float = real("m^2", "mean variance of the samples")
+    scored_s: float = real("s", "how long predictions were scored since the harmonics began")
     shot_ns: int = whole("ns", "time of the states that are being scored")
     shot: Matrix = real("m", "states that are being scored", TARGET_MODELS, TARGET_N)
     heart_found: int = whole("", "1 once the heart's rate is known")

@@ -51,6 +51,8 @@ _SMALLEST_M = 5e-5  # a peak of the spectrum below this is noise
 _TAKE_OVER_S = 2.0  # the steady model restarts from a restless one that was better for this long
 _RANGE_m = 10.0  # samples beyond this are not plausible
 _MEAN_RATE_S = 5.0
+# Errors are averaged over this share of the time since the harmonics began, but not over less than _LEAST_MEMORY_S.
+_RECENT_SHARE, _LEAST_MEMORY_S = 0.4, 0.5
 _BREATHLESS = 100.0  # factor of the squared acceleration of a slow stream's level while its breath is unknown
 
 
@@ -59,7 +61,7 @@ def start(config: TargetParams, state: TargetState, stamp_ns: int, level_m: floa
     """Start at `stamp_ns` with the wall at `level_m` and its motion unknown."""
     state.started, state.time_ns, state.shot_ns = 1, stamp_ns, stamp_ns
     state.heart_found = state.breath_found = state.agreed = state.rejected = 0
-    state.rejected_s = state.worse_s = state.mean_rate = state.last_heart_Hz = 0.0
+    state.rejected_s = state.worse_s = state.scored_s = state.mean_rate = state.last_heart_Hz = 0.0
     state.bank_value, state.bank_s, state.bank_n, state.noise_m2 = 0.0, 0.0, 0, 0.0
     frequency_bank.start(state.heart_bank, config.heart_min_Hz, config.heart_max_Hz, 0.8, level_m)
     frequency_bank.start(state.breath_bank, config.breath_min_Hz, config.breath_max_Hz, 3.0, level_m)
@@ -269,7 +271,10 @@ def _score(config: TargetParams, state: TargetState, wall_m: float, ago_s: float
         return
     models = _in_use(config, state)
     if age_s < 3.0 * config.horizon_s:
-        share = min(age_s / config.score_memory_s, 1.0)
+        # While the models converge, old errors say nothing of the next ones.
+        state.scored_s += age_s
+        memory_s = min(max(_RECENT_SHARE * state.scored_s, _LEAST_MEMORY_S), config.score_memory_s)
+        share = min(age_s / memory_s, 1.0)
         for m in range(MODELS):
             error = wall_m - target_models.position(state.shot[m], age_s)
             if m == PHASED:
@@ -351,6 +356,7 @@ def _start_harmonics(
 ) -> None:
     """Start the harmonics of heart or breath in all models: at `rate_Hz` (Hz), amplitude about `size_m` (m), from `bank`."""
     fresh = state.heart_found == 0 and state.breath_found == 0
+    state.scored_s = 0.0
     for m in (STEADY, RESTLESS, PHASED):
         x, P = state.x[m], state.P[m]
         before_m = _position(state, m, 0.0)

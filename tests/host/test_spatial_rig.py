@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,6 +119,27 @@ def test_errors_of_the_actuation_are_followed_and_stated() -> None:
     assert one.errors.covariance[0, 0] < 0.1 * 0.8e-3**2
     noise = found.covariance_N2 - found.lasting_covariance_N2
     assert np.linalg.eigvalsh(noise).min() > -1e-12 and np.linalg.eigvalsh(found.lasting_covariance_N2).min() > -1e-12
+
+
+def test_a_backlash_wider_than_assumed_is_learned_from_its_flanks() -> None:
+    on_tip, normal, half_m = np.array([0.0, 0.0, -0.12]), np.array([0.0, 0.0, 1.0]), 0.25e-3
+    unsure = ActuationKnowledge((0.8e-3, 0.5, 0.02), (2e-3, 0.1, 0.02), (1e-4, 0.1, 0.005))
+    missed_m = {}
+    for flank_m in (0.3e-3, 0.0):
+        rng, side, off_m = np.random.default_rng(4), 0.0, []
+        one = estimator(replace(unsure, flank_m=flank_m), tangential_sd_N=0.02)
+        for k in range(200):
+            before_m, swing_m = (1e-3 * math.sin(0.06 * math.pi * i) for i in (k - 1, k))
+            side = min(max(side + (swing_m - before_m) / half_m, -1.0), 1.0)
+            tip, shaft = poses(on_tip, -0.07 + swing_m - half_m * side, 18.0, 0.3, rng)
+            found = one.estimate(tip, shaft, Actuation(-0.07 + swing_m, 0.3, 18.0, k * 25_000_000, normal))
+            assert found.converged
+            off_m.append(one.errors.mean[0] + half_m * side)
+        missed_m[flank_m] = float(np.std(off_m[100:]))
+        if flank_m:
+            learned, sd = one.errors.missing_backlash
+            assert learned == pytest.approx(2.0 * half_m, abs=3.0 * sd) and sd < 0.12e-3
+    assert missed_m[0.3e-3] < 0.5 * missed_m[0.0]
 
 
 def test_the_covariance_is_true_when_the_world_is_drawn_from_what_it_states() -> None:

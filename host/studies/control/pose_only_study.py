@@ -49,15 +49,23 @@ def run(rig: Rig, seed: int, model: str, beat: str, tilt_deg: float, seconds: fl
 
 
 def row(runs: list[Held], still_rms_N: list[float]) -> str:
-    """Return one row of the table: each RMS error is compared with the still catheter of the same seed."""
-    rms, reference = np.array([held.rms_N(WANTED_N) for held in runs]), np.array(still_rms_N)
-    mean = np.mean([held.mean_N() for held in runs])
+    """Return one row of the table: each RMS error is compared with the still catheter of the same seed.
+
+    Runs that did not reach the wall have no force to judge; they are counted as lost for ever.
+    """
+    pairs = [(held, still_N) for held, still_N in zip(runs, still_rms_N, strict=True) if held.reached]
+    if not pairs:
+        return f"wall not reached | | | | | | {len(runs)} of {len(runs)} | for ever |"
+    there, reference = [held for held, _ in pairs], np.array([still_N for _, still_N in pairs])
+    rms = np.array([held.rms_N(WANTED_N) for held in there])
+    mean = np.mean([held.mean_N() for held in there])
     lost_s = [held.longest_loss_s() for held in runs]
+    longest = f"{max(lost_s):.3f} s" if max(lost_s) < np.inf else "for ever"
     return (
         f"{1e3 * np.sqrt(np.mean(rms**2)):.1f} mN | {1e3 * np.min(rms):.1f} to {1e3 * np.max(rms):.1f} mN | "
         f"{1e3 * mean:.0f} mN | {np.sqrt(np.mean(rms**2) / np.mean(reference**2)):.2f} | {np.max(rms / reference):.2f} | "
-        f"{1e3 * max(held.overshoot_N(WANTED_N) for held in runs):.0f} mN | "
-        f"{sum(lost > 0.0 for lost in lost_s)} of {len(runs)} | {max(lost_s):.3f} s |"
+        f"{1e3 * max(held.overshoot_N(WANTED_N) for held in there):.0f} mN | "
+        f"{sum(lost > 0.0 for lost in lost_s)} of {len(runs)} | {longest} |"
     )
 
 
