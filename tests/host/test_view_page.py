@@ -522,7 +522,8 @@ def test_a_point_is_picked_on_the_tissue_and_moves_nothing_by_itself(rig: tuple[
     page.evaluate("() => { const b = document.querySelector('[data-do=\"goto\"]'); b.click(); b.click(); }")
     open_page.wait(lambda: len(fake.asked) == 1)
     assert fake.asked[0]["point_m"] == pytest.approx([mm / 1000 for mm in picked[1]])
-    page.mouse.dblclick(across, down - 90)  # above the tissue, where the ray meets its plane far away or never
+    # At the upper edge of the scene the ray meets the plane of the tissue far away or never.
+    page.mouse.dblclick(across, page.locator("#scene").bounding_box()["y"] + 12)
     open_page.wait(lambda: "No tissue" in open_page.text("#answer"))
     assert open_page.complaints == []
 
