@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 import seldinger as sd
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.rules import RULES, Budget
 from host.diagnosis.model.effect import Array, Candidate, Parameter, Port
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
+from host.diagnosis.selection import search
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import fit_nominal, try_fit, with_wider
+from host.diagnosis.selection.search import Found, fit_nominal, try_fit, with_wider
 from host.diagnosis.selection.trial import at_bound, called_for, wider
 
 PRESS: dict[str, Any] = {
@@ -97,3 +100,19 @@ def test_friction_that_grows_with_speed_is_not_named_stribeck(sign: float) -> No
     verdict = sd.diagnose([pressed(k, 1.0, yields_m_per_s=5e-3, sign=sign) for k in range(3)], PRESS)
     ids = [str(effect["id"]) for effect in verdict.effects]
     assert ids and ids[0] in ("coulomb_friction", "presliding_friction") and "stribeck_friction" not in ids
+
+
+def test_several_effects_of_one_name_may_leave_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = [(Parameter("jump", "N", (size,)),) for size in (1.0, 2.0, 3.0)]
+    first, second, other = (Term(one("coulomb_friction"), part) for part in parts)
+    found = Found(Fit((), np.zeros(0)), Fit((first, second), np.zeros(2)), [])
+    asked = []
+
+    def exchanged(problem: Any, found: Found, term: Term, *more: Any) -> None:
+        asked.append(term)
+        found.best = Fit((other,), np.zeros(1))
+
+    monkeypatch.setattr(search, "_in_place_of", exchanged)
+    problem: Any = SimpleNamespace(rules=RULES, budget=Budget())
+    search._exchange(problem, found, [], np.zeros(1), lambda *_: None)
+    assert asked == [first] and found.best.terms == (other,)
