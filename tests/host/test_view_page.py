@@ -67,6 +67,7 @@ class OpenPage:
     def fresh(self, width: int = 1280, scheme: str = "dark") -> OpenPage:
         """Load the page again, so that a test inherits nothing of the one before."""
         self.look_as(width, scheme)
+        self.page.evaluate("scrollTo(0, 0)")  # a browser scrolls a page that is loaded again to where it was
         self.page.reload()
         self.complaints.clear()
         self.ready()
