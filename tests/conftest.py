@@ -8,14 +8,17 @@ from hypothesis import settings
 settings.register_profile("seldinger", deadline=None, derandomize=True, print_blob=False)
 settings.load_profile("seldinger")
 
-# Files whose tests fit models to recordings or run a whole rig: longer than ten seconds each on one core. A single slow test
-# in another file has the mark itself. Every run prints its slowest tests, so that this list can be kept true.
+# Files whose tests fit models to recordings, run a whole rig or start processes: longer than eight seconds each on one core.
+# A single slow test in another file has the mark itself. Every run prints its slowest tests; keep this list true by them.
 SLOW = {
     "firmware": "proof",
     "host/diagnosis": "benches experiment folded_reading live nested nominals places planted rig_recording standing",
-    "host/proof": "runner",
-    "host": "access demo estimator_process live_study reproduction reproduction_mechanics services subscribers unplugged",
-    "sim": "scenario sensor_failures rig_effects",
+    "host/proof": "runner worlds",
+    "host": "access demo device_commands estimator_process first_day live_study reproduction reproduction_mechanics "
+    "rig_sweeps services stop_paths subscribers unplugged view_commands",
+    "protocol": "zenoh_session",
+    "realtime": "hybrid_control",
+    "sim": "concealed home_run hostile_commands scenario sensor_failures sensor_servers rig_effects",
 }
 SLOW_FILES = {f"{folder}/test_{name}.py" for folder, names in SLOW.items() for name in names.split()}
 

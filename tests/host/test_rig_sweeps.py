@@ -88,7 +88,6 @@ def test_the_same_bytes_as_in_lock_step(rig: Rig, tmp_path: Path) -> None:
     assert bench.world.edges[0] > 2 * 0.008 * rig.stages.insertion.steps_per_unit
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("device", ["tracker", "force", "board"])
 def test_a_device_that_never_answers_keeps_the_stages_still(rig: Rig, device: str) -> None:
     bench = Bench(rig)

@@ -72,7 +72,6 @@ def still_catheter_N(rig: Rig) -> float:
     return float(np.std(run.run(6.0).force_N))
 
 
-@pytest.mark.slow
 def test_force_on_a_beating_wall_against_thesis_and_still_catheter(rig: Rig) -> None:
     ours = pressed(rig, HeartConfig())
     assert np.all(ours.phase == Phase.CONTACT) and np.min(ours.force_N) > 0.0
@@ -81,7 +80,6 @@ def test_force_on_a_beating_wall_against_thesis_and_still_catheter(rig: Rig) -> 
     assert np.mean(ours.force_N[ours.time_s > 4.0]) == pytest.approx(WANTED_N, abs=0.005)
 
 
-@pytest.mark.slow
 def test_an_irregular_beat_never_breaks_the_touch(rig: Rig) -> None:
     trace = pressed(rig, HeartConfig(irregularity=0.1, premature_share=0.05), 12.0)
     assert np.min(trace.force_N) > 0.0 and rms_N(trace) < 0.02
@@ -244,7 +242,6 @@ def test_the_force_loop_acts_along_the_normal_and_the_position_loop_across(
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_the_pi_form_holds_the_force_with_the_gains_of_the_experiments(rig: Rig, factor: float) -> None:
     """(7.6) at 25 ms, K_ip halved and doubled: Fig. 7.24's gains all hold 0.1 N."""
@@ -254,7 +251,6 @@ def test_the_pi_form_holds_the_force_with_the_gains_of_the_experiments(rig: Rig,
     assert abs(late.mean() - 0.1) < 3e-3 and late.std() < 7e-3
 
 
-@pytest.mark.slow
 def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_the_wall(rig: Rig) -> None:
     """Fig. 7.12: the steady error falls with K_if. The desired position is 3 mm in front of the wall."""
     error_N = []
@@ -265,7 +261,6 @@ def test_the_pi_form_needs_the_force_integral_where_the_desired_position_is_off_
     assert error_N[0] > 0.02 and abs(error_N[1]) < 1e-3
 
 
-@pytest.mark.slow
 def test_the_incremental_form_from_the_desired_position_needs_ten_times_the_force_integral(rig: Rig) -> None:
     """Fig. 7.12 in the other reading: without K_if the force gain alone carries the 3 mm.
 
@@ -280,7 +275,6 @@ def test_the_incremental_form_from_the_desired_position_needs_ten_times_the_forc
     assert error_N[0] > error_N[1] + 0.01 and error_N[1] > 0.01 and abs(error_N[2]) < 2e-3
 
 
-@pytest.mark.slow
 def test_the_thesis_law_acts_on_a_predicted_force(rig: Rig) -> None:
     """A force that rises steadily, read at 40 Hz, 25 ms late: a tenth of the error of holding the last reading."""
     config, state = tick_parameters(changed(rig, law="thesis"))[0].force_predictor, new(FORCE_PREDICTOR_STATE)[0]
@@ -298,7 +292,6 @@ def test_the_thesis_law_acts_on_a_predicted_force(rig: Rig) -> None:
     assert np.abs(misses).max() < 0.1 * np.abs(held).mean()
 
 
-@pytest.mark.slow
 def test_a_contact_elsewhere_softer_is_held_too(rig: Rig) -> None:
     """Nothing of the simulator's stiffness is built in: a wall of 300 N/m instead of 1000."""
     run = bench(rig, HeartConfig())

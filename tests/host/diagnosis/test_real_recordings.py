@@ -45,6 +45,7 @@ def test_positioning_system_friction() -> None:
     assert result.found.steps[0].key.startswith("coulomb_friction")
 
 
+@pytest.mark.long
 def test_silverbox_spring() -> None:
     result, verdict = run("silverbox")
     assert verdict["effects"][0]["id"] == "nonlinear_stiffness"
