@@ -73,6 +73,9 @@ def payloads(draw: st.DrawFn) -> tuple[str, bytes]:
     if name == "command":
         values |= {"id": "c", "commander": "console", "action": "arm", "target": "none", "expires_ns": values["stamp_ns"]}
         values["axis"] = "none"
+    if name == "plan":
+        values["steps"] = min(values["step"] + 1 + values["steps"], 255)
+        values["step"] = min(values["step"], values["steps"] - 1)
     message = message_class(**values)
     try:
         return name, encode(message)
