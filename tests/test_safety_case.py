@@ -32,5 +32,5 @@ def test_every_hazard_has_barriers_with_tests_and_says_what_remains() -> None:
     for hazard in HAZARDS:
         rows = [line for line in hazard.splitlines() if line.startswith("|")][2:]
         assert len(rows) >= 5 and all("::test_" in row and row.count("|") == 4 for row in rows), hazard[:40]
-        remains = hazard.partition("*Remains.*")[2]
-        assert re.search(r"\*\*(wire|driver|person)\*\*", remains), hazard[:40]
+        remains = hazard.partition("**Remaining risk.**")[2]
+        assert re.search(r"\*\*(Wire|Driver|Person):\*\*", remains), hazard[:40]
