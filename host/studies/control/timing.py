@@ -36,9 +36,9 @@ def _timed(params, state, inputs, outputs, noise_N, period_ns: int, out_us) -> N
         if k % every == every // 5:
             u.estimate.count += 1
             u.estimate.stamp_ns, u.estimate.arrival_ns = u.now_ns - 30_000_000, u.now_ns
-            u.estimate.force_N[2] = 0.2 + 3.0 * noise_N[k]
+            u.estimate.force_N[2] = u.estimate.nominal_N[2] = 0.2 + 3.0 * noise_N[k]
             for i in range(3):
-                u.estimate.covariance_N2[i, i] = 4e-4
+                u.estimate.covariance_N2[i, i] = u.estimate.nominal_covariance_N2[i, i] = 4e-4
         begin_ns = monotonic_ns()
         tick(params, state, inputs, outputs)
         out_us[k] = (monotonic_ns() - begin_ns) * 1e-3
