@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 
 
 class InputError(ValueError):
@@ -42,6 +43,14 @@ class Description(str):
 def reason(error: Exception) -> Description:
     """Say why a file could not be read, without the number and the path that the system's message adds."""
     return Description(getattr(error, "strerror", None) or str(error) or type(error).__name__)
+
+
+def one_of(key: str, value: object, allowed: Collection[str]) -> str:
+    """Return `value` if it is one of `allowed`. Raises InputError named `key`."""
+    if not isinstance(value, str) or value not in allowed:
+        found = value if isinstance(value, str) else str(value)
+        raise InputError(key, found, " or ".join(allowed) if len(allowed) < 4 else "one of " + ", ".join(allowed))
+    return value
 
 
 def _short(value: object, limit: int = 80) -> str:

@@ -125,16 +125,14 @@ def _estimate_off(run: FaultyScenario) -> bool:
     return abs(truth_N - force.normal_N[SOURCE_ESTIMATE]) > max(4.0 * sd_N, 0.2)
 
 
-def _estimate_scaled(run: FaultyScenario, size: float, seconds: float) -> None:
-    def wrong(estimate: ForceEstimate) -> ForceEstimate:
-        force_N, nominal_N = _scaled(estimate.force_N, size), _scaled(estimate.nominal_force_N, size)
-        return msgspec.structs.replace(estimate, force_N=force_N, nominal_force_N=nominal_N)
+def _on_estimate(*forces: str) -> Inject:
+    def inject(run: FaultyScenario, size: float, seconds: float) -> None:
+        def wrong(estimate: ForceEstimate) -> ForceEstimate:
+            return msgspec.structs.replace(estimate, **{name: _scaled(getattr(estimate, name), size) for name in forces})
 
-    run.wrong = wrong
+        run.wrong = wrong
 
-
-def _adapted_scaled(run: FaultyScenario, size: float, seconds: float) -> None:
-    run.wrong = lambda estimate: msgspec.structs.replace(estimate, force_N=_scaled(estimate.force_N, size))
+    return inject
 
 
 def _scaled(force_N: tuple[float, ...] | None, size: float) -> tuple[float, ...] | None:
@@ -339,7 +337,7 @@ FAULTS: tuple[FaultKind, ...] = (
     FaultKind(
         "estimate_scaled",
         "the model process answers this times its estimate: zero, or the wrong sign",
-        _estimate_scaled,
+        _on_estimate("force_N", "nominal_force_N"),
         (-1.0, 0.3),
         "times",
         seconds=(1.5, 1.5),
@@ -350,7 +348,7 @@ FAULTS: tuple[FaultKind, ...] = (
     FaultKind(
         "adapted_scaled",
         "the same, of the force by the adapted stiffness alone",
-        _adapted_scaled,
+        _on_estimate("force_N"),
         (-1.0, 0.3),
         "times",
         seconds=(1.5, 1.5),

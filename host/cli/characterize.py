@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, one_of, within, writable_folder
+from host.cli.options import BOARDS, Board, Folder, Json, RigFile, Seed, checked_seed, within, writable_folder
 from host.cli.progress import share_bar
 from host.cli.recordings import open_recording
-from protocol.errors import Description, InputError
+from protocol.errors import Description, InputError, one_of
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, RigFile, one_of, within
+from host.cli.options import Json, RigFile, within
 from host.cli.progress import Working
+from protocol.errors import one_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 if TYPE_CHECKING:

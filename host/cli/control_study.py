@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import SEEDS, Json, RigFile, one_of, within
-from protocol.errors import InputError
+from host.cli.options import SEEDS, Json, RigFile, within
+from protocol.errors import InputError, one_of
 from protocol.rig_file import SIMULATED_RIG
 
 

@@ -18,11 +18,10 @@ from host.cli.options import (
     Seed,
     checked_effects,
     checked_seed,
-    one_of,
     writable_folder,
 )
 from host.cli.progress import share_bar
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Folder, Json, one_of, writable_folder
+from host.cli.options import Folder, Json, writable_folder
 from host.cli.progress import Working
 from host.cli.recordings import UnpackLimit, open_recording
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 
 
 def export(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Docs, Jobs, Json, Seed, checked_jobs, checked_seed, one_of, within, writable_file
+from host.cli.options import BOARDS, Board, Docs, Jobs, Json, Seed, checked_jobs, checked_seed, within, writable_file
 from host.cli.progress import Progress
+from protocol.errors import one_of
 
 if TYPE_CHECKING:
     from host.studies.faults.campaign import RunResult

@@ -13,9 +13,9 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.drive import Driver, Endpoint, Keys, Name, driving
-from host.cli.options import Json, RigFile, one_of
+from host.cli.options import Json, RigFile
 from host.cli.progress import Working
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 from protocol.rig_file import AXES, Rig, load_rig
 from protocol.stop_client import ask_socket
 from protocol.topics import check_name

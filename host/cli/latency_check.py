@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, one_of, within, writable_file
+from host.cli.options import Json, within, writable_file
 from host.cli.progress import Working
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 if TYPE_CHECKING:

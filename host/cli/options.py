@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -30,13 +30,6 @@ Docs = Annotated[
 
 SEEDS = (0, 2**31 - 1)
 BOARDS = ("avr", "native", "auto")  # sim.board.KINDS, which takes the simulator's modules to import
-
-
-def one_of(key: str, value: str, allowed: Collection[str]) -> str:
-    """Return `value` if it is one of `allowed`. Raises InputError named `key`."""
-    if value not in allowed:
-        raise InputError(key, value, " or ".join(allowed) if len(allowed) < 4 else "one of " + ", ".join(allowed))
-    return value
 
 
 def within(key: str, value: float, low: float, high: float, unit: str = "") -> float:

@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Folder, Json, one_of, writable_folder
+from host.cli.options import Folder, Json, writable_folder
+from protocol.errors import one_of
 
 # part -> module with run(directory, quick, progress) -> (sections, path of the report); imported only when requested
 PARTS = {"mechanics": "host.studies.reproduction.mechanics", "control": "host.studies.reproduction.control"}

@@ -18,12 +18,11 @@ from host.cli.options import (
     Seed,
     checked_effects,
     checked_seed,
-    one_of,
     writable_file,
     writable_folder,
 )
 from host.cli.progress import Progress
-from protocol.errors import Description, InputError
+from protocol.errors import Description, InputError, one_of
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 if TYPE_CHECKING:

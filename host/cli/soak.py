@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Docs, Json, Seed, checked_seed, one_of, within, writable_file
+from host.cli.options import BOARDS, Board, Docs, Json, Seed, checked_seed, within, writable_file
 from host.cli.progress import share_bar
+from protocol.errors import one_of
 
 
 def soak(

@@ -15,9 +15,10 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.extras import missing_extra
-from host.cli.options import Jobs, Json, checked_jobs, one_of
+from host.cli.options import Jobs, Json, checked_jobs
 from host.cli.progress import Progress
 from host.cli.warm_workloads import WORKLOADS
+from protocol.errors import one_of
 
 POLL_S = 0.2
 

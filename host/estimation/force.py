@@ -17,9 +17,10 @@ from host.estimation.spatial import ONE_TO_ONE, SpatialEstimate, checked_case, e
 from host.estimation.spatial_batch import BatchEstimate, estimate_batch
 from host.estimation.spatial_residuals import ROWS_OF_CASE
 from host.mechanics.pcar import arcs_of
-from host.mechanics.rod import checked_catheter, checked_workers, column, finite, number, one_of, real, yes_or_no
+from host.mechanics.rod import checked_catheter, checked_workers, column, finite, number, real, yes_or_no
+from host.mechanics.statics import MODELS
 from protocol.catheter import Catheter
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 
 Array = NDArray[np.float64]
 
@@ -113,7 +114,7 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
     Examples:
         >>> estimate_force(catheter, 0.01, 10.0, [(0.0, r0, q0), (0.03, r1, q1)], case=4).force_N  # doctest: +SKIP
     """
-    one_of("model", model, ("cosserat", "pcar"))
+    one_of("model", model, MODELS)
     checked_catheter(catheter)
     _check_settings(sensors, prior, thorough, ordered)
     workers = checked_workers(workers)
@@ -152,7 +153,9 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
 
 def _check_settings(sensors: object, prior: object, thorough: object, ordered: object) -> None:
     """Raise InputError where an argument is not of its kind; what it holds is checked where it is used."""
-    if not isinstance(sensors, list | tuple) or not all(isinstance(s, list | tuple) and len(s) >= 3 for s in sensors):
+    if not (
+        isinstance(sensors, list | tuple) and sensors and all(isinstance(s, list | tuple) and len(s) >= 3 for s in sensors)
+    ):
         raise InputError(
             "sensors", str(sensors), "a list of (offset_m, position_m, quaternion_wxyz), from the tip backwards"
         )
@@ -178,13 +181,10 @@ def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[A
 
 
 def _check_rows(positions_m: Array, offsets_m: Sequence[float], exposed_m: Array) -> None:
-    """Raise InputError for the first of n samples, positions (n, k, ...), that the catheter cannot reach."""
-    if exposed_m.size not in (1, len(positions_m)):
-        return  # lengths that do not match are named by the estimator
+    """Raise InputError for the first of n samples, positions (n, k, ...), that the catheter cannot reach; exposed_m (n,)."""
     for row in np.flatnonzero(out_of_reach(positions_m, offsets_m, exposed_m)):
-        exposed = float(np.broadcast_to(exposed_m, len(positions_m))[row])
         for index, position in enumerate(positions_m[row]):
-            check_reach(f"sensors.{index}.position_m.{row}", position, exposed)
+            check_reach(f"sensors.{index}.position_m.{row}", position, float(exposed_m[row]))
         check_apart(f"sensors.{{}}.position_m.{row}", offsets_m, list(positions_m[row]))
 
 
@@ -212,10 +212,7 @@ def _search_again(
 
 def _many(sensors: Sequence[Any]) -> bool:
     """Whether the first sensor has a row for each of n samples."""
-    try:
-        position = sensors[0][1]
-    except (IndexError, TypeError, KeyError):
-        raise InputError("sensors", str(sensors), "a list of (offset_m, position_m, quaternion_wxyz)") from None
+    position = sensors[0][1]
     ndim = getattr(position, "ndim", None)
     if ndim is not None:
         return bool(ndim == 2)

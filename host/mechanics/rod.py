@@ -7,7 +7,7 @@ Python, and only a bad one is looked at closely.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -34,13 +34,6 @@ def real(key: str, value: ArrayLike, wanted: str) -> Array:
     if array.dtype.kind not in "fiu" or np.ma.is_masked(value):
         raise InputError(key, str(value), wanted)
     return array.astype(np.float64, copy=False)
-
-
-def one_of(key: str, value: object, names: Iterable[str]) -> str:
-    """Return `value`, one of `names`. Raises InputError naming `key`."""
-    if not isinstance(value, str) or value not in names:
-        raise InputError(key, value if isinstance(value, str) else str(value), " or ".join(names))
-    return value
 
 
 def yes_or_no(key: str, value: object) -> bool:

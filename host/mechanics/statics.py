@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from host.mechanics import pcar
 from host.mechanics.cosserat import FRAMES, CosseratSolution, CosseratSolutions, solve_cosserat, solve_cosserat_cases
-from host.mechanics.rod import checked_catheter, checked_stations, checked_workers, column, number, one_of, real
+from host.mechanics.rod import checked_catheter, checked_stations, checked_workers, column, number, real
 from host.mechanics.threads import in_threads
 from protocol.catheter import Catheter
-from protocol.errors import InputError
+from protocol.errors import InputError, one_of
 
 Array = NDArray[np.float64]
 

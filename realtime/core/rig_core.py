@@ -218,7 +218,7 @@ class RigCore:
         self._outputs = outputs
         self.phase, self.force_source = Phase(int(outputs.phase)), ForceSource(int(outputs.force_source))
         self.action = SafetyAction(int(outputs.action))
-        if self.commands.homing is not None:
+        if self._homes:
             self.phase = Phase.HOMING
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
@@ -226,8 +226,8 @@ class RigCore:
         if number % telemetry.STAGE_EVERY == 0:
             self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs, self._located))
         if number % telemetry.STATE_EVERY == 0:
-            homing = self._homes
-            self._publish("state", telemetry.state_message(self._records["command"], outputs, self._located, homing))
+            state = telemetry.state_message(self._records["command"], outputs, self._located, self._homes)
+            self._publish("state", state)
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             self._publish("board", board_message(self.link, tick_ns))
         if number % telemetry.LOOP_EVERY == 0:

@@ -14,7 +14,8 @@ from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Sca
 from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
-FORCES = ("N", "mN", "kN", "N m", "Nm", "N*m", "mN m")  # units of a load
+# Units of a load, each with the same unit without its scale.
+FORCES = {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}
 Mask = npt.NDArray[np.bool_]
 ActiveEffect = tuple[Candidate, Array]
 

@@ -24,6 +24,7 @@ from host.diagnosis.effects.gravity_load import payload
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale, spread
 from host.diagnosis.model.model import (
+    FORCES,
     ActiveEffect,
     Begin,
     Model,
@@ -168,7 +169,7 @@ class SimulatedModel(Model):
     def _chain(self) -> list[tuple[str, str]]:
         """Torque and angle of each joint, where angles go in and as many torques come out: an arm, in the order given."""
         angles = [name for name in self.section.inputs if self.units[name] == "rad"]
-        torques = [name for name in self.section.outputs if _dimension(self.units[name]) == "N m"]
+        torques = [name for name in self.section.outputs if FORCES.get(self.units[name]) == "N m"]
         alike = len(torques) == len(self.section.outputs) and len({self.units[name] for name in torques}) == 1
         return list(zip(torques, angles, strict=True)) if alike and 1 < len(angles) == len(torques) <= MOST_LINKS else []
 
@@ -182,7 +183,7 @@ class SimulatedModel(Model):
             (force, motion)
             for force in self.section.outputs
             for motion in self.section.inputs
-            if FORCE_OF.get(self.units[motion]) == _dimension(self.units[force])
+            if (wanted := FORCE_OF.get(self.units[motion])) and wanted == FORCES.get(self.units[force])
         ]
         declared = [(a, b) for a, b in pairs if a in self.section.ports and b in self.section.ports]
         own = [pair for pair in declared if self.subsystem_of(pair[0]) == self.subsystem_of(pair[1])]
@@ -450,11 +451,6 @@ class SimulatedModel(Model):
 
 
 UNSCALED = Scale("", 1.0, 0.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True)
-
-
-def _dimension(unit: str) -> str:
-    """A unit of force without its scale, "" for others."""
-    return {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}.get(unit, "")
 
 
 def offered(offer: OfferSpec) -> Effect:
