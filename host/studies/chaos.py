@@ -204,9 +204,10 @@ def section(runs: list[ChaosRun], seed: int) -> str:
         "",
         f"`make chaos RUNS={len(runs)} SEED={seed}`",
         "",
-        f"{len(runs)} runs with the simulated rig, the model process and the realtime process as processes. "
-        f"{len(done)} reached contact with the beating wall; there one or two troubles were drawn. The rig was then "
-        f"watched for {WATCHED_S:g} s, and stopped over both paths. Forces are the plant's, times those of the rig's clock.",
+        f"In {len(runs)} runs the simulated rig, the model process and the realtime process were separate processes. "
+        f"{len(done)} of them reached contact with the beating wall. One or two troubles were then drawn at random, the rig "
+        f"was watched for {WATCHED_S:g} s, and it was stopped over both paths. Forces are those of the plant, times "
+        "those of the rig's clock.",
         "",
         f"Runs that broke a rule: **{len(broken)}**. Largest true force: {max(peaks, default=math.nan):.3f} N "
         f"(limit {LIMIT_N} N).",
@@ -226,9 +227,9 @@ def section(runs: list[ChaosRun], seed: int) -> str:
         "recorder fails (limit of a file's size).",
         "- *at rest before the stop*: runs whose stages came to rest by themselves; in the others the loop stayed in "
         "contact and followed the wall, until the stop.",
-        "- *stop confirmed*: of the runs in which the realtime process was not killed. After it was killed the board has "
+        "- *stop confirmed*: of the runs in which the realtime process was not killed. After it was killed, the board has "
         "stopped the stages, and a stop is reported as not confirmed.",
-        "- A simulated rig that is killed cannot say what its plant did; `tests/host/test_wall_clock.py` covers it.",
+        "- A simulated rig that is killed leaves no data of its plant; `tests/host/test_wall_clock.py` covers this case.",
     ]
     if len(done) < len(runs):
         lines.append(f"- {len(runs) - len(done)} runs did not reach contact on this machine and are not in the table.")

@@ -143,9 +143,9 @@ def page_section(found: Study, kinds: Sequence[str], seconds: float) -> str:
         "",
         f"`seldinger latency-check --with {','.join(kinds)} --seconds {seconds:g} --docs docs/reliability.md`",
         "",
-        "The loop at 1 kHz on the wall clock, the model process and the simulated rig on the same machine; kinds in turn,",
-        "so that all share its disturbances; times in us. In virtual time every step edge is the same with each of them",
-        "(`pytest tests/host/test_subscribers.py`).",
+        "The loop at 1 kHz, the model process and the simulated rig run on one machine, on the wall clock. The kinds of",
+        "subscriber take turns, so that other load of the machine affects all of them equally. Times are in us. In virtual",
+        "time every step edge is the same with each kind (`pytest tests/host/test_subscribers.py`).",
         "",
         "| with | ticks | missed | lateness p50 | p99 | p99.9 | pass p50 | p99 | p99.9 | threads late p50 | p99 | "
         "queries dropped |",
@@ -170,9 +170,8 @@ def page_section(found: Study, kinds: Sequence[str], seconds: float) -> str:
         )
     lines += [
         "",
-        "*lateness*: time between the due time of a tick and the wake-up of the loop; *pass*: one pass of its work;",
-        "*threads late*: how",
-        "late a thread of the same process woke that slept 1 ms, as those that read the devices do. Compare with the",
-        "first row and with cyclictest: other load of the machine is in all of them.",
+        "*lateness*: time between the due time of a tick and the wake-up of the loop. *pass*: time of one pass of its work.",
+        "*threads late*: lateness of a thread of the same process that sleeps for 1 ms, as the threads do that read the",
+        "devices. The first row and cyclictest are the reference, because other load of the machine is in all rows.",
     ]
     return "\n".join(lines)

@@ -16,17 +16,18 @@ _PAGE = """## Faults
 
 `seldinger faults --runs {runs} --seed {seed} --board {board} --docs docs/reliability.md`
 
-{reached} runs in lock step, each with a rig that reached its phase without a fault. (Approach: on the way to the beating
-wall; contact: up to {touch_s:g} s after first contact; hold: from {hold_s:g} s after it.) Force and motion are those of the
-plant, not readings of a sensor. In {not_reached} further runs the rig did not reach the phase: its drawn catheter, wall or
-heart is so far from its file that it retracted before, without a fault.
+In {reached} runs in lock step the rig reached the phase in which the fault was injected. (Approach: on the way to the
+beating wall; contact: up to {touch_s:g} s after first contact; hold: from {hold_s:g} s after it.) In {not_reached} further
+runs it did not reach the phase: the drawn catheter, wall or heart differs so much from the rig file that the rig retracted
+before, without a fault. Force and motion are those of the plant, not readings of a sensor.
 
-Of three rigs one is as its file says. One has a drawn patient: wall 1 to 10 N/mm, heart 0.8 to 3 Hz and 0.5 to 5 mm,
-irregular. One also has a catheter of 0.5 to 2 times the stiffness of its file. Half of all rigs close the loop with the
-force sensor, half with the estimate. A fifth of the runs has a second fault within {second_s:g} s. The limit of the true
-force is {limit_N} N. It is higher only where a catheter that stands still gets more from its drawn wall: no software can
-take the catheter away from such a wall while the board has no link. An alarm without a fault counts as false unless the
-catheter is not that of its file, or the true force was above {over_share:.0%} of the limit.
+One rig of three is as its file says. One of three has another patient: wall 1 to 10 N/mm, heart 0.8 to 3 Hz and 0.5 to
+5 mm, irregular. One of three also has another catheter, with 0.5 to 2 times the stiffness of its file. Half of the rigs
+close the loop with the force sensor, half with the estimate. A fifth of the runs has a second fault within {second_s:g} s.
+
+The limit of the true force is {limit_N} N. It is higher only if the drawn wall presses a catheter at rest with a larger
+force, because no software can move the catheter while the board has no link. An alarm without a fault counts as false
+unless the catheter differs from its file, or the true force was above {over_share:.0%} of the limit.
 
 Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {limit_N} N). Unhandled exceptions:
 {unhandled}. Recordings that could not be read: {unreadable}. Motion without a command after a stop: {rearmed}.
@@ -36,23 +37,23 @@ Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {li
 |---|---|---|---|---|---|---|---|---|---|
 {rows}
 
-- *must be detected*: runs in which the fault was large or long enough to matter (`sim/fault_table.py`); the others may or
-  may not be detected. *first detected by*: a cause of the failsafe, a line in the log, or a count of a driver or the board.
-  Of a jam or slip what was really lost counts, and the time from when it was more than {steps_to_find} steps for good
-  ({lost_s:g} s or longer).
+- *must be detected*: runs in which the fault was large or long enough to have an effect (`sim/fault_table.py`); the others
+  may or may not be detected. A jam or slip must be detected if more than {steps_to_find} steps were lost for {lost_s:g} s
+  or longer; its time of detection counts from the begin of that loss.
+- *first detected by*: a cause of the failsafe, a line in the log, or a count of a driver or the board.
 - *motion into the tissue after*: motion of the insertion stage after the fault was detected, if the action was hold,
   retract or stop.
 - After a lost link, reset or power cycle all stages must be at rest within {rest_ms:.0f} ms: longest {longest_ms:.0f} ms.
 
 {violations}
 
-Loss of the zenoh router, processes killed with SIGKILL and real disks need the wall clock and are tested elsewhere
+Loss of the zenoh router, processes killed with SIGKILL and real disks need the wall clock. Other tests cover them
 (`tests/host/test_wall_clock.py`, `tests/host/test_recording.py`). An encoder that fails while its axis is at rest is
-detected when the axis moves. A force sensor that is wrong is detected by its difference from the estimate, once that is
-larger than 1.5 standard deviations of the estimate (`realtime/control/witnesses.py`).
+detected when the axis moves. A wrong force sensor is detected when its difference from the estimate exceeds 1.5 standard
+deviations of the estimate (`realtime/control/witnesses.py`).
 
 **A knob that slips at the stage's full speed straightens the catheter** before the insertion stage has crossed its
-backlash ({crossing_ms:.0f} ms). A motor with a torque reserve slips more slowly; use one.
+backlash ({crossing_ms:.0f} ms). Use a motor with a torque reserve: it slips more slowly.
 """
 
 
