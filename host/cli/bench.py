@@ -15,7 +15,9 @@ ACCURACY_KEYS = (("tip_error_m", "m"), ("force_error_N", "N"), ("width_error_rad
 
 def bench(
     json: Json = False,
-    only: Annotated[list[str] | None, typer.Option(help="Run this benchmark alone; may be given several times.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Benchmark to run; may be given several times. Default: all.")
+    ] = None,
     seed: Seed = 1,
 ) -> None:
     """Time the kernels and their peers on equal inputs, one core. Progress on standard error."""

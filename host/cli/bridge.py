@@ -17,7 +17,9 @@ from host.cli.options import Json, RigFile
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
-bridge = typer.Typer(help="Serve the running rig to other systems: OpenIGTLink, ROS 2.", no_args_is_help=True)
+bridge = typer.Typer(
+    help="Send the running rig's poses and forces to other systems: OpenIGTLink, ROS 2.", no_args_is_help=True
+)
 
 
 @bridge.callback()
@@ -58,7 +60,7 @@ def ros2(
     router: Annotated[str, typer.Option(help="Zenoh endpoint of rmw_zenohd.")] = "tcp/127.0.0.1:7447",
     namespace: Annotated[str, typer.Option(help="ROS namespace of the topics.")] = "seldinger",
     domain: Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID.")] = 0,
-    commands: Annotated[bool, typer.Option("--commands", help="Take force commands (servo_cf) during a touch.")] = False,
+    commands: Annotated[bool, typer.Option("--commands", help="Accept force commands (servo_cf) during a touch.")] = False,
     json: Json = False,
 ) -> None:
     """Publish measured_cp, measured_cf and operating_state (CRTK) to ROS 2 over rmw_zenoh."""

@@ -17,18 +17,29 @@ from protocol.errors import InputError
 def calibrate(
     shapes: Annotated[
         str,
-        typer.Argument(help="Recorded shapes: .csv, .json, or - (JSON); format: host/identification/recorded_shapes.py."),
+        typer.Argument(
+            help="Recorded shapes: .csv, .json, or - (JSON). The format is in host/identification/recorded_shapes.py."
+        ),
     ],
-    catheter: Annotated[str, typer.Option(help="Where the search starts: a shipped catheter or a .toml file.")],
+    catheter: Annotated[str, typer.Option(help="Catheter from which the search starts: a shipped one or a .toml file.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the calibrated catheter, NAME.toml.")] = None,
     name: Annotated[str, typer.Option(help="Name of the calibrated catheter: a-z, 0-9 and _.")] = "calibrated",
     model: Annotated[
-        str, typer.Option(help="pcar (planar), cosserat (spatial), or wire (friction of the pull-wire, from a loop).")
+        str,
+        typer.Option(
+            help="Model: pcar (planar), cosserat (spatial), or wire (friction of the pull-wire, from a loading loop)."
+        ),
     ] = "pcar",
-    fit: Annotated[str, typer.Option(help="Some of stiffness, lengths, curvature, comma separated.")] = "stiffness,lengths",
-    loss: Annotated[str, typer.Option(help="squares, huber, cauchy, or distance (the thesis' sum).")] = "huber",
-    method: Annotated[str, typer.Option(help="gauss-newton, nelder-mead, or both to compare them.")] = "gauss-newton",
-    leave_one_out: Annotated[bool, typer.Option(help="Refit without each recording in turn.")] = True,
+    fit: Annotated[
+        str, typer.Option(help="Parameters to fit: stiffness, lengths, curvature, comma separated.")
+    ] = "stiffness,lengths",
+    loss: Annotated[
+        str, typer.Option(help="Loss function: squares, huber, cauchy, or distance (the sum of the thesis).")
+    ] = "huber",
+    method: Annotated[
+        str, typer.Option(help="Search: gauss-newton, nelder-mead, or both (to compare them).")
+    ] = "gauss-newton",
+    leave_one_out: Annotated[bool, typer.Option(help="Fit again without each recording in turn.")] = True,
     json: Json = False,
 ) -> None:
     """Identify a catheter: stiffness, lengths and unloaded curvature with intervals, and what the data do not determine.

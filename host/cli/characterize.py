@@ -23,14 +23,16 @@ def characterize(
     json: Json = False,
     rig: RigFile = SIMULATED_RIG,
     recording: Annotated[Path | None, typer.Option(help="Identify from this recording of sweeps; nothing moves.")] = None,
-    repeats: Annotated[int, typer.Option(help="Cycles of each sweep.")] = 5,
+    repeats: Annotated[int, typer.Option(help="Number of cycles of each sweep.")] = 5,
     seed: Seed = 1,
     board: Board = "auto",
     directory: Folder = Path("runs"),
-    real: Annotated[bool, typer.Option("--real", help="Move the rig at the rig file's ports, not a simulated one.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="With --real: the tip hangs free, do not ask.")] = False,
-    board_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
-    tracker_port: Annotated[str | None, typer.Option(help="With --real, instead of the rig file's.")] = None,
+    real: Annotated[
+        bool, typer.Option("--real", help="Move the rig at the ports of the rig file instead of a simulated one.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --real: do not ask whether the tip hangs free.")] = False,
+    board_port: Annotated[str | None, typer.Option(help="With --real: port to use instead of the rig file's.")] = None,
+    tracker_port: Annotated[str | None, typer.Option(help="With --real: port to use instead of the rig file's.")] = None,
     force_port: Annotated[int, typer.Option(help="With --real: UDP port of the force box.", hidden=True)] = 49152,
 ) -> None:
     """Characterize a rig in free space: backlash, slopes, dead zones, curves; write its calibration."""
@@ -45,11 +47,11 @@ def characterize(
     within("--force-port", force_port, 1, 65535)
     checked_seed(seed)
     if real and recording is not None:
-        raise InputError("--real", "with --recording", "one of them: a recording moves nothing")
+        raise InputError("--real", "with --recording", "one of them; a recording needs no motion")
     loaded = load_rig(rig)
     if real and not (yes or sys.stdin.isatty()):
         raise InputError(
-            "--yes", Description("nothing"), "a terminal to ask in, or --yes once the tip hangs free: the catheter will move"
+            "--yes", Description("nothing"), "a terminal, or --yes once the tip hangs free, because the catheter will move"
         )
     opened = None if recording is None else open_recording(recording)
     writable_folder("--out", directory)
@@ -90,8 +92,10 @@ def _record_on_rig(rig: Rig, repeats: int, ports: PortNames, yes: bool, director
 
     sweeps = standard_sweeps(rig, repeats)
     print(f"seldinger: {describe(sweeps)}", file=sys.stderr)
-    if not (yes or typer.confirm("Does the catheter's tip hang free, nothing within its reach?", err=True)):
-        print("seldinger: nothing was moved", file=sys.stderr)
+    if not (
+        yes or typer.confirm("The catheter will move. Does its tip hang free, with nothing within its reach?", err=True)
+    ):
+        print("seldinger: nothing has moved", file=sys.stderr)
         raise typer.Exit(1)
     path = new_recording_path(directory, "characterize")
     return record_on_rig(rig, sweeps, path, ports, lambda share: print(f"sweeps: {share:.0%}", file=sys.stderr, flush=True))

@@ -22,7 +22,7 @@ DEVICES = ("tracker", "force", "board")
 def check_device(
     device: Annotated[str, typer.Argument(help="tracker, force or board.")],
     rig: RigFile = SIMULATED_RIG,
-    seconds: Annotated[float, typer.Option(help="How long to read it.")] = 5.0,
+    seconds: Annotated[float, typer.Option(help="Time to read the device, s.")] = 5.0,
     port: Annotated[str, typer.Option(help="Serial port, or the box's address, instead of the rig file's.")] = "",
     udp_port: Annotated[int, typer.Option(help="RDT port of the force box.", hidden=True)] = 49152,
     web_port: Annotated[int, typer.Option(help="Port of the force box's page.", hidden=True)] = 80,

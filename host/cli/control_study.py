@@ -14,10 +14,10 @@ from protocol.rig_file import SIMULATED_RIG
 
 
 def control_study(
-    seeds: Annotated[str, typer.Option(help="Seeds, comma separated; one run of each kind for each.")] = "1,2,3",
-    seconds: Annotated[float, typer.Option(help="How long each force is held after contact (s).")] = 60.0,
-    goals: Annotated[int, typer.Option(help="Random points for positioning.")] = 50,
-    only: Annotated[str, typer.Option(help="Sections, comma separated; default: all.")] = "",
+    seeds: Annotated[str, typer.Option(help="Seeds, comma separated; each kind of run is made with every seed.")] = "1,2,3",
+    seconds: Annotated[float, typer.Option(help="Time to hold each force after contact, s.")] = 60.0,
+    goals: Annotated[int, typer.Option(help="Number of random points for positioning.")] = 50,
+    only: Annotated[str, typer.Option(help="Sections to run, comma separated; default: all.")] = "",
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
 ) -> None:

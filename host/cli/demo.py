@@ -36,14 +36,17 @@ def demo(
     board: Board = "auto",
     seed: Seed = 1,
     force: Annotated[float, typer.Option(help="Contact force to hold, N.")] = 0.2,
-    hold: Annotated[float, typer.Option(help="Seconds to hold it.")] = 20.0,
-    fast: Annotated[bool, typer.Option("--fast", help="As fast as possible instead of in real time.")] = False,
-    wall_clock: Annotated[bool, typer.Option("--wall-clock", help="As on a rig: processes, ptys, real time.")] = False,
-    force_source: Annotated[str, typer.Option(help="What closes the force loop: sensor or estimate.")] = "sensor",
+    hold: Annotated[float, typer.Option(help="Time to hold the force, s.")] = 20.0,
+    fast: Annotated[bool, typer.Option("--fast", help="Run as fast as possible instead of in real time.")] = False,
+    wall_clock: Annotated[
+        bool, typer.Option("--wall-clock", help="Run every part as a process in real time, as on a rig.")
+    ] = False,
+    force_source: Annotated[str, typer.Option(help="Force that the loop controls: sensor or estimate.")] = "sensor",
     rig: RigFile = SIMULATED_RIG,
     directory: Folder = Path("runs"),
     effect: Annotated[
-        list[str] | None, typer.Option(help="Plant an effect: ID@PORT, or ID@PORT:NAME=VALUE,start_s=VALUE.")
+        list[str] | None,
+        typer.Option(help="Effect to plant in the simulated rig: ID@PORT, or ID@PORT:NAME=VALUE,start_s=VALUE."),
     ] = None,
 ) -> None:
     """Bring the tip from rest to a beating wall and hold a force on it."""

@@ -17,37 +17,37 @@ from protocol.rig_file import SIMULATED_RIG
 
 def diagnose(
     recordings: Annotated[
-        list[str] | None, typer.Argument(help="Tables or folders; without any, those that the nominal TOML names.")
+        list[str] | None, typer.Argument(help="Tables or folders; default: the files that the nominal TOML lists.")
     ] = None,
-    nominal: Annotated[str, typer.Option(help="Nominal model: a TOML file, or the name of one that ships.")] = "",
+    nominal: Annotated[str, typer.Option(help="Nominal model: a TOML file, or the name of a shipped one.")] = "",
     json: Json = False,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for verdict.json, report.html, and the scripts of discriminating experiments."),
     ] = None,
     data: Annotated[
-        str | None, typer.Option(help="Folder of the recordings that the nominal TOML names (default: SELDINGER_DATA).")
+        str | None, typer.Option(help="Folder of the recordings that the nominal TOML lists (default: SELDINGER_DATA).")
     ] = None,
-    without: Annotated[list[str] | None, typer.Option(help="Id of an effect that is not to be considered.")] = None,
+    without: Annotated[list[str] | None, typer.Option(help="Id of an effect to exclude from the candidates.")] = None,
     time_budget: Annotated[
-        float | None, typer.Option(help="Seconds after which nothing further is tried; the verdict says so.", min=0.0)
+        float | None, typer.Option(help="Time after which the search ends, s; the verdict reports it.", min=0.0)
     ] = None,
-    quiet: Annotated[bool, typer.Option(help="No progress on standard error.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Compare a running rig with its twin, and raise alarms.")] = False,
+    quiet: Annotated[bool, typer.Option(help="Print no progress on standard error.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Compare a running rig with its twin and raise alarms.")] = False,
     rig: RigFile = SIMULATED_RIG,
     effect: Annotated[
         list[str] | None,
-        typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as the report gives it."),
+        typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as printed in a report."),
     ] = None,
     export: Annotated[
         Path | None,
         typer.Option(
-            help="File for the extended model: .py (module), .json, .xml, .ssv (a simulator's parameters), .toml (rig)."
+            help="File for the extended model: .py (module), .json, .xml, .ssv (parameters of a simulator), .toml (rig)."
         ),
     ] = None,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="Run the code that the nominal TOML names even if another user may have written it."),
+        typer.Option("--trust", help="Run the code of the nominal TOML even if another user may have written it."),
     ] = False,
 ) -> None:
     """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""

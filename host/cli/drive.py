@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from host.run.connection import RigConnection
     from protocol.topics import Message
 
-Name = Annotated[str, typer.Option("--name", help="Name under which the command is given.")]
-Endpoint = Annotated[str | None, typer.Option(help="Where a rig on another machine listens: tls/HOST:PORT.")]
+Name = Annotated[str, typer.Option("--name", help="Name of the commander.")]
+Endpoint = Annotated[str | None, typer.Option(help="Address of a rig on another machine: tls/HOST:PORT.")]
 Keys = Annotated[Path | None, typer.Option(help="Folder of the certificate for --endpoint.")]
 Force = Annotated[str, typer.Option(help="Contact force, such as 0.2, 200mN or 20g.")]
 # Of jogs along a direction of the base frame.
@@ -137,8 +137,8 @@ def _plain(command: str, words: str, lease: bool = True) -> Callable[..., None]:
     return run
 
 
-disarm = _plain("disarm", "accepted; the stages come to rest, the board is disarmed")
-hold = _plain("hold", "accepted; the rig holds where it is", lease=False)
+disarm = _plain("disarm", "accepted; the stages come to rest and the board is disarmed")
+hold = _plain("hold", "accepted; the rig holds its position", lease=False)
 clear = _plain("clear", "accepted; latched causes and faults are cleared, the rig is disarmed")
 zero = _plain("zero", "accepted; the present load of the force sensor is its zero now")
 
@@ -155,11 +155,11 @@ def arm(
 
 
 def jog(
-    axis: Annotated[str, typer.Argument(help="insertion, roll, knob; or the tip along e1, e2, e3 or a direction X,Y,Z.")],
-    travel: Annotated[str, typer.Argument(help="How far, such as 2mm, -0.002, 5deg; the sign is the direction.")],
-    speed: Annotated[
-        str | None, typer.Option(help="Speed, such as 5mm (per second). Default: half of the greatest.")
-    ] = None,
+    axis: Annotated[
+        str, typer.Argument(help="Axis (insertion, roll, knob), or direction of the tip (e1, e2, e3 or X,Y,Z).")
+    ],
+    travel: Annotated[str, typer.Argument(help="Distance or angle, such as 2mm, -0.002, 5deg; the sign is the direction.")],
+    speed: Annotated[str | None, typer.Option(help="Speed, such as 5mm (per second). Default: half of the maximum.")] = None,
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
     name: Name = "console",
@@ -193,7 +193,7 @@ def jog(
 
 def goto(
     place: Annotated[str, typer.Argument(help="Point X,Y,Z of the base frame, such as 0,-10.7mm,21mm.")],
-    tolerance: Annotated[str, typer.Option(help="How near is near enough.")] = "1mm",
+    tolerance: Annotated[str, typer.Option(help="Largest accepted distance from the point.")] = "1mm",
     within: Annotated[str, typer.Option(help="Longest time to get there.")] = "20s",
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
@@ -232,7 +232,10 @@ def touch(
     place: Annotated[str, typer.Argument(help="Point X,Y,Z on the tissue, base frame, such as 0,-10.7mm,25mm.")],
     normal: Annotated[str, typer.Option(help="Direction X,Y,Z into the tissue.")] = "0,0,1",
     force: Force = "0.2",
-    seconds: Annotated[str | None, typer.Option("--for", help="Retract after so long. Default: press until told.")] = None,
+    seconds: Annotated[
+        str | None,
+        typer.Option("--for", help="Time after which the tip is retracted. Default: press until the next command."),
+    ] = None,
     within: Annotated[str, typer.Option(help="Longest time until contact.")] = "20s",
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
@@ -252,7 +255,7 @@ def touch(
             raise driver.failed(f"no contact within {patience_s:g} s; the rig holds")
         driver.say(f"in contact, {force_N:g} N wanted")
         if hold_s is None:
-            driver.say("the force stays until hold, retract or stop")
+            driver.say("the force is held until hold, retract or stop")
             return
         forces = _pressed(driver, hold_s)
         driver.result |= {"mean_force_N": sum(forces) / max(len(forces), 1), "seconds": hold_s}
@@ -287,7 +290,7 @@ def force(
     endpoint: Endpoint = None,
     keys: Keys = None,
 ) -> None:
-    """Change the force of the touch that goes on."""
+    """Change the force of the present touch."""
     force_N = quantity("newton", newton, "N")
     with driving("force", rig, json, name, endpoint, keys) as driver:
         driver.rig.force(force_N)
@@ -302,18 +305,18 @@ def retract(
         driver.rig.retract()
         if not driver.wait(10.0, lambda state: state.mode == "stopped"):  # type: ignore[attr-defined]
             raise driver.failed("accepted, but not retracted within 10 s")
-        driver.say("done; the rig has stopped. Disarm and arm to go on")
+        driver.say("done; the rig has stopped. To continue, disarm and arm it")
 
 
 def mark(
-    note: Annotated[str, typer.Argument(help="What to note, at most 500 characters.")],
+    note: Annotated[str, typer.Argument(help="Text of the note, at most 500 characters.")],
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
     name: Name = "console",
     endpoint: Endpoint = None,
     keys: Keys = None,
 ) -> None:
-    """Put a note with the rig's time into log and recording."""
+    """Write a note with the rig's time into log and recording."""
     if not 0 < len(note.strip()) <= 500:
         raise InputError("note", note, "1 to 500 characters")
     with driving("mark", rig, json, name, endpoint, keys, lease=False) as driver:

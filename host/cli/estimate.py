@@ -14,7 +14,7 @@ from host.cli.options import Json, RequestFile, plot_file
 def estimate(
     request: RequestFile,
     json: Json = False,
-    plot: Annotated[str | None, typer.Option(help="Draw the shape and the force into this PNG file.")] = None,
+    plot: Annotated[str | None, typer.Option(help="PNG file for a drawing of the shape and the force.")] = None,
 ) -> None:
     """Estimate the force at the tip from poses.
 

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 def experiment(
     script: Annotated[Path, typer.Argument(help="Script (TOML), as `seldinger diagnose --out` writes it.")],
     rig: RigFile = SIMULATED_RIG,
-    go: Annotated[bool, typer.Option("--go", help="Command the running rig: take the lease, arm, move.")] = False,
+    go: Annotated[bool, typer.Option("--go", help="Run it on the running rig: take the lease, arm, move.")] = False,
     simulated: Annotated[bool, typer.Option("--simulated", help="Run it in virtual time on the simulated rig.")] = False,
-    effect: Annotated[list[str] | None, typer.Option(help="With --simulated: plant an effect, as in `demo`.")] = None,
+    effect: Annotated[list[str] | None, typer.Option(help="With --simulated: effect to plant, as in `demo`.")] = None,
     board: Board = "auto",
     seed: Seed = 1,
     directory: Folder = Path("runs"),
@@ -53,7 +53,10 @@ def experiment(
     show(wanted, path, loaded)
     result: dict[str, Any] = {"script": str(script), "good": True, "seconds": path.seconds, "recording": None}
     if not (go or simulated):
-        print("nothing was moved: --go commands the running rig, --simulated runs it in virtual time", file=sys.stderr)
+        print(
+            "nothing has moved: --go runs the script on the running rig, --simulated runs it in virtual time",
+            file=sys.stderr,
+        )
     if simulated:
         writable_folder("--out", directory)
     try:

@@ -22,7 +22,9 @@ def faults(
     json: Json = False,
     jobs: Jobs = 0,
     board: Board = "native",
-    fault: Annotated[list[str] | None, typer.Option(help="Only this one; may be given several times.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Fault to inject; may be given several times. Default: all.")
+    ] = None,
     docs: Docs = None,
 ) -> None:
     """Inject faults in approach, contact and hold. Exit status 1 when a run broke a rule."""

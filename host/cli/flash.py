@@ -16,12 +16,16 @@ from protocol.rig_file import SIMULATED_RIG, load_rig
 
 
 def flash(
-    port: Annotated[str, typer.Option(help="Serial port of the board, as /dev/ttyACM0 or /dev/serial/by-id/...")],
+    port: Annotated[str, typer.Option(help="Serial port of the board, such as /dev/ttyACM0 or /dev/serial/by-id/...")],
     rig: RigFile = SIMULATED_RIG,
-    mcu: Annotated[str, typer.Option(help="atmega2560 or atmega328p; another than the rig file's: its usual pins.")] = "",
-    baud: Annotated[int, typer.Option(help="Of the boot loader; 0: the usual one of this board.")] = 0,
-    image: Annotated[Path | None, typer.Option(help="ELF file to write, instead of building one.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Build, and show the command only.")] = False,
+    mcu: Annotated[
+        str, typer.Option(help="atmega2560 or atmega328p. If it is not the one of the rig file, its default pins are used.")
+    ] = "",
+    baud: Annotated[int, typer.Option(help="Baud rate of the boot loader; 0: the usual one of this board.")] = 0,
+    image: Annotated[Path | None, typer.Option(help="ELF file to write instead of a new build.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Build the firmware and print the command; write nothing.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Build the firmware and write it to the board. The board resets: make sure that the stages may stop."""

@@ -1,4 +1,4 @@
-"""`seldinger home AXIS --rig FILE`: creep to the axis' switch and set the position there to the rig file's.
+"""`seldinger home AXIS --rig FILE`: move to the axis' switch and set the position there to the rig file's.
 
 A rig that runs homes itself. One that does not run is homed by this command, which then opens the board's port.
 """
@@ -30,8 +30,8 @@ _BEGINS_S, _ENDS_S = 2.0, 600.0
 def home(
     axis: Annotated[str, typer.Argument(help="insertion, roll or knob.")],
     rig: RigFile,
-    port: Annotated[str, typer.Option(help="Serial port of the board of a rig that does not run.")] = "",
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before it moves.")] = False,
+    port: Annotated[str, typer.Option(help="Serial port of the board, if the rig does not run.")] = "",
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the axis moves.")] = False,
     json: Json = False,
     name: Name = "console",
     endpoint: Endpoint = None,
@@ -42,7 +42,7 @@ def home(
 
     one_of("axis", axis, AXES)
     if port and endpoint:
-        raise InputError("--port", port, "no --port with --endpoint: a running rig has opened its port itself")
+        raise InputError("--port", port, "no --port with --endpoint, because a running rig has opened its port itself")
     try:
         check_name(name)
     except ValueError as error:
@@ -51,7 +51,7 @@ def home(
     wanted = home_of(settings, AXES.index(axis))
     if not yes:
         typer.confirm(
-            f"{axis} will creep to its {settings.stage(wanted.axis).home_end} switch. "
+            f"{axis} will move slowly to its {settings.stage(wanted.axis).home_end} switch. "
             "Is the clamp empty, and a hand at the emergency stop?",
             abort=True,
             err=True,
@@ -81,7 +81,7 @@ def _home_running(driver: Driver, axis: str) -> None:
         lines.extend(driver.rig.logged("home"))
         return bool(lines) and state.mode != "homing"
 
-    with Working(f"{axis} creeps to its switch"):
+    with Working(f"{axis} moves slowly to its switch"):
         driver.wait(_BEGINS_S, lambda state: state.mode == "homing")  # type: ignore[attr-defined]
         if not driver.wait(_ENDS_S, ended):
             raise driver.failed(f"accepted, but {axis} is not homed within {_ENDS_S:g} s")
@@ -98,14 +98,14 @@ def _home_stopped(rig: Rig, wanted: Home, port: str) -> dict[str, Any]:
 
     axis, stage = AXES[wanted.axis], rig.stage(wanted.axis)
     try:
-        with Working(f"{axis} creeps to its switch"):
+        with Working(f"{axis} moves slowly to its switch"):
             homing = home_stage(rig, wanted, port or rig.board.port)
     except (OSError, HomingFailed) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     print(
         f"{axis}: switch found, its position is {stage.home_unit:g} {'m' if axis == 'insertion' else 'rad'}; two touches "
-        f"differ by {homing.difference_steps} steps; the board is disarmed, the stage stands next to the switch",
+        f"differ by {homing.difference_steps} steps; the board is disarmed, the stage is next to the switch",
         file=sys.stderr,
     )
     return {"axis": axis, "end": stage.home_end, "home_unit": stage.home_unit, "difference_steps": homing.difference_steps}

@@ -21,11 +21,11 @@ _MANAGER = Path("/run/systemd/system")
 
 def install_services(
     rig: RigFile = SIMULATED_RIG,
-    simulated: Annotated[bool, typer.Option("--simulated", help="Add the simulated rig as a service.")] = False,
-    cpu: Annotated[int, typer.Option(help="Processor of the control loop; -1: the last.")] = -1,
-    root: Annotated[Path, typer.Option(help="Write below this directory, without calling systemd.", hidden=True)] = Path(
-        "/"
-    ),
+    simulated: Annotated[bool, typer.Option("--simulated", help="Install the simulated rig as a service too.")] = False,
+    cpu: Annotated[int, typer.Option(help="Processor for the control loop; -1: the last one.")] = -1,
+    root: Annotated[
+        Path, typer.Option(help="Write the files below this directory and do not call systemd.", hidden=True)
+    ] = Path("/"),
     take_away: Annotated[bool, typer.Option("--undo", help="Stop the services and remove what was installed.")] = False,
     json: Json = False,
 ) -> None:
@@ -35,7 +35,7 @@ def install_services(
 
     system = root == Path("/")
     if system and os.geteuid() != 0:
-        raise InputError("user", "not root", "root (sudo), or --root DIRECTORY to look at the files first")
+        raise InputError("user", "not root", "root (sudo), or --root DIRECTORY to inspect the files first")
     if take_away:
         removed = _undo(root, system)
         if json:
@@ -55,7 +55,7 @@ def install_services(
     except ValueError as error:
         raise InputError.from_sentence(str(error)) from None
     except FileExistsError as error:
-        raise InputError("--root", str(error), "a place without files of that name") from None
+        raise InputError("--root", str(error), "a folder without files of that name") from None
     for path in written:
         print(f"seldinger: wrote {path}", file=sys.stderr)
     if system and _MANAGER.is_dir():
@@ -79,7 +79,7 @@ def _undo(root: Path, system: bool) -> list[str]:
     if managed:
         _call("systemctl", "daemon-reload")
     print(
-        "seldinger: recordings in /var/lib/seldinger and the user stay; `userdel seldinger` removes the user"
+        "seldinger: recordings in /var/lib/seldinger and the user remain; `userdel seldinger` removes the user"
         if removed
         else "seldinger: nothing was installed here",
         file=sys.stderr,

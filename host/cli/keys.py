@@ -29,7 +29,7 @@ def _group() -> None:
 def init(
     directory: Directory = KEYS,
     laboratory: Annotated[str, typer.Option(help="Name of the laboratory, for the authority's certificate.")] = "laboratory",
-    passphrase: Annotated[bool, typer.Option("--passphrase", help="Ask for a passphrase that protects the key.")] = False,
+    passphrase: Annotated[bool, typer.Option("--passphrase", help="Ask for a passphrase that encrypts the key.")] = False,
     passphrase_file: PassphraseFile = None,
     json: Json = False,
 ) -> None:
@@ -41,7 +41,7 @@ def init(
         secret = typer.prompt("Passphrase of the authority's key", hide_input=True, confirmation_prompt=True, err=True)
     folder = make_authority(directory, laboratory, secret)
     print(
-        f"authority in {folder}; its key.pem gives command over every rig: keep it off the rigs, and back it up",
+        f"authority in {folder}; its key.pem allows commands to every rig: keep it off the rigs, and back it up",
         file=sys.stderr,
     )
     if json:
@@ -53,9 +53,11 @@ def issue(
     name: Annotated[str, typer.Argument(help="Name of the rig's machine, the reader or the commander: a-z, 0-9, - and _.")],
     role: Annotated[str, typer.Option(help="rig (the machine that listens), reader, or commander (reads too).")],
     directory: Directory = KEYS,
-    address: Annotated[list[str] | None, typer.Option(help="Of a rig: IP address or host name; may be repeated.")] = None,
-    connect: Annotated[str, typer.Option(help="Of a reader or commander: the rig, as tls/ADDRESS:PORT.")] = "",
-    days: Annotated[int, typer.Option(help="How long it is valid.")] = 365,
+    address: Annotated[
+        list[str] | None, typer.Option(help="For a rig: its IP address or host name; may be given several times.")
+    ] = None,
+    connect: Annotated[str, typer.Option(help="For a reader or commander: the rig, as tls/ADDRESS:PORT.")] = "",
+    days: Annotated[int, typer.Option(help="Number of days for which the certificate is valid.")] = 365,
     passphrase_file: PassphraseFile = None,
     json: Json = False,
 ) -> None:

@@ -22,7 +22,7 @@ MAX_SECONDS = 86_400
 
 
 def latency_check(
-    seconds: Annotated[float, typer.Option(help="How long in all; cyclictest, where installed, takes half.")] = 20.0,
+    seconds: Annotated[float, typer.Option(help="Total time, s; cyclictest, if installed, takes half of it.")] = 20.0,
     hz: Annotated[int, typer.Option(help="Ticks per second, 100 to 4000.")] = 1000,
     json: Json = False,
     beside: Annotated[
@@ -35,7 +35,7 @@ def latency_check(
         ),
     ] = "",
     docs: Annotated[
-        Path | None, typer.Option(help="With --with: page whose section on subscribers is written again.", hidden=True)
+        Path | None, typer.Option(help="With --with: page whose section on subscribers is written.", hidden=True)
     ] = None,
 ) -> None:
     """Run the wall-clock loop with the real tick; report how late it woke and how long it worked."""
@@ -44,7 +44,7 @@ def latency_check(
         raise InputError("--seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
     if docs is not None:
         if not beside:
-            raise InputError("--docs", str(docs), "--with too: the page has the section on subscribers alone")
+            raise InputError("--docs", str(docs), "--with too, because only the section on subscribers is on the page")
         writable_file("--docs", docs)
     if beside:
         _with_subscribers(beside, seconds, json, docs)
@@ -102,9 +102,9 @@ def _table(result: LatencyResult) -> str:
         columns["cyclictest"] = result.cyclictest
     lines = [f"{'us':>24} {'p50':>9} {'p99':>9} {'p99.9':>9} {'max':>9}"]
     for label, key in (
-        ("loop woken late by", "lateness_us"),
-        ("cyclictest late by", "cyclictest_us"),
-        ("one pass of the loop", "tick_us"),
+        ("lateness of the loop", "lateness_us"),
+        ("lateness of cyclictest", "cyclictest_us"),
+        ("time of one pass", "tick_us"),
     ):
         row = figures[key]
         if isinstance(row, dict):

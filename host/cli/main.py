@@ -22,46 +22,50 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "solve": ("host.cli.solve", "solve", "Compute the shape of a catheter under a tip force, from a JSON request."),
     "estimate": ("host.cli.estimate", "estimate", "Estimate the tip force from measured poses, from a JSON request."),
     "calibrate": ("host.cli.calibrate", "calibrate", "Identify a catheter's stiffness from shapes under known loads."),
-    "bench": ("host.cli.bench", "bench", "Measure the kernels' times, each with a peer in the same run."),
+    "bench": (
+        "host.cli.bench",
+        "bench",
+        "Measure computing times and errors, each next to a reference method in the same run.",
+    ),
     "diagnose": (
         "host.cli.diagnose",
         "diagnose",
-        "Find where recordings and simulation differ, and which physics is missing.",
+        "Find where recordings and simulation disagree, and which physics is missing.",
     ),
     "experiment": ("host.cli.experiment", "experiment", "Check the script of a diagnosis, or run it on the rig."),
-    "prove": ("host.cli.prove", "prove", "Score the mismatch finder on concealed cases with sealed labels."),
+    "prove": ("host.cli.prove", "prove", "Test the mismatch finder on concealed cases and print its scores."),
     "reproduce": ("host.cli.reproduce", "reproduce", "Reproduce the thesis' figures: mechanics or control."),
     "characterize": ("host.cli.characterize", "characterize", "Measure a rig's backlash, slopes and dead zones by sweeps."),
     "tune": ("host.cli.tune", "tune", "Tune the force controller's gains on the simulated rig."),
     "control-study": (
         "host.cli.control_study",
         "control_study",
-        "Measure the controller's figures, each with its reference.",
+        "Measure the errors of the controllers on the simulated rig.",
     ),
     "plan": ("host.cli.plan", "plan", "Plan a path of the tip past obstacles, from a JSON request."),
     "faults": ("host.cli.faults", "faults", "Inject faults in every phase on the simulated rig; report their detection."),
-    "run": ("host.cli.run", "run", "Run a protocol, a scripted experiment, with a report per point."),
-    "bridge": ("host.cli.bridge", "bridge", "Serve the running rig over OpenIGTLink or ROS 2."),
+    "run": ("host.cli.run", "run", "Run a protocol (a scripted experiment) and write a report."),
+    "bridge": ("host.cli.bridge", "bridge", "Send the running rig's poses and forces over OpenIGTLink or ROS 2."),
     "rig": ("host.cli.rig", "rig", "Check a rig file; show the effective configuration."),
-    "stop": ("host.cli.stop", "stop", "Stop the rig over every path; say whether its own state confirms it."),
+    "stop": ("host.cli.stop", "stop", "Stop the rig over every path and report whether its state confirms the stop."),
     "check-device": (
         "host.cli.check_device",
         "check_device",
         "Read one device of a rig and report whether it is fit for use.",
     ),
-    "status": ("host.cli.drive", "status", "Show a running rig on one screen, the first cause first."),
+    "status": ("host.cli.drive", "status", "Show the state of a running rig and the first cause of a problem."),
     "arm": ("host.cli.drive", "arm", "Power the stages of the running rig; they hold."),
     "disarm": ("host.cli.drive", "disarm", "Bring the stages to rest and disarm the board."),
     "jog": ("host.cli.drive", "jog", "Move one axis, or the tip along a direction, a short way."),
     "goto": ("host.cli.drive", "goto", "Bring the tip to a point in free space."),
     "touch": ("host.cli.drive", "touch", "Approach the tissue along a normal and hold a force."),
-    "force": ("host.cli.drive", "force", "Change the force of the touch that goes on."),
-    "hold": ("host.cli.drive", "hold", "Stay where the rig is; needs no lease."),
+    "force": ("host.cli.drive", "force", "Change the force of the present touch."),
+    "hold": ("host.cli.drive", "hold", "Hold the present position; needs no lease."),
     "retract": ("host.cli.drive", "retract", "Withdraw the tip from the tissue, then stop."),
-    "clear": ("host.cli.drive", "clear", "Clear latched causes and faults; leaves the rig disarmed."),
+    "clear": ("host.cli.drive", "clear", "Clear latched causes and faults; the rig is disarmed afterwards."),
     "zero": ("host.cli.drive", "zero", "Make the present load of the force sensor its zero."),
-    "mark": ("host.cli.drive", "mark", "Put a note with the rig's time into log and recording."),
-    "home": ("host.cli.home", "home", "Find the home switch of an axis; the stage moves."),
+    "mark": ("host.cli.drive", "mark", "Write a note with the rig's time into log and recording."),
+    "home": ("host.cli.home", "home", "Move an axis to its home switch and set its position."),
     "flash": ("host.cli.flash", "flash", "Write the firmware to the stepper board."),
     "install-services": (
         "host.cli.install_services",
@@ -69,12 +73,16 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
         "Install the rig's systemd services, or remove them.",
     ),
     "keys": ("host.cli.keys", "keys", "Issue certificates for readers and commanders on other machines."),
-    "soak": ("host.cli.soak", "soak", "Run for hours of virtual time; check memory, clocks and steps."),
-    "view": ("host.cli.view", "view", "Show the running rig on a page: shape, force, safety; arm, hold, stop."),
-    "play": ("host.cli.play", "play", "Show a recording on the same page, with the windows of its diagnosis."),
+    "soak": ("host.cli.soak", "soak", "Run the simulated rig for hours of virtual time; check memory, clocks and steps."),
+    "view": ("host.cli.view", "view", "Show the running rig on a page (shape, force, safety) with buttons to drive it."),
+    "play": ("host.cli.play", "play", "Show a recording on the page of `view`, with the windows of its diagnosis."),
     "export": ("host.cli.export", "export", "Write a recording's topics as parquet or csv tables."),
     "warm": ("host.cli.warm", "warm", "Compile every kernel that a command needs, on all cores."),
-    "latency-check": ("host.cli.latency_check", "latency_check", "Measure how punctual the loop is on this machine."),
+    "latency-check": (
+        "host.cli.latency_check",
+        "latency_check",
+        "Measure the lateness of the control loop on this machine.",
+    ),
 }
 
 # Commands whose arguments may begin with a minus, such as -2mm.
@@ -84,7 +92,7 @@ NEGATIVE_VALUES = ("jog", "goto", "touch", "force")
 Refused = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 COMPILES = (
-    "seldinger: compiling kernels, which takes up to some minutes; `seldinger warm` compiles all of them once, on all cores"
+    "seldinger: compiling kernels, which can take some minutes; `seldinger warm` compiles all of them once, on all cores"
 )
 
 
@@ -186,7 +194,7 @@ def _run(argv: list[str]) -> int:
     try:
         return int(typer.main.get_command(build(argv)).main(argv, "seldinger", standalone_mode=False) or 0)
     except typer.Abort:  # Ctrl-C, or "no" to a question
-        print("seldinger: ended before it was done", file=sys.stderr)
+        print("seldinger: interrupted before the end", file=sys.stderr)
         return 1
 
 

@@ -20,13 +20,11 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on sta
 RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (TOML).")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Board = Annotated[str, typer.Option(help="avr (the firmware's ELF in simavr), native, or auto.")]
-Folder = Annotated[Path, typer.Option("--out", help="Folder for recording, report and other results; made where missing.")]
+Folder = Annotated[Path, typer.Option("--out", help="Folder for recording, report and other results; created if missing.")]
 Jobs = Annotated[int, typer.Option("--jobs", help="Processes at a time; 0: one for each core.")]
 RequestFile = Annotated[str, typer.Argument(help="The request: a JSON file, or - for standard input.")]
 # For developers: the help does not list it.
-Docs = Annotated[
-    Path | None, typer.Option(help="Page of the documentation whose section is to be written again.", hidden=True)
-]
+Docs = Annotated[Path | None, typer.Option(help="Page of the documentation whose section is written.", hidden=True)]
 
 SEEDS = (0, 2**31 - 1)
 BOARDS = ("avr", "native", "auto")  # sim.board.KINDS, which takes the simulator's modules to import

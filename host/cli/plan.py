@@ -31,7 +31,7 @@ def plan(
         answer = search(checked, loaded, Path(".") if request == "-" else Path(request).parent)
     if answer is None:
         print(
-            f"seldinger: no path found in {checked.samples} samples; more samples or less clearance_m may find one",
+            f"seldinger: no path found with {checked.samples} samples; try more samples or a smaller clearance_m",
             file=sys.stderr,
         )
         if json:

@@ -15,8 +15,8 @@ from host.cli.recordings import UnpackLimit, open_recording
 
 def play(
     recording: Annotated[Path, typer.Argument(help="The recording (MCAP).")],
-    speed: Annotated[float, typer.Option(help="Times real time, 0.05 to 50.")] = 1.0,
-    diagnosis: Annotated[str | None, typer.Option(help="JSON of `seldinger diagnose`: its windows are marked.")] = None,
+    speed: Annotated[float, typer.Option(help="Speed relative to real time, 0.05 to 50.")] = 1.0,
+    diagnosis: Annotated[str | None, typer.Option(help="JSON of `seldinger diagnose`; the page marks its windows.")] = None,
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page, on 127.0.0.1.")] = 8448,
     unpack_limit: UnpackLimit = None,
     json: Json = False,

@@ -22,17 +22,22 @@ def prove(
     json: Json = False,
     jobs: Jobs = 0,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, whose workers then make the verdicts.", hidden=True)
+        str | None, typer.Option(help="Address of a Dask scheduler; its workers make the verdicts.", hidden=True)
     ] = None,
     resume: Annotated[Path | None, typer.Option(help="Folder of a run to continue.")] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for everything that is made (default: runs/prove_SEED_CASES).")
+        Path | None, typer.Option("--out", help="Folder for all results (default: runs/prove_SEED_CASES).")
     ] = None,
-    finder: Annotated[str | None, typer.Option(help="Another command to score, called as `seldinger diagnose` is.")] = None,
+    finder: Annotated[
+        str | None, typer.Option(help="Command to test instead of `seldinger diagnose`; it gets the same arguments.")
+    ] = None,
     limit_s: Annotated[float, typer.Option(help="Longest time for one case (s).", hidden=True)] = 900.0,
-    baselines: Annotated[bool, typer.Option(help="Run the baselines too, on the project's own world.")] = True,
+    baselines: Annotated[bool, typer.Option(help="Run the baseline methods too, in the world `own`.")] = True,
     world: Annotated[
-        str, typer.Option(help="own, mujoco, ode, contact, several joined by commas, or all; --cases of each.")
+        str,
+        typer.Option(
+            help="Generators of cases: own, mujoco, ode, contact (comma separated), or all. --cases counts for each."
+        ),
     ] = "own",
     calibration: Annotated[
         Path | None,
@@ -50,7 +55,7 @@ def prove(
     within("--limit-s", limit_s, 1.0, 1e6, "s")
     checked_seed(seed)
     if resume is not None and not (resume / "suite.json").exists():
-        raise InputError("--resume", str(resume), "a folder that an earlier run made")
+        raise InputError("--resume", str(resume), "a folder of an earlier run")
     chosen = _worlds(world)
     named = "" if chosen == ("own",) else "_" + "_".join(chosen)
     calibrate = _calibration(calibration)
@@ -59,7 +64,7 @@ def prove(
         raise InputError("--finder", finder, "a command whose program can be run")
     folder = writable_folder("--out", resume or out or Path("runs") / f"prove_{seed}_{cases}{named}")
     if is_spent(seed):
-        print(f"seed {seed} was used while the finder was built: its figures prove nothing", file=sys.stderr)
+        print(f"seed {seed} was used during the development of the finder, so its figures are no proof", file=sys.stderr)
     with Progress() as bar:
         result = run(
             Settings(cases, seed, folder, processes, scheduler, command, limit_s, baselines, chosen, calibrate),

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 UnpackLimit = Annotated[
     int | None,
-    typer.Option("--unpack-limit", min=1, help="MiB that the file may unpack to; default 64, or 64 times the file's size."),
+    typer.Option(
+        "--unpack-limit", min=1, help="Largest unpacked size of the file, MiB; default: 64, or 64 times the file's size."
+    ),
 ]
 
 

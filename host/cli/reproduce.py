@@ -20,7 +20,9 @@ PARTS = {"mechanics": "host.studies.reproduction.mechanics", "control": "host.st
 def reproduce(
     part: Annotated[str, typer.Argument(help="mechanics or control.")],
     json: Json = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Shorter runs, whose figures are not to be published.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Run shorter; the figures are then not fit for publication.")
+    ] = False,
     directory: Folder = Path("runs"),
 ) -> None:
     """Reproduce the thesis' figures: one section for each figure, with its verdict."""

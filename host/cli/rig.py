@@ -24,7 +24,7 @@ def _group() -> None:
 def check(
     file: Annotated[Path, typer.Argument(help="Rig file (TOML).")],
     json: Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only what is wrong.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only mistakes.")] = False,
 ) -> None:
     """Check FILE and show its effective configuration. Exit status 2 and a line for each mistake."""
     data = read_rig_data(file)

@@ -34,10 +34,12 @@ def run(
     protocol: Annotated[Path, typer.Argument(help="Protocol (TOML), see docs/protocols.md.")],
     rig: RigFile = SIMULATED_RIG,
     simulated: Annotated[bool, typer.Option("--simulated", help="Run it in virtual time on the simulated rig.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check it against the rig's limits; nothing moves.")] = False,
-    resume: Annotated[Path | None, typer.Option(help="Result (JSON) of an earlier run: do what is not done yet.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before it moves, nor at steps that wait.")] = False,
-    effect: Annotated[list[str] | None, typer.Option(help="With --simulated: plant an effect, as in `demo`.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check the protocol against the rig's limits; nothing moves.")
+    ] = False,
+    resume: Annotated[Path | None, typer.Option(help="Result (JSON) of an earlier run to continue.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the rig moves, nor at steps that wait.")] = False,
+    effect: Annotated[list[str] | None, typer.Option(help="With --simulated: effect to plant, as in `demo`.")] = None,
     board: Board = "auto",
     seed: Seed = 1,
     directory: Folder = Path("runs"),
@@ -51,7 +53,9 @@ def run(
     checked_seed(seed)
     effects = checked_effects(effect)
     if not (dry_run or simulated or yes or sys.stdin.isatty()):
-        raise InputError("--yes", Description("nothing"), "--yes without a terminal: the protocol moves the catheter")
+        raise InputError(
+            "--yes", Description("nothing"), "--yes without a terminal, because the protocol moves the catheter"
+        )
     loaded = load_rig(rig)
     if not dry_run:
         writable_folder("--out", directory)
@@ -95,7 +99,7 @@ def _carry_out(
             return protocol_run.run_simulated(job, directory, board, seed, effects, estimator, bar)
         if not yes:
             typer.confirm("The catheter will move. Is a hand at the emergency stop?", abort=True, err=True)
-        return protocol_run.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Go on?", err=True), bar)
+        return protocol_run.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Continue?", err=True), bar)
 
 
 def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
@@ -128,7 +132,7 @@ def _tell(result: ProtocolResult, target: Path, report: Path) -> None:
         print(f"{item.id:>6}  {item.kind:<6}{item.verdict:<17}{figures or '  ' + item.says}", file=sys.stderr)
     if result.ended:
         print(f"ended at {result.ended}", file=sys.stderr)
-        print(f"to go on: the same command with --resume {target}", file=sys.stderr)
+        print(f"to continue: the same command with --resume {target}", file=sys.stderr)
     if result.recording:
         print(f"recording  {result.recording}", file=sys.stderr)
     print(f"result     {target}\nreport     {report}", file=sys.stderr)

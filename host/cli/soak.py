@@ -14,7 +14,7 @@ from protocol.errors import one_of
 
 
 def soak(
-    minutes: Annotated[float, typer.Option(help="Of virtual time.")] = 30.0,
+    minutes: Annotated[float, typer.Option(help="Length of the run in virtual time, minutes.")] = 30.0,
     seed: Seed = 1,
     board: Board = "native",
     record: Annotated[bool, typer.Option(help="Write a recording.")] = True,

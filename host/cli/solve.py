@@ -14,7 +14,7 @@ from host.cli.options import Json, RequestFile, plot_file
 def solve(
     request: RequestFile,
     json: Json = False,
-    plot: Annotated[str | None, typer.Option(help="Draw the shape into this PNG file.")] = None,
+    plot: Annotated[str | None, typer.Option(help="PNG file for a drawing of the shape.")] = None,
 ) -> None:
     """Compute shape, tip pose and internal state of a loaded catheter.
 

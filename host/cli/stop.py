@@ -21,9 +21,9 @@ _OPENING_S, _AGAIN_S = 2.0, 0.02
 
 def stop(
     rig: RigFile,
-    endpoint: Annotated[str, typer.Option(help="Of a rig on another machine: tls/HOST:PORT.")] = "",
+    endpoint: Annotated[str, typer.Option(help="Address of a rig on another machine: tls/HOST:PORT.")] = "",
     keys: Annotated[Path | None, typer.Option(help="Folder of the certificate for --endpoint.")] = None,
-    name: Annotated[str, typer.Option(help="Name of the commander; with --endpoint that of the certificate.")] = "stop",
+    name: Annotated[str, typer.Option(help="Name of the commander; with --endpoint the name in the certificate.")] = "stop",
     json: Json = False,
 ) -> None:
     """Stop the rig over its socket and over zenoh at once; print what each answered.

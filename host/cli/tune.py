@@ -22,7 +22,7 @@ def tune(
     evaluations: Annotated[int, typer.Option(help="Evaluations of (7.4) for each method.")] = 100,
     jobs: Jobs = 0,
     seed: Seed = 1,
-    check: Annotated[bool, typer.Option("--check", help="Only the margin of the rig's present gains.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Report only the margin of the present gains.")] = False,
 ) -> None:
     """Tune the gains of the thesis' law on the simulated rig, over desired forces of 0.1, 0.2 and 0.3 N."""
     from host.commissioning.characterization import load_calibrated_rig
@@ -53,7 +53,7 @@ def _print(result: dict[str, Any]) -> None:
             margin = item["margin"]
             phase = f"phase {margin['phase_deg']:.0f} deg at {margin['crossover_Hz']:.2f} Hz"
             print(
-                f"{'':<24} rings at {margin['gain_factor']:.1f} times the gain; "
+                f"{'':<24} oscillates at {margin['gain_factor']:.1f} times the gain; "
                 + (
                     f"with {margin['delay_s'] * 1e3:.0f} ms more delay, {phase}"
                     if math.isfinite(margin["phase_deg"])

@@ -27,7 +27,8 @@ def warm(
     json: Json = False,
     jobs: Jobs = 0,
     only: Annotated[
-        list[str] | None, typer.Option(help="Only this part and those it needs; may be given several times.")
+        list[str] | None,
+        typer.Option(help="Part to compile, with the parts that it needs; may be given several times. Default: all."),
     ] = None,
 ) -> None:
     """Compile every kernel that a command needs. Exit status 1 when a part failed; the others are compiled then."""

@@ -59,7 +59,7 @@ class HomeRun:
             return f"{self.problem}; not homed, the rig is disarmed"
         return (
             f"{self.axis}: switch found, its position is {self._home_unit:g} {self._unit}; two touches differ by "
-            f"{self._homing.difference_steps} steps; the rig is disarmed, the stage stands next to the switch"
+            f"{self._homing.difference_steps} steps; the rig is disarmed, the stage is next to the switch"
         )
 
     def end(self, why: str) -> None:

@@ -139,7 +139,7 @@ def test_a_refusal_or_a_stop_breaks_it_off_and_holds(control: RigControl) -> Non
 def test_without_go_nothing_is_commanded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     experiment(write_script(Script(**FREE), tmp_path / "s.toml"), json=True)
     out, err = capsys.readouterr()
-    assert '"good": true' in out and "nothing was moved" in err and "roll: " in err
+    assert '"good": true' in out and "nothing has moved" in err and "roll: " in err
     with pytest.raises(InputError, match="--go"):
         experiment(tmp_path / "s.toml", go=True, simulated=True)
 

@@ -177,7 +177,7 @@ def test_a_port_that_is_held_is_refused(rig: Rig, lines: tuple[str, str]) -> Non
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (["--real"], 2, "--yes: found nothing, wanted a terminal to ask in"),
+        (["--real"], 2, "--yes: found nothing, wanted a terminal, or --yes"),
         (["--real", "--yes"], 1, "board.port: found pty:board that does not open"),
         (["--real", "--recording", "x.mcap"], 2, '--real: found "with --recording"'),
         (["--real", "--yes", "--force-port", "0"], 2, "--force-port: found 0"),

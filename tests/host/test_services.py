@@ -81,7 +81,7 @@ def test_a_file_of_someone_else_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "etc/systemd/system/seldinger-host.service"
     path.parent.mkdir(parents=True)
     path.write_text("mine")
-    with pytest.raises(InputError, match="a place without files of that name"):
+    with pytest.raises(InputError, match="a folder without files of that name"):
         install_services(rig=RIG_FILE, simulated=False, cpu=-1, root=tmp_path, take_away=False)
     assert files(tmp_path) == [path] and path.read_text() == "mine"
 
