@@ -29,7 +29,7 @@ RULES: dict[str, Rule] = {
     "operator_stop": Rule("The operator stopped the rig.", "Disarm and arm again when ready."),
     "loop_late": Rule(
         "The control loop was late: the computer was too busy.",
-        "Close other programs, and give the loop real-time priority; `seldinger latency-check` shows how late it wakes.",
+        "Close other programs, and give the loop real-time priority; `seldinger latency-check` measures its lateness.",
     ),
     "board_reset": Rule(
         "The stepper board was reset.", "Check the board's supply and its USB cable, then home the axes.", ("operator_stop",)
@@ -43,83 +43,88 @@ RULES: dict[str, Rule] = {
         ("loop_late", "board_silent", "board_reset"),
     ),
     "deadman": Rule(
-        "The board's dead man stopped the axes: no set-points came.",
+        "The board received no set-points, so its dead man stopped the axes.",
         "Check the cable of the board and the load of the computer, then clear.",
         ("loop_late", "underrun", "board_silent", "board_reset"),
     ),
-    "estop": Rule("The emergency stop opened.", "Close the emergency stop when it is safe, then clear."),
+    "estop": Rule("The emergency stop opened.", "Release the emergency stop when it is safe, then clear."),
     "limit": Rule("A limit switch opened.", "Move the stage off the switch by hand, clear, and home the axis."),
     "board_fault": Rule(
         "The stepper board latched a fault.",
-        "Look the fault up in docs/devices.md, remove it, then clear.",
+        "Remove the fault (docs/devices.md), then clear.",
         ("loop_late", "deadman", "estop", "limit", "board_reset", "operator_stop"),
     ),
     "steps_lost": Rule(
         "Encoder and steps disagree.",
-        "Look for a jam or a loose encoder plug, clear, and home the axes.",
+        "Check for a jam or a loose encoder plug, clear, and home the axes.",
         ("board_reset", "limit", "board_fault", "over_force"),
     ),
     "pose_rejected": Rule(
         "A pose was not finite, out of the workspace or too fast.",
-        "Look for metal or a field near the tracker's generator.",
+        "Check for metal or motors near the tracker's field generator.",
         ("loop_late",),
     ),
     "poses_wild": Rule(
         "Three poses in a row were rejected.", "Check the tracker and its tools.", ("loop_late", "pose_rejected")
     ),
     "pose_stale": Rule(
-        "No fresh pose came from the tracker.",
-        "Check the tracker's cable, and that the tip is in its field.",
+        "The tracker sent no recent pose.",
+        "Check the tracker's cable, and that the tip is in its measurement volume.",
         ("loop_late", "poses_wild"),
     ),
     "pose_lost": Rule(
-        "No pose came for longer than the limit.",
-        "Check the tracker's cable, and that the tip is in its field, then clear.",
+        "The tracker sent no pose for longer than the limit.",
+        "Check the tracker's cable, and that the tip is in its measurement volume, then clear.",
         ("loop_late", "poses_wild", "pose_stale"),
     ),
     "force_rejected": Rule(
         "A force reading was not finite or out of the sensor's range.", "Check the force sensor's cable.", ("loop_late",)
     ),
     "force_stale": Rule(
-        "No fresh force came in contact.", "Check the force sensor and its network.", ("loop_late", "force_rejected")
+        "The force source sent no recent value in contact.",
+        "Check the force sensor and its network.",
+        ("loop_late", "force_rejected"),
     ),
     "force_lost": Rule(
-        "No force came for longer than the limit in contact.",
+        "The force source sent no value for longer than the limit in contact.",
         "Check the force sensor and its network, then clear.",
         ("loop_late", "force_rejected", "force_stale"),
     ),
     "force_handover": Rule(
-        "The force sensor sends nothing or is frozen: the estimate closes the loop.",
+        "The force sensor sends no data or repeats one value. The loop uses the estimate.",
         "Check the force sensor.",
         ("force_rejected", "force_stale", "force_lost"),
     ),
     "force_disagrees": Rule(
         "Force sensor and estimate disagree.",
-        "Zero the force sensor in free space; if it still differs, check its mounting and the catheter's stiffness.",
+        "Zero the force sensor in free space; if they still disagree, check its mounting and the catheter's stiffness.",
         ("force_rejected", "force_stale", "steps_lost"),
     ),
     "force_undecided": Rule(
         "Force sensor and estimate began to disagree.",
-        "Wait; if they stay apart, the catheter retracts. Zero the force sensor in free space.",
+        "Wait; if they still disagree, the catheter retracts. Zero the force sensor in free space.",
         ("force_rejected", "force_stale", "steps_lost"),
     ),
     "host_silent": Rule(
         "The model process does not answer.",
-        "Look whether it runs: `systemctl status seldinger-host`, or start it again.",
+        "Check whether it runs (`systemctl status seldinger-host`), or start it again.",
         ("loop_late",),
     ),
     "host_lost": Rule(
-        "The model process did not come back in time.", "Start the model process, then clear.", ("loop_late", "host_silent")
+        "The model process did not answer for longer than the limit.",
+        "Start the model process, then clear.",
+        ("loop_late", "host_silent"),
     ),
     "force_unreached": Rule(
-        "The requested force is not reached: the catheter gives way.", "Request less force, or expose less of the catheter."
+        "The requested force is not reached, because the catheter bends too far.",
+        "Request less force, or insert the catheter less far.",
     ),
     "body_contact": Rule(
         "The catheter's body touches something away from the tip.",
-        "Look where (topic contact, or the page), and lead the catheter away from it; do not trust the estimated force.",
+        "Move the catheter away from the place on the page (topic contact); do not use the estimated force until then.",
     ),
     "still_pressed": Rule(
-        "A force remains on the stopped tip.",
+        "A force remains on the tip after the retraction.",
         "Pull the catheter back by hand until the force is gone.",
         ("over_force", "force_disagrees", "board_silent", "board_fault", "operator_stop"),
     ),
@@ -129,7 +134,7 @@ RULES: dict[str, Rule] = {
         ("loop_late", "steps_lost", "force_disagrees", "force_handover"),
     ),
 }
-_UNKNOWN = Rule("", "See the log for what came before it.")
+_UNKNOWN = Rule("", "Check the log lines before it.")
 _RANK = {cause: rank for rank, cause in enumerate(RULES)}
 
 

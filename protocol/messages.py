@@ -59,8 +59,8 @@ class Message(
     # Whether a measurement that is not finite or not plausible is sent as nil. A command is sent as given or not at all.
     measured: ClassVar[bool] = True
 
-    stamp_ns: Annotated[Stamp_ns, doc("time that the content is about, on the rig's clock")]
-    sequence: Annotated[Count, doc("counts up by one with each message of a topic from one publisher")] = 0
+    stamp_ns: Annotated[Stamp_ns, doc("time to which the content applies, on the rig's clock")]
+    sequence: Annotated[Count, doc("number of the message, increases by one for each topic and publisher")] = 0
 
     def check(self) -> None:
         """Check what must hold between fields.

@@ -159,9 +159,9 @@ class Stage(Message, frozen=True, kw_only=True):
 class Pose(Message, frozen=True, kw_only=True):
     """One reading of one tracker tool, in the base frame. `stamp_ns` is the time of measurement, latency subtracted."""
 
-    arrival_ns: Annotated[Stamp_ns, doc("when its last byte arrived")]
+    arrival_ns: Annotated[Stamp_ns, doc("time of arrival of its last byte")]
     frame: Annotated[U32, doc("the tracker's frame number")]
-    missing: Annotated[bool, doc("the tool was not seen; position and quaternion are nil")]
+    missing: Annotated[bool, doc("true if the tracker did not measure the tool; position and quaternion are then nil")]
     position_m: Annotated[tuple[Place_m, ...], columns_of("position of the sensor", _XYZ_m)] | None = None
     quaternion_wxyz: (
         Annotated[tuple[UnitPart, ...], columns_of("rotation sensor to base, scalar first", ("qw", "qx", "qy", "qz"))] | None
@@ -184,7 +184,7 @@ class Pose(Message, frozen=True, kw_only=True):
 class ForceSensor(Message, frozen=True, kw_only=True):
     """One reading of the force sensor: the force on the tissue, in the base frame."""
 
-    arrival_ns: Annotated[Stamp_ns, doc("when the datagram arrived")]
+    arrival_ns: Annotated[Stamp_ns, doc("time of arrival of the datagram")]
     force_N: Annotated[tuple[Force_N, ...], columns_of("force on the tissue, base frame", _FORCE)]
     torque_Nm: Annotated[tuple[Torque_Nm, ...], columns_of("torque, base frame", _triple("torque", "Nm"))] | None = None
     status: Annotated[U32, doc("the sensor's status word, 0 is healthy")] = 0
@@ -194,20 +194,22 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
     """The tip force that explains a pose. `stamp_ns` is that pose's; no force without its covariance."""
 
     frame: Annotated[str, choice("frame of force and covariance", FRAMES)]
-    converged: Annotated[bool, doc("a force explains the pose; if false, force and covariance may be nil")]
+    converged: Annotated[bool, doc("true if a force explains the pose; if false, force and covariance may be nil")]
     force_N: Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue", _FORCE)] | None = None
     covariance_N2: Annotated[tuple[Covariance_N2, ...], columns_of("covariance, row by row", _COVARIANCE)] | None = None
     lasting_covariance_N2: (
         Annotated[
             tuple[Covariance_N2, ...],
-            columns_of("part of the covariance that the poses of some seconds share, row by row", _LASTING),
+            columns_of("part of the covariance that is common to the poses of some seconds, row by row", _LASTING),
         ]
         | None
     ) = None
     nominal_force_N: (
         Annotated[
             tuple[Force_N, ...],
-            columns_of("force by the stiffness of the catheter's file; nil where the stiffness is not adapted", _NOMINAL),
+            columns_of(
+                "force computed with the stiffness of the catheter's file; nil if the stiffness is not adapted", _NOMINAL
+            ),
         ]
         | None
     ) = None
@@ -215,11 +217,11 @@ class ForceEstimate(Message, frozen=True, kw_only=True):
         Annotated[tuple[Covariance_N2, ...], columns_of("covariance of that force, row by row", _NOMINAL_COVARIANCE)] | None
     ) = None
     body_contact: Annotated[
-        bool, doc("the catheter touches away from the tip (topic `contact`): the force is not the tip's")
+        bool, doc("true if the catheter's body touches something (topic `contact`); the force is then not that of the tip")
     ] = False
     residual: Annotated[Number | None, doc("residual of the best force")] = None
-    published_ns: Annotated[Stamp_ns, doc("when the estimate left the estimator")]
-    compute_us: Annotated[Duration_us, doc("time the estimator took")]
+    published_ns: Annotated[Stamp_ns, doc("time at which the estimate was published")]
+    compute_us: Annotated[Duration_us, doc("computing time of the estimate")]
 
     def check(self) -> None:
         """Check that a converged estimate has a force and a covariance whose diagonal is not negative."""
@@ -238,8 +240,8 @@ class Stiffness(Message, frozen=True, kw_only=True):
 
     scale: Annotated[Ratio, doc("stiffness in use, relative to the catheter's file")]
     sd: Annotated[Ratio, doc("relative standard deviation of the stiffness in use")]
-    adaptation: Annotated[str, choice("what the adaptation does", ADAPTATIONS)]
-    text: Annotated[Text, doc("why, in words")] = ""
+    adaptation: Annotated[str, choice("state of the adaptation", ADAPTATIONS)]
+    text: Annotated[Text, doc("reason in words")] = ""
     samples: Annotated[Count, doc("free poses used since the start")]
     changes: Annotated[Count, doc("sudden changes of the stiffness found since the start")]
 
@@ -250,26 +252,32 @@ class BodyContact(Message, frozen=True, kw_only=True):
     Forces and places are nil where the poses do not determine them.
     """
 
-    place: Annotated[str, choice("what explains the poses; tip: a force on the tip, or none", CONTACT_PLACES)]
-    sensors: Annotated[U8, doc("poses of one frame that were used")]
+    place: Annotated[
+        str, choice("place of the force that explains the poses; tip: a force on the tip, or no force", CONTACT_PLACES)
+    ]
+    sensors: Annotated[U8, doc("number of poses of one frame that were used")]
     excess: Annotated[
-        Score, doc("mean chi square of the best tip force, relative to its limit; above 1 it explains nothing")
+        Score, doc("mean chi square of the best tip force, relative to its limit; above 1 no tip force explains the poses")
     ]
     body_offset_m: Annotated[Travel_m | None, doc("place of the contact of the body, back from the tip")] = None
     body_offset_sd_m: Annotated[Travel_m | None, doc("its standard deviation")] = None
-    body_force_N: Annotated[tuple[Force_N, ...], columns_of("force of the body on what it touches", _BODY_FORCE)] | None = (
-        None
-    )
+    body_force_N: (
+        Annotated[tuple[Force_N, ...], columns_of("force of the body on the touched object", _BODY_FORCE)] | None
+    ) = None
     body_covariance_N2: (
         Annotated[tuple[Covariance_N2, ...], columns_of("its covariance, row by row", _BODY_COVARIANCE)] | None
     ) = None
     tip_force_N: (
-        Annotated[tuple[Force_N, ...], columns_of("force of the tip on the tissue, with that", _TIP_FORCE)] | None
+        Annotated[
+            tuple[Force_N, ...],
+            columns_of("force of the tip on the tissue, estimated together with the force of the body", _TIP_FORCE),
+        ]
+        | None
     ) = None
     tip_covariance_N2: (
         Annotated[tuple[Covariance_N2, ...], columns_of("its covariance, row by row", _TIP_COVARIANCE)] | None
     ) = None
-    text: Annotated[Text, doc("the same in words; what the poses do not determine")] = ""
+    text: Annotated[Text, doc("result in words, with the quantities that the poses do not determine")] = ""
 
 
 class RigState(Message, frozen=True, kw_only=True):
@@ -277,13 +285,21 @@ class RigState(Message, frozen=True, kw_only=True):
 
     mode: Annotated[str, choice("phase of the control loop", Phase.labels())]
     safety_action: Annotated[str, choice("safety action, weakest first", SafetyAction.labels())]
-    cause: Annotated[Text, doc("why, in words; empty when nothing is wrong")] = ""
-    target_m: Annotated[tuple[Place_m, ...], columns_of("tip wanted, base frame", _triple("target", "m"))] | None = None
-    tip_m: Annotated[tuple[Place_m, ...], columns_of("tip predicted for now, base frame", _triple("tip", "m"))] | None = None
+    cause: Annotated[Text, doc("cause of the safety action in words; empty if there is none")] = ""
+    target_m: (
+        Annotated[tuple[Place_m, ...], columns_of("requested position of the tip, base frame", _triple("target", "m"))]
+        | None
+    ) = None
+    tip_m: (
+        Annotated[
+            tuple[Place_m, ...], columns_of("tip predicted for the time of the message, base frame", _triple("tip", "m"))
+        ]
+        | None
+    ) = None
     tip_velocity_m_per_s: (
         Annotated[
             tuple[Speed_m_per_s, ...],
-            columns_of("tip velocity predicted for now, base frame", _triple("tip_velocity", "m_per_s")),
+            columns_of("tip velocity predicted for the time of the message, base frame", _triple("tip_velocity", "m_per_s")),
         ]
         | None
     ) = None
@@ -291,13 +307,14 @@ class RigState(Message, frozen=True, kw_only=True):
         Annotated[
             tuple[UnitPart, ...],
             columns_of(
-                "unit vector along which force is controlled, base frame, nil if none is", _triple("force_direction")
+                "unit vector along which force is controlled, base frame; nil if no force is controlled",
+                _triple("force_direction"),
             ),
         ]
         | None
     ) = None
     target_force_N: Annotated[Force_N | None, doc("requested force along that direction")] = None
-    force_N: Annotated[Force_N | None, doc("force along that direction that the loop controls")] = None
+    force_N: Annotated[Force_N | None, doc("force along that direction, as the control loop uses it")] = None
     pose_age_ns: Annotated[Stamp_ns, doc("age of the newest accepted pose")] = 0
     poses_rejected: Annotated[Count, doc("poses refused since the start")] = 0
     forces_rejected: Annotated[Count, doc("force readings refused since the start")] = 0
@@ -309,7 +326,7 @@ class BoardCounters(Message, frozen=True, kw_only=True):
     mcu_time_us: Annotated[Clock_us, doc("the board's clock")]
     state: Annotated[U8, doc("0 disarmed, 1 armed, 2 running, 3 stopping, 4 fault")]
     fault: Annotated[U8, doc("fault code, 0 is none")]
-    fault_name: Annotated[Text, doc("the fault in words, empty when none")] = ""
+    fault_name: Annotated[Text, doc("fault in words, empty if there is none")] = ""
     inputs: Annotated[U8, doc("limit switches and emergency stop, bit by bit")]
     queue_depth: Annotated[U8, doc("set-points in the queue")]
     last_setpoint: Annotated[U16, doc("number of the newest executed set-point")]
@@ -317,10 +334,10 @@ class BoardCounters(Message, frozen=True, kw_only=True):
     encoder_counts: Annotated[tuple[EncoderCounts, ...], columns_of("encoder of each axis", _axes("encoder", "counts"))]
     crc_errors: Annotated[U32, doc("damaged frames that the board received")]
     host_crc_errors: Annotated[U32, doc("damaged frames that the host received")] = 0
-    underruns: Annotated[U32, doc("times the queue was empty while moving")]
+    underruns: Annotated[U32, doc("number of times that the queue was empty during a motion")]
     rejected: Annotated[U32, doc("set-points refused")]
-    last_reject: Annotated[Text, doc("why the last one was refused, empty when none was")] = ""
-    boot_count: Annotated[U32, doc("resets of the board")]
+    last_reject: Annotated[Text, doc("reason of the last refusal, empty if there was none")] = ""
+    boot_count: Annotated[U32, doc("number of resets of the board")]
     deadman_age_ms: Annotated[Duration_ms, doc("time since the newest valid set-point")]
 
 
@@ -334,20 +351,20 @@ class LoopTiming(Message, frozen=True, kw_only=True):
     tick_p99_us: Annotated[Duration_us, doc("time of the tick's work, 99th percentile")]
     tick_p999_us: Annotated[Duration_us, doc("time of the tick's work, 99.9th percentile")]
     tick_max_us: Annotated[Duration_us, doc("time of the tick's work, longest")]
-    lateness_p50_us: Annotated[Duration_us | None, doc("wake-up after due time, median; nil in virtual time")] = None
-    lateness_p99_us: Annotated[Duration_us | None, doc("the same, 99th percentile")] = None
-    lateness_p999_us: Annotated[Duration_us | None, doc("the same, 99.9th percentile")] = None
-    lateness_max_us: Annotated[Duration_us | None, doc("the same, longest")] = None
+    lateness_p50_us: Annotated[Duration_us | None, doc("lateness of the wake-up, median; nil in virtual time")] = None
+    lateness_p99_us: Annotated[Duration_us | None, doc("lateness of the wake-up, 99th percentile")] = None
+    lateness_p999_us: Annotated[Duration_us | None, doc("lateness of the wake-up, 99.9th percentile")] = None
+    lateness_max_us: Annotated[Duration_us | None, doc("lateness of the wake-up, longest")] = None
     longest_gap_ns: Annotated[Stamp_ns, doc("longest time between two set-points sent")] = 0
-    longest_gap_where: Annotated[Text, doc("where that gap arose, empty where not known")] = ""
-    tick_histogram: Annotated[tuple[Ticks, ...], columns_of("ticks by the time of their work", _BUCKETS)]
+    longest_gap_where: Annotated[Text, doc("part of the loop that caused this gap, empty if not known")] = ""
+    tick_histogram: Annotated[tuple[Ticks, ...], columns_of("number of ticks by the time of their work", _BUCKETS)]
 
 
 class Log(Message, frozen=True, kw_only=True):
     """One line of a log."""
 
     level: Annotated[str, choice("how serious", LOG_LEVELS)]
-    source: Annotated[Text, doc("process or part that wrote it")]
+    source: Annotated[Text, doc("process or part that wrote the line")]
     text: Annotated[Text, doc("text")]
 
 
@@ -360,10 +377,10 @@ class Command(Message, frozen=True, kw_only=True):
     measured: ClassVar[bool] = False
 
     id: Annotated[Text, doc("unique to this command; the same id twice is refused")]
-    commander: Annotated[Text, doc("commander; must be the name in the key that it came on")]
-    lease: Annotated[Text, doc("the lease under which it is given; clock, take, hold, mark and stop need none")] = ""
-    expires_ns: Annotated[Stamp_ns, doc("not to be executed after this time, on the rig's clock")]
-    action: Annotated[str, choice("what to do", ACTIONS)]
+    commander: Annotated[Text, doc("name of the commander; must be the name in the key of the message")]
+    lease: Annotated[Text, doc("lease of the commander; clock, take, hold, mark and stop need none")] = ""
+    expires_ns: Annotated[Stamp_ns, doc("time after which the command is not executed, on the rig's clock")]
+    action: Annotated[str, choice("requested action", ACTIONS)]
     target: Annotated[str, choice("kind of the target; none unless action is target", TARGETS)]
     target_m: Annotated[tuple[Place_m, ...], columns_of("tip position, base frame", _triple("target", "m"))] | None = None
     normal: (
@@ -375,18 +392,18 @@ class Command(Message, frozen=True, kw_only=True):
     ) = None
     force_N: Annotated[AllowedForce_N | None, doc("force to hold along the normal")] = None
     fault: Annotated[U8, doc("fault code that clear_fault clears, 0 for all")] = 0
-    axis: Annotated[str, choice("what a jog moves, or the axis to be homed; none for other actions", JOG_AXES)] = "none"
+    axis: Annotated[str, choice("axis of a jog, or the axis to be homed; none for other actions", JOG_AXES)] = "none"
     direction: (
         Annotated[
             tuple[UnitPart, ...], columns_of("unit vector along which a jog moves the tip, base frame", _triple("along"))
         ]
         | None
     ) = None
-    travel_unit: Annotated[
-        JogTravel | None, doc("how far a jog moves; m for the tip and insertion, rad for roll and knob")
-    ] = None
-    speed_unit_per_s: Annotated[JogSpeed | None, doc("how fast a jog moves, in that unit")] = None
-    note: Annotated[Text, doc("what a mark notes")] = ""
+    travel_unit: Annotated[JogTravel | None, doc("length of a jog; m for the tip and insertion, rad for roll and knob")] = (
+        None
+    )
+    speed_unit_per_s: Annotated[JogSpeed | None, doc("speed of a jog, in that unit per second")] = None
+    note: Annotated[Text, doc("text of a mark")] = ""
 
     def check(self) -> None:
         """Check that each action carries what it needs, and that expiry comes after issue."""
@@ -434,33 +451,33 @@ class Reply(Message, frozen=True, kw_only=True):
 
     id: Annotated[Text, doc("id of the command that it answers")]
     result: Annotated[str, choice("result of the command", RESULTS)]
-    lease: Annotated[Text, doc("the lease that a take has given, empty otherwise")] = ""
-    lease_expires_ns: Annotated[Stamp_ns, doc("when that lease ends if it is not renewed")] = 0
-    text: Annotated[Text, doc("why, in words")] = ""
+    lease: Annotated[Text, doc("lease that the action take gave, empty for other actions")] = ""
+    lease_expires_ns: Annotated[Stamp_ns, doc("end of that lease if it is not renewed")] = 0
+    text: Annotated[Text, doc("reason in words")] = ""
 
 
 class CommandCounts(Message, frozen=True, kw_only=True):
     """Holder of the lease, and the results of all commands since the start."""
 
     holder: Annotated[Text, doc("commander that holds the lease, empty when there is none")] = ""
-    lease_expires_ns: Annotated[Stamp_ns, doc("when the lease ends if it is not renewed")] = 0
-    accepted: Annotated[Count, doc("commands carried out")]
-    refused: Annotated[Count, doc("refused: no lease, wrong role, or not possible now")]
-    expired: Annotated[Count, doc("came after their expiry")]
-    replayed: Annotated[Count, doc("came a second time, or out of sequence")]
-    malformed: Annotated[Count, doc("not a command, or larger than a command may be")]
-    flooded: Annotated[Count, doc("not read, because their sender sends too many")]
+    lease_expires_ns: Annotated[Stamp_ns, doc("end of the lease if it is not renewed")] = 0
+    accepted: Annotated[Count, doc("number of commands carried out")]
+    refused: Annotated[Count, doc("number of commands refused: no lease, wrong role, or not possible in the present phase")]
+    expired: Annotated[Count, doc("number of commands that came after their expiry")]
+    replayed: Annotated[Count, doc("number of commands that came a second time or out of sequence")]
+    malformed: Annotated[Count, doc("number of messages that are not a command, or too large")]
+    flooded: Annotated[Count, doc("number of commands that were not read, because the sender sent too many")]
 
 
 class PlannedStep(Message, frozen=True, kw_only=True):
     """One step of a plan that is carried out: the shape that the model gives the catheter there, as loaded on the way."""
 
-    plan: Annotated[Text, doc("which plan: the number of the protocol's step")]
+    plan: Annotated[Text, doc("number of the protocol's step that carries out the plan")]
     step: Annotated[U8, doc("number of the step, from 0")]
-    steps: Annotated[U8, doc("how many steps are drawn of this plan")]
-    status: Annotated[str, choice("what the step is; ended closes the plan", STEP_STATUS)]
+    steps: Annotated[U8, doc("number of drawn steps of the plan")]
+    status: Annotated[str, choice("state of the step; ended closes the plan", STEP_STATUS)]
     time_s: Annotated[Duration_s, doc("planned time of the step, from the start of the plan")]
-    load_N: Annotated[AllowedForce_N, doc("force with which a puncture bends the catheter there")] = 0.0
+    load_N: Annotated[AllowedForce_N, doc("force of the puncture on the catheter in this step")] = 0.0
     shape_m: Annotated[
         tuple[Place_m, ...], columns_of("planned centre line from the sheath's exit to the tip, base frame", _SHAPE)
     ]
@@ -479,17 +496,15 @@ class Alarm(Message, frozen=True, kw_only=True):
     channel: Annotated[Text, doc("output with the largest mismatch")]
     score: Annotated[Score, doc("mismatch relative to its limit; above 1 is an alarm")]
     explained: Annotated[Share, doc("share of the mismatch that the cause explains")]
-    since_ns: Annotated[Stamp_ns, doc("when it was first seen, on the rig's clock")]
-    words: Annotated[Text, doc("the same in one sentence")]
+    since_ns: Annotated[Stamp_ns, doc("time of the first abnormal window, on the rig's clock")]
+    words: Annotated[Text, doc("alarm in one sentence")]
 
 
 class SimulatedTruth(Message, frozen=True, kw_only=True):
     """True values that only a simulator knows. For reports; no controller, estimator or verdict reads them."""
 
     tip_m: Annotated[tuple[Place_m, ...], columns_of("true tip, base frame", _triple("tip", "m"))]
-    wall_m: (
-        Annotated[tuple[Place_m, ...], columns_of("a point of the wall now, base frame", _triple("wall", "m"))] | None
-    ) = None
+    wall_m: Annotated[tuple[Place_m, ...], columns_of("point of the wall, base frame", _triple("wall", "m"))] | None = None
     contact_force_N: Annotated[tuple[Force_N, ...], columns_of("true force on the tissue, base frame", _FORCE)]
     distal_insertion_m: Annotated[Travel_m | None, doc("true insertion of the distal end")] = None
     distal_roll_rad: Annotated[Turn_rad | None, doc("true roll of the distal end")] = None
@@ -513,19 +528,21 @@ _TABLE = (
     Topic("pose/shaft", Pose, 40, "state", "realtime -> host, tools", "tracker tool down the shaft"),
     Topic("force/sensor", ForceSensor, 500, "state", "realtime -> host, tools", "measured force"),
     Topic("force/estimate", ForceEstimate, 40, "state", "host -> realtime, tools", "force estimated from poses"),
-    Topic("stiffness", Stiffness, 4, "state", "host -> tools", "stiffness of the catheter as adapted"),
-    Topic("contact", BodyContact, 4, "state", "host -> tools", "contact away from the tip: whether, where, and which force"),
+    Topic("stiffness", Stiffness, 4, "state", "host -> tools", "adapted stiffness of the catheter"),
+    Topic("contact", BodyContact, 4, "state", "host -> tools", "contact away from the tip: place and force"),
     Topic("state", RigState, 100, "state", "realtime -> host, tools", "mode, safety action and cause, target"),
     Topic("board", BoardCounters, 20, "state", "realtime -> host, tools", "counters of the stepper board"),
     Topic("loop", LoopTiming, 2, "state", "realtime -> host, tools", "timing of the control loop"),
     Topic("log", Log, 0, "event", "all -> host, tools", "log lines"),
-    Topic("request", Command, 0, "query", "commander -> realtime", "commands, on request/NAME; each is answered by a Reply"),
+    Topic(
+        "request", Command, 0, "query", "commander -> realtime", "commands, on request/NAME; the answer to each is a Reply"
+    ),
     Topic("command", Command, 0, "event", "realtime -> host, tools", "commands as received, for the recording"),
     Topic("reply", Reply, 0, "event", "realtime -> host, tools", "results of the commands"),
     Topic("commander", CommandCounts, 2, "state", "realtime -> host, tools", "holder of the lease; counts of commands"),
     Topic("plan", PlannedStep, 0, "event", "protocol -> host, tools", "steps of a plan that is carried out"),
     Topic("alarm", Alarm, 0, "event", "diagnosis -> host, tools", "rig and twin disagree: subsystem and probable cause"),
-    Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "the simulator's truth, for reports only"),
+    Topic("sim/truth", SimulatedTruth, 100, "state", "sim -> host", "true values of the simulator, for reports only"),
 )
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 
@@ -567,7 +584,7 @@ def as_markdown() -> str:
     """Return the table as Markdown: every topic, then every message with its fields, units and bounds."""
     lines = ["| topic | message | rate | direction | what |", "|---|---|---|---|---|"]
     for topic in _TABLE:
-        rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "when it happens"
+        rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "at each event"
         lines.append(f"| `{topic.name}` | {topic.message.__name__} | {rate} | {topic.direction} | {topic.doc} |")
     for declared in dict.fromkeys(topic.message for topic in _TABLE):
         lines += [

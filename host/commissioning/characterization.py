@@ -115,7 +115,7 @@ def record_simulated(
     """Drive `sweeps` on the simulated rig in free space, in lock step, into the recording `path`.
 
     `plant_changes` go to the plant (another truth to be found). Raises BoardUnavailable, ValueError before anything moves,
-    RuntimeError where the sweeps were broken off.
+    RuntimeError where the sweeps were ended early.
     """
     plant = simulated_plant(rig, seed, tissue=_NO_WALL, **plant_changes)
     with (
@@ -136,7 +136,7 @@ def record_simulated(
             if ticks % 1000 == 0:
                 progress(loop.progress)
     if loop.problem:
-        raise RuntimeError(f"characterize: {loop.problem}; the sweeps were broken off")
+        raise RuntimeError(f"characterize: {loop.problem}; the sweeps were ended early")
     return path
 
 

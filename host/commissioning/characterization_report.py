@@ -41,7 +41,7 @@ def write_characterization(found: Characterization, target: Path, rig_name: str,
 
 def _title(found: Characterization) -> str:
     return (
-        f"Insertion has {quantity(found.insertion.width.value * 1e3, 'mm', 2)} of play; "
+        f"Insertion has {quantity(found.insertion.width.value * 1e3, 'mm', 2)} of backlash; "
         f"{found.roll.slope.value:.2f} of the roll arrives."
     )
 

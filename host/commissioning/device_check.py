@@ -61,7 +61,7 @@ def check_board(rig: Rig, port: str, seconds: float) -> DeviceReport:
         _read_board(link, transport, seconds, report)
         _name_inputs(rig.board.pins, link, report)
     except OSError as error:
-        report.problems.append(f"the port went away: {error}")
+        report.problems.append(f"the port was closed: {error}")
     finally:
         transport.close()
     return report

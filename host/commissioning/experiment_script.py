@@ -210,7 +210,7 @@ def perform(script: Script, control: RigControl, progress: Callable[[float], Non
             if script.motion == "contact" and control.mode() == "approach":
                 continue  # the wall went away for a moment; it is being followed
             if control.mode() != wanted:
-                raise RuntimeError(f"broken off at {row[0]:.1f} s: found the rig in mode {control.mode()}, wanted {wanted}")
+                raise RuntimeError(f"ended at {row[0]:.1f} s: found the rig in mode {control.mode()}, wanted {wanted}")
             if script.motion == "free":
                 _ask(control, "target", "position", target_m=tuple(row[1:]))
             else:

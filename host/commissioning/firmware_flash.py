@@ -50,7 +50,7 @@ def write_firmware(command: Sequence[str], port: str, mcu: str) -> None:
     try:
         status = subprocess.run(command, timeout=TIMEOUT_S, check=False).returncode
     except subprocess.TimeoutExpired:
-        raise RuntimeError(f"avrdude did not end within {TIMEOUT_S} s; is another program holding {port}?") from None
+        raise RuntimeError(f"avrdude did not end within {TIMEOUT_S} s; does another program use {port}?") from None
     if status:
         raise RuntimeError(
             f"avrdude ended with status {status}: no other program may hold {port}, and the board must have an {mcu}"

@@ -64,7 +64,7 @@ def record_on_rig(
     Nothing is written while the stages move: a disk, or a thread that writes to it, may hold the loop up for longer than
     the board waits for a set-point. What there is of sweeps broken off is written as well.
     Raises ValueError (sweeps that the stages cannot do) and OSError (a port that does not open, or is held by another
-    process) before anything moves; RuntimeError where the sweeps were broken off.
+    process) before anything moves; RuntimeError where the sweeps were ended early.
     """
     received: list[tuple[str, Message]] = []
 
@@ -87,7 +87,7 @@ def record_on_rig(
             loop.problem = recording.failure
     if loop.problem:
         lost = "".join(f"; {device}: {why}" for device, why in lines.failures.items())
-        raise RuntimeError(f"characterize: {loop.problem}{lost}; the sweeps were broken off")
+        raise RuntimeError(f"characterize: {loop.problem}{lost}; the sweeps were ended early")
     return path
 
 

@@ -165,7 +165,7 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
         raise InputError.from_sentence(
             f"gains: found a loop that rings at {rig.control.loop_hz} Hz with "
             + ", ".join(f"{key} = {value:.4g}" for key, value in gains.items())
-            + ", wanted gains that settle on a still wall"
+            + ", wanted gains that settle on a wall at rest"
         )
     factor = _limit(lambda x: _rings(trial(x, 0.0), force_N), 1.0, 16.0, steps)
     delay = _limit(lambda x: _rings(trial(1.0, x), force_N), 0.001, MOST_DELAY_S, steps)

@@ -110,7 +110,9 @@ SUPPLY = (
 def supply_drawing() -> str:
     """The supply of the drivers and the emergency stop that cuts it, as the text of an SVG file."""
     body = [
-        _text(15, 26, "The emergency stop cuts the drivers' supply; the board is told", 'font-size="15" font-weight="bold"')
+        _text(
+            15, 26, "The emergency stop cuts the drivers' supply and signals the board", 'font-size="15" font-weight="bold"'
+        )
     ]
     for i, (source, first, second, sink) in enumerate(SUPPLY):
         y = 50 + 62 * i

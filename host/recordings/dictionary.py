@@ -42,13 +42,13 @@ MEANINGS: dict[tuple[str, str], Meaning] = {
     ("force/estimate", "nominal_covariance_N2"): Meaning("column frame", "of that estimate"),
     ("contact", "body_offset_m"): Meaning("arc length, back from the tip", "contact of the body, estimated"),
     ("contact", "body_offset_sd_m"): Meaning("arc length", "of that estimate"),
-    ("contact", "body_force_N"): Meaning(BASE, "of the body on what it touches, estimated"),
+    ("contact", "body_force_N"): Meaning(BASE, "of the body on the touched object, estimated"),
     ("contact", "body_covariance_N2"): Meaning(BASE, "of that estimate"),
     ("contact", "tip_force_N"): Meaning(BASE, f"{ON_TISSUE}, estimated together with that of the body"),
     ("contact", "tip_covariance_N2"): Meaning(BASE, "of that estimate"),
-    ("state", "tip_m"): Meaning(BASE, "tip as the controller sees it"),
+    ("state", "tip_m"): Meaning(BASE, "tip as estimated by the controller"),
     ("state", "target_m"): Meaning(BASE, "commanded point"),
-    ("state", "tip_velocity_m_per_s"): Meaning(BASE, "tip as the controller sees it"),
+    ("state", "tip_velocity_m_per_s"): Meaning(BASE, "tip as estimated by the controller"),
     ("state", "force_direction"): Meaning(BASE, "unit vector into the tissue, commanded"),
     ("state", "force_N"): Meaning("along force_direction", f"{ON_TISSUE}, as the controller uses it"),
     ("state", "target_force_N"): Meaning("along force_direction", f"{ON_TISSUE}, commanded"),
@@ -79,7 +79,7 @@ def as_markdown() -> str:
     """Return the tables of docs/recordings.md: one for each topic, a row for each column of its table."""
     lines: list[str] = []
     for topic in recorded_topics():
-        rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "when it happens"
+        rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "at each event"
         lines += ["", f"### `{topic.name}`", "", f"{_sentence(topic.doc)} {rate[0].upper()}{rate[1:]}.", ""]
         lines += ["| column | unit | frame | whose | what |", "|---|---|---|---|---|"]
         names = {column: field for field, spec in specs(topic.message).items() for column in spec.columns or (field,)}
@@ -89,9 +89,9 @@ def as_markdown() -> str:
                 continue
             meaning = MEANINGS.get((topic.name, names[column]), Meaning("-", "-"))
             shown = f"`{column}`" if column not in histogram else f"`{column}` to `{histogram[-1]}`"
-            what = spec.doc + (", empty where not known" if spec.optional else "")
+            what = spec.doc + (", empty if not known" if spec.optional else "")
             lines.append(f"| {shown} | {spec.unit or '-'} | {meaning.frame} | {meaning.whose} | {what} |")
-        lines.append("| `recorded_ns` | ns | - | - | when the recorder took the message, on the rig's clock |")
+        lines.append("| `recorded_ns` | ns | - | - | time at which the recorder received the message, on the rig's clock |")
     return "\n".join(lines[1:]) + "\n"
 
 

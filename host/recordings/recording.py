@@ -171,11 +171,11 @@ class RecordingFile:
             self._chunk_places.append((place, length))
         elif opcode == Opcode.MESSAGE:
             if length < _MESSAGE_HEAD.size:
-                raise ValueError("a message shorter than its head")
+                raise ValueError("a message shorter than its header")
             self._note(stream.read(_MESSAGE_HEAD.size), 0, _OUTSIDE, place + _MESSAGE_HEAD.size, length - _MESSAGE_HEAD.size)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
             if length > CHUNK_LIMIT_BYTES:
-                raise ValueError("a description larger than a chunk may be")
+                raise ValueError("a description above the limit of a chunk's size")
             self._describe(opcode, stream.read(length))
 
     def _describe(self, opcode: int, data: bytes) -> None:
@@ -206,16 +206,16 @@ class RecordingFile:
             InputError: With this chunk the file unpacks to more than its limit.
         """
         if length > CHUNK_LIMIT_BYTES:
-            raise ValueError("a chunk larger than a chunk may be")
+            raise ValueError("a chunk above the limit of a chunk's size")
         chunk = Chunk.read(ReadDataStream(io.BytesIO(stream.read(length))))
         if chunk.uncompressed_size > CHUNK_LIMIT_BYTES:
-            raise ValueError("a chunk that unpacks to more than a chunk may")
+            raise ValueError("a chunk that unpacks to more than the limit")
         self._unpacked_bytes += chunk.uncompressed_size
         if self._unpacked_bytes > self._limit_bytes:
             raise InputError(
                 str(self.path),
                 f"chunks that unpack to more than {self._limit_bytes / 2**20:.0f} MiB",
-                "less; a recording that is trusted and really so large is read with a higher unpack limit",
+                "less; raise the unpack limit if the recording is trusted and that large",
             )
         content = unpack_chunk(chunk)
         if len(content) != chunk.uncompressed_size or (

@@ -104,8 +104,8 @@ def _traces(touches: list[dict[str, Any]]) -> ReportFigure:
         figure.supylabel("force, N", color=MUTED, fontsize=9)
 
     rows = math.ceil(len(touches) / 3)
-    alt = f"Force over time of {len(touches)} touches; the dashed line is the wanted force."
-    caption = "Measured force along the normal, 20 samples a second. Dashed: wanted force."
+    alt = f"Force over time of {len(touches)} touches; the dashed line is the requested force."
+    caption = "Measured force along the normal, 20 samples a second. Dashed: requested force."
     return report_figure(draw, 0.6 + 1.5 * rows, 0.6 + 1.4 * math.ceil(len(touches) / 2), "Force", alt, caption)
 
 
@@ -128,5 +128,5 @@ def _places(touches: list[dict[str, Any]]) -> ReportFigure:
         axes.set_ylabel("mean force, N")
 
     alt = "Mean force of each touch with its RMS error."
-    caption = "Mean force of each touch, settled; bars: RMS error; black: wanted force."
+    caption = "Mean force of each touch, settled; bars: RMS error; black: requested force."
     return report_figure(draw, 2.4, 2.4, "Touches", alt, caption)

@@ -128,7 +128,7 @@ class LiveRig:
         if press.button == "stop" and answer.accepted:
             text = "confirmed by " + ", ".join(f"{path.path} ({path.text})" for path in answer.paths if path.confirmed)
         if press.button == "home" and answer.accepted:
-            text = f"{press.axis} creeps to its switch; the log says how it ends. Stop, Hold and Disarm end it"
+            text = f"{press.axis} moves slowly to its switch; the log reports the end. Stop, Hold and Disarm interrupt it"
         if answer.result == "unanswered" and self._received_s is None:
             text = "no answer: no message of the rig yet; it may still be starting"
         return {"action": press.button, "result": answer.result, "text": text}

@@ -77,7 +77,7 @@ class Guard:
         if any(origin not in self._origins for origin in origins) or (scope["type"] == "websocket" and len(origins) != 1):
             return "an Origin that is not this page's"
         if scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
-            return "only reading is done over HTTP"
+            return "HTTP is read-only here"
         return ""
 
 

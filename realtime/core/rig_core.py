@@ -238,7 +238,7 @@ class RigCore:
         gap_ns = tick_ns - self._tick_ns
         if self._tick_ns and not 0 < gap_ns <= LONGEST_GAP_NS:
             text = (
-                f"the computer stood still, or its clock jumped: {gap_ns * 1e-6:.1f} ms between two ticks, "
+                f"the computer stalled, or its clock jumped: {gap_ns * 1e-6:.1f} ms between two ticks, "
                 f"wanted {self.params[0].period_s * 1e3:g} ms"
             )
             self._leaving.log(tick_ns, "warning", "realtime", text)

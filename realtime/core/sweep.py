@@ -181,7 +181,7 @@ class SweepLoop:
         gap_ns, self._step_ns = now_ns - self._step_ns, now_ns
         if self._armed_ns > 0 and gap_ns > self.rig.safety.stop_after_s * 1e9:
             self.break_off(
-                f"computer: found that the loop of the sweeps stood still for {gap_ns * 1e-9:.2f} s, wanted a "
+                f"computer: found that the loop of the sweeps stalled for {gap_ns * 1e-9:.2f} s, wanted a "
                 f"turn every {self.period_ns * 1e-6:g} ms"
             )
 

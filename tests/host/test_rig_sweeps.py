@@ -127,7 +127,7 @@ def test_a_computer_that_stood_still_is_blamed_itself(rig: Rig) -> None:
             bench.ports.sleep_until(bench.world.now_ns + 700_000_000)
 
     bench.run(each=pause_once)
-    assert bench.loop.problem.startswith("computer: found that the loop of the sweeps stood still for 0.7")
+    assert bench.loop.problem.startswith("computer: found that the loop of the sweeps stalled for 0.7")
     assert not bench.loop.finished
 
 
