@@ -79,6 +79,7 @@ class NetFtEmulator:
         self._torque_noise = MarkovNoise(noise_rng, 3, c.torque_noise_Nm, c.noise_correlation_s)
         self._scale = np.array([c.counts_per_N] * 3 + [c.counts_per_Nm] * 3)
         self._limit = np.array(c.range_N + c.range_Nm) * c.saturation
+        self._zero_offset_N = np.array(c.zero_offset_N)
         self._samples = 0
         self._ft_step = round(INTERNAL_RATE_HZ / c.rate_hz)
         self._ft_sequence = self._rdt_sequence = 0
@@ -134,7 +135,7 @@ class NetFtEmulator:
         delay_s = c.latency_s + (self._delay_rng.exponential(c.jitter_s) if c.jitter_s > 0 else 0.0)
         self._samples += 1
         self._ft_sequence = (self._ft_sequence + self._ft_step) & 0xFFFFFFFF
-        self._load = np.concatenate((np.asarray(force_N, float) + c.zero_offset_N, np.asarray(torque_Nm, float)))
+        self._load = np.concatenate((force_N + self._zero_offset_N, torque_Nm))
         for fault in active(self.faults, time_ns, "scale"):
             self._load[:3] *= fault.value
         for fault in active(self.faults, time_ns, "offset"):
@@ -144,8 +145,10 @@ class NetFtEmulator:
         self._load += noise
         status = self._status(time_ns)
         if not active(self.faults, time_ns, "frozen"):
-            shown = np.clip(self._load, -self._limit, self._limit) - self._bias
-            self._counts = np.clip(np.rint(shown * self._scale), -(2**31), 2**31 - 1).astype(np.int64).tolist()
+            shown = self._load.clip(-self._limit, self._limit) - self._bias
+            self._counts = [
+                min(max(count, -(2**31)), 2**31 - 1) for count in map(int, np.rint(shown * self._scale).tolist())
+            ]
         if not self.streaming:
             return
         self._rdt_sequence = (self._rdt_sequence + 1) & 0xFFFFFFFF
@@ -159,7 +162,7 @@ class NetFtEmulator:
         status = 0
         if active(self.faults, time_ns, "saturated"):
             self._load[:3] = 4.0 * self._limit[:3]
-        if np.any(np.abs(self._load) >= self._limit):
+        if (np.abs(self._load) >= self._limit).any():
             status |= _ERROR | _SATURATED
         if active(self.faults, time_ns, "broken"):
             status |= _ERROR | _BRIDGE

@@ -74,6 +74,9 @@ class Plant:
                 effects.pack(c.effects),
             )
         )
+        # What every millisecond reads: views, as records look their fields up by name each time.
+        self._wall_force = self._arrays.tissue_state["force"][0]
+        self._wall_point, self._tip = self._arrays.tissue["point"][0], self._arrays.chain_state["tip"][0]
         self._stage = np.array(c.start_stage, float)
         self._position, self._frame, self._quaternion = np.zeros(3), np.eye(3), np.zeros(4)
         self._wrench = np.zeros(6)
@@ -120,13 +123,12 @@ class Plant:
     @property
     def contact_force_N(self) -> Array:
         """Force (3,) of the tip on the tissue, base frame (N)."""
-        return -self._parts.tissue_state.force
+        return -self._wall_force
 
     @property
     def contact_torque_Nm(self) -> Array:
         """Torque (3,) of that force about the wall's point, base frame (Nm)."""
-        (x, y, z), (fx, fy, fz) = self._parts.chain_state.tip - self._parts.tissue.point, self.contact_force_N
-        return np.array((y * fz - z * fy, z * fx - x * fz, x * fy - y * fx))
+        return np.array(_cross((self._tip - self._wall_point).tolist(), self.contact_force_N.tolist()))
 
     def truth(self) -> dict[str, Any]:
         """What no device shows, for reports and tests: SI scalars and arrays by name, and the planted effects."""
@@ -156,3 +158,8 @@ class Plant:
         """Centre line (points, 3) from the sheath's exit to the tip (m)."""
         length = float(self._parts.chain_state.exposed_m)
         return np.array([self.sensor_pose(offset)[0] for offset in np.linspace(length, 0.0, points)])
+
+
+def _cross(arm: Sequence[float], force: Sequence[float]) -> tuple[float, float, float]:
+    (x, y, z), (fx, fy, fz) = arm, force
+    return y * fz - z * fy, z * fx - x * fz, x * fy - y * fx

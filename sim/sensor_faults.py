@@ -27,11 +27,11 @@ def checked(faults: Iterable[SensorFault], kinds: Sequence[str]) -> list[SensorF
     return faults
 
 
-def active(faults: Iterable[SensorFault], time_ns: int, kind: str | None = None) -> list[SensorFault]:
+def active(faults: Sequence[SensorFault], time_ns: int, kind: str | None = None) -> list[SensorFault]:
     """Those of `kind` (None: any) that last at `time_ns`."""
-    return [f for f in faults if f.start_ns <= time_ns < f.stop_ns and kind in (None, f.kind)]
+    return [f for f in faults if f.start_ns <= time_ns < f.stop_ns and kind in (None, f.kind)] if faults else []
 
 
-def strongest(faults: Iterable[SensorFault], time_ns: int, kind: str) -> float:
+def strongest(faults: Sequence[SensorFault], time_ns: int, kind: str) -> float:
     """The largest value among the active faults of `kind`, 0 without any."""
-    return max((fault.value for fault in active(faults, time_ns, kind)), default=0.0)
+    return max((fault.value for fault in active(faults, time_ns, kind)), default=0.0) if faults else 0.0

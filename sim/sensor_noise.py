@@ -22,10 +22,12 @@ class MarkovNoise:
 
     def step(self, dt_s: float) -> np.ndarray:
         """The noise `dt_s` after the last call, (size,)."""
-        a = math.exp(-dt_s / self._correlation_s) if self._correlation_s > 0 else 0.0
         fresh = self._rng.standard_normal(self._value.size) * self._sigma
-        self._value = a * self._value + math.sqrt(1 - a * a) * fresh
-        return self._value.copy()
+        if self._correlation_s > 0:
+            a = math.exp(-dt_s / self._correlation_s)
+            fresh = a * self._value + math.sqrt(1 - a * a) * fresh
+        self._value = fresh
+        return fresh.copy()
 
 
 def generators(seed: int, count: int) -> list[np.random.Generator]:

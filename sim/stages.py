@@ -12,6 +12,7 @@ from sim.effect_codes import PORTS
 from sim.effects import PlantedEffect
 
 Array = np.ndarray
+_NONE = np.zeros(3, np.int64)
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ class SimulatedStages:
         """At step zero, at rest. Of `effects` only missed_steps is used here; the plant takes the others."""
         self.config = config or StagesConfig()
         self._per_unit = np.array(self.config.steps_per_unit)
+        self._encoder_ratio = np.array(self.config.encoder_counts_per_step)
+        self._screw_error, self._screw_pitch = np.array(self.config.screw_error_unit), np.array(self.config.screw_pitch_unit)
+        self._screws_err = bool(self._screw_error.any())
         self._counts = np.zeros(3, np.int64)  # edges seen
         self._lost = np.zeros(3)  # steps that the rotor did not follow
         self._rotor, self._speed = np.zeros(3), np.zeros(3)
@@ -77,10 +81,13 @@ class SimulatedStages:
         edge_axis (n,) 0..2; edge_sign (n,) +1 or -1.
         """
         self._time_s += dt_s
-        axes = np.asarray(edge_axis, np.int64)
-        turned = np.rint(np.bincount(axes, np.asarray(edge_sign, float), minlength=3)).astype(np.int64)
-        self._counts += turned
-        self._lose(dt_s, turned)
+        turned = _NONE
+        if len(edge_axis):
+            signs = np.asarray(edge_sign, float)
+            turned = np.rint(np.bincount(np.asarray(edge_axis, np.int64), signs, minlength=3)).astype(np.int64)
+            self._counts += turned
+        if self._troubles or self._losses:
+            self._lose(dt_s, turned)
         field = self._counts - self._lost
         for axis, frequency_Hz in enumerate(self.config.rotor_Hz):
             if frequency_Hz > 0.0:
@@ -134,7 +141,7 @@ class SimulatedStages:
     @property
     def encoder_counts(self) -> Array:
         """Encoder counts (3,) int64 of the rotors."""
-        counts = np.floor(self._rotor * np.array(self.config.encoder_counts_per_step) + 0.5).astype(np.int64)
+        counts = np.floor(self._rotor * self._encoder_ratio + 0.5).astype(np.int64)
         for axis, stands in self._encoder_stands.items():
             counts[axis] = stands
         return counts
@@ -143,5 +150,6 @@ class SimulatedStages:
     def position(self) -> Array:
         """Stage positions (3,) m, rad, rad: rotors through lead screw and gears."""
         position = self._rotor / self._per_unit
-        error, pitch = np.array(self.config.screw_error_unit), np.array(self.config.screw_pitch_unit)
-        return position + error * np.sin(2.0 * math.pi * position / pitch)
+        if self._screws_err:
+            position += self._screw_error * np.sin(2.0 * math.pi * position / self._screw_pitch)
+        return position

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import Any
 
 import numpy as np
@@ -120,16 +121,19 @@ class World:
         limit_bits = self.limit_bits | self._home_switches()
         part = self.board.exchange(until_ns // 1000, to_board, limit_bits, self.estop, self.stages.encoder_counts)
         self.slice = part
-        np.add.at(self.edges, part.edge_axis, 1)
-        np.add.at(self.edge_phases, part.edge_cycle % STEP_TIMER_CYCLES, 1)
+        if len(part.edge_axis):
+            np.add.at(self.edges, part.edge_axis, 1)
+            np.add.at(self.edge_phases, part.edge_cycle % STEP_TIMER_CYCLES, 1)
         dt_s = (until_ns - self.now_ns) * 1e-9
         self.plant.step(dt_s, self.stages.advance(dt_s, part.edge_axis, part.edge_sign))
         self._sample(until_ns)
         self.now_ns = until_ns
-        self.peak_force_N = max(self.peak_force_N, float(np.linalg.norm(self.plant.contact_force_N)))
-        for column in (part.edge_cycle, part.edge_axis, part.edge_sign):
-            self._digest.update(np.ascontiguousarray(column).tobytes())
-        self._digest.update(np.ascontiguousarray(self.plant.sensor_pose(0.0)[0]).tobytes())
+        force_N = self.plant.contact_force_N
+        self.peak_force_N = max(self.peak_force_N, math.sqrt(force_N @ force_N))
+        if len(part.edge_axis):
+            for column in (part.edge_cycle, part.edge_axis, part.edge_sign):
+                self._digest.update(column.tobytes())
+        self._digest.update(self.plant.sensor_pose(0.0)[0].tobytes())
         return part.uart_out
 
     def _home_switches(self) -> int:

@@ -79,7 +79,7 @@ def _fill_predictive(p: np.record, rig: Rig) -> None:
         )
 
 
-def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.recarray:
+def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.ndarray:
     """Return the PARAMS record of `rig`; `force_source` is `sensor` or `estimate`. Raises ValueError otherwise."""
     if force_source not in ForceSource.labels():
         raise ValueError(f"force_source: found {force_source!r}, wanted {' or '.join(ForceSource.labels())}")

@@ -535,9 +535,9 @@ HISTORY = dtype_of(History)
 PARAMS, STATE, OUTPUTS = dtype_of(Params), dtype_of(State), dtype_of(Outputs)
 
 
-def new(dtype: np.dtype) -> np.recarray:
-    """Return a zeroed record array of length 1, for `record[0]` in kernels and in plain Python alike."""
-    return np.zeros(1, dtype).view(np.recarray)
+def new(dtype: np.dtype) -> np.ndarray:
+    """Return a zeroed array of one record of a declared class, for `array[0]` in kernels and in plain Python alike."""
+    return np.zeros(1, dtype)
 
 
 def page() -> str:

@@ -38,9 +38,10 @@ class LockstepLoop:
         self.rig, self.publish = rig, publish
         self.period_ns = round(1e9 / rig.control.loop_hz)
         self.state, self.inputs, self.outputs = new(STATE), new(INPUTS), new(OUTPUTS)
+        self._state, self._inputs, self._outputs = self.state[0], self.inputs[0], self.outputs[0]
         self.sensors = SensorClients(rig)
         names = [name for name in INPUTS.names or () if name != "now_ns"]
-        records = {name: getattr(self.inputs[0], name) for name in names}
+        records = {name: getattr(self._inputs, name) for name in names}
         self._leases = 0
         self.core = RigCore(rig, records, self._timing, force_source, new_lease=self._next_lease)
         self.params = self.core.params
@@ -65,12 +66,12 @@ class LockstepLoop:
         arrived = Arrived(board=arriving.board, poses=readings.poses, forces=readings.forces, device_events=readings.events)
         arrived.estimates = self._due_estimates(now_ns)
         self._step_core(now_ns, arrived)
-        self.inputs[0].now_ns = now_ns
+        self._inputs.now_ns = now_ns
         started = time.perf_counter_ns()
         tick(self.params, self.state, self.inputs, self.outputs)
         setpoint = self._setpoint()
         count_in(self.work, WORK_BIN_NS, time.perf_counter_ns() - started)
-        self._ticks.append(Tick(int(self.state[0].ticks), self.outputs[0]))
+        self._ticks.append(Tick(int(self._state.ticks), self._outputs))
         commands, self._frames = b"".join(self._frames), []
         return self.sensors.outgoing(setpoint + commands, now_ns)
 
@@ -102,7 +103,7 @@ class LockstepLoop:
         return due
 
     def _setpoint(self) -> bytes:
-        y = self.outputs[0]
+        y = self._outputs
         if not y.valid:
             return b""
         n = encode_setpoint(self._buffer, y.number & 0xFF, y.number, y.execute_us, y.expiry_us, y.position_steps)

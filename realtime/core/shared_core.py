@@ -6,8 +6,6 @@ import logging
 import threading
 from collections.abc import Callable
 
-import numpy as np
-
 from protocol.topics import Log, Message
 from realtime.core.rig_core import Arrived, Leaving, RigCore, Tick
 from realtime.loop.loop_thread import NativeLoop
@@ -59,7 +57,7 @@ class SharedCore:
             raise TimeoutError
         try:
             records = self._loop.telemetry.drain()
-            outputs = records["outputs"].view(np.recarray)
+            outputs = records["outputs"]
             arrived.ticks = [Tick(int(number), outputs[i]) for i, number in enumerate(records["loop"]["tick"])]
             arrived.loop_runs = self._loop.alive
             leaving = self._core.step(self._now_ns(), arrived)

@@ -148,8 +148,7 @@ class NetFtClient:
             1.0 / config.ft_rate_hz, window_s=20.0, block_s=0.5, early_s=0.002, late_s=0.5, strange_in_row=200
         )
         c = config.calibration
-        self._newton = np.array([1.0 / c.counts_per_N] * 3)
-        self._newton_metre = np.array([1.0 / c.counts_per_Nm] * 3)
+        self._per_count = np.array([1.0 / c.counts_per_N] * 3 + [1.0 / c.counts_per_Nm] * 3)
         self._wild = np.array(c.range_N + c.range_Nm) * config.wild_ratio
         self._counters = NetFtCounters()
         self._events: list[DeviceEvent] = []
@@ -231,9 +230,9 @@ class NetFtClient:
         if self._is_frozen(tuple(counts), now_ns):
             self._counters.frozen += 1
             return None
-        force_N = np.array(counts[:3]) * self._newton
-        torque_Nm = np.array(counts[3:]) * self._newton_metre
-        if np.any(np.abs(np.concatenate((force_N, torque_Nm))) > self._wild):
+        load = np.array(counts) * self._per_count  # N, then N m
+        force_N, torque_Nm = load[:3], load[3:]
+        if (np.abs(load) > self._wild).any():
             self._counters.wild += 1
             return None
         if not self._streaming:

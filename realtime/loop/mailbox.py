@@ -36,7 +36,7 @@ def n_words(dtype: np.dtype) -> int:
     return -(-np.dtype(dtype).itemsize // WORD_BYTES)
 
 
-def record_with_words(dtype: np.dtype) -> tuple[np.recarray, np.ndarray]:
+def record_with_words(dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """One zeroed record of `dtype`, shape (1,), and the int64 words of the same memory, shape (n_words,)."""
     words = np.zeros(n_words(dtype), np.int64)
     return _record_view(words, np.dtype(dtype)), words
@@ -50,8 +50,9 @@ def words_of(record: np.ndarray) -> np.ndarray:
     return record.view(np.ndarray).view(np.int64)
 
 
-def _record_view(words: np.ndarray, dtype: np.dtype) -> np.recarray:
-    return words.view(np.uint8)[: dtype.itemsize].view(dtype).view(np.recarray)
+def _record_view(words: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    record = words.view(np.uint8)[: dtype.itemsize].view(dtype)
+    return record if issubclass(dtype.type, np.record) else record.view(np.recarray)
 
 
 @njit(cache=True, error_model="numpy")
