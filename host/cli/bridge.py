@@ -24,7 +24,7 @@ bridge = typer.Typer(
 
 @bridge.callback()
 def _group() -> None:
-    """Group the bridges."""
+    """Hold the commands `igtl` and `ros2`."""
 
 
 @bridge.command()

@@ -85,7 +85,7 @@ def _record_simulated(rig: Rig, repeats: int, seed: int, board: str, directory: 
 
 
 def _record_on_rig(rig: Rig, repeats: int, ports: PortNames, yes: bool, directory: Path) -> Path:
-    """Ask first: sweeps swing the tip through free space, and the command cannot see what stands there."""
+    """Ask before the stages move: sweeps swing the tip through free space, and the command cannot detect obstacles there."""
     from host.commissioning.characterization import standard_sweeps
     from host.commissioning.rig_sweeps import describe, record_on_rig
     from host.recordings.writer import new_recording_path

@@ -28,7 +28,7 @@ def check_device(
     web_port: Annotated[int, typer.Option(help="Port of the force box's page.", hidden=True)] = 80,
     json: Json = False,
 ) -> None:
-    """Read a device for some seconds; nothing moves. Exit status 1 when it is not fit."""
+    """Read a device for some seconds; nothing moves. Exit status 1 if it is not fit for an experiment."""
     from host.commissioning.device_check import check_board, check_force_box, check_tracker
 
     one_of("device", device, DEVICES)

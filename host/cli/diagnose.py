@@ -94,7 +94,7 @@ def diagnose(
 
 
 def _say_what_runs(nominal: str, trust: bool) -> None:
-    """One line about the code that the nominal TOML runs. Raises InputError where another user may have written it."""
+    """Print the code that the nominal TOML runs. Raises InputError if another user may have written it."""
     from host.diagnosis.model.nominal import nominal_path, read_nominal
     from host.diagnosis.model.trust import check_owner, code_of, code_path
 

@@ -42,7 +42,7 @@ NOT_RUNNING_S = 0.2
 
 
 class Driver:
-    """One command to a rig: what was asked, what the rig answered, and how it went on."""
+    """One command to a rig: the request, the rig's answer, and the progress of the motion."""
 
     def __init__(self, connection: RigConnection, command: str, json: bool) -> None:
         self.rig, self._command, self._json = connection, command, json
@@ -54,7 +54,7 @@ class Driver:
         return self.rig.latest("state")
 
     def say(self, text: str) -> None:
-        """Print a line for people."""
+        """Print `text` with the command's name on standard error."""
         print(f"{self._command}: {text}", file=sys.stderr, flush=True)
 
     def wait(self, seconds: float, done: Callable[[Message], bool]) -> bool:
@@ -68,7 +68,7 @@ class Driver:
         return False
 
     def failed(self, text: str) -> typer.Exit:
-        """Note that the command was accepted but did not come to its end; exit status 1."""
+        """Note that the command was accepted but not completed; the exit status is 1."""
         state = self.state
         why = f"; safety: {state.cause}" if state is not None and state.cause else ""
         self.result |= {"done": False, "text": text + why}
@@ -76,7 +76,7 @@ class Driver:
         return typer.Exit(1)
 
     def finish(self) -> None:
-        """Print the JSON object."""
+        """Print the result as one JSON object on standard output, if `--json` is given."""
         state = self.state
         if state is not None:
             self.result |= {"phase": state.mode, "tip_m": state.tip_m, "force_N": state.force_N}

@@ -39,7 +39,7 @@ def experiment(
     directory: Folder = Path("runs"),
     json: Json = False,
 ) -> None:
-    """Check a script against the rig's limits and show what it does; with --go or --simulated, do it."""
+    """Check a script against the rig's limits and show its motion; with --go or --simulated, run it."""
     from host.commissioning.experiment_script import check_script, read_script
     from host.run.experiment_run import run_live, run_simulated
 

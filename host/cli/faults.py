@@ -82,7 +82,7 @@ def _broken(result: RunResult) -> dict[str, object]:
 
 
 def _print_table(results: list[RunResult], bad: list[RunResult]) -> None:
-    """Print a row per fault, and every broken rule, on standard error."""
+    """Print a row for each fault, and every broken rule, on standard error."""
     from rich.console import Console
     from rich.table import Table
 

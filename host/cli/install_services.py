@@ -88,7 +88,7 @@ def _undo(root: Path, system: bool) -> list[str]:
 
 
 def _call(*command: str) -> None:
-    """Run one of systemd's tools; print what it complains of, and go on."""
+    """Run one of systemd's tools; print its error message and continue."""
     if shutil.which(command[0]) is None:
         return
     result = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -33,7 +33,7 @@ def init(
     passphrase_file: PassphraseFile = None,
     json: Json = False,
 ) -> None:
-    """Make the laboratory's authority. Refused where there is one: all its certificates would become invalid."""
+    """Make the laboratory's authority. Refused if there is one, because all its certificates would become invalid."""
     from host.security.keys import make_authority
 
     secret = _read_passphrase(passphrase_file) if passphrase_file is not None else ""

@@ -38,7 +38,7 @@ def latency_check(
         Path | None, typer.Option(help="With --with: page whose section on subscribers is written.", hidden=True)
     ] = None,
 ) -> None:
-    """Run the wall-clock loop with the real tick; report how late it woke and how long it worked."""
+    """Run the wall-clock loop with the real tick; report the lateness of its wake-ups and the time of its work."""
     within("--hz", hz, *RATES_HZ)
     if not 0 < seconds <= MAX_SECONDS:
         raise InputError("--seconds", seconds, f"more than 0, at most {MAX_SECONDS}")

@@ -142,11 +142,11 @@ def _options(
 
 
 def _only_listed() -> None:
-    """Stand in for every command where none is called, so that the overview imports nothing."""
+    """Represent every command when none is called, so that the overview imports nothing."""
 
 
 def error_log() -> Path:
-    """The file that keeps the traceback of the last unexpected error: below XDG_STATE_HOME, or ~/.local/state."""
+    """Return the file that keeps the traceback of the last unexpected error: below XDG_STATE_HOME, or ~/.local/state."""
     chosen = os.environ.get("XDG_STATE_HOME")
     return (Path(chosen) if chosen else Path.home() / ".local" / "state") / "seldinger" / "last_error.log"
 
@@ -231,7 +231,7 @@ def main() -> None:
 
 
 def _leave_stalled_stop(ending: SystemExit) -> None:
-    """End the program at once where a stop still waits in zenoh for a process that is stalled.
+    """End the program at once if a stop still waits in zenoh for a stalled process.
 
     An interpreter that ends below such a thread aborts the program, and its exit status would be lost.
     """

@@ -43,7 +43,7 @@ def checked_seed(value: int) -> int:
 
 
 def checked_effects(effects: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the effects to plant in the simulated rig. Raises InputError for one that `sim.effects` does not know."""
+    """Return the effects to plant in the simulated rig. Raises InputError for one that `sim.effects` does not have."""
     from sim.effects import parse
 
     for text in effects or ():
@@ -56,7 +56,7 @@ def checked_effects(effects: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def checked_jobs(value: int) -> int:
-    """Return the number of processes that `--jobs` asks for, at least 1. Raises InputError."""
+    """Return the number of processes for `--jobs`, at least 1. Raises InputError."""
     return int(within("--jobs", value, 0, 1024)) or os.cpu_count() or 1
 
 
@@ -93,7 +93,7 @@ def writable_folder(key: str, path: Path) -> Path:
 
 
 def plot_file(path: str | None) -> None:
-    """Refuse a plot that could not be written. Raises InputError."""
+    """Refuse a plot file that cannot be written. Raises InputError."""
     if path is None:
         return
     if Path(path).suffix.lower() != ".png":

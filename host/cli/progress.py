@@ -25,7 +25,7 @@ class Progress:
         self._stage, self._share, self._printed_s, self._drawn = "", 0.0, 0.0, False
 
     def __call__(self, stage: str, share: float, count: str = "") -> None:
-        """Show that `share` (0 to 1) of `stage` is done; `count`: the same as a number, such as 3/24."""
+        """Show that `share` (0 to 1) of `stage` is done. count: the same as text, such as 3/24."""
         if self._quiet:
             return
         now_s = time.monotonic()

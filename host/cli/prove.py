@@ -84,7 +84,7 @@ def prove(
 
 
 def _calibration(path: Path | None) -> Any:
-    """How raw probabilities are stated: as they are, or by the table in a file. Raises InputError."""
+    """Return the calibration of raw probabilities: none, or the table in a file. Raises InputError."""
     from host.studies.proof.calibration import as_stated, read
 
     try:
@@ -94,7 +94,7 @@ def _calibration(path: Path | None) -> Any:
 
 
 def _worlds(text: str) -> tuple[str, ...]:
-    """Worlds that `--world` names. Raises InputError for one that is not known."""
+    """Return the worlds of `--world`. Raises InputError for an unknown one."""
     from host.studies.proof.worlds.suite import WORLDS
 
     chosen = WORLDS if text == "all" else tuple(text.split(","))
@@ -104,7 +104,7 @@ def _worlds(text: str) -> tuple[str, ...]:
 
 
 def _line(case: dict) -> str:  # type: ignore[type-arg]
-    """One case as a line of text: right or not, truth, verdict."""
+    """Return one case as a line of text: right or not, truth, verdict."""
     effects = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in case["verdict"].get("effects") or [])
     truth = " + ".join(case["truth"]) or "nothing"
     loop = "closed" if case["closed_loop"] else "open"

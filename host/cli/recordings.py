@@ -23,7 +23,7 @@ UnpackLimit = Annotated[
 
 
 def open_recording(path: Path, unpack_limit_MiB: int | None = None) -> RecordingFile:
-    """Open the recording at `path`; say on standard error where it is incomplete. Raises InputError."""
+    """Open the recording at `path`; print a warning if it is incomplete. Raises InputError."""
     from host.recordings.recording import RecordingFile
 
     recording = RecordingFile(path, None if unpack_limit_MiB is None else unpack_limit_MiB * 2**20)

@@ -103,7 +103,7 @@ def _carry_out(
 
 
 def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
-    """Print what the protocol asks of the rig."""
+    """Print the motion, forces and duration of the protocol."""
     ends = zip("xyz", 1e3 * checked.low_m, 1e3 * checked.high_m, strict=True)
     rows = [
         f"{steps.file.name}: {len(steps.file.steps)} steps, {len(steps.actions)} actions, about {checked.seconds:.0f} s",
@@ -119,7 +119,7 @@ def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
 
 
 def _tell(result: ProtocolResult, target: Path, report: Path) -> None:
-    """Print a line for each action, and where the files are."""
+    """Print a line for each action, and the paths of the files."""
     for item in result.results:
         touch = item.touch
         figures = ""

@@ -26,7 +26,7 @@ def stop(
     name: Annotated[str, typer.Option(help="Name of the commander; with --endpoint the name in the certificate.")] = "stop",
     json: Json = False,
 ) -> None:
-    """Stop the rig over its socket and over zenoh at once; print what each answered.
+    """Stop the rig over its socket and over zenoh at once; print each answer.
 
     Exit status 0 if the rig's own state shows the stop within 100 ms, 1 if it is not confirmed: use the emergency stop.
     """
@@ -56,7 +56,7 @@ def _print_answer(answer: PathAnswer) -> None:
 
 
 def _stop_by_zenoh(rig: Rig, name: str, endpoint: str, keys: Path | None) -> PathAnswer:
-    """Stop over a session that is opened for it, asked again until it has reached the model process."""
+    """Stop over a new session, and repeat the request until it has reached the model process."""
     from host.run.commander import Commander
     from protocol.zenoh_session import Session
 

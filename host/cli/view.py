@@ -21,7 +21,7 @@ def view(
     directory: Folder = Path("runs"),
     json: Json = False,
 ) -> None:
-    """Show the running rig in a browser: shape, force, safety, timing; arm, hold and stop it."""
+    """Show the running rig in a browser (shape, force, safety, timing), with buttons to drive it."""
     from host.view.serve import check_port, page_address, serve_rig, simulated_rig
 
     def report(line: str) -> None:

@@ -19,12 +19,12 @@ class InputLine(NamedTuple):
 
     @property
     def contact(self) -> str:
-        """What the contact does now: "open" or "closed"."""
+        """Return the present state of the contact: "open" or "closed"."""
         return "closed" if self.hit == self.normally_open else "open"
 
     @property
     def contact_at_rest(self) -> str:
-        """What it does while nothing touches the switch."""
+        """Return the state of the contact while nothing touches the switch: "open" or "closed"."""
         return "open" if self.normally_open else "closed"
 
     def __str__(self) -> str:
@@ -35,7 +35,7 @@ class InputLine(NamedTuple):
 
 
 def input_lines(pins: Pins, inputs: int) -> list[InputLine]:
-    """Every switch input in the board's order. inputs: STATUS.inputs, a bit of InputBit each, set when hit."""
+    """Return every switch input in the board's order. inputs: STATUS.inputs, one InputBit each, set when hit."""
     wires = [s for s in board_pins.signals(**pins.ports()) if s.name.startswith("limit") or s.name == "estop"]
     lines = []
     for wire in wires:
@@ -48,7 +48,7 @@ def input_lines(pins: Pins, inputs: int) -> list[InputLine]:
 
 
 def input_problems(pins: Pins, inputs: int) -> list[str]:
-    """What the inputs show that keeps a rig from moving, one line each; empty at rest."""
+    """Return the inputs that keep the rig from moving, one line each; empty if there are none."""
     lines = {line.name: line for line in input_lines(pins, inputs)}
     problems = []
     estop = lines.pop("estop")

@@ -70,12 +70,12 @@ class Characterization:
 
     @property
     def insertion_at_home_m(self) -> Estimate:
-        """Body insertion where the stage reads zero, in the middle of the backlash."""
+        """Return the body insertion (m) at stage position zero, in the middle of the backlash."""
         return Estimate(self.insertion.offset.value - self.distal_length_m, self.insertion.offset.half95)
 
 
 def standard_sweeps(rig: Rig, repeats: int = 5, rates_rad_per_s: Sequence[float] = RATES_RAD_PER_S) -> list[Sweep]:
-    """The thesis' sweeps for `rig`: two amplitudes of insertion, three of roll, the knob from end to end; each at all rates.
+    """Return the thesis' sweeps for `rig`: two amplitudes of insertion, three of roll, the whole knob; each at all rates.
 
     Raises ValueError where the rig's travel has no room for them.
     """
@@ -218,7 +218,7 @@ class _Cuts:
         return _Poses(t[keep] - span.start_s, np.column_stack([column[name][keep] for name in ("x_m", "y_m", "z_m")]), axis)
 
     def run(self, span: _Span, axis: int, output: Array) -> Run:
-        """The encoder of `axis` around the sweep and `output` at its poses."""
+        """Return the encoder of `axis` around the sweep, and `output` at the poses of the sweep."""
         t = self._stage["stamp_ns"] * 1e-9
         keep = (t >= span.start_s - 0.1) & (t <= span.end_s + 0.1)
         name = ("encoder_insertion_m", "encoder_roll_rad", "encoder_knob_rad")[axis]
@@ -304,7 +304,7 @@ def transmission_toml(found: Characterization) -> str:
 
 
 def calibrated_rig_text(rig_text: str, section: str) -> str:
-    """`rig_text` (a rig file) with its [transmission] section replaced by `section`."""
+    """Return `rig_text` (a rig file) with `section` in the place of its [transmission] section."""
     pattern = re.compile(r"^\[transmission\].*?(?=^\[|\Z)", re.MULTILINE | re.DOTALL)
     if not pattern.search(rig_text):
         raise InputError.from_sentence("rig file: found no [transmission] section, wanted one to replace")

@@ -51,7 +51,7 @@ def _bounded(value: Estimate, scale: float, digits: int) -> str:
 
 
 def lines_of(found: Characterization) -> list[TableRow]:
-    """The figures in mm and degrees, each with its interval."""
+    """Return the figures in mm and degrees, each with its interval."""
     width, slope, roll, edges = found.insertion.width, found.insertion.slope, found.roll.slope, found.knob.edges_rad
     lines = [
         TableRow("Backlash of insertion", quantity(width.value * 1e3, "mm", 3), _bounded(width, 1e3, 3)),
@@ -76,7 +76,7 @@ def lines_of(found: Characterization) -> list[TableRow]:
 
 
 def pictures_of(found: Characterization) -> list[ReportFigure]:
-    """Figs. 6.3 to 6.8 of this rig, and the tip's curves over the knob (6.10, 6.11)."""
+    """Draw Figs. 6.3 to 6.8 of this rig, and the tip's curves over the knob (6.10, 6.11)."""
     degrees = (_DEG, "°")
     return [
         _in_time(
@@ -196,7 +196,7 @@ def _loops(
 
 
 def knob_picture(found: Characterization) -> ReportFigure:
-    """Curvature over the knob: measured by (6.1), by the tip's direction, fitted, and without dead zones (Fig. 6.8)."""
+    """Draw the curvature over the knob: by (6.1), by the tip's direction, fitted, and without dead zones (Fig. 6.8)."""
     sweep, knob = found.knob_sweep, found.knob
 
     def draw(figure: Figure, narrow: bool) -> None:
@@ -238,7 +238,7 @@ def knob_picture(found: Characterization) -> ReportFigure:
 
 
 def tip_picture(found: Characterization) -> ReportFigure:
-    """Where the tip is, seen from the distal shaft's proximal end, over the knob (Figs. 6.10, 6.11)."""
+    """Draw the tip's position over the knob, from the distal shaft's proximal end (Figs. 6.10, 6.11)."""
     sweep, length = found.knob_sweep, found.distal_length_m
     fitted = np.interp(sweep.knob_rad, found.knob.knob_rad, found.knob.curvature_per_m)
     order = np.argsort(sweep.knob_rad)

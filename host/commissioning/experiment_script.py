@@ -50,7 +50,7 @@ class Script(Request):
 
 @dataclass(frozen=True)
 class Path3D:
-    """What a script comes to: seconds, box of the tip (m), its speed (m/s), travel of each stage (its unit), forces (N)."""
+    """Motion of a script: seconds, box of the tip (m), its speed (m/s), travel of each stage (its unit), forces (N)."""
 
     seconds: float
     low_m: Array
@@ -61,7 +61,7 @@ class Path3D:
 
 
 def read_script(path: Path) -> Script:
-    """The script in TOML file `path`. Raises InputError naming the key."""
+    """Read the script in TOML file `path`. Raises InputError with the key."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -85,7 +85,7 @@ def _floats(row: list[Any]) -> list[Any]:
 
 
 def write_script(script: Script, path: Path) -> Path:
-    """`script` as TOML at `path`, read back equal."""
+    """Write `script` as TOML to `path`; reading it back gives equal values."""
     head = "# seldinger experiment FILE --rig RIG.toml checks and shows it; nothing moves without --go."
     fields = script.model_dump(exclude={"rows"})
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
@@ -96,7 +96,7 @@ def write_script(script: Script, path: Path) -> Path:
 
 
 def check_script(script: Script, rig: Rig) -> Path3D:
-    """What `script` asks of `rig`. Raises InputError for anything beyond its limits: nothing is commanded then."""
+    """Return the motion of `script` on `rig`. Raises InputError if it exceeds a limit; no command is sent."""
     if script.rig != rig.name:
         raise InputError("rig", script.rig, f"{rig.name}, the rig's name")
     if script.catheter != rig.catheter.name:
@@ -146,7 +146,7 @@ def _inside(points: Array, rig: Rig) -> None:
 
 
 def travel_of(points: Array, rig: Rig) -> dict[str, tuple[float, float]]:
-    """Range of each stage over tip positions (n, 3), play either way. Raises InputError beyond a stage's travel."""
+    """Return the range of each stage over tip positions (n, 3) with the backlash. Raises InputError beyond the travel."""
     config, known = tick_parameters(rig)[0].kinematics, rig.transmission
     joint, stages = np.array([known.insertion_at_home_m, 0.0, 0.0]), []
     for point in points:
@@ -169,7 +169,7 @@ class RigControl(Protocol):
     """A rig as a script needs it, in virtual time or on the wall clock."""
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """One command under the lease."""
+        """Give one command under the lease and return its result."""
         ...
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -181,7 +181,7 @@ class RigControl(Protocol):
         ...
 
     def mode(self) -> str:
-        """What the loop does: the label of a `protocol.enums.Phase`."""
+        """Return the label of the loop's phase (`protocol.enums.Phase`)."""
         ...
 
     def tip_m(self) -> Sequence[float] | None:

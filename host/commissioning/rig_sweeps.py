@@ -22,7 +22,7 @@ _UNITS = (("mm", 1e3), ("deg", 57.29577951308232), ("deg", 57.29577951308232))
 
 
 class PortNames(NamedTuple):
-    """Where the devices are; None: where the rig file says."""
+    """Ports of the devices; None: the port of the rig file."""
 
     board: str | None = None
     tracker: str | None = None
@@ -30,7 +30,7 @@ class PortNames(NamedTuple):
 
 
 def describe(sweeps: Sequence[Sweep]) -> str:
-    """Describe what will move, how far and for how long, for the question whether it may."""
+    """Describe the motion, its range and its duration, for the question to the operator."""
     parts = []
     for axis, (unit, scale) in enumerate(_UNITS):
         swing = [
@@ -43,7 +43,7 @@ def describe(sweeps: Sequence[Sweep]) -> str:
 
 
 def duration_s(sweeps: Sequence[Sweep]) -> float:
-    """How long the sweeps take (s), from stages at home."""
+    """Return the duration of the sweeps (s), from stages at home."""
     total, place = 0.0, (0.0, 0.0, 0.0)
     for sweep in sweeps:
         total += max(abs(a - b) / speed for a, b, speed in zip(sweep.centre, place, MOVE_SPEED, strict=True))
@@ -104,7 +104,7 @@ def _progress_of(loop: SweepLoop, progress: Callable[[float], None]) -> Callable
 
 
 class _stopping:
-    """While it lasts, SIGINT and SIGTERM set the event that it gives, instead of ending the process."""
+    """While active, SIGINT and SIGTERM set the returned event instead of ending the process."""
 
     def __init__(self) -> None:
         self._event, self._before = threading.Event(), dict[int, Any]()

@@ -27,12 +27,12 @@ class Estimate(NamedTuple):
 
     @property
     def low(self) -> float:
-        """Lower end of the interval."""
+        """Return the lower end of the 95 % interval."""
         return self.value - self.half95
 
     @property
     def high(self) -> float:
-        """Upper end of the interval."""
+        """Return the upper end of the 95 % interval."""
         return self.value + self.half95
 
 
@@ -48,7 +48,7 @@ class Run(NamedTuple):
     rate_rad_per_s: float
 
     def input_at(self, delay_s: float = 0.0) -> Array:
-        """The encoder (k,) when the outputs were taken, `delay_s` earlier."""
+        """Return the encoder (k,) `delay_s` before the times of the outputs."""
         return np.interp(self.time_s - delay_s, self.encoder_s, self.encoder)
 
 
@@ -79,7 +79,7 @@ class KnobFit(NamedTuple):
 
 @njit(cache=True)
 def play(inputs: Array, width: float, start: float) -> Array:
-    """The play operator of `width` over `inputs` (n,), from `start` on; the output follows the side that pushes it."""
+    """Apply the play operator of `width` to `inputs` (n,), from `start` on; the output follows the side that pushes it."""
     out, y = np.empty_like(inputs), start
     for i in range(inputs.size):
         y = min(max(y, inputs[i] - 0.5 * width), inputs[i] + 0.5 * width)
@@ -88,7 +88,7 @@ def play(inputs: Array, width: float, start: float) -> Array:
 
 
 def _after_first_turn(run: Run) -> Run:
-    """The run from its first extreme on: before it, where in its gap the catheter lay is not known."""
+    """Return the run from its first extreme on: before it, the position of the catheter within the gap is not known."""
     keep = run.time_s >= 0.5 * np.pi / run.rate_rad_per_s
     return run._replace(time_s=run.time_s[keep], output=run.output[keep])
 

@@ -65,7 +65,7 @@ class Tuned:
 
 
 def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
-    """The demo's plant with a still heart, the tip `clearance_m` before the wall, the backlash taken up forward."""
+    """Return the demo's plant: heart at rest, tip `clearance_m` before the wall, backlash crossed forward."""
     out = np.zeros(3)
     kinematics = tick_parameters(rig)[0].kinematics
     out[:] = inverse_kinematics.apply(kinematics, np.array([*WALL_POINT_M[:2], WALL_POINT_M[2] - clearance_m]), 0.0)
@@ -80,7 +80,7 @@ def still_wall(rig: Rig, clearance_m: float = _CLEARANCE_M) -> PlantConfig:
 
 
 def with_gains(rig: Rig, gains: dict[str, float]) -> Rig:
-    """`rig` under the thesis' law with these gains. Raises InputError for a gain out of its bounds or not known."""
+    """Return `rig` under the thesis' law with these gains. Raises InputError for an unknown gain or out of bounds."""
     data = rig.effective()
     data["control"] = {**data["control"], "law": "thesis", "form": "incremental", "force_added_to": "tip", **gains}
     return parse_rig(data, "gains")
@@ -98,7 +98,7 @@ def response(
 
 
 def cost_of(trace: IdealTrace, force_N: float, seconds: float) -> float:
-    """Mean absolute force error (N) of one response; the part it spent out of contact counts as FAILED_N."""
+    """Return the mean absolute force error (N) of one response; time without contact counts as FAILED_N."""
     held = trace.phase == Phase.CONTACT
     wanted = max(1, round(seconds / max(_period_s(trace), 1e-9)))
     error = np.abs(trace.force_N - force_N)[held]
@@ -132,7 +132,7 @@ def _rings(trace: IdealTrace, force_N: float) -> bool:
 
 
 def _frequency_Hz(trace: IdealTrace) -> float:
-    """Strongest frequency of the force's last 1.5 s."""
+    """Return the strongest frequency (Hz) of the force in its last 1.5 s."""
     late = trace.force_N[trace.time_s > trace.time_s[-1] - 1.5]
     late = (late - late.mean()) * np.hanning(late.size)
     spectrum = np.abs(np.fft.rfft(late, 8 * late.size))
@@ -140,7 +140,7 @@ def _frequency_Hz(trace: IdealTrace) -> float:
 
 
 def _limit(rings: Callable[[float], bool], low: float, high: float, steps: int) -> float:
-    """Where between `low` (calm) and `high` it begins to ring, by bisection in ratio; `high` where it never does."""
+    """Return where oscillation begins between `low` (none) and `high`, by bisection in ratio; `high` if it never does."""
     if not rings(high):
         return high
     for _ in range(steps):
@@ -150,7 +150,7 @@ def _limit(rings: Callable[[float], bool], low: float, high: float, steps: int) 
 
 
 def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, steps: int = 5) -> Margin:
-    """How far the loop with `gains` is from ringing, found by more gain and by more delay until it rings.
+    """Measure how much more gain and how much more delay the loop with `gains` takes before it oscillates.
 
     Raises InputError where it rings as it is.
     """
@@ -176,7 +176,7 @@ def stability_margin(rig: Rig, gains: dict[str, float], force_N: float = 0.2, st
 
 
 def _unchecked(rig: Rig, gains: dict[str, float]) -> Rig:
-    """As `with_gains` with gains that may be out of bounds: only for the simulated search of a margin."""
+    """Return `rig` with gains that may be out of bounds, only for the simulated search of a margin."""
     return rig.model_copy(
         update={
             "control": rig.control.model_copy(
@@ -279,7 +279,7 @@ def best_of(results: Sequence[Tuned]) -> Tuned:
 
 
 def half_way(rig: Rig, tuned: Tuned) -> Tuned:
-    """`tuned` with its force gains halved: the proposal where the margin of the optimum is too small."""
+    """Return `tuned` with its force gains halved, the proposal if the margin of the optimum is too small."""
     gains = {key: value * (0.5 if key in GAINS[2:] else 1.0) for key, value in tuned.gains.items()}
     return replace(tuned, gains=gains, cost_N=criterion(rig, gains), evaluations=tuned.evaluations + 1)
 

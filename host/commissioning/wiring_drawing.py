@@ -50,7 +50,7 @@ def _wire(y: float, signal: Signal, terminal: str) -> list[str]:
 
 
 def _devices(pins: Pins) -> list[tuple[str, list[tuple[Signal, str]]]]:
-    """Blocks on the right side and their wires: (signal, terminal of the device)."""
+    """Return the blocks on the right side and their wires: (signal, terminal of the device)."""
     by_name = {signal.name: signal for signal in signals(**pins.ports())}
     ground, supply = Signal("GND", "GND", "GND"), Signal("5V", "5V", "5V")
     inverse = "low = powered" if pins.enable_active == "low" else "high = powered"

@@ -20,7 +20,7 @@ FAR_M = 1.0
 
 @dataclass(frozen=True)
 class Sphere:
-    """Solid."""
+    """A solid sphere."""
 
     centre_m: tuple[float, float, float]
     radius_m: float
@@ -28,7 +28,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Capsule:
-    """Solid: all within `radius_m` of the line between two points."""
+    """A solid capsule: all points within `radius_m` of the line between two points."""
 
     from_m: tuple[float, float, float]
     to_m: tuple[float, float, float]
@@ -37,7 +37,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A closed surface: solid, or with `chamber` the wall of the room that the tip must stay in."""
+    """A closed surface: a solid, or with `chamber` the wall of the space that the tip must not leave."""
 
     vertices_m: Array
     faces: NDArray[np.int64]
@@ -91,7 +91,7 @@ def _turn_to(axis: Array) -> Array:
 
 
 class Surroundings:
-    """All obstacles together; give the distance of a polyline with thickness."""
+    """All obstacles together; computes the distance of a polyline with thickness from them."""
 
     def __init__(self, obstacles: list[Obstacle]) -> None:
         self.obstacles = obstacles
@@ -130,7 +130,7 @@ class Surroundings:
         return least
 
     def holds(self, point_m: Array) -> str:
-        """Why a point cannot be a goal ("" if it can): inside which obstacle, or outside the chamber."""
+        """Return why a point cannot be a goal (inside an obstacle, outside the chamber); empty if it can."""
         for number, item in enumerate(self.obstacles):
             if isinstance(item, Sphere):
                 if np.linalg.norm(point_m - np.array(item.centre_m)) <= item.radius_m:

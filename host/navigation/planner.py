@@ -30,7 +30,7 @@ class _Tree:
         return len(self.points) - 1
 
     def path(self, index: int) -> list[Array]:
-        """From `index` to its root."""
+        """Return the joints from `index` to the root of the tree."""
         out = []
         while index >= 0:
             out.append(self.points[index])
@@ -39,7 +39,7 @@ class _Tree:
 
 
 def free_between(start: Array, end: Array, free: Free, check_m: float = CHECK_M) -> bool:
-    """Whether the straight way between two scaled joints is free, both ends taken as free; far points first."""
+    """Return whether the straight line between two scaled joints is free of collision; both ends are assumed free."""
     count = int(np.ceil(np.linalg.norm(end - start) / check_m))
     order = sorted(range(1, count), key=lambda k: k & -k, reverse=True)
     return all(free(start + (end - start) * k / count) for k in order)
@@ -77,7 +77,7 @@ def _extend(tree: _Tree, sample: Array, free: Free) -> int | None:
 
 
 def _grow_to(tree: _Tree, target: Array, free: Free) -> int:
-    """Extend towards `target` until there or stopped; the last point's index."""
+    """Extend the tree towards `target` until it is reached or blocked; return the index of the last point."""
     last = tree.nearest(target)
     while not np.allclose(tree.points[last], target, atol=1e-12):
         way = target - tree.points[last]
@@ -90,7 +90,7 @@ def _grow_to(tree: _Tree, target: Array, free: Free) -> int:
 
 
 def shorten(path: list[Array], free: Free, seed: int, tries: int = 150) -> list[Array]:
-    """The same way with free short cuts between random points of it."""
+    """Shorten the path by direct connections between random points of it."""
     random = np.random.default_rng(seed)
     path = list(path)
     for _ in range(tries):
@@ -105,7 +105,7 @@ def shorten(path: list[Array], free: Free, seed: int, tries: int = 150) -> list[
 
 
 def _halfway(path: list[Array], random: np.random.Generator) -> list[Array]:
-    """With one more point on the longest leg, so that later short cuts can begin there; at most 60 points."""
+    """Add a point on the longest segment, so that later direct connections can begin there; at most 60 points."""
     if len(path) >= 60:
         return path
     legs = [float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(path)]

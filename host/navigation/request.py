@@ -50,7 +50,7 @@ class CapsuleRequest(Request):
 
 
 class MeshRequest(Request):
-    """A closed triangle mesh: a solid, or with role chamber the room to stay in. Lengths in the file times `scale` are m."""
+    """A closed triangle mesh: a solid, or with role chamber the space to stay in. File lengths times `scale` are m."""
 
     type: Literal["mesh"]
     file: str
@@ -70,7 +70,7 @@ class PunctureRequest(Request):
 
 
 class JointRequest(Request):
-    """Where the catheter is."""
+    """Joints at the start: insertion, roll and curvature of the distal end."""
 
     insertion_m: float
     roll_rad: float
@@ -81,7 +81,7 @@ AnyObstacle = Annotated[SphereRequest | CapsuleRequest | MeshRequest, Field(disc
 
 
 class PlanRequest(Request):
-    """What `seldinger plan` reads."""
+    """Request of `seldinger plan`, as in docs/navigation.md."""
 
     goal_m: Point
     start: JointRequest
@@ -136,7 +136,7 @@ class PlanAnswer(NamedTuple):
 
 
 class _World:
-    """Return whether this joint is free of collisions; the planner calls it."""
+    """Test whether a set of joints is free of collision; the planner calls it."""
 
     def __init__(self, request: PlanRequest, rig: Rig, folder: Path) -> None:
         self.catheter = load_catheter(rig.catheter.name)
@@ -145,7 +145,7 @@ class _World:
         self.puncture, self.clearance_m = request.puncture, request.clearance_m
 
     def line(self, joint: Array) -> LoadedLine | None:
-        """The catheter at `joint`, bent by the puncture where it does not pass it freely; None where it cannot pass."""
+        """Return the catheter at `joint`, bent by the puncture if it touches its edge; None if it cannot pass."""
         if self.puncture is None:
             return LoadedLine(shape.centre_line(self.reach, joint, LINE_POINTS), 0.0)
         hole, free = np.array(self.puncture.point_m), shape.centre_line(self.reach, joint, 3 * LINE_POINTS)
@@ -154,7 +154,7 @@ class _World:
         return through_hole(self.catheter, self.reach, joint, hole, self.puncture.radius_m, 3 * LINE_POINTS)
 
     def tip(self, joint: Array) -> Array:
-        """Position (3,) m of the tip; NaN where the catheter has no shape."""
+        """Return the position (3,) m of the tip; NaN if the catheter has no shape."""
         line = self.line(joint)
         return np.full(3, np.nan) if line is None else line.points_m[-1]
 
@@ -163,7 +163,7 @@ class _World:
         return 0.0 if line is None else self.surroundings.clearance_m(line.points_m, self.reach.radius_m)
 
     def refused(self, joint: Array) -> str:
-        """Why `joint` is not free, "" if it is."""
+        """Return why `joint` is not free; empty if it is."""
         if not shape.within(self.reach, joint):
             return "out of the stages' travel"
         line = self.line(joint)
@@ -198,7 +198,7 @@ class _World:
         return f"{why} when it presses" if why else ""
 
     def aim(self, joint: Array, goal_m: Array) -> Array | None:
-        """The joint next to `joint` whose tip, bent by the puncture, is at the goal; None where there is none."""
+        """Return the joint next to `joint` whose tip, bent by the puncture, is at the goal; None if there is none."""
         return aimed(self.tip, joint, goal_m, self.reach.scale_m)
 
     def _touches(self, points_m: Array) -> str:
@@ -221,7 +221,7 @@ def _obstacle(item: Any, folder: Path) -> Obstacle:
 
 
 def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> PlanAnswer | None:
-    """The fastest found way of the tip to the goal; None where `request.samples` found none. Mesh files are in `folder`.
+    """Return the fastest path of the tip to the goal; None if `request.samples` found none. Mesh files are in `folder`.
 
     Raises InputError: goal inside an obstacle, out of reach, reachable only in contact; start not free; a mesh not usable.
     """
@@ -273,7 +273,7 @@ def _goals(request: PlanRequest, rig: Rig, world: _World) -> list[Array]:
 
 
 def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> PlanAnswer:
-    """Time over the way; where the spline through it cuts a corner too close, again with the points nearer together."""
+    """Compute the time along the path; if the spline cuts a corner too closely, repeat it with denser points."""
     for spacing in (SPACING_M, 0.5 * SPACING_M, 0.2 * SPACING_M):
         dense = _dense(way, world.reach.scale_m, spacing)
         timed = timing.fastest(shape.stages_of(rig, dense), rig, request.period_s)
@@ -322,7 +322,7 @@ def read_plan_request(source: str) -> PlanRequest:
 
 
 def with_tuples(value: Any) -> Any:
-    """Return `value` with lists of three numbers as tuples, which strict checking of points wants."""
+    """Return `value` with lists of three numbers as tuples, as the strict check of points requires."""
     if isinstance(value, dict):
         return {key: with_tuples(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Reach:
-    """What the rig's catheter and stages can do. `low`, `high` (3,): joint limits; `scale_m` (3,): tip motion per joint."""
+    """Limits of the rig's catheter and stages. `low`, `high` (3,): joint limits; `scale_m` (3,): tip motion per joint."""
 
     length_m: float
     radius_m: float
@@ -30,7 +30,7 @@ class Reach:
 
 
 def reach_of(rig: Rig, diameter_m: float) -> Reach:
-    """Limits in joints from the stages' travel through the transmission; the knob's from its curve."""
+    """Return the joint limits from the stages' travel through the transmission; those of the knob from its curve."""
     t, length = rig.transmission, rig.catheter.distal_length_m
     play = 0.5 * t.insertion_backlash_m
     stage = rig.stages.insertion
@@ -56,12 +56,12 @@ def centre_line(reach: Reach, joint: Array, points: int) -> Array:
 
 
 def tip(reach: Reach, joint: Array) -> Array:
-    """Position (3,) m of the tip."""
+    """Return the position (3,) m of the tip."""
     return centre_line(reach, joint, 2)[-1]
 
 
 def joints_of(reach: Reach, rig: Rig, goal_m: Array) -> list[Array]:
-    """All joints within the limits whose unloaded tip is at `goal_m` (3,): both ways of roll, both sides of the fold."""
+    """Return all joints within the limits whose unloaded tip is at `goal_m` (3,): both rolls, both sides of the fold."""
     config = tick_parameters(rig)[0].kinematics
     across, along = math.hypot(goal_m[0], goal_m[1]), float(goal_m[2])
     turn = math.atan2(goal_m[0], -goal_m[1])

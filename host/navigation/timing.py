@@ -55,5 +55,5 @@ def fastest(waypoints: Array, rig: Rig, period_s: float) -> Timed:
 
 
 def _scale(rig: Rig) -> Array:
-    """Stage motion in seconds at full speed, so that no axis counts for nothing."""
+    """Return the stage motion as seconds at full speed, so that every axis has weight."""
     return 1.0 / np.array([rig.stage(axis).max_speed_unit_per_s for axis in range(3)])

@@ -15,7 +15,7 @@ FORMATS = ("parquet", "csv")
 
 
 def arrow_table(recording: RecordingFile, topic: str) -> pa.Table:
-    """The table of `topic`; every field's metadata has its unit, the table's has run, configuration and catheter."""
+    """Return the table of `topic`, with units as metadata of the fields and run, configuration, catheter of the table."""
     units = recording.units(topic)
     columns = recording.table(topic)
     schema = pa.schema(

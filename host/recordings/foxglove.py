@@ -19,7 +19,7 @@ Body = dict[str, Any]
 
 
 def plain_schema(message_class: type[Message]) -> str:
-    """The class' JSON Schema in the part of the language that Foxglove knows: one type a property, absent for nil."""
+    """Return the class' JSON Schema as Foxglove supports it: one type for each property, absent for nil."""
     schema = json.loads(json_schema(message_class))
     for name, item in schema["properties"].items():
         if name == "schema_version":

@@ -23,7 +23,7 @@ def software_version() -> str:
 
 
 def git_revision() -> str:
-    """The revision that this code stands at, with `+changes` where files differ from it; `unknown` outside git."""
+    """Return the revision of this code, with `+changes` if files differ from it; `unknown` outside git."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return "unknown"
@@ -36,7 +36,7 @@ def git_revision() -> str:
 
 
 class RecordingHeader(NamedTuple):
-    """What must be known, in addition to its messages, to understand a recording."""
+    """Everything that is needed to understand a recording, apart from its messages."""
 
     rig: str
     clock: str

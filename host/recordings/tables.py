@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class RecordingTables:
-    """One recording, read whole; damaged or cut-off files give every message that is intact."""
+    """One recording, read completely; a damaged or cut-off file gives every message that is intact."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the MCAP file `path`. Raises InputError where it cannot be read or is no recording."""

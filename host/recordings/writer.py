@@ -51,20 +51,20 @@ class ChunkBuilder:
 
     @property
     def empty(self) -> bool:
-        """Whether it holds no message."""
+        """Return whether the chunk holds no message."""
         return not self._index
 
     def describe(self, record: Schema | Channel) -> None:
-        """A schema or channel, before the first message that needs it."""
+        """Add a schema or channel, before the first message that needs it."""
         record.write(self._records)
 
     def add(self, message: Message) -> None:
-        """A message, which is found again by its log_time."""
+        """Add a message; its log_time is its key in the index."""
         self._index.setdefault(message.channel_id, []).append((message.log_time, self._records.count))
         message.write(self._records)
 
     def end(self) -> bytes:
-        """The chunk. Not to be asked of an empty one."""
+        """End the chunk and return its bytes. Not allowed for an empty chunk."""
         times = [time_ns for places in self._index.values() for time_ns, _ in places]
         content = self._records.end()
         out = RecordBuilder()
@@ -108,7 +108,7 @@ class GuardedFile:
         return self._position
 
     def flush(self) -> None:
-        """Everything written so far is whole: bring it to the disk."""
+        """Write everything so far to the disk; it is then whole."""
         if self.error is not None:
             return
         try:
@@ -120,7 +120,7 @@ class GuardedFile:
         self._whole = self._position
 
     def read_back(self) -> BinaryIO:
-        """What was written so far, to read."""
+        """Open the bytes that were written so far for reading."""
         return open(f"/proc/self/fd/{self._fd}", "rb")
 
     def _fail(self, error: OSError) -> None:
@@ -142,7 +142,7 @@ def _description(topic: str) -> tuple[str, str, dict[str, str]]:
 
 
 def new_recording_path(directory: Path, name: str) -> Path:
-    """A path in `directory` (made if needed) that no file has yet: name, date and time, and a number if needed."""
+    """Return a path in `directory` (made if needed) that no file has yet: name, date and time, and a number if needed."""
     directory.mkdir(parents=True, exist_ok=True)
     stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = directory / f"{stem}.mcap", 1
@@ -178,7 +178,7 @@ class RecordingWriter:
         self._sync()
 
     def _record(self, record: McapRecord) -> None:
-        """A record outside the chunks."""
+        """Write a record outside the chunks."""
         out = RecordBuilder()
         record.write(out)
         self._file.write(out.end())

@@ -17,27 +17,27 @@ from host.report.run_summary import RunSummary, summarize
 
 
 class FinishedRun(Protocol):
-    """What is known of a run in addition to its recording: how it ended, and what the loop and the board counted."""
+    """Information on a run that its recording does not contain: its end, and the counters of loop and board."""
 
     @property
     def recording(self) -> Path:
-        """Path of the recording."""
+        """Return the path of the recording."""
 
     @property
     def outcome(self) -> Any:
-        """How the scenario ended (`sim.scenario.Outcome`)."""
+        """Return the end of the scenario (`sim.scenario.Outcome`)."""
 
     @property
     def counts(self) -> Mapping[str, Any]:
-        """Counters of the loop and the board, by name."""
+        """Return the counters of the loop and the board, by name."""
 
     @property
     def interrupted(self) -> str:
-        """Name of the signal that ended the run, empty if none did."""
+        """Return the name of the signal that ended the run, empty if none did."""
 
 
 def demo_result(recording: RecordingFile, run: FinishedRun, report: Path) -> dict[str, Any]:
-    """The object of `seldinger demo --json`.
+    """Return the object of `seldinger demo --json`.
 
     Forces, tip and timing come from the recording. `run.counts` adds what happened between two recorded board messages
     (faults, crc_errors, underruns: the worse of both is given); `run.outcome` the steps, where there are pins to count.
@@ -78,7 +78,7 @@ def _whole(value: float) -> float | int:
 
 
 def print_summary(result: dict[str, Any], run: FinishedRun, console: Console | None = None) -> None:
-    """Verdict, a short table, and where recording and report are, on standard error."""
+    """Print verdict, a short table, and the paths of recording and report, on standard error."""
     console = console or Console(stderr=True, highlight=False)
     summary = summarize(RecordingFile(run.recording))
     verdict = verdict_of(summary)

@@ -20,7 +20,7 @@ WORDS = {HOLDS: "holds", DOES_NOT_HOLD: "does not hold", NOT_REPRODUCIBLE: "not 
 
 @dataclass(frozen=True)
 class Section:
-    """One figure or table again. `thesis`, `ours`: one or two sentences each; `says`: the verdict's line with its figure.
+    """One reproduced figure or table. `thesis`, `ours`: one or two sentences each; `says`: the verdict with its figure.
 
     rows: a table, its heading first.
     """
@@ -42,7 +42,7 @@ class Section:
 
 
 def verdict(holds: bool) -> str:
-    """HOLDS or DOES_NOT_HOLD."""
+    """Return HOLDS or DOES_NOT_HOLD."""
     return HOLDS if holds else DOES_NOT_HOLD
 
 

@@ -42,7 +42,7 @@ class RunFigures:
         self.end_s = max(summary.duration_s, 1e-3)
 
     def all(self) -> list[ReportFigure]:
-        """Those for which the recording has the data, in the order of the report."""
+        """Return the figures for which the recording has data, in the order of the report."""
         made = [self.force(), self.force_detail(), self.tip(), self.path(), self.stages(), self.timeline(), self.ticks()]
         return [figure for figure in made if figure is not None]
 
@@ -92,7 +92,7 @@ class RunFigures:
         axes.set_ylabel("force into the wall, N")
 
     def force(self) -> ReportFigure | None:
-        """The whole run's force."""
+        """Draw the force of the whole run; None without force data."""
         if not self.recording.topics.get("force/sensor") and not self.recording.topics.get("force/estimate"):
             return None
 
@@ -120,7 +120,7 @@ class RunFigures:
         )
 
     def force_detail(self) -> ReportFigure | None:
-        """The last seconds of contact, large enough to see the heart beat."""
+        """Draw the force of the last seconds of contact, large enough to show the heart beat."""
         contact = self.summary.contact
         if contact is None or not self.recording.topics.get("force/sensor"):
             return None
@@ -142,7 +142,7 @@ class RunFigures:
         )
 
     def tip(self) -> ReportFigure | None:
-        """Tip against target (and wall, where a simulator knows it), along and across the force direction."""
+        """Draw tip and target (and the wall, in a simulation), along and across the force direction."""
         pose, state = table_or_none(self.recording, "pose/tip"), table_or_none(self.recording, "state")
         if pose is None or state is None:
             return None
@@ -197,7 +197,7 @@ class RunFigures:
         )
 
     def path(self) -> ReportFigure | None:
-        """The tip's way from the side and from above, with the catheter's shape at its start and its end."""
+        """Draw the path of the tip from the side and from above, with the catheter's shape at its start and its end."""
         tip, shaft = table_or_none(self.recording, "pose/tip"), table_or_none(self.recording, "pose/shaft")
         if tip is None:
             return None
@@ -259,7 +259,7 @@ class RunFigures:
         axes.set_ylabel(f"{row[0]}, mm")
 
     def stages(self) -> ReportFigure | None:
-        """Commands and encoders of the three axes."""
+        """Draw commands and encoders of the three axes."""
         stage = table_or_none(self.recording, "stage")
         if stage is None:
             return None
@@ -295,7 +295,7 @@ class RunFigures:
         )
 
     def timeline(self) -> ReportFigure | None:
-        """Phases and safety actions as bars."""
+        """Draw phases and safety actions as bars."""
         if not self.summary.modes:
             return None
 
@@ -338,7 +338,7 @@ class RunFigures:
         )
 
     def ticks(self) -> ReportFigure | None:
-        """How long the loop's work took, on a logarithmic scale."""
+        """Draw the time of the loop's work, on a logarithmic scale."""
         times = self.summary.ticks
         if not times.histogram.any():
             return None

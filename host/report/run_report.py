@@ -19,7 +19,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 class RunVerdict(NamedTuple):
-    """`level` good, fair or bad; one sentence; and what else must be known, sentence by sentence.
+    """Verdict on a run: `level` good, fair or bad; one sentence; remarks, one sentence each.
 
     Of a failed run the sentence ends in the first cause: `remedy` is what to do about it, `followed` what came after it.
     """
@@ -32,7 +32,7 @@ class RunVerdict(NamedTuple):
 
 
 class TableRow(NamedTuple):
-    """One line of the table of figures: what, how much, and what to hold it against."""
+    """One line of the table of figures: name, value, and the limit or reference."""
 
     name: str
     value: str
@@ -68,7 +68,7 @@ def render(recording: RecordingFile) -> str:
 
 
 def quantity(value: float, unit: str, digits: int) -> str:
-    """`value` with its unit, rounded; a dash where there is none."""
+    """Return `value` with its unit, rounded; a dash if it is not finite."""
     return f"{value:.{digits}f}{NBSP}{unit}" if math.isfinite(value) else "–"
 
 
@@ -78,7 +78,7 @@ def duration(time_us: float) -> str:
 
 
 def signed(value: float, unit: str, digits: int) -> str:
-    """As `quantity`, with its sign."""
+    """Return `value` with its sign and unit, rounded as by `quantity`."""
     return f"{value:+.{digits}f}{NBSP}{unit}".replace("-", "\u2212") if math.isfinite(value) else "–"
 
 
@@ -88,7 +88,7 @@ def lateness_of(summary: RunSummary) -> str:
 
 
 def verdict_of(summary: RunSummary) -> RunVerdict:
-    """Judge a run. Good: the force was kept and nothing intervened. Bad: no contact, a stop or a board fault."""
+    """Judge a run. Good: force kept, no safety action. Bad: no contact, a stop or a board fault."""
     remarks = _remarks(summary)
     stopped = summary.worst_action in ("retract", "stop") or bool(summary.board.faults)
     if summary.contact is None or summary.contact_seconds == 0:
@@ -123,7 +123,7 @@ def _with_first_cause(verdict: RunVerdict, summary: RunSummary) -> RunVerdict:
 
 
 def _remarks(summary: RunSummary) -> tuple[str, ...]:
-    """Everything that is not as it should be."""
+    """Return a sentence for each irregularity of the run."""
     board, ticks = summary.board, summary.ticks
     said = [
         (summary.truncated, "The recording ended early or is damaged; the figures are those of its readable part."),
@@ -222,7 +222,7 @@ def _safety_rows(recording: RecordingFile, summary: RunSummary) -> list[TableRow
 
 
 def _event_rows(recording: RecordingFile, most: int = 200) -> list[TableRow]:
-    """Commands with their replies, and log lines, in order of time."""
+    """Return commands with their replies, and log lines, in order of time."""
     start_ns = recording.span_ns[0]
     replies = {reply["id"]: reply for reply in recording.messages("reply")}
     rows: list[tuple[int, str, str]] = []

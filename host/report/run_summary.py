@@ -21,7 +21,7 @@ SETTLE_S = 3.0
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """Something that held from start_ns to end_ns."""
+    """A time span from start_ns to end_ns, with a name and a note."""
 
     start_ns: int
     end_ns: int
@@ -36,7 +36,7 @@ class TimeSpan:
 
 @dataclass(frozen=True)
 class TickTimes:
-    """The loop's own account at the end of the run; NaN where it gave none."""
+    """Times of the loop's ticks at the end of the run; NaN if the recording has none."""
 
     loop_hz: float = float("nan")
     ticks: int = 0
@@ -109,13 +109,13 @@ class RunSummary:
 
     @property
     def judged_over(self) -> str:
-        """Over which part of the contact mean force and RMS errors are: the same for all of them."""
+        """Return the part of the contact over which mean force and RMS errors are computed."""
         settled = self.contact is not None and self.contact.seconds > SETTLE_S
         return f"after {SETTLE_S:g} s of settling" if settled else f"whole contact, not longer than {SETTLE_S:g} s"
 
     @property
     def force_kept(self) -> bool:
-        """The mean after settling is within a tenth of the target."""
+        """Return whether the mean force after settling is within a tenth of the set-point."""
         return abs(self.force_mean_N - self.target_force_N) <= 0.1 * self.target_force_N
 
 
@@ -182,7 +182,7 @@ def summarize(recording: RecordingFile) -> RunSummary:
 
 
 def _first_cause(recording: RecordingFile) -> FirstCause | None:
-    """What went wrong first since the rig was last armed, from the messages in the order of their time."""
+    """Return the first cause since the rig was last armed, from the messages in the order of their time."""
     watch = CauseWatch()
     bodies = {topic: list(recording.messages(topic)) for topic in ("loop", "board", "state")}
     merged = sorted(((body["stamp_ns"], topic, index) for topic, some in bodies.items() for index, body in enumerate(some)))

@@ -70,7 +70,7 @@ WIDE_IN, NARROW_IN = 7.4, 3.5
 
 
 class ReportFigure(NamedTuple):
-    """One figure as two SVG data addresses, what it shows in words for those who do not see it, and a caption."""
+    """One figure as two SVG data addresses, with a text for readers who cannot see it, and a caption."""
 
     wide: str
     narrow: str

@@ -33,7 +33,7 @@ class Commander(CommandSender):
         self._keeper: threading.Thread | None = None
 
     def take(self) -> Acknowledgement:
-        """Take the lease and keep it. `lost` says why it went, where renewing was refused."""
+        """Take the lease and renew it in the background. `lost` states the reason if renewing was refused."""
         answer = super().take()
         if answer.accepted:
             self.lost = ""
@@ -47,7 +47,7 @@ class Commander(CommandSender):
         return answer
 
     def release(self) -> Acknowledgement:
-        """Give the lease back, and renew it no more."""
+        """Release the lease and end its renewal."""
         with self._lock:
             self._wanted.clear()
             return super().release()
@@ -88,7 +88,7 @@ class Commander(CommandSender):
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Release what is held and end the thread."""
+        """Release the lease and end the thread."""
         if self._wanted.is_set():
             self.release()
         self._ending.set()

@@ -27,7 +27,7 @@ KEY_FILES = (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
 class CommandRefused(RuntimeError):
-    """The rig did not carry out a command. `acknowledgement` says what became of it."""
+    """The rig did not carry out a command. `acknowledgement` holds the result and the reason."""
 
     def __init__(self, action: str, acknowledgement: Acknowledgement) -> None:
         super().__init__(f"{action}: {acknowledgement.reason}")
@@ -117,7 +117,7 @@ class RigConnection:
         self._said("take", self._commander.take())
 
     def release(self) -> None:
-        """Give the lease back. What moves goes on as commanded."""
+        """Release the lease. A motion in progress continues as commanded."""
         self._said("release", self._commander.release())
 
     def arm(self) -> None:
@@ -125,7 +125,7 @@ class RigConnection:
         self._said("arm", self._commander.arm())
 
     def disarm(self) -> None:
-        """Disarm the board. Raises CommandRefused."""
+        """Bring the stages to rest and disarm the board. Raises CommandRefused."""
         self._said("disarm", self._commander.disarm())
 
     def goto(self, position_m: Sequence[float]) -> None:
@@ -145,7 +145,7 @@ class RigConnection:
         self._said("touch", self._commander.press(position_m, normal, force_N))
 
     def force(self, force_N: float) -> None:
-        """Change the contact force, N, of the touch that goes on. Raises CommandRefused."""
+        """Change the contact force, N, of the present touch. Raises CommandRefused."""
         self._said("force", self._commander.force(force_N))
 
     def hold(self) -> None:
@@ -157,7 +157,7 @@ class RigConnection:
         self._said("retract", self._commander.retract())
 
     def stop(self) -> None:
-        """Stop. Needs no lease; only disarming and arming lead out of it. Raises CommandRefused where no answer came."""
+        """Stop the rig; after it, it needs `disarm` and `arm`. Needs no lease. Raises CommandRefused without an answer."""
         self._said("stop", self._commander.stop())
 
     def jog(self, axis: str, travel: float, speed: float | None = None, direction: Sequence[float] | None = None) -> None:
@@ -218,7 +218,7 @@ class RigConnection:
         self._said("clear_fault", self._commander.clear_fault())
 
     def close(self) -> None:
-        """Give the lease back, where it is held, and close the connection."""
+        """Release the lease, if it is held, and close the connection."""
         self._commander.close()
         self._session.close()
 
@@ -281,7 +281,7 @@ def connect(
 
 
 def may_run(rig: Rig) -> bool:
-    """Whether a rig of this computer may be running: one of its sockets is there, or its rig file connects elsewhere."""
+    """Return whether a rig may run on this computer: one of its sockets exists, or its rig file connects elsewhere."""
     return bool(rig.zenoh.connect) or rig.local.zenoh_socket.exists() or rig.local.stop_socket.exists()
 
 

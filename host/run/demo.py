@@ -43,7 +43,7 @@ class DemoSettings:
 
 @dataclass
 class DemoRun:
-    """What a run leaves: the recording, how the scenario ended, what the board and the loop counted."""
+    """Result of a run: the recording, the end of the scenario, the counters of board and loop."""
 
     recording: Path
     outcome: Outcome
@@ -87,7 +87,7 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
 
 
 def _counts(scenario: Scenario, world: World, outcome: Outcome) -> dict[str, Any]:
-    """What must agree and what must be zero."""
+    """Return the counters that must agree and those that must be zero."""
     loop, status = scenario.loop, scenario.loop.core.link.status
     return {
         "missed_ticks": 0,
@@ -103,7 +103,7 @@ def _counts(scenario: Scenario, world: World, outcome: Outcome) -> dict[str, Any
 
 
 class _SignalsStop:
-    """While it lasts, SIGINT and SIGTERM end the scenario instead of the process."""
+    """While active, SIGINT and SIGTERM end the scenario instead of the process."""
 
     def __init__(self, scenario: Scenario, run: DemoRun) -> None:
         self._scenario, self._run = scenario, run
@@ -123,7 +123,7 @@ class _SignalsStop:
 
 
 def exit_status(run: DemoRun, reached: bool) -> int:
-    """0 when the job was done and recorded; 130 or 143 when a signal ended it; 1 otherwise."""
+    """Return 0 if the run was completed and recorded; 130 or 143 after a signal; 1 otherwise."""
     if run.interrupted:
         return 128 + int(getattr(signal, run.interrupted))
     return 0 if reached and not run.outcome.stopped and not run.recording_failure else 1

@@ -50,13 +50,13 @@ class SimulatedCommands:
         return Phase(self._scenario.phase).label
 
     def tip_m(self) -> Sequence[float]:
-        """The tip as the loop predicts it."""
+        """Return the tip (3,) m as the loop predicts it."""
         return [float(v) for v in self._scenario.loop.outputs[0].tip_m]
 
 
 def run_simulated(script: Script, rig: Rig, directory: Path, board: str, seed: int, effects: tuple[str, ...],
                   progress: Callable[[float], None] = lambda share: None) -> Path:  # fmt: skip
-    """Perform `script` on the simulated rig in virtual time; the recording. Raises InputError, RuntimeError."""
+    """Run `script` on the simulated rig in virtual time; return the recording. Raises InputError, RuntimeError."""
     try:
         plant = simulated_plant(rig, seed, effects=tuple(map(parse, effects)))
     except ValueError as error:
@@ -96,7 +96,7 @@ class LiveCommands:
         return answer
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """On the wall clock, looking every 10 ms; ends where the lease was lost."""
+        """Wait on the wall clock, with a check every 10 ms; end if the lease was lost."""
         end = time.monotonic() + seconds
         while True:
             self._look()
@@ -118,18 +118,18 @@ class LiveCommands:
         return time.monotonic()
 
     def mode(self) -> str:
-        """The loop's phase, empty before the first message."""
+        """Return the loop's phase, empty before the first message."""
         self._look()
         return self._state.mode if self._state else ""
 
     def tip_m(self) -> Sequence[float] | None:
-        """The tip as the loop predicts it."""
+        """Return the tip (3,) m as the loop predicts it."""
         tip_m = self._state.tip_m if self._state else None
         return None if tip_m is None else [float(v) for v in tip_m]
 
 
 def run_live(script: Script, rig: Rig, progress: Callable[[float], None]) -> None:
-    """Perform `script` on the running rig of the rig file; its own services record. Raises RuntimeError."""
+    """Run `script` on the running rig of the rig file; its own services record. Raises RuntimeError."""
     with Session.of_rig(rig) as session, Commander(session, "experiment") as commander:
         commands = LiveCommands(session, commander)
         taken = commander.take()

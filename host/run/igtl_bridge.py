@@ -55,7 +55,7 @@ class NDArrayMessage(MessageBase):  # type: ignore[misc]
 
 
 def messages_of(topic: str, message: Message, time_s: float) -> list[Any]:
-    """Return the OpenIGTLink messages that a message of the rig makes, none for one that says nothing.
+    """Return the OpenIGTLink messages for a message of the rig; none if it has no content for them.
 
     Args:
         topic: as in docs/topics.md. message: of that topic. time_s: its time of measurement, s since 1970.
@@ -95,7 +95,7 @@ class IgtlBridge:
         self.sent = 0
 
     def step(self) -> None:
-        """Send what has come since the last call."""
+        """Send all messages that have arrived since the last call."""
         self.server.accept()
         for topic, reader in self._latest.items():
             message = reader.take()
@@ -122,5 +122,5 @@ class IgtlBridge:
                 report(f"{clients} client{'' if clients == 1 else 's'}")
 
     def close(self) -> None:
-        """Disconnect all clients."""
+        """Close the server and disconnect all clients."""
         self.server.close()

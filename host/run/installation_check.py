@@ -39,7 +39,7 @@ def check_installation(python: Path, checkout: Path, rig_file: Path) -> None:
 
 
 def writable_by_others(path: Path, trusted: Collection[int]) -> str:
-    """Say who other than the `trusted` users (ids) can write `path`; empty where no one can.
+    """Return the reason why users other than `trusted` (ids) can write `path`; empty if they cannot.
 
     A folder with the sticky bit, as /tmp, lets others add files but not replace those of another user.
     """

@@ -49,7 +49,7 @@ class EstimatorProcess:
         self._steps = 0
 
     def step(self) -> bool:
-        """Take in what has come, record it, answer the newest pose. True if there was anything."""
+        """Process the messages that have arrived: record them, and answer the newest pose. Return whether there were any."""
         self._steps += 1
         taken = self._everything.take()
         self._newest_ns = max([self._newest_ns, *(message.stamp_ns for _, message, _ in taken)])

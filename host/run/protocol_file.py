@@ -70,21 +70,21 @@ class RoundStep(Request):
 
 
 class WaitStep(Request):
-    """Hold until the operator says that it goes on."""
+    """Hold until the operator confirms."""
 
     do: Literal["wait"]
     message: Annotated[str, Field(min_length=1, max_length=300)]
 
 
 class RestStep(Request):
-    """Hold for a time."""
+    """Hold for `seconds`."""
 
     do: Literal["rest"]
     seconds: Seconds
 
 
 class FollowPlanStep(Request):
-    """Go the way that `seldinger plan` computes for a request file (path relative to the protocol)."""
+    """Follow the path that `seldinger plan` computes for a request file (path relative to the protocol)."""
 
     do: Literal["plan"]
     request: str
@@ -96,7 +96,7 @@ Step = Annotated[
 
 
 class Tolerance(Request):
-    """What counts as good."""
+    """Largest errors of a touch or a point that count as within tolerance."""
 
     tip_m: Metres = 0.0015
     point_m: Metres = 0.003
@@ -105,7 +105,7 @@ class Tolerance(Request):
 
 
 class Stop(Request):
-    """What ends a step early, and what ends the protocol."""
+    """Conditions that end a step early, and those that end the protocol."""
 
     after: Literal["failed", "out_of_tolerance", "never"] = "failed"
     within_s: Annotated[float, Field(gt=0.0, le=120.0)] = 20.0
@@ -114,7 +114,7 @@ class Stop(Request):
 
 
 class ProtocolFile(Request):
-    """A protocol as its TOML file has it."""
+    """Content of a protocol's TOML file."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     force_N: Newton = 0.2
@@ -127,7 +127,7 @@ class ProtocolFile(Request):
 
 
 class Action(NamedTuple):
-    """One thing to do: a step, or one point of a line or a round.
+    """One action of a protocol: a step, or one point of a line or a round.
 
     id: as in results, "3" or "3.2" (step and point, from 1). kind: move, touch, wait, rest or plan.
     """
@@ -143,7 +143,7 @@ class Action(NamedTuple):
 
 
 class ScriptedProtocol(NamedTuple):
-    """A checked protocol: its file's content, the hash of the file, and all that is to be done, in order."""
+    """A checked protocol: the content and the hash of its file, and all actions in order."""
 
     file: ProtocolFile
     sha256: str
@@ -151,7 +151,7 @@ class ScriptedProtocol(NamedTuple):
 
 
 class DryRun(NamedTuple):
-    """What a protocol asks of a rig: estimated time (s), box of the tip (m), travel of each stage (its unit), forces (N)."""
+    """Motion of a protocol on a rig: estimated time (s), box of the tip (m), travel of each stage (its unit), forces (N)."""
 
     seconds: float
     low_m: Array
@@ -180,7 +180,7 @@ def read_protocol(path: Path, rig: Rig) -> ScriptedProtocol:
 
 
 def _with_floats(value: Any, key: str = "") -> Any:
-    """Points as tuples and whole numbers as floats, which strict checking wants; `points` stay whole."""
+    """Return points as tuples and whole numbers as floats, as the strict check requires; `points` stay whole."""
     if isinstance(value, dict):
         return {name: _with_floats(item, name) for name, item in value.items()}
     if isinstance(value, list):
@@ -192,7 +192,7 @@ def _with_floats(value: Any, key: str = "") -> Any:
 
 
 def _actions_of(number: str, step: Any, file: ProtocolFile, rig: Rig, folder: Path) -> list[Action]:
-    """Return what `step` comes to."""
+    """Return the actions of `step`, one for each point."""
     normal = _unit(f"steps.{number}.normal", getattr(step, "normal", None) or file.normal)
     if isinstance(step, GotoStep):
         return [Action(number, "move", step.point_m)]
@@ -254,7 +254,7 @@ def before(action: Action, clearance_m: float) -> Point:
 
 
 def dry_run(protocol: ScriptedProtocol, rig: Rig) -> DryRun:
-    """Check everything that `protocol` asks of `rig` against its limits. Nothing moves.
+    """Check the whole motion of `protocol` against the limits of `rig`. Nothing moves.
 
     Raises:
         InputError: a point, force or stage travel is beyond a limit; the key names the step.
@@ -289,7 +289,7 @@ def dry_run(protocol: ScriptedProtocol, rig: Rig) -> DryRun:
 
 
 def _way(action: Action, clearance_m: float) -> list[Point]:
-    """Points of the tip, in order."""
+    """Return the points of the tip (n, 3), m, in order."""
     if action.kind == "touch":
         assert action.point_m is not None
         front = before(action, clearance_m)

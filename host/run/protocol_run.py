@@ -47,14 +47,14 @@ Progress = Callable[[str, float], None]
 
 
 class DrivenRig(Protocol):
-    """A rig as a protocol needs it, in virtual time or on the wall clock."""
+    """Interface of a rig for a protocol, in virtual time or on the wall clock."""
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
         """Give one command under the lease."""
         ...
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let time pass; true if `until` ended it."""
+        """Let time pass; return whether `until` ended it."""
         ...
 
     def states(self) -> list[RigState]:
@@ -66,7 +66,7 @@ class DrivenRig(Protocol):
         ...
 
     def operator(self, message: str) -> bool:
-        """Show `message` and wait for the operator; false where the protocol is to end."""
+        """Show `message` and wait for the operator; return False if the protocol is to end."""
         ...
 
     def publish_step(self, step: PlannedStep) -> None:
@@ -99,7 +99,7 @@ class TouchResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ActionResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of one action: verdict (ok, out_of_tolerance, failed), why in words, and its figures."""
+    """Result of one action: verdict (ok, out_of_tolerance, failed), reason in words, and its figures."""
 
     id: str
     kind: str
@@ -169,11 +169,11 @@ class _Run:
 
     @property
     def now_s(self) -> float:
-        """The rig's time of the newest state."""
+        """Return the rig's time (s) of the newest state."""
         return self._now.stamp_ns * 1e-9
 
     def look(self) -> RigState:
-        """Take in the states since the last look; return the newest."""
+        """Process the states since the last call; return the newest."""
         states = self._driven.states()
         self._kept += states
         self._poses += [pose for pose in self._driven.poses() if pose.position_m is not None]
@@ -182,7 +182,7 @@ class _Run:
         return self._now
 
     def wait(self, seconds: float, until: Callable[[RigState], bool] = lambda state: False) -> bool:
-        """Wait for `until`; raise StepFailed where the rig stops."""
+        """Wait for `until`; raise StepFailed if the rig stops."""
 
         def looking() -> bool:
             state = self.look()
@@ -194,7 +194,7 @@ class _Run:
         return ended
 
     def ask(self, action: str, target: str = "none", **fields: Any) -> None:
-        """Give a command; raise StepFailed where it is refused."""
+        """Give a command; raise StepFailed if it is refused."""
         answer = self._driven.give(action, target, **fields)
         if not answer.accepted:
             raise StepFailed(f"{action}: {answer.reason}")
@@ -359,7 +359,7 @@ class _Run:
         return why
 
     def _away(self, front: Sequence[float]) -> None:
-        """Leave the tissue."""
+        """Move the tip away from the tissue, back to the point before it."""
         self.ask("target", "position", target_m=tuple(front))
         self.wait(self._file.stop.within_s, lambda state: (state.force_N or 0.0) < 0.5 * self._contact_N)
 
@@ -430,7 +430,7 @@ def _result(action: Action, verdict: str, says: str, **figures: Any) -> ActionRe
 
 
 class Job(NamedTuple):
-    """A protocol to be run: its steps, the rig, where results go, and what an earlier run has done already."""
+    """A protocol to be run: its steps, the rig, the folder of results, and the results of an earlier run."""
 
     protocol: ScriptedProtocol
     rig: Rig
@@ -439,7 +439,7 @@ class Job(NamedTuple):
 
 
 def carry_out(job: Job, driven: DrivenRig, blank: ProtocolResult, progress: Progress) -> ProtocolResult:
-    """Run what is not done yet on an armed rig. After each action the result is written to `job.target` (JSON)."""
+    """Run the remaining actions on an armed rig. The result is written to `job.target` (JSON) after each action."""
     file = job.protocol.file
     run = _Run(file, driven, job.rig.control.contact_force_N)
     kept = {item.id: item for item in job.earlier if item.verdict != FAILED}
@@ -507,7 +507,7 @@ def blank_result(job: Job, simulated: bool, recording: str = "") -> ProtocolResu
 
 
 class SimulatedDrive:
-    """A simulated rig in lock step (`sim.scenario.Scenario`). The operator of a simulation always goes on."""
+    """A simulated rig in lock step (`sim.scenario.Scenario`). The operator of a simulation always confirms."""
 
     def __init__(self, scenario: Scenario, publish: Callable[[str, Message], None]) -> None:
         self._scenario, self._publish = scenario, publish
@@ -522,30 +522,30 @@ class SimulatedDrive:
             self._poses.append(message)
 
     def poses(self) -> list[Pose]:
-        """As DrivenRig.poses."""
+        """Return the tracker's poses of the tip since the last call; see DrivenRig.poses."""
         taken, self._poses = self._poses, []
         return taken
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """As DrivenRig.give."""
+        """Give one command; see DrivenRig.give."""
         return self._scenario.command(action, target, **fields)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """As DrivenRig.wait; looks where a state has come."""
+        """Let virtual time pass, with a check at each new state; see DrivenRig.wait."""
         return self._scenario.run(seconds, lambda: bool(self._states) and until())
 
     def states(self) -> list[RigState]:
-        """As DrivenRig.states."""
+        """Return the loop's states since the last call; see DrivenRig.states."""
         taken, self._states = self._states, []
         return taken
 
     def operator(self, message: str) -> bool:
-        """As DrivenRig.operator."""
+        """Confirm at once; see DrivenRig.operator."""
         self._scenario.commander.mark(f"operator: {message}"[:500])
         return True
 
     def publish_step(self, step: PlannedStep) -> None:
-        """As DrivenRig.publish_step."""
+        """Publish a step of a plan; see DrivenRig.publish_step."""
         self._publish("plan", step)
 
 
@@ -587,7 +587,7 @@ def run_simulated(
 
 
 class LiveDrive:
-    """The running rig over zenoh. ask_operator: shows a message and returns whether to go on."""
+    """The running rig over zenoh. ask_operator: shows a message and returns whether to continue."""
 
     def __init__(self, session: Session, commander: Commander, ask_operator: Callable[[str], bool]) -> None:
         self._commander, self._ask = commander, ask_operator
@@ -598,11 +598,11 @@ class LiveDrive:
         )
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """As DrivenRig.give."""
+        """Give one command over zenoh; see DrivenRig.give."""
         return self._commander.give(action, target, **fields)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """As DrivenRig.wait, looking every 10 ms; raises StepFailed where the lease was lost."""
+        """Wait, with a check every 10 ms; see DrivenRig.wait. Raises StepFailed if the lease was lost."""
         end_s = time.monotonic() + seconds
         while True:
             if until():
@@ -614,19 +614,19 @@ class LiveDrive:
             time.sleep(0.01)
 
     def states(self) -> list[RigState]:
-        """As DrivenRig.states; what is malformed is left out."""
+        """Return the loop's states since the last call; see DrivenRig.states. Malformed ones are omitted."""
         return _taken(self._subscriber, RigState)
 
     def poses(self) -> list[Pose]:
-        """As DrivenRig.poses; what is malformed is left out."""
+        """Return the tracker's poses since the last call; see DrivenRig.poses. Malformed ones are omitted."""
         return _taken(self._pose_subscriber, Pose)
 
     def operator(self, message: str) -> bool:
-        """As DrivenRig.operator."""
+        """Ask the operator; see DrivenRig.operator."""
         return self._ask(message)
 
     def publish_step(self, step: PlannedStep) -> None:
-        """As DrivenRig.publish_step."""
+        """Publish a step of a plan; see DrivenRig.publish_step."""
         self._steps.put(step)
 
 

@@ -18,7 +18,7 @@ _LOOK_S = 0.02
 
 
 class RigStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A rig's newest messages by topic, and the first cause of what holds it back, with its remedy and what followed."""
+    """A rig's newest messages by topic, and the first cause with its remedy and consequences."""
 
     rig: str
     newest: dict[str, Message]

@@ -62,11 +62,11 @@ class RosMessages:
         self._store.register(get_types_from_msg(_OPERATING_STATE, OPERATING_STATE))
 
     def type_hash(self, type_name: str) -> str:
-        """The RIHS01 hash of a type, by which rmw_zenoh tells versions apart."""
+        """Return the RIHS01 hash of a type, with which rmw_zenoh distinguishes versions of a type."""
         return self._store.hash_rihs01(type_name)
 
     def pack(self, message: Message, time_ns: int) -> bytes | None:
-        """Return the CDR bytes of a rig's message, None where it says nothing.
+        """Return the CDR bytes for a rig's message; None if it has no content for ROS.
 
         Args:
             message: Pose, ForceSensor, ForceEstimate or RigState. time_ns: of measurement, since 1970.
@@ -124,7 +124,7 @@ class RosMessages:
 
 
 def operating_state(state: RigState) -> str:
-    """CRTK's state: DISABLED (disarmed), FAULT (stopped, or a safety action acts), PAUSED (hold), ENABLED (moves)."""
+    """Return CRTK's state: DISABLED (disarmed), FAULT (stopped, or a safety action), PAUSED (hold), ENABLED (moves)."""
     if state.mode == "disarmed":
         return "DISABLED"
     if state.mode == "stopped" or state.safety_action in ("stop", "retract"):
@@ -204,7 +204,7 @@ class RosBridge:
                 self.obey(sample.payload.to_bytes())
 
     def obey(self, data: bytes) -> None:
-        """Change the contact force to that of a servo_cf message; what the rig refuses is kept in `refused`."""
+        """Set the contact force to that of a servo_cf message; a refusal of the rig is stored in `refused`."""
         try:
             force_N = self._messages.force_of(data)
             state: Any = self._rig.latest("state")
@@ -234,7 +234,7 @@ class RosBridge:
                 report(self.refused.pop(0))
 
     def close(self) -> None:
-        """Leave the ROS 2 network."""
+        """Close the session and so leave the ROS 2 network."""
         self._session.close()
 
 

@@ -111,7 +111,7 @@ class Fleet:
             )
 
     def tell_rig(self, line: str) -> None:
-        """Give the simulated rig a line: `unplug board`, `unplug tracker` or `mark NAME` (`sim.rig_server`)."""
+        """Send a line to the simulated rig: `unplug board`, `unplug tracker` or `mark NAME` (`sim.rig_server`)."""
         commands = self.processes["rig"].stdin
         assert commands is not None
         commands.write(f"{line}\n")
@@ -152,16 +152,16 @@ class Fleet:
                 time.sleep(0.02)
 
     def last_log_line(self, name: str) -> str:
-        """The last line that process `name` wrote to its log."""
+        """Return the last line of the log of process `name`."""
         lines = (Path(self._folder.name) / f"{name}.log").read_text(encoding="utf-8").strip().splitlines()
         return lines[-1] if lines else "no message"
 
     def dead(self) -> list[str]:
-        """Names of processes that have ended."""
+        """Return the names of processes that have ended."""
         return [name for name, process in self.processes.items() if process.poll() is not None]
 
     def close(self) -> None:
-        """Realtime first (it disarms), then the recorder, then the rig."""
+        """End the processes: realtime first (it disarms), then the recorder, then the rig."""
         deadline = time.monotonic() + _STOP_TIMEOUT_S
         for name in ("realtime", "host", "rig"):
             process = self.processes.get(name)
@@ -180,7 +180,7 @@ class Fleet:
 
 
 class Operator:
-    """Commands and what comes back, over zenoh."""
+    """An operator over zenoh: gives commands and reads the rig's state."""
 
     def __init__(self, fleet: Fleet) -> None:
         rig = load_rig(fleet.rig_file)
@@ -255,11 +255,11 @@ class Operator:
         return False
 
     def stands(self) -> bool:
-        """Whether the rig was stopped or disarmed."""
+        """Return whether the rig is stopped or disarmed."""
         return self.mode() in ("stopped", "disarmed")
 
     def mode(self) -> str:
-        """The loop's phase, empty before the first message."""
+        """Return the loop's phase, empty before the first message."""
         return self.state.mode if self.state else ""
 
 
@@ -309,7 +309,7 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
 
 
 def _in_use(paths: LocalPaths) -> bool:
-    """Whether a rig's realtime process listens in this folder; the socket of one that was killed does not count."""
+    """Return whether a realtime process listens in this folder; the socket of a killed process does not count."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(str(paths.stop_socket))

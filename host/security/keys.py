@@ -137,7 +137,7 @@ def issue(
 
 
 def issued(directory: Path) -> list[Issued]:
-    """All certificates in `directory`, by name. Raises InputError where one cannot be read."""
+    """Return all certificates in `directory`, by name. Raises InputError if one cannot be read."""
     if not directory.is_dir():
         raise InputError("directory", str(directory), "a folder that `seldinger keys init` made")
     found = []
@@ -242,7 +242,7 @@ def _builder(
 
 
 def _life(days: int, ca: x509.Certificate) -> datetime.timedelta:
-    """`days`, or what remains of the authority's own."""
+    """Return the smaller of `days` and the remaining validity of the authority."""
     return min(datetime.timedelta(days=days), ca.not_valid_after_utc - datetime.datetime.now(datetime.UTC))
 
 
@@ -278,6 +278,6 @@ def _make_private(folder: Path) -> None:
 
 
 def _write(path: Path, content: bytes, mode: int) -> None:
-    """A new file, never one that is there, with `mode` from its first moment on."""
+    """Write a new file, never an existing one, with `mode` from the start."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
         file.write(content)

@@ -19,7 +19,7 @@ _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def keys_problems(folder: Path, listen: Sequence[str], now: datetime.datetime | None = None) -> list[str]:
-    """All that is wrong with `folder` for a rig that listens on `listen`; empty when nothing is.
+    """Return all problems of the keys in `folder` for a rig that listens on `listen`; empty if there are none.
 
     listen: endpoints, tls/ADDRESS:PORT. now: default, this machine's clock.
     """

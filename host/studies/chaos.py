@@ -195,7 +195,7 @@ def _rest_s(interval: dict[str, Any]) -> float | None:
 
 
 def section(runs: list[ChaosRun], seed: int) -> str:
-    """The section of docs/reliability.md."""
+    """Return the section of docs/reliability.md on these runs."""
     done = [run for run in runs if run.contact]
     broken = [run for run in done if run.broken]
     peaks = [run.peak_N for run in done if run.peak_N is not None]

@@ -283,7 +283,7 @@ class Book:
         self.rows = read_rows(path) if path else {}
 
     def row(self, task: Task) -> LiveRow:
-        """The finished run of `task`."""
+        """Return the finished run of `task`; run it if needed."""
         if task.key not in self.rows:
             row = self.rows[task.key] = run(task, self._board)
             print(row.line if task.planted else quiet_line([row]), file=sys.stderr, flush=True)

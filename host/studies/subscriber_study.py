@@ -43,7 +43,7 @@ class MeasuredLoop:
     threads_s: list[float] = field(default_factory=list)
 
     def figures(self) -> dict[str, Any]:
-        """For JSON, times in us."""
+        """Return the percentiles as JSON's types, times in us."""
         threads = np.percentile(self.threads_s, (50, 99)) * 1e6 if self.threads_s else (0.0, 0.0)
         return {
             "ticks": self.ticks,

@@ -15,7 +15,7 @@ MAX_CONNECTIONS = 64
 
 
 class LimitedHttp(H11Protocol):
-    """uvicorn's HTTP/1.1 with these limits. A connection that became a web socket is no longer among them."""
+    """HTTP/1.1 of uvicorn with these limits. A connection that became a web socket is not counted."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -24,11 +24,11 @@ class LimitedHttp(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no request is being answered."""
+        """Return whether no request is being answered."""
         return self.cycle is None or self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take the connection; close the one that has been idle longest where there are too many."""
+        """Accept the connection; if there are too many, close the one that has been idle longest."""
         super().connection_made(transport)
         self.idle_since_s = self.loop.time()
         self._watch = self.loop.call_later(REQUEST_S, self._close_if_idle)
@@ -37,7 +37,7 @@ class LimitedHttp(H11Protocol):
             min(idle, key=lambda other: other.idle_since_s).transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End the watch."""
+        """Stop the idle timer of a closed connection."""
         self._end_watch()
         super().connection_lost(exc)
 

@@ -70,7 +70,7 @@ class ButtonPress(Request):
 
 
 class LiveRig:
-    """A `Source`. Never makes the rig wait: what is not taken in time is lost here."""
+    """Source of the running rig. The rig never waits for it: messages that are not read in time are lost here."""
 
     def __init__(self, rig: Rig, session: Session) -> None:
         self._rig, self._session = rig, session
@@ -96,7 +96,7 @@ class LiveRig:
         }
 
     def frame(self) -> dict[str, Any]:
-        """The picture, and the time since the rig's last message (nil before the first)."""
+        """Return the picture, and the time since the rig's last message (nil before the first)."""
         for topic, subscriber in self._subscribers.items():
             while (sample := subscriber.try_recv()) is not None:
                 self._take(topic, bytes(sample.payload))
@@ -114,7 +114,7 @@ class LiveRig:
             self._received_s = time.monotonic()
 
     def act(self, text: str) -> dict[str, Any]:
-        """Send the command of a `Press`. What is malformed or not confirmed is never sent."""
+        """Send the command of a `Press`. A malformed or unconfirmed one is not sent."""
         try:
             press = ButtonPress.model_validate_json(text)
         except ValidationError as error:

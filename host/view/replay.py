@@ -28,7 +28,7 @@ MIN_SPEED, MAX_SPEED = 0.05, 50.0
 
 
 class ReplayControl(Request):
-    """What the page asks of the player; what is not named stays as it is."""
+    """Request of the page to the player; fields that are not given stay unchanged."""
 
     play: bool | None = None
     seek_s: float | None = None
@@ -44,7 +44,7 @@ class Window(Request):
 
 
 class Findings(Request):
-    """What the player shows of a diagnosis: its verdict, what it says of each effect, its windows."""
+    """Parts of a diagnosis that the player shows: verdict, a sentence for each effect, windows."""
 
     verdict: str
     says: list[str]
@@ -70,7 +70,7 @@ def read_findings(source: str) -> Findings:
 
 
 def origin_ns(recording: RecordingFile) -> int:
-    """Where the time of a diagnosis begins: the first stamp of the topic with most messages."""
+    """Return the origin of the times of a diagnosis: the first stamp of the topic with most messages."""
     base = max(recording.topics, key=lambda topic: recording.topics[topic])
     first = recording.message(base, 0)
     if first is None:

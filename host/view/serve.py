@@ -39,7 +39,7 @@ def page_address(port: int) -> str:
 
 
 def check_port(port: int) -> None:
-    """Raise InputError where the page's port is in use: said before a rig is started for it."""
+    """Raise InputError if the page's port is in use, before a rig is started for it."""
     with socket.socket() as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

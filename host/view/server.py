@@ -97,7 +97,7 @@ def _with_policy(send: Send) -> Send:
 
 
 class Page:
-    """One open page: a short queue that loses its oldest, and the task that empties it at the page's own pace."""
+    """One open page: a short queue that drops its oldest frame, and the task that sends it at the page's speed."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
@@ -116,7 +116,7 @@ class Page:
         self._something.set()
 
     def answer(self, content: dict[str, Any]) -> None:
-        """Goes before all frames that wait."""
+        """Queue an answer before all waiting frames."""
         self._answers.append(orjson.dumps({"answer": content}))
         self._something.set()
 

@@ -65,7 +65,7 @@ def face_cases(seed: int) -> list[FaceCase]:
 
 
 def repeated(call: Callable[[], object]) -> Callable[[int], object]:
-    """Call `call` repeatedly."""
+    """Return a function that calls `call` a given number of times."""
 
     def run(repeats: int) -> object:
         for _ in range(repeats):

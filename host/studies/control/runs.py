@@ -45,7 +45,7 @@ class Held(NamedTuple):
     reached: bool
 
     def rms_N(self, wanted_N: float) -> float:
-        """RMS force error once settled."""
+        """Return the RMS error (N) relative to `wanted_N` after settling."""
         return float(np.sqrt(np.mean((self.force_N[self.time_s > SETTLED_S] - wanted_N) ** 2)))
 
     def spread_N(self) -> float:
@@ -53,7 +53,7 @@ class Held(NamedTuple):
         return float(np.std(self.force_N[self.time_s > SETTLED_S]))
 
     def mean_N(self) -> float:
-        """Mean force once settled."""
+        """Return the mean force (N) after settling."""
         return float(np.mean(self.force_N[self.time_s > SETTLED_S]))
 
     def longest_loss_s(self) -> float:

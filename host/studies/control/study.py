@@ -37,7 +37,7 @@ class StudySettings:
 
 
 def _quiet(text: str) -> None:
-    """The default of `progress`."""
+    """Ignore `text`; the default of `progress`."""
 
 
 def study(settings: StudySettings, progress: Progress = _quiet) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def _summary(values: Iterable[float]) -> dict[str, Any]:
 
 
 def _force(runs: _Runs) -> dict[str, Any]:
-    """RMS force error, once settled."""
+    """Return the RMS force errors after settling, for each law and seed."""
     seeds, rig = runs.settings.seeds, runs.rig
     table: dict[str, Any] = {}
     for beat in ("regular", "irregular"):
@@ -136,7 +136,7 @@ def _kept(runs: _Runs) -> dict[str, Any]:
 
 
 def _prediction(runs: _Runs) -> dict[str, Any]:
-    """RMS error 40 ms ahead."""
+    """Return the RMS errors of the wall predicted 40 ms ahead."""
     table: dict[str, Any] = {"ahead_s": control_runs.AHEAD_S}
     for source, by_pose in (("force", False), ("pose", True)):
         for beat, heart, wanted in (("regular", REGULAR, 0.25), ("irregular", IRREGULAR, 0.5)):

@@ -50,7 +50,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RigDraw:
-    """One rig of the campaign: what closes its loop, and a catheter, wall and heart that the rig file does not know."""
+    """One rig of the campaign: source of the force of its loop, and a catheter, wall and heart unlike its file."""
 
     force_source: str
     stiffness: float  # of the catheter, relative to the model's
@@ -378,7 +378,7 @@ def by_fault(results: list[RunResult]) -> list[dict[str, Any]]:
 
 
 def summary_of(results: list[RunResult]) -> dict[str, Any]:
-    """Figures over some runs."""
+    """Return counts, times of detection, actions and peak force over `results`."""
     outcomes = [result.outcome for result in results if result.outcome]
     times_ms = [
         1e3 * max(result.outcome["detected_s"] - (found_due_s(result) or 0.0), 0.0)

@@ -299,5 +299,5 @@ def _honest(label: Label, kind: Any, said: list[tuple[str, set[str]]]) -> bool:
 
 
 def mean(values: list[float]) -> float | None:
-    """Mean, None of nothing."""
+    """Return the mean of `values`, None if there are none."""
     return float(np.mean(values)) if values else None

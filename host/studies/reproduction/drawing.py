@@ -24,7 +24,7 @@ class PlotLine(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """One pair of axes."""
+    """One pair of axes with labels and curves."""
 
     x_label: str
     y_label: str

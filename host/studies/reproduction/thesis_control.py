@@ -39,7 +39,7 @@ class Gains:
     K_df: float = 0.0062
 
     def scaled(self, **factors: float) -> Gains:
-        """With some gains multiplied."""
+        """Return these gains with some of them multiplied by a factor."""
         return replace(self, **{key: getattr(self, key) * factor for key, factor in factors.items()})
 
 

@@ -67,7 +67,7 @@ class Plantable:
 
 @dataclass(frozen=True)
 class Planted:
-    """An effect with its parameters."""
+    """A planted effect with its parameters."""
 
     effect: Plantable
     size: float
@@ -207,7 +207,7 @@ class Case:
 
 @dataclass(frozen=True)
 class DrawnCase:
-    """A case before noise."""
+    """A case before noise is added."""
 
     setup: Setup
     planted: tuple[Planted, ...]
@@ -339,7 +339,7 @@ def _finished(mechanism: Mechanism, plan: CasePlan, drawn: DrawnCase) -> Case:
 
 
 def _label(mechanism: Mechanism, plan: CasePlan, drawn: DrawnCase, held: Mapping[str, float]) -> Label:
-    """Return what the seal keeps."""
+    """Return the label that is sealed."""
     rho, each = size_of(drawn.setup, drawn.left)
     order = sorted(each, key=lambda name: -each[name])
     planted: list[PlantedTruth] = [
