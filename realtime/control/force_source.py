@@ -81,16 +81,19 @@ def _sensor_at(state: ForceSourceState, stamp_ns: int) -> int:
 @njit(cache=True)
 def _take_estimate(state: ForceSourceState, estimate: Force, normal: ReadFloats, now_ns: int, touching: bool) -> bool:
     """Take in a new estimate; in contact, compare it with the sensor at its time. Return whether it is plausible."""
-    noise_N2 = nominal_noise_N2 = 0.0
+    noise_N2 = lasting_N2 = nominal_noise_N2 = 0.0
     for i in range(3):
         for j in range(3):
             noise_N2 += normal[i] * estimate.covariance_N2[i, j] * normal[j]
+            lasting_N2 += normal[i] * estimate.lasting_covariance_N2[i, j] * normal[j]
             nominal_noise_N2 += normal[i] * estimate.nominal_covariance_N2[i, j] * normal[j]
     if not (_plausible(estimate) and 0.0 <= noise_N2 < 1e3) or now_ns - estimate.stamp_ns > _ESTIMATE_AGE_NS:
         return False
     normal_N = compression(estimate.force_N, normal)
     state.arrival_ns[SOURCE_ESTIMATE], state.normal_N[SOURCE_ESTIMATE] = estimate.arrival_ns, normal_N
-    state.noise_N2, state.nominal_noise_N2 = max(noise_N2, 1e-6), max(nominal_noise_N2, 1e-6)
+    # A filter averages what scatters. The error that estimates shortly after each other share does not.
+    state.noise_N2 = max(noise_N2 - lasting_N2, 1e-6)
+    state.nominal_noise_N2 = max(nominal_noise_N2, 1e-6)
     state.nominal_N = compression(estimate.nominal_N, normal)
     place = _sensor_at(state, estimate.stamp_ns)
     state.estimate_stamp_ns = estimate.stamp_ns

@@ -42,6 +42,7 @@ def remember(state: History, time_ns: int, joint: ReadFloats, flank: float) -> N
     state.flank[state.head] = flank
     for axis in range(N_AXES):
         state.joint[state.head, axis] = joint[axis]
+    state.joint[state.head, 1] -= state.windup_rad
 
 
 @njit(cache=True)
@@ -62,4 +63,4 @@ def joint_at(state: History, time_ns: int) -> tuple[Joint, float]:
     insertion_m = state.joint[k, 0] + share * (state.joint[after, 0] - state.joint[k, 0])
     roll_rad = state.joint[k, 1] + share * (state.joint[after, 1] - state.joint[k, 1])
     knob_rad = state.joint[k, 2] + share * (state.joint[after, 2] - state.joint[k, 2])
-    return (insertion_m, roll_rad, knob_rad), state.flank[k]
+    return (insertion_m, roll_rad + state.windup_rad, knob_rad), state.flank[k]

@@ -152,6 +152,12 @@ def _faded(radius_m: float, axis_radius_m: float) -> float:
 
 
 @njit(cache=True)
+def roll_of(config: KinematicsParams, tip_m: ReadFloats, last_roll_rad: float) -> float:
+    """Return the roll (rad) nearest to `last_roll_rad` of a tip at `tip_m` (3,), held near the axis."""
+    return _roll_and_lateral(config, tip_m, last_roll_rad)[0]
+
+
+@njit(cache=True)
 def _roll_and_lateral(config: KinematicsParams, tip_m: ReadFloats, last_roll_rad: float) -> tuple[float, float]:
     """Roll (rad) nearest to `last_roll_rad`, unwrapped, and the tip's offset (m, signed) in the plane of that roll."""
     radius_m = math.hypot(tip_m[0], tip_m[1])

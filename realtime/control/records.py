@@ -42,6 +42,7 @@ class Force:
     arrival_ns: int = whole("ns", "when it arrived")
     force_N: Floats = real("N", "force on the tissue", 3)
     covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
+    lasting_covariance_N2: Matrix = real("N^2", "its part that estimates shortly after each other share", 3, 3)
     nominal_N: Floats = real("N", "an estimate's force without adaptation of the stiffness; zero for the sensor", 3)
     nominal_covariance_N2: Matrix = real("N^2", "covariance of that; zero for the sensor", 3, 3)
 
@@ -314,6 +315,13 @@ class TipOffsetState:
     insertion_learned_s: float = real("s", "time that the insertion was learned from, up to its time constant")
 
 
+class RollWindupState:
+    """By how much a force across turns the tip about the sheath's axis (`roll_windup`)."""
+
+    windup_rad: float = real("rad", "roll of the tip minus that of the handle, scaled by the slope")
+    stamp_ns: int = whole("ns", "when the newest pose was measured")
+
+
 class WallParams:
     """Observation of the wall by force and by pose (`wall_observer`)."""
 
@@ -369,7 +377,7 @@ class ForceSourceState:
     seen: Ints = whole("", "count of the newest reading that was processed", 2)
     arrival_ns: Ints = whole("ns", "when the newest plausible reading arrived", 2)
     normal_N: Floats = real("N", "its compression", 2)
-    noise_N2: float = real("N^2", "variance of the newest estimate along the normal")
+    noise_N2: float = real("N^2", "variance of the newest estimate along the normal, without its lasting part")
     nominal_N: float = real("N", "compression by the newest estimate without adaptation of the stiffness")
     nominal_noise_N2: float = real("N^2", "its variance")
     equal: int = whole("", "equal readings of the sensor in a row")
@@ -419,7 +427,8 @@ class History:
     head: int = whole("", "newest place of the ring")
     count: int = whole("", "places in use")
     time_ns: Ints = whole("ns", "when the stages are there", HISTORY_POINTS)
-    joint: Matrix = real("m, rad, rad", "joints then", HISTORY_POINTS, N_AXES)
+    joint: Matrix = real("m, rad, rad", "joints then, the roll that of the handle", HISTORY_POINTS, N_AXES)
+    windup_rad: float = real("rad", "windup of the roll as it is known now, for all of them")
     flank: Floats = real("", "+1 or -1: side of the gap that pushed last", HISTORY_POINTS)
 
 
@@ -485,6 +494,7 @@ class State:
     retract_knob_rad: float = real("rad", "knob where the retraction began")
     history: History = part(History, "predicted joints of the last 0.2 s")
     tip_offset: TipOffsetState = part(TipOffsetState, "offset of the tip")
+    windup: RollWindupState = part(RollWindupState, "windup of the roll")
     wall: WallState = part(WallState, "motion of the wall")
     predictive: PredictiveState = part(PredictiveState, "the predictive law")
     jog: JogState = part(JogState, "the jog that goes on")

@@ -18,6 +18,7 @@ from realtime.control import (
     jog,
     predictive,
     predictor,
+    roll_windup,
     safety,
     stage_limiter,
     target_predictor,
@@ -49,7 +50,7 @@ from realtime.control.codes import (
     SOURCE_SENSOR,
 )
 from realtime.control.constraint_frame import dot
-from realtime.control.declare import Floats, Point, ReadFloats
+from realtime.control.declare import Floats, Joint, Point, ReadFloats
 from realtime.control.records import N_AXES, CommandRecord, Inputs, Outputs, Params, State
 
 # Contact begins after this long above the threshold, and is lost after this long below half of it.
@@ -57,6 +58,9 @@ _CONTACT_NS = 3_000_000
 _LOST_NS = 500_000_000
 # Estimates are noisier than a sensor: their threshold is so much higher.
 _NOISY_FACTOR = 2.0
+# With estimates the force is corrected slowly. The windup is learned so many times more slowly than with a sensor: where
+# the wall is tilted, turning the tip back presses it into the wall, and both corrections would swing against each other.
+_SLOW_FACTOR = 4.0
 # The wall's normal is learned over this time.
 _NORMAL_S = 2.0
 # How far beyond the given target the approach goes on looking for the wall.
@@ -72,6 +76,35 @@ _WILD_POSES = 3
 
 
 @njit(cache=True)
+def _depth_m(params: Params, state: State) -> float:
+    """Return the depth (m) of the predicted free tip along the inward normal."""
+    return -dot(free_tip.apply(params.kinematics, state.predicted_joint), state.normal)
+
+
+@njit(cache=True)
+def _learn_windup(params: Params, state: State, inputs: Inputs, joint: Joint, touching: bool, free: bool) -> Joint:
+    """Learn the windup of the roll from an accepted pose. Return the joints with the roll that the pose shows.
+
+    What is learned changes where the free tip is thought to be, not the force: the wall, which is known by its distance
+    from the free tip, moves with it.
+    """
+    memory_s, before_m = params.tip_offset.contact_memory_s, _depth_m(params, state)
+    if state.force.source == SOURCE_ESTIMATE:
+        memory_s *= _SLOW_FACTOR
+    roll_rad = roll_windup.apply(
+        params.kinematics, state.windup, joint[1], inputs.tip, state.tip_offset.touch_offset_m, touching, free, memory_s
+    )
+    state.predicted_joint[1] += state.windup.windup_rad - state.history.windup_rad
+    state.history.windup_rad = state.windup.windup_rad
+    if touching and state.wall.force.started != 0:
+        further_m = _depth_m(params, state) - before_m
+        target_predictor.shift(state.wall.force, further_m)
+        state.wall.mean_depth_m += further_m
+        state.predictive.touch_depth_m += further_m
+    return joint[0], roll_rad, joint[2]
+
+
+@njit(cache=True)
 def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> None:
     """Learn the tip's offset, and in contact the wall, from an accepted pose."""
     joint, flank = free_tip.joint_at(state.history, inputs.tip.stamp_ns)
@@ -80,6 +113,8 @@ def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> 
     witnesses.take_pose(params, state.witness, inputs, joint, state.normal, state.phase)
     moving = state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH or state.phase == PHASE_JOG
     free = (moving or state.phase == PHASE_HOLD) and state.force.smooth_N < params.hybrid.contact_force_N
+    if params.law == LAW_PREDICTIVE:
+        joint = _learn_windup(params, state, inputs, joint, touching, free)
     tip_offset.apply(params.tip_offset, params.kinematics, state.tip_offset, joint, inputs.tip, state.normal, touching, free)
     if touching:
         wall_observer.take_pose(params.wall, state.wall, inputs.tip.stamp_ns, inputs.tip.position_m, state.normal)
@@ -194,7 +229,7 @@ def _predict_joint(params: Params, state: State) -> None:
     """Predict where the distal end will be when the stages are where they were sent: backlash, slopes, knob."""
     insertion_m = backlash.follow(params.backlash, state.backlash, state.stage.position[0])
     state.predicted_joint[0] = insertion_m + state.home_m
-    state.predicted_joint[1] = backlash.distal_roll(params.backlash, state.stage.position[1])
+    state.predicted_joint[1] = backlash.distal_roll(params.backlash, state.stage.position[1]) + state.windup.windup_rad
     state.predicted_joint[2] = state.stage.position[2]
 
 
@@ -205,6 +240,8 @@ def _locate(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> 
         state.stage.position[axis] = inputs.board.position_steps[axis] / params.stage.steps_per_unit[axis]
         state.stage.speed[axis] = 0.0
     config, joint = params.backlash, state.hybrid.joint
+    roll_windup.forget(state.windup)
+    state.history.windup_rad = 0.0
     forward_m = (state.stage.position[0] - 0.5 * backlash.first_width(config)) * config.slope
     backlash.start(config, state.backlash, forward_m)
     joint[1] = backlash.distal_roll(config, state.stage.position[1])
@@ -334,12 +371,6 @@ def _follow_command(params: Params, state: State, command: CommandRecord, tip_m:
         _enter(params, state, PHASE_POSITION, tip_m)
     elif command.kind == COMMAND_CONTACT and state.phase != PHASE_CONTACT:
         _enter(params, state, PHASE_APPROACH, tip_m)
-
-
-@njit(cache=True)
-def _depth_m(params: Params, state: State) -> float:
-    """Return the depth (m) of the predicted free tip along the inward normal."""
-    return -dot(free_tip.apply(params.kinematics, state.predicted_joint), state.normal)
 
 
 @njit(cache=True)
@@ -499,7 +530,7 @@ def _move_stages(params: Params, state: State, plan_reversals: bool) -> None:
             stage_limiter.brake(params.stage, state.stage, axis, period_s)
         return
     body_m = hy.joint[0] - state.home_m
-    roll_rad = backlash.roll(gap, hy.joint[1])
+    roll_rad = backlash.roll(gap, hy.joint[1] - state.windup.windup_rad)
     if plan_reversals:
         crossing_m, after_m = own.joint_at_crossing[0] - state.home_m, own.joint_after_crossing[0] - state.home_m
         handle_m = backlash.apply_ahead(gap, state.backlash, body_m, crossing_m, after_m, own.reversal_depth_m)

@@ -70,6 +70,8 @@ class Intake:
         record.stamp_ns, record.arrival_ns = estimate.stamp_ns, arrival_ns
         record.force_N[:] = force_N
         record.covariance_N2.flat = covariance_N2
+        lasting_N2 = estimate.lasting_covariance_N2
+        record.lasting_covariance_N2.flat = lasting_N2 if lasting_N2 is not None else 0.0
         adapted = estimate.nominal_force_N is not None
         record.nominal_N[:] = estimate.nominal_force_N if adapted else force_N
         record.nominal_covariance_N2.flat = estimate.nominal_covariance_N2 if adapted else covariance_N2
