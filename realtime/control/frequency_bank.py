@@ -66,8 +66,18 @@ def apply(bank: Bank, value: float, dt_s: float) -> None:
 
 
 @njit(cache=True)
-def peak(bank: Bank) -> tuple[float, float]:
+def _strength(bank: Bank, point: int, by_speed: bool) -> float:
+    """Return the amplitude near a grid point, or the amplitude of its speed (over 2 pi)."""
+    size = amplitude(bank, point)
+    return size * frequency_Hz(bank, point) if by_speed else size
+
+
+@njit(cache=True)
+def peak(bank: Bank, by_speed: bool) -> tuple[float, float]:
     """Return frequency (Hz) and amplitude of the strongest motion inside the grid; (0, 0) if it is at the edge.
+
+    by_speed: the strongest is the one with the greatest speed. After two breaths a drift of the mean has a larger amplitude
+    at the grid's low end than the breath: its spectrum falls with the frequency, that of its speed does not.
 
     If the amplitude at half the frequency is more than a third of it, half the frequency is returned, because the
     strongest motion may be a second harmonic. This is tested only after several periods of half the frequency, when
@@ -75,19 +85,20 @@ def peak(bank: Bank) -> tuple[float, float]:
     """
     best = 0
     for k in range(1, POINTS - 1):
-        if _is_top(bank, k) and (best == 0 or amplitude(bank, k) > amplitude(bank, best)):
+        if _is_top(bank, k, by_speed) and (best == 0 or _strength(bank, k, by_speed) > _strength(bank, best, by_speed)):
             best = k
     if best == 0:
         return 0.0, 0.0
     octave = (POINTS - 1) * math.log(2.0) / math.log(bank.high_Hz / bank.low_Hz)
     half = best - round(octave)
     long_enough = bank.since_s * frequency_Hz(bank, half) > 4.0
-    if 1 <= half and long_enough and _is_top(bank, half) and amplitude(bank, half) > 0.33 * amplitude(bank, best):
+    if 1 <= half and long_enough and _is_top(bank, half, by_speed) and amplitude(bank, half) > 0.33 * amplitude(bank, best):
         best = half
-    left, middle, right = amplitude(bank, best - 1), amplitude(bank, best), amplitude(bank, best + 1)
+    left, middle = _strength(bank, best - 1, by_speed), _strength(bank, best, by_speed)
+    right = _strength(bank, best + 1, by_speed)
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    return frequency_Hz(bank, best + min(max(shift, -0.5), 0.5)), middle
+    return frequency_Hz(bank, best + min(max(shift, -0.5), 0.5)), amplitude(bank, best)
 
 
 @njit(cache=True)
@@ -103,6 +114,6 @@ def pair(bank: Bank, rate_Hz: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _is_top(bank: Bank, point: int) -> bool:
-    here = amplitude(bank, point)
-    return here >= amplitude(bank, point - 1) and here >= amplitude(bank, point + 1)
+def _is_top(bank: Bank, point: int, by_speed: bool) -> bool:
+    here = _strength(bank, point, by_speed)
+    return here >= _strength(bank, point - 1, by_speed) and here >= _strength(bank, point + 1, by_speed)

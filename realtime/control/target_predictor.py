@@ -329,7 +329,7 @@ def _find_rates(config: TargetParams, state: TargetState, wall_m: float, dt_s: f
     frequency_bank.apply(state.breath_bank, mean_m, step_s)
     if state.heart_bank.since_s < 1.0:
         return
-    heart_Hz, size_m = frequency_bank.peak(state.heart_bank)
+    heart_Hz, size_m = frequency_bank.peak(state.heart_bank, False)
     steady = heart_Hz > 0.0 and abs(heart_Hz - state.last_heart_Hz) < 0.003 * heart_Hz * step_s / STEP_S
     state.agreed = state.agreed + 1 if steady and size_m > _SMALLEST_M else 0
     state.last_heart_Hz = heart_Hz
@@ -344,7 +344,7 @@ def _find_rates(config: TargetParams, state: TargetState, wall_m: float, dt_s: f
             state.heart_found, state.agreed = 1, -200
             state.mean_rate = 2.0 * math.pi * heart_Hz
     if state.heart_found and state.breath_found == 0 and state.breath_bank.since_s > 5.0:
-        breath_Hz, size_m = frequency_bank.peak(state.breath_bank)
+        breath_Hz, size_m = frequency_bank.peak(state.breath_bank, True)
         if breath_Hz > 0.0 and size_m > _SMALLEST_M:
             _start_harmonics(state, state.breath_bank, BREATH, BREATH_HARMONICS, BREATH_RATE, breath_Hz, size_m)
             state.breath_found = 1
