@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
-from protocol.errors import Description, InputError, reason
+from protocol.errors import InputError
 from protocol.requests import Request, validate
+from protocol.text_files import read_toml
 
 CATHETER_FOLDER = Path(__file__).resolve().parent / "catheters"
 LENGTH_TOLERANCE_m = 1e-9
@@ -125,11 +125,7 @@ def load_catheter(name_or_path: str | Path) -> Catheter:
     path = CATHETER_FOLDER / f"{text}.toml" if text in shipped else Path(text)
     if text not in shipped and path.suffix != ".toml":
         raise InputError("catheter", text, f"one of {', '.join(shipped)}, or the path of a .toml file")
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise InputError("catheter", Description(f"{text}: {reason(error)}"), "a readable catheter TOML file") from None
-    return catheter_from_table(data)
+    return catheter_from_table(read_toml(path, "catheter", "a readable catheter TOML file"))
 
 
 def catheter_from_table(data: dict[str, object]) -> Catheter:

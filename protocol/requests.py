@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
-import sys
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from protocol.errors import Description, InputError, reason
+from protocol.errors import Description, InputError
 from protocol.unit_slips import hint_of
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -24,21 +21,6 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def read_json(source: str) -> dict[str, Any]:
-    """The JSON object in file `source`, or on standard input if it is `-`. Raises InputError."""
-    try:
-        text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(source, reason(error), "a readable JSON file, or - for standard input") from None
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also a whole number of more digits than Python converts
-        raise InputError(source, Description(error), "one JSON object") from None
-    if not isinstance(value, dict):
-        raise InputError(source, value, "one JSON object")
-    return value
-
-
 # Type of a pydantic error -> what is wanted, with the names of its context.
 _WANTED = {
     "missing": "a value",
@@ -47,7 +29,7 @@ _WANTED = {
     "string_type": "a text",
     "bool_type": "true or false",
     "list_type": "a list",
-    "tuple_type": "a list",
+    "tuple_type": "a list of three numbers",
     "dict_type": "an object",
     "model_type": "an object",
     "finite_number": "a finite number",
@@ -59,6 +41,8 @@ _WANTED = {
     "too_long": "{max_length} items or fewer",
     "string_too_short": "a text that is not empty",
     "literal_error": "{expected}",
+    "union_tag_not_found": "an object with the key {discriminator}",
+    "union_tag_invalid": "{discriminator} of {expected_tags}",
 }
 
 
@@ -127,4 +111,4 @@ def plain(value: Any) -> Any:
     return value
 
 
-__all__ = ["InputError", "Request", "plain", "read_json", "validate", "wanted_of"]
+__all__ = ["InputError", "Request", "plain", "validate", "wanted_of"]

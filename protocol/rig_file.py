@@ -5,7 +5,6 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,9 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from protocol import board_pins, loop_margin
 from protocol.catheter import load_catheter
-from protocol.errors import InputError, reason
+from protocol.errors import InputError
 from protocol.local_paths import LocalPaths, local_paths
 from protocol.requests import first_of, known_keys, unknown_key, wanted_of
+from protocol.text_files import read_toml
 from protocol.topics import check_name
 from protocol.unit_slips import hint_of
 from protocol.zenoh_access import Network, check_network_endpoint
@@ -544,10 +544,7 @@ def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
 
 def read_rig_data(path: str | Path) -> dict[str, Any]:
     """The TOML file `path`, unchecked. Raises InputError where it cannot be read."""
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError.from_sentence(f"{path}: found {reason(error)}, wanted a readable TOML file") from None
+    return read_toml(path)
 
 
 def catheter_problems(rig: Rig) -> list[str]:

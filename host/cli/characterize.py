@@ -48,6 +48,9 @@ def characterize(
     checked_seed(seed)
     if real and recording is not None:
         raise InputError("--real", "with --recording", "one of them; a recording needs no motion")
+    for option, port in (("--board-port", board_port), ("--tracker-port", tracker_port)):
+        if port is not None and not real:
+            raise InputError(option, port, "--real with it: without, a simulated rig is characterized")
     loaded = load_rig(rig)
     if real and not (yes or sys.stdin.isatty()):
         raise InputError(

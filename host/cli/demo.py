@@ -22,7 +22,7 @@ from host.cli.options import (
     writable_folder,
 )
 from host.cli.progress import Progress
-from protocol.errors import InputError, one_of
+from protocol.errors import Description, InputError, one_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 if TYPE_CHECKING:
@@ -64,6 +64,8 @@ def demo(
     if not 0.02 <= force < limit_N:
         raise InputError("--force", force, f"at least 0.02 and below safety.over_force_N {limit_N} (N)")
     within("--hold", hold, 1.0, 3600.0, "s")
+    if fast and wall_clock:
+        raise InputError("--fast", Description("--wall-clock, too"), "one of them: the wall clock cannot go faster")
     writable_folder("--out", directory)
     settings = DemoSettings(
         board=board,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,8 +12,8 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile, writable_folder
 from host.cli.progress import Progress
-from protocol.errors import InputError
-from protocol.rig_file import SIMULATED_RIG
+from protocol.errors import Description, InputError
+from protocol.rig_file import SIMULATED_RIG, load_rig
 
 
 def diagnose(
@@ -52,12 +53,15 @@ def diagnose(
 ) -> None:
     """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""
     if live:
+        if recordings:
+            raise InputError("recordings", recordings[0], "none with --live, which compares the running rig")
         _watch(rig, json)
         return
     from host.diagnosis import diagnose as run
 
     if not nominal:
         raise InputError("--nominal", "nothing", "a TOML file")
+    _refuse_twice(recordings or [])
     if data is not None and not Path(data).is_dir():
         raise InputError("--data", data, "a folder that exists")
     if out is not None:
@@ -93,6 +97,14 @@ def diagnose(
         print("\n".join(summary(verdict.as_dict())))
 
 
+def _refuse_twice(recordings: list[str]) -> None:
+    """Raise InputError for a file that is given twice: it would count as evidence of its own."""
+    places = [os.path.realpath(recording) for recording in recordings]
+    twice = next((place for place in places if places.count(place) > 1), None)
+    if twice is not None:
+        raise InputError("recording", Description(f"{twice} twice"), "each recording once")
+
+
 def _say_what_runs(nominal: str, trust: bool) -> None:
     """Print the code that the nominal TOML runs. Raises InputError if another user may have written it."""
     from host.diagnosis.model.nominal import nominal_path, read_nominal
@@ -112,6 +124,7 @@ def _say_what_runs(nominal: str, trust: bool) -> None:
 def _watch(rig: Path, json: bool) -> None:
     """Watch a running rig until it is stopped; with `json`, one JSON object a line for each alarm."""
     from host.diagnosis.live.attach import attach
+    from host.run.connection import may_run
     from protocol.messages import body_of
     from protocol.topics import Alarm
 
@@ -120,6 +133,9 @@ def _watch(rig: Path, json: bool) -> None:
             write_json(body_of(alarm))
             sys.stdout.flush()
 
+    read = load_rig(rig)
+    if not may_run(read):
+        print(f"seldinger diagnose: no rig {read.name} runs at {read.local.folder} yet", file=sys.stderr, flush=True)
     attach(rig, lambda text: print(f"seldinger diagnose: {text}", file=sys.stderr, flush=True), print_alarm)
 
 

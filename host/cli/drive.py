@@ -14,7 +14,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile
-from host.cli.quantities import direction, point, quantity
+from host.cli.quantities import direction, point, positive, quantity
 from protocol.enums import JogAxis
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG
@@ -33,6 +33,8 @@ TIP_DIRECTIONS = {
     "e2": (0.0, 1.0, 0.0),
     "e3": (0.0, 0.0, 1.0),
 }
+# Beyond these a number is a slip; what the rig accepts is narrower, and its answer says so.
+FASTEST_PER_S, WIDEST_M, LONGEST_S, MOST_N = 10.0, 0.1, 3600.0, 1.0
 LOOK_S = 0.02
 # A goal is reached when the tip has been near it for so long.
 THERE_S = 0.3
@@ -176,10 +178,13 @@ def jog(
             if axis.count(",") != 2:
                 raise InputError("axis", axis, "insertion, roll, knob, e1, e2, e3, or a direction X,Y,Z")
             along = direction("axis", axis)
-    from protocol.jog_limits import unit_of
+    from protocol.jog_limits import LONGEST_JOG, unit_of
 
-    way = quantity("travel", travel, unit_of(what))
-    pace = None if speed is None else quantity("--speed", speed, unit_of(what))
+    unit, most = unit_of(what), LONGEST_JOG[what]
+    way = quantity("travel", travel, unit)
+    if not 0.0 < abs(way) <= most:
+        raise InputError("travel", travel, f"other than 0, at most {most:g} {unit} either way")
+    pace = None if speed is None else positive("--speed", speed, unit, FASTEST_PER_S, "per second")
     with driving("jog", rig, json, name, endpoint, keys) as driver:
         driver.rig.jog(what.label, way, pace, along)
         driver.wait(0.5, lambda state: state.mode == "jog")  # type: ignore[attr-defined]
@@ -204,8 +209,8 @@ def goto(
     """Bring the tip to a point in free space and stay there. Ctrl-C holds."""
     goal_m, near_m, seconds = (
         point("place", place),
-        quantity("--tolerance", tolerance, "m"),
-        quantity("--within", within, "s"),
+        positive("--tolerance", tolerance, "m", WIDEST_M),
+        positive("--within", within, "s", LONGEST_S),
     )
     with driving("goto", rig, json, name, endpoint, keys) as driver:
         driver.rig.goto(goal_m)
@@ -244,9 +249,9 @@ def touch(
     keys: Keys = None,
 ) -> None:
     """Approach the tissue along a normal and hold a force on it. Ctrl-C holds."""
-    goal_m, into, force_N = point("place", place), direction("--normal", normal), quantity("--force", force, "N")
-    hold_s = None if seconds is None else quantity("--for", seconds, "s")
-    patience_s = quantity("--within", within, "s")
+    goal_m, into, force_N = point("place", place), direction("--normal", normal), positive("--force", force, "N", MOST_N)
+    hold_s = None if seconds is None else positive("--for", seconds, "s", LONGEST_S)
+    patience_s = positive("--within", within, "s", LONGEST_S)
     with driving("touch", rig, json, name, endpoint, keys) as driver:
         driver.rig.touch(goal_m, into, force_N)
         ended = ("contact", "stopped", "retract", "disarmed")
@@ -291,7 +296,7 @@ def force(
     keys: Keys = None,
 ) -> None:
     """Change the force of the present touch."""
-    force_N = quantity("newton", newton, "N")
+    force_N = positive("newton", newton, "N", MOST_N)
     with driving("force", rig, json, name, endpoint, keys) as driver:
         driver.rig.force(force_N)
         driver.say(f"accepted; {force_N:g} N wanted")
@@ -317,8 +322,8 @@ def mark(
     keys: Keys = None,
 ) -> None:
     """Write a note with the rig's time into log and recording."""
-    if not 0 < len(note.strip()) <= 500:
-        raise InputError("note", note, "1 to 500 characters")
+    if not 0 < len(note.strip()) <= 500 or not note.isprintable():
+        raise InputError("note", note, "1 to 500 characters that can be printed, on one line")
     with driving("mark", rig, json, name, endpoint, keys, lease=False) as driver:
         driver.rig.mark(note)
         driver.say("noted")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, RigFile
+from host.cli.options import Json, RigFile, within
 from host.cli.progress import Working
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -35,8 +35,10 @@ def flash(
     if not dry_run:
         check_avrdude()
         check_port(port)
-    if image is not None and not image.is_file():
+    if image is not None and not _is_elf(image):
         raise InputError("--image", str(image), "an ELF file of the firmware")
+    if baud:
+        within("--baud", baud, 300, 4_000_000)
     command = avrdude_command(pins.mcu, port, image or built(pins), baud)
     print("seldinger: " + " ".join(command), file=sys.stderr)
     if json and dry_run:
@@ -52,3 +54,12 @@ def flash(
     print("seldinger: written and verified; next: `seldinger check-device board`", file=sys.stderr)
     if json:
         write_json({"command": command, "written": True})
+
+
+def _is_elf(path: Path) -> bool:
+    """Whether `path` is a file that begins as an ELF does."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4) == b"\x7fELF"
+    except OSError:
+        return False

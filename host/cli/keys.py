@@ -39,6 +39,8 @@ def init(
     secret = _read_passphrase(passphrase_file) if passphrase_file is not None else ""
     if passphrase and not secret:
         secret = typer.prompt("Passphrase of the authority's key", hide_input=True, confirmation_prompt=True, err=True)
+    if not 0 < len(laboratory.strip()) <= 60:
+        raise InputError("--laboratory", laboratory, "1 to 60 characters")
     folder = make_authority(directory, laboratory, secret)
     print(
         f"authority in {folder}; its key.pem allows commands to every rig: keep it off the rigs, and back it up",

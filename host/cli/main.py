@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import io
 import os
+import re
 import signal
 import sys
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import typer
 
 from host.cli.extras import missing_extra
 from protocol import compile_notice
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -96,6 +99,9 @@ COMPILES = (
 )
 
 
+ENDED = "seldinger: interrupted before the end"
+
+
 def build(argv: list[str]) -> typer.Typer:
     """Make the application with the called command in it, or with all their lines when none is named (help)."""
     app = typer.Typer(
@@ -172,8 +178,12 @@ def _report(error: Exception, argv: list[str]) -> int:
         print(f"seldinger: {_one_line(str(error))}", file=sys.stderr)
         return 2
     if isinstance(error, Refused):
-        print(f"seldinger: {_one_line(error.format_message())}", file=sys.stderr)  # type: ignore[attr-defined]
+        print(f"seldinger: {_one_line(_refusal(error))}", file=sys.stderr)
         return 2
+    failure = getattr(getattr(getattr(sys.stdout, "buffer", None), "raw", None), "failure", "")
+    if failure:
+        print(f"seldinger: standard output: found {failure}, wanted a place that can be written", file=sys.stderr)
+        return 1
     command = " ".join(["seldinger", *(word for word in argv[:1] if not word.startswith("-"))])
     missing = missing_extra(error, command) if isinstance(error, ModuleNotFoundError) else None
     if missing is not None:
@@ -185,20 +195,115 @@ def _report(error: Exception, argv: list[str]) -> int:
     return 1
 
 
+def _refusal(error: Exception) -> str:
+    """What is wrong with the words of the command line: typer's sentence, or for a group of commands which ones it has."""
+    context = getattr(error, "ctx", None)
+    group = getattr(getattr(context, "command", None), "commands", None)
+    said = str(error.format_message())  # type: ignore[attr-defined]
+    found = re.match(r"No such command '(.*)'", said)
+    if group is None or not (found or said.startswith("Usage")):
+        return said
+    name = str(context.info_name)  # type: ignore[union-attr]
+    what = Description("nothing") if found is None else found[1]
+    return str(InputError(name, what, " or ".join(group) if len(group) < 4 else f"one of {', '.join(group)}"))
+
+
+class _Standard(io.RawIOBase):
+    """Standard output or error.
+
+    A failure of standard output is kept, so that it is reported as what it is. One of standard error is not raised: a log on
+    a full disk must not end a command that moves a rig. A reader that has gone (BrokenPipeError) ends a command in both.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number, self.failure = number, ""
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self.number
+
+    def isatty(self) -> bool:
+        return os.isatty(self.number)
+
+    def write(self, content: Any) -> int:
+        try:
+            return os.write(self.number, content)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            if self.number == 2 or self.failure:
+                return len(content)
+            self.failure = error.strerror or str(error)
+            raise
+
+
+def _open_standard_streams() -> None:
+    """Give the streams that the caller has closed a place, so that no recording or socket gets their number."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free, which is this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, encoding="utf-8", errors="backslashreplace", closefd=False))
+    for number, stream, original in ((1, sys.stdout, sys.__stdout__), (2, sys.stderr, sys.__stderr__)):
+        if original is not None and stream is original:  # not where a test has put another in its place
+            name = "stdout" if number == 1 else "stderr"
+            stream.flush()
+            text = io.TextIOWrapper(
+                io.BufferedWriter(_Standard(number)),
+                stream.encoding,
+                stream.errors,
+                line_buffering=number == 2 or os.isatty(1),
+            )
+            setattr(sys, name, text)
+
+
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    """Return `text` on one line, without the characters that would steer a terminal."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in " ".join(text.split()))
 
 
 def _run(argv: list[str]) -> int:
     """Run the command that `argv` names. Returns its exit status."""
+    program = typer.main.get_command(build(argv))
+    _refuse_unknown_options(program, argv)
     try:
-        return int(typer.main.get_command(build(argv)).main(argv, "seldinger", standalone_mode=False) or 0)
+        return int(program.main(argv, "seldinger", standalone_mode=False) or 0)
     except typer.Abort:  # Ctrl-C, or "no" to a question
-        print("seldinger: interrupted before the end", file=sys.stderr)
+        print(ENDED, file=sys.stderr)
         return 1
 
 
+def _refuse_unknown_options(program: Any, argv: list[str]) -> None:
+    """Refuse an option that a command of NEGATIVE_VALUES does not have: its parser takes it for a value.
+
+    Raises InputError with the option that was probably meant.
+    """
+    called = next((word for word in argv if not word.startswith("-")), "")
+    if called not in NEGATIVE_VALUES:
+        return
+    known = [name for option in program.commands[called].params for name in option.opts if name.startswith("--")]
+    words = argv[: argv.index("--")] if "--" in argv else argv
+    for word in (word.partition("=")[0] for word in words if word.startswith("--")):
+        if word not in (*known, "--help"):
+            near = difflib.get_close_matches(word, known, 1)
+            raise InputError(called, word, f"an option; did you mean {near[0]}?" if near else f"one of {', '.join(known)}")
+
+
+class _Interrupted:
+    """Whether Ctrl-C or SIGTERM has ended the command.
+
+    A KeyboardInterrupt that is raised while compiled code runs or is compiled comes out as SystemError or another exception.
+    """
+
+    yes = False
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    _Interrupted.yes = True
     raise KeyboardInterrupt
 
 
@@ -211,7 +316,10 @@ def main() -> None:
     """
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     argv = sys.argv[1:]
+    _open_standard_streams()
     compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
         status = _run(argv)
@@ -223,7 +331,10 @@ def main() -> None:
     except BrokenPipeError:  # the reader of the output has closed it, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
+        if _Interrupted.yes or isinstance(error, KeyboardInterrupt):
+            print(ENDED, file=sys.stderr)
+            sys.exit(1)
         sys.exit(_report(error, argv))
     finally:
         if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server passes the signal on as it ends: nothing is left to do

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 RigFile = Annotated[Path, typer.Option("--rig", help="Rig file (TOML).")]
@@ -51,7 +51,7 @@ def checked_effects(effects: Sequence[str] | None) -> tuple[str, ...]:
             parse(text)
         except ValueError as error:
             found, _, wanted = str(error).partition(": found ")[2].partition(", wanted ")
-            raise InputError(f"--effect {text}", found, wanted) from None
+            raise InputError(f"--effect {text}", Description(found), wanted) from None
     return tuple(effects or ())
 
 

@@ -22,6 +22,8 @@ UNITS = {
     "s": ("s", 1.0),
     "min": ("s", 60.0),
 }
+# No catheter reaches further: such a number is in another unit.
+FARTHEST_M = 1.0
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([a-zA-Z]*)\s*")
 
 
@@ -42,12 +44,26 @@ def quantity(key: str, text: str, unit: str) -> float:
     return number * UNITS[name][1]
 
 
+def positive(key: str, text: str, unit: str, most: float, what: str = "") -> float:
+    """Return the quantity in `text` in the SI unit `unit`, above 0 and at most `most`.
+
+    Raises:
+        InputError: named `key`; `what` says whose limit `most` is.
+    """
+    value = quantity(key, text, unit)
+    if not 0.0 < value <= most:
+        raise InputError(key, text, f"more than 0, at most {most:.4g} {unit}{f' ({what})' if what else ''}")
+    return value
+
+
 def point(key: str, text: str) -> tuple[float, float, float]:
     """Return the point X,Y,Z in `text`, m. Raises InputError."""
     parts = text.split(",")
     if len(parts) != 3:
         raise InputError(key, text, "three numbers with commas between them, such as 0,-10.7mm,21mm")
     x, y, z = (quantity(key, part, "m") for part in parts)
+    if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
+        raise InputError(key, text, f"a point within {FARTHEST_M:g} m; mm need their unit, such as -10.7mm")
     return x, y, z
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from host.commissioning.characterization import Characterization, calibrated_rig
 from host.commissioning.characterization_report import TableRow, lines_of, write_characterization
 from host.commissioning.sweep_fits import Estimate
 from protocol.rig_file import Rig, parse_rig
+from protocol.text_files import read_text, toml_of
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ def write_calibration(
     """
     directory.mkdir(parents=True, exist_ok=True)
     section = transmission_toml(found)
-    text = calibrated_rig_text(rig_file.read_text(encoding="utf-8"), section)
-    parse_rig(tomllib.loads(text), "calibrated rig")
+    text = calibrated_rig_text(read_text(rig_file), section)
+    parse_rig(toml_of(text, "calibrated rig"), "calibrated rig")
     stem = directory / recording.stem
     calibration, whole = stem.with_suffix(".calibration.toml"), stem.with_suffix(".rig.toml")
     calibration.write_text(section, encoding="utf-8")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
 from protocol.rig_file import Rig, load_rig, parse_rig
+from protocol.text_files import read_toml
 from protocol.topics import Message
 from realtime.core.lines import FromRig
 from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
@@ -319,11 +319,7 @@ def load_calibrated_rig(rig_file: str | Path, calibration_file: str | Path | Non
     if calibration_file is None:
         return load_rig(rig_file)
     load_rig(rig_file)
-    data = tomllib.loads(Path(rig_file).read_text(encoding="utf-8"))
-    try:
-        found = tomllib.loads(Path(calibration_file).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError.from_sentence(f"{calibration_file}: found {error}, wanted a readable TOML file") from None
+    data, found = read_toml(rig_file), read_toml(calibration_file)
     if set(found) != {"transmission"}:
         raise InputError.from_sentence(
             f"{calibration_file}: found sections {', '.join(found) or 'none'}, wanted [transmission] alone"

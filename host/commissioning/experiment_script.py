@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,10 @@ import numpy.typing as npt
 from pydantic import Field
 
 from protocol.commander import Acknowledgement
-from protocol.errors import Description, InputError, reason
+from protocol.errors import InputError
 from protocol.requests import Request, validate
 from protocol.rig_file import AXES, Rig
+from protocol.text_files import read_toml
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
 
@@ -62,10 +62,7 @@ class Path3D:
 
 def read_script(path: Path) -> Script:
     """Read the script in TOML file `path`. Raises InputError with the key."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError("script", Description(f"{path}: {reason(error)}"), "a readable TOML file") from None
+    content = read_toml(path, "script")
     rows = content.get("rows")
     if isinstance(rows, list):
         content["rows"] = [_floats(row) if isinstance(row, list) else row for row in rows]

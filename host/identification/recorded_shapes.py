@@ -13,9 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,7 +21,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from protocol.errors import InputError
-from protocol.requests import Request, read_json, validate
+from protocol.requests import Request, validate
+from protocol.text_files import read_json, read_text
 
 Array = NDArray[np.float64]
 Coordinate = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -93,10 +92,7 @@ def checked_shapes(data: Any, dimensions: int) -> list[RecordedShape]:
 
 def _table(source: str, dimensions: int) -> dict[str, Any]:
     """A CSV file in the shape of the JSON one; numbers are converted here, checked by the caller."""
-    try:
-        text = sys.stdin.read() if source == "-" else Path(source).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(source, str(error), "a readable CSV file") from None
+    text = read_text(source, wanted="a readable CSV file")
     wanted = PLANAR_COLUMNS if dimensions == 2 else SPATIAL_COLUMNS
     reader = csv.DictReader(io.StringIO(text))
     columns = tuple(reader.fieldnames or ())

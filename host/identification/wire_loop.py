@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 
 from protocol.catheter import Catheter, ConstitutiveParameters, catheter_toml
 from protocol.errors import InputError, reason
+from protocol.text_files import read_text
 
 Array = NDArray[np.float64]
 
@@ -70,9 +71,10 @@ class WireFriction:
 
 def read_wire_loop(path: str | Path) -> WireLoop:
     """The loop in a CSV file headed curvature_per_m,bend_rad. Raises InputError naming the file or the key."""
+    lines = read_text(path, wanted="a readable CSV file headed " + ",".join(COLUMNS)).splitlines()
     try:
-        rows = list(csv.DictReader(Path(path).read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.DictReader(lines))
+    except csv.Error as error:
         raise InputError(str(path), reason(error), "a readable CSV file headed " + ",".join(COLUMNS)) from None
     values: list[list[float]] = []
     for name in COLUMNS:

@@ -10,7 +10,8 @@ from pydantic import Field
 
 from protocol.catheter import Catheter, load_catheter
 from protocol.errors import InputError
-from protocol.requests import Request, read_json, unknown_key, validate
+from protocol.requests import Request, unknown_key, validate
+from protocol.text_files import read_json
 
 # Far beyond any catheter: a value outside is a mistaken unit, and must not reach a kernel.
 Insertion = Annotated[float, Field(ge=-0.5, le=0.5)]

@@ -16,14 +16,19 @@ from host.navigation.loaded_shape import LoadedLine, aimed, pressed, through_hol
 from host.navigation.obstacles import Capsule, Mesh, Obstacle, Sphere, Surroundings, load_mesh, to_line_m
 from protocol.catheter import load_catheter
 from protocol.errors import InputError
-from protocol.requests import Request, read_json, validate
+from protocol.requests import Request, validate
 from protocol.rig_file import Rig
+from protocol.text_files import read_json
 from protocol.topics import SHAPE_POINTS
 from realtime.control import inverse_kinematics as ik
 from realtime.control.configure import tick_parameters
 
 Array = NDArray[np.float64]
-Point = tuple[float, float, float]
+# Wide bounds: beyond them a value is one in another unit, and the refusal says so.
+Coordinate_m = Annotated[float, Field(ge=-1.0, le=1.0)]
+Length_m = Annotated[float, Field(gt=0.0, le=1.0)]
+Point = tuple[Coordinate_m, Coordinate_m, Coordinate_m]
+Component_N = Annotated[float, Field(ge=-1.0, le=1.0)]
 LINE_POINTS = 16
 # Spacing of the way's points (m of tip, about) before time is laid over it.
 SPACING_M = 0.003
@@ -37,7 +42,7 @@ class SphereRequest(Request):
 
     type: Literal["sphere"]
     centre_m: Point
-    radius_m: Annotated[float, Field(gt=0)]
+    radius_m: Length_m
 
 
 class CapsuleRequest(Request):
@@ -46,7 +51,7 @@ class CapsuleRequest(Request):
     type: Literal["capsule"]
     from_m: Point
     to_m: Point
-    radius_m: Annotated[float, Field(gt=0)]
+    radius_m: Length_m
 
 
 class MeshRequest(Request):
@@ -65,16 +70,16 @@ class PunctureRequest(Request):
     """
 
     point_m: Point
-    radius_m: Annotated[float, Field(gt=0)]
+    radius_m: Length_m
     largest_force_N: Annotated[float, Field(ge=0, le=0.5)] = 0.2
 
 
 class JointRequest(Request):
     """Joints at the start: insertion, roll and curvature of the distal end."""
 
-    insertion_m: float
-    roll_rad: float
-    curvature_per_m: float
+    insertion_m: Coordinate_m
+    roll_rad: Annotated[float, Field(ge=-50.0, le=50.0)]
+    curvature_per_m: Annotated[float, Field(ge=-1000.0, le=1000.0)]
 
 
 AnyObstacle = Annotated[SphereRequest | CapsuleRequest | MeshRequest, Field(discriminator="type")]
@@ -87,7 +92,7 @@ class PlanRequest(Request):
     start: JointRequest
     obstacles: list[AnyObstacle] = Field(default_factory=list)
     puncture: PunctureRequest | None = None
-    contact_force_N: Point | None = None
+    contact_force_N: tuple[Component_N, Component_N, Component_N] | None = None
     clearance_m: Annotated[float, Field(ge=0, le=0.05)] = 0.001
     seed: int = 1
     samples: Annotated[int, Field(ge=10, le=1_000_000)] = 20_000
@@ -234,7 +239,7 @@ def plan(request: PlanRequest, rig: Rig, folder: Path = Path()) -> PlanAnswer | 
     start = np.array([request.start.insertion_m, request.start.roll_rad, request.start.curvature_per_m])
     why = world.refused(start)
     if why:
-        raise InputError("start", start.tolist(), f"a free start; found {why}")
+        raise InputError("start", start.tolist(), f"a free start; this one is refused for {why}")
     goals = _goals(request, rig, world)
     scale = world.reach.scale_m
     path = planner.connect(

@@ -28,7 +28,8 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 
 from host.recordings.foxglove import PREFIX
 from host.recordings.index import MAGIC
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
+from protocol.text_files import kind_of
 from protocol.topics import TOPICS, Message
 
 # A chunk is held whole while it is read; other recorders make chunks of 1 to 4 MB.
@@ -135,9 +136,11 @@ class RecordingFile:
 
     def _scan(self, stream: BinaryIO, size: int) -> None:
         """Go over all records once; stops at the first that is not whole."""
-        magic = stream.seek(0) or stream.read(len(MAGIC))
+        stream.seek(0)
+        magic = stream.read(len(MAGIC))
         if magic != MAGIC:
-            raise InputError(str(self.path), repr(magic), "an MCAP recording")
+            found = kind_of(magic) or (f"bytes {magic.hex(' ')} at its beginning" if magic else "an empty file")
+            raise InputError(str(self.path), Description(found), "an MCAP recording")
         place = len(MAGIC)
         while len(head := stream.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
             opcode, length = _RECORD_HEAD.unpack(head)

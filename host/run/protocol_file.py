@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -15,9 +14,10 @@ from pydantic import Field
 
 from host.commissioning.experiment_script import FORCE_SHARE, LEAST_FORCE_N
 from host.navigation.request import PlanAnswer, plan, read_plan_request
-from protocol.errors import Description, InputError, reason
+from protocol.errors import Description, InputError
 from protocol.requests import Request, validate
 from protocol.rig_file import AXES, Rig
+from protocol.text_files import read_text, toml_of
 from realtime.control import inverse_kinematics
 from realtime.core.reach import TargetReach
 
@@ -162,11 +162,8 @@ class DryRun(NamedTuple):
 
 def read_protocol(path: Path, rig: Rig) -> ScriptedProtocol:
     """Read the protocol in TOML file `path` and expand it for `rig`; plans are computed. Raises InputError with the key."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        content = tomllib.loads(text)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError("protocol", Description(f"{path}: {reason(error)}"), "a readable TOML file") from None
+    text = read_text(path, "protocol", "a readable TOML file")
+    content = toml_of(text, path, "protocol")
     try:
         file = validate(ProtocolFile, _with_floats(content))
     except InputError as error:

@@ -21,10 +21,11 @@ from host.run.commander import Commander
 from host.run.connection import may_run
 from host.run.protocol_file import Action, ProtocolFile, ScriptedProtocol, before
 from protocol.commander import Acknowledgement
-from protocol.errors import Description, InputError, reason
+from protocol.errors import Description, InputError
 from protocol.messages import MessageType
 from protocol.requests import plain
 from protocol.rig_file import Rig
+from protocol.text_files import json_of, read_text
 from protocol.topics import Message, PlannedStep, Pose, RigState, decode, key
 from protocol.zenoh_session import Session
 from sim.board import SimulatedBoard
@@ -478,13 +479,11 @@ def write_result(result: ProtocolResult, target: Path) -> None:
 def read_result(path: Path, protocol: ScriptedProtocol) -> tuple[ActionResult, ...]:
     """Return the results of an earlier run of the same protocol. Raises InputError where it is none, or of another."""
     wanted = "the JSON file of an earlier run of this protocol"
+    data = json_of(read_text(path, "--resume", wanted), path, "--resume", wanted)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
         data.pop("summary", None)
         result = msgspec.convert(data, ProtocolResult)
-    except OSError as error:
-        raise InputError("--resume", Description(f"{path}: {reason(error)}"), wanted) from None
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, TypeError):
         raise InputError("--resume", str(path), wanted) from None
     if result.sha256 != protocol.sha256:
         raise InputError("--resume", Description(f"{path}, of another protocol or another version of it"), wanted)

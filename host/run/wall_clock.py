@@ -21,6 +21,7 @@ from host.run.commander import Commander
 from host.run.demo import DemoRun, DemoSettings, Progress
 from protocol.local_paths import LocalPaths
 from protocol.rig_file import load_rig
+from protocol.text_files import read_text
 from protocol.topics import LoopTiming, RigState
 from protocol.zenoh_session import Session
 from sim.scenario import TARGET_M, ContactJob, Outcome
@@ -62,7 +63,7 @@ class Fleet:
         self.close()
 
     def _start(self) -> None:
-        text = self._settings.rig_file.read_text(encoding="utf-8")
+        text = read_text(self._settings.rig_file)
         self.rig_file.write_text(with_folder(text, self._sockets.folder), encoding="utf-8")
         rig = str(self.rig_file)
         planted = [word for text in self._settings.effects for word in ("--effect", text)]

@@ -15,7 +15,8 @@ from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import WAITING, Picture
 from host.view.source import refusal
 from protocol.errors import InputError
-from protocol.requests import Request, read_json
+from protocol.requests import Request
+from protocol.text_files import read_json
 
 # Topics whose every message is shown, and those of which only the newest counts.
 EVERY = ("state", "force/estimate", "log", "plan")

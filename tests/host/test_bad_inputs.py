@@ -6,6 +6,7 @@ Each case is a command line and a text that its line of output must contain. All
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import socket
@@ -81,6 +82,10 @@ FILES: dict[str, str | bytes] = {
     "cut.json": json.dumps(SOLVE)[:40],
     "list.json": "[1, 2, 3]",
     "deep.json": "[" * 100_000,
+    "deep.toml": "x = " + "[" * 100_000,
+    "utf-16": json.dumps(SOLVE).encode("utf-16"),
+    "packed": gzip.compress(b"name = 1"),
+    "archive": b"PK\x03\x04" + bytes(40),
     "number.json": "7",
     "cut.toml": RIG[:700],
     "other.toml": 'colour = "red"\n',
@@ -111,6 +116,7 @@ FILES: dict[str, str | bytes] = {
     "solve-station.json": solve(stations_m=[30.0]),
     "solve-tendon.json": solve(tendon_tension_N=-1.0),
     "solve-none.json": json.dumps({key: SOLVE[key] for key in SOLVE if key != "force_N"}),
+    "solve-twice.json": json.dumps(SOLVE)[:-1] + ', "insertion_m": 0.02}',
     "solve-inside.json": solve(insertion_m=-0.4),
     "estimate-far.json": json.dumps(
         ESTIMATE | {"sensors": [{"offset_m": 0.0, "position_m": [0.9, 0.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}]}
@@ -142,6 +148,10 @@ FILES: dict[str, str | bytes] = {
     "short.csv": "t,force,position\n0,0,0\n1,1,1\n",
     "other-column.csv": table(head="t,force,place"),
     "twice.csv": table(head="t,force,force"),
+    "semicolons.csv": table().replace(",", ";").replace(".", ","),
+    "tabs.csv": table().replace(",", "\t"),
+    "utf-16.csv": table().encode("utf-16"),
+    "packed.csv": gzip.compress(table().encode()),
     "ragged.csv": "t,force,position\n0,0\n1,1,1,1\n",
     "backwards.csv": "t,force,position\n" + "\n".join(f"{5 - 0.01 * i},0.{i % 7},0.{i % 9}" for i in range(300)) + "\n",
     "cut.parquet": b"PAR1" + bytes(20),
@@ -170,6 +180,7 @@ FILES: dict[str, str | bytes] = {
     "rig-twice.toml": rig('name = "simulated"', 'name = "simulated"\nname = "again"'),
     "rig-unit.toml": rig("[0.5, 0.5, 0.5, 0.5]", "[1.0, 1.0, 0.0, 0.0]"),
     "rig-tracker-mm.toml": rig("position_noise_m = 0.00029", "position_noise_m = 0.29"),
+    "rig-digits.toml": rig("loop_hz = 1000 ", "loop_hz = 1" + "0" * 5000),
     "rig-length.toml": rig("distal_length_m = 0.110", "distal_length_m = 110.0"),
     # protocols and scripts
     "protocol-key.toml": PROTOCOL + "[tolerence]\nforce_N = 0.1\n",
@@ -186,13 +197,29 @@ FILES: dict[str, str | bytes] = {
     "script-rig.toml": SCRIPT.replace('rig = "simulated"', 'rig = "other"'),
     # other files
     "plan-key.json": json.dumps({**PLAN, "goal": 1}),
+    "plan-mm.json": json.dumps({**PLAN, "goal_m": [0.0, -10.7, 20.0]}),
+    "plan-short.json": json.dumps({**PLAN, "goal_m": [0.0, 0.02]}),
+    "plan-degrees.json": json.dumps({**PLAN, "start": {**PLAN["start"], "roll_rad": 360.0}}),  # type: ignore[dict-item]
+    "plan-kind.json": json.dumps({**PLAN, "obstacles": [{"kind": "sphere"}]}),
+    "plan-shape.json": json.dumps({**PLAN, "obstacles": [{"type": "cube"}]}),
     "verdict.json": '{"verdict": 3}',
     "calibration.toml": "[transmission]\ncolour = 1\n",
 }
 
-REQUEST = ("missing.json", "folder", "empty", "binary", "cut.json", "list.json", "deep.json", "number.json")
-TOML = ("missing.toml", "folder", "empty", "binary", "cut.toml", "other.toml")
-RECORDING = ("missing.mcap", "folder", "empty", "binary", "cut.mcap", "good.csv")
+REQUEST = (
+    "missing.json",
+    "folder",
+    "empty",
+    "binary",
+    "cut.json",
+    "list.json",
+    "deep.json",
+    "number.json",
+    "utf-16",
+    "/dev/zero",
+)
+TOML = ("missing.toml", "folder", "empty", "binary", "cut.toml", "other.toml", "deep.toml", "utf-16", "packed", "/dev/zero")
+RECORDING = ("missing.mcap", "folder", "empty", "binary", "cut.mcap", "archive", "/dev/zero", "good.csv")
 # Places where nothing can be written: a folder below a file, and a file of the kernel's.
 UNWRITABLE = ("rig.toml/below", "/dev/null/runs", "/proc/runs")
 NO_SEED = ("-1", "1.5", "one", "99999999999999", "nan")
@@ -273,6 +300,9 @@ CASES: list[Case] = [
     (("demo", "--effect", "backlsh@insertion"), "backlsh"),
     (("demo", "--effect", "backlash@insertion:width=1"), "width"),
     (("demo", "--effect", ""), "--effect"),
+    (("demo", "--fast", "--wall-clock"), "--fast"),
+    (("characterize", "--board-port", "/dev/null"), "--real"),
+    (("characterize", "--tracker-port", "/dev/null"), "--real"),
     (("soak", "--minutes", "nan"), "--minutes"),
     (("soak", "--minutes", "-5"), "--minutes"),
     (("faults", "--runs", "0"), "--runs"),
@@ -310,6 +340,13 @@ CASES: list[Case] = [
     (("flash",), "--port"),
     (("flash", "--port", "/dev/null", "--dry-run", "--mcu", "z80"), "z80"),
     (("flash", "--port", "/dev/null", "--dry-run", "--image", "missing.elf"), "--image"),
+    (("flash", "--port", "/dev/null", "--dry-run", "--image", "rig.toml"), "--image"),
+    (("flash", "--port", "/dev/null", "--dry-run", "--image", "archive", "--baud", "-5"), "--image"),
+    (("bridge",), "igtl or ros2"),
+    (("bridge", "ros1"), "igtl or ros2"),
+    (("rig",), "check"),
+    (("rig", "show"), "check"),
+    (("keys", "init", "--directory", "folder/new", "--laboratory", ""), "--laboratory"),
     (("install-services", "--root", "folder", "--cpu", "9999"), "--cpu"),
     (("view", "--port", "80"), "--port"),
     (("view", "--port", "{port in use}"), "--port"),
@@ -327,6 +364,21 @@ CASES: list[Case] = [
     (("jog", "insertion"), "travel"),
     (("jog", "0,0,0", "1mm"), "axis"),
     (("jog", "e1", "1mm", "--speed", "quick"), "--speed"),
+    (("jog", "insertion", "30mm"), "travel"),
+    (("jog", "insertion", "0mm"), "travel"),
+    (("jog", "roll", "90"), "travel"),
+    (("jog", "e1", "1mm", "--speed", "-5mm"), "--speed"),
+    (("jog", "e1", "1mm", "--speed", "0mm"), "--speed"),
+    (("goto", "0,-10.7,20"), "mm need their unit"),
+    (("goto", "0,0,20mm", "--tolerance", "-1mm"), "--tolerance"),
+    (("goto", "0,0,20mm", "--within", "0s"), "--within"),
+    (("touch", "0,0,25mm", "--force", "-0.2"), "--force"),
+    (("touch", "0,0,25mm", "--force", "20"), "--force"),
+    (("touch", "0,0,25mm", "--froce", "0.2"), "did you mean --force?"),
+    (("touch", "0,0,25mm", "--for", "-5s"), "--for"),
+    (("touch", "0,0,25mm", "--within", "1e9s"), "--within"),
+    (("force", "20"), "newton"),
+    (("mark", "\x1b[2Jgone"), "note"),
     (("goto", "0,1"), "place"),
     (("goto", "0,1,far"), "place"),
     (("goto", "0,0,1e999"), "place"),
@@ -387,6 +439,12 @@ CASES: list[Case] = [
     (("estimate", "estimate-none.json"), "sensors"),
     (("estimate", "estimate-case.json"), "case"),
     (("plan", "plan-key.json"), "goal"),
+    (("plan", "plan-mm.json"), "-10.7 mm is -0.0107"),
+    (("plan", "plan-short.json"), "goal_m"),
+    (("plan", "plan-degrees.json"), "360 degrees is 6.28319"),
+    (("plan", "plan-kind.json"), "'type'"),
+    (("plan", "plan-shape.json"), "'sphere', 'capsule', 'mesh'"),
+    (("solve", "solve-twice.json"), "insertion_m"),
     # calibrate
     *(
         (("calibrate", f"shapes-{name}", "--catheter", "thermocool_sf"), text)
@@ -418,10 +476,16 @@ CASES: list[Case] = [
             ("other-column", "position"),
             ("twice", "force"),
             ("ragged", "ragged.csv"),
+            ("semicolons", "semicolons between the columns"),
+            ("tabs", "tabs between the columns"),
+            ("utf-16", "text in UTF-16"),
+            ("packed", "data packed by gzip"),
             ("backwards", "t"),
         )
     ),
     (("diagnose", "good.csv"), "--nominal"),
+    (("diagnose", "good.csv", "folder/../good.csv", "--nominal", "nominal.toml"), "good.csv twice"),
+    (("diagnose", "good.csv", "--live"), "--live"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--without", "backlsh"), "backlsh"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--time-budget", "nan"), "--time-budget"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--time-budget", "-1"), "--time-budget"),
@@ -458,6 +522,7 @@ CASES: list[Case] = [
             ("unit", "base_from_tracker_wxyz"),
             ("tracker-mm", "0.29 mm is 0.00029"),
             ("length", "110 mm is 0.11"),
+            ("digits", "rig-digits.toml"),
         )
         for words in (("rig", "check", f"rig-{name}.toml"), ("demo", "--rig", f"rig-{name}.toml"))
     ),

@@ -152,3 +152,39 @@ def test_a_place_for_output_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
         writable_file("--report", tmp_path / "no" / "folder.html")
     with pytest.raises(InputError, match="--out"):
         writable_folder("--out", kept)
+
+
+def shell(line: str) -> subprocess.CompletedProcess[str]:
+    """Run the program (`$seldinger`) in a shell, whose redirections are those of a user."""
+    environment = os.environ | {"seldinger": f"{sys.executable} -m host.cli.main"}
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False, cwd=ROOT, env=environment)
+
+
+def test_a_full_disk_below_standard_output_is_one_line() -> None:
+    done = shell("$seldinger rig check protocol/rigs/simulated.toml --json > /dev/full")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("seldinger: standard output: found No space left on device"), done.stderr
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-", "2> /dev/full"])
+def test_streams_that_are_closed_or_full_do_not_end_a_command(closed: str) -> None:
+    good = shell(f"$seldinger rig check protocol/rigs/simulated.toml {closed}")
+    assert good.returncode == 0, good.stderr
+    bad = shell(f"$seldinger rig check missing.toml {closed}")
+    assert bad.returncode == 2 and "Traceback" not in bad.stderr
+
+
+def test_an_interrupt_that_compiled_code_turns_into_another_error_is_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba raises SystemError where KeyboardInterrupt came up in its callbacks."""
+
+    def interrupted(argv: list[str]) -> int:
+        with pytest.raises(KeyboardInterrupt):
+            command_line._interrupt(2, None)
+        raise SystemError("CPUDispatcher returned a result with an exception set")
+
+    monkeypatch.setattr(command_line._Interrupted, "yes", False)
+    monkeypatch.setattr(command_line, "_run", interrupted)
+    monkeypatch.setattr(command_line, "_report", lambda error, argv: pytest.fail(f"reported as {error!r}"))
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert ended.value.code == 1

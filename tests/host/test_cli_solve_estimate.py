@@ -245,10 +245,10 @@ def test_missing_files_are_refused() -> None:
 def test_standard_input_and_the_words_for_people(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps(PLANAR)))
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(json.dumps(PLANAR).encode())))
     solve("-")
     assert "tip (mm):        +114.4728  -28.3299" in capsys.readouterr().out
-    monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps(POSE)))
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(json.dumps(POSE).encode())))
     estimate("-")
     assert "standard deviation" in capsys.readouterr().out
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
-from protocol.errors import Description, InputError, reason
+from protocol.errors import InputError
 from protocol.requests import Request, validate
+from protocol.text_files import read_toml
 
 
 class ChannelSpec(Request):
@@ -389,14 +389,7 @@ def effect_of(text: str) -> EffectSpec:
 def read_nominal(path: Path | str) -> NominalSpec:
     """The nominal model in TOML file `path`. Raises InputError naming the key."""
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "nominal", Description(f"{path}: {reason(error)}"), "a readable TOML file, or the name of one that ships"
-        ) from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError("nominal", Description(f"{path}: {error}"), "valid TOML") from None
+    content = read_toml(path, "nominal", "a readable TOML file, or the name of one that ships")
     try:
         return nominal_of(content, path.parent)
     except InputError as error:

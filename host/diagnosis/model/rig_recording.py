@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.recordings.recording import RecordingFile
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 from protocol.rig_file import Rig, parse_rig
 
 Array = npt.NDArray[np.float64]
@@ -65,8 +65,8 @@ def _open(path: Path) -> RecordingFile:
         raise InputError("recording", str(path), "a file that exists")
     try:
         recording = RecordingFile(path)
-    except ValueError as error:
-        raise InputError("recording", str(error), "an MCAP recording of a rig") from None
+    except InputError as error:
+        raise InputError("recording", Description(f"{path.name}: {error.found}"), error.wanted) from None
     missing = [topic for topic in TOPICS if not recording.topics.get(topic)]
     if missing:
         raise InputError("recording", f"{path.name} without {', '.join(missing)}", "a recording of a running rig (MCAP)")

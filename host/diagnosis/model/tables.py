@@ -17,12 +17,14 @@ import numpy.typing as npt
 
 from host.recordings.recording import CHUNK_LIMIT_BYTES, unpack_chunk
 from protocol.errors import Description, InputError, reason
+from protocol.text_files import kind_of
 
 Array = npt.NDArray[np.float64]
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
 # A packed table may unpack to so much, or to so many times its own size where that is more.
 UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED = 256 * 2**20, 64
 _PIECE_BYTES = 2**20
+_HEAD_BYTES = 4096
 _MAT_COMPRESSED, _MAT_HEAD_BYTES = 15, 128
 
 
@@ -127,11 +129,30 @@ def _read_csv(path: Path, limit: int) -> Any:
         if len(content) > limit:
             raise _TooLarge
         source = pyarrow.BufferReader(content)
+    _refuse_other_separators(path, content if path.name.lower().endswith(".gz") else None)
     table = pyarrow.csv.read_csv(source, convert_options=options)
     for name, column in zip(table.column_names, table.columns, strict=True):
         if pyarrow.types.is_string(column.type):
             _refuse_text_among_numbers(path.name, name, column.to_pylist())
     return table
+
+
+def _refuse_other_separators(path: Path, unpacked: bytes | None) -> None:
+    """Raise InputError for a table that is no UTF-8 text, or has semicolons or tabs between its columns."""
+    if unpacked is None:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    else:
+        head = unpacked[:_HEAD_BYTES]
+    found = kind_of(head)
+    heading = head.partition(b"\n")[0]
+    if not found and b"," not in heading:
+        found = {b";": "semicolons between the columns", b"\t": "tabs between the columns"}.get(
+            next((mark for mark in (b";", b"\t") if mark in heading), b""), ""
+        )
+    if found:
+        wanted = "a text (UTF-8) with commas between the columns and points in the numbers"
+        raise InputError("recording", Description(f"{path.name}: {found}"), wanted)
 
 
 def _refuse_text_among_numbers(file: str, column: str, cells: list[str | None]) -> None:

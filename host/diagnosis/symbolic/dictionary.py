@@ -341,7 +341,7 @@ class _Sums:
     """Inner products, over the samples to fit and in units of noise, of forms, parameters and residual."""
 
     def __init__(self, problem: Problem, fit: Fit, noise_sd: Array, slopes: list[Array], responses: list[Response]) -> None:
-        unit = np.maximum(noise_sd, 1e-300)[:, None]
+        unit = np.maximum(noise_sd, 1e-100)[:, None]  # its square is a number too: recordings without noise exist
         count, rates = len(responses[0].table), len(slopes[0])
         gram, cross, pull = np.zeros((count, count)), np.zeros((count, rates)), np.zeros(count)
         own, start = np.zeros((rates, rates)), np.zeros(rates)
