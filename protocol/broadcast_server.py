@@ -20,17 +20,17 @@ class BroadcastServer:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port at which it listens."""
+        """Return host and port at which the server listens."""
         host, port = self._listener.getsockname()[:2]
         return str(host), int(port)
 
     @property
     def clients(self) -> int:
-        """Number of clients that are connected."""
+        """Return the number of connected clients."""
         return len(self._clients)
 
     def accept(self) -> None:
-        """Let in the clients that wait; read away what clients send."""
+        """Accept waiting clients; read and drop the bytes that clients send."""
         if self._listener.fileno() < 0:
             return
         with contextlib.suppress(BlockingIOError):
@@ -50,7 +50,7 @@ class BroadcastServer:
                     self._drop(client)
 
     def send(self, data: bytes) -> None:
-        """Send `data` whole to every client; one that does not take it whole is disconnected."""
+        """Send `data` to every client; disconnect a client that does not accept all of it."""
         for client in list(self._clients):
             try:
                 whole = client.send(data) == len(data)

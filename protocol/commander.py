@@ -34,14 +34,14 @@ class Acknowledgement:
 
 
 class Asker(Protocol):
-    """Whatever carries a command to a rig and its reply back: a zenoh session, or a rig in the same process."""
+    """Interface that sends a command to a rig and returns its reply: a zenoh session, or a rig in the same process."""
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        """The reply, None where no answer arrives in time."""
+        """Return the reply, None if no answer arrives in time."""
 
 
 class CommandSender:
-    """Commands one rig as `name`. Each method sends one command and returns its Acknowledgement; none raises.
+    """Commands one rig as `name`. Each method sends one command and returns its Acknowledgement; none raises an exception.
 
     session: as in Asker. clock_ns: this side's clock; the rig's is learnt from its replies. new_id: unique texts.
     Raises ValueError for a bad name.
@@ -63,7 +63,7 @@ class CommandSender:
         self._lock = threading.RLock()
 
     def take(self) -> Acknowledgement:
-        """Take the lease, or keep it for longer. Refused while another commander holds it."""
+        """Take the lease, or renew it. Refused while another commander holds it."""
         with self._lock:
             try:
                 reply = self._ask("take")
@@ -74,30 +74,30 @@ class CommandSender:
             return _said(reply)
 
     def release(self) -> Acknowledgement:
-        """Give the lease back. What moves goes on as commanded."""
+        """Release the lease. A motion in progress continues as commanded."""
         with self._lock:
             answer = self.give("release")
             self._lease, self._lease_expires_ns = "", 0
             return answer
 
     def arm(self) -> Acknowledgement:
-        """Arm the board and the loop; they hold."""
+        """Arm the board and the loop; the rig holds."""
         return self.give("arm")
 
     def disarm(self) -> Acknowledgement:
-        """Stages at rest, board disarmed."""
+        """Bring the stages to rest and disarm the board."""
         return self.give("disarm")
 
     def hold(self) -> Acknowledgement:
-        """Stay where it is. Needs no lease."""
+        """Hold the present position. Needs no lease."""
         return self.give("hold")
 
     def stop(self) -> Acknowledgement:
-        """Stop; only disarming and arming lead out of it. Needs no lease, is obeyed late too."""
+        """Stop; only disarming and arming end the stop. Needs no lease, and is obeyed even if it is late."""
         return self.give("stop")
 
     def clear_fault(self) -> Acknowledgement:
-        """Clear what is latched, and leave the rig disarmed."""
+        """Clear latched causes and faults; the rig is disarmed afterwards."""
         return self.give("clear_fault")
 
     def target(self, position_m: Sequence[float]) -> Acknowledgement:
@@ -109,11 +109,11 @@ class CommandSender:
         return self.give("target", "contact", target_m=position_m, normal=normal, force_N=force_N)
 
     def force(self, force_N: float) -> Acknowledgement:
-        """Another force (N) on the tissue that is pressed on."""
+        """Change the force (N) of the present touch."""
         return self.give("force", force_N=force_N)
 
     def retract(self) -> Acknowledgement:
-        """Away from the tissue, then stop."""
+        """Move away from the tissue, then stop."""
         return self.give("target", "retract")
 
     def jog(
@@ -127,15 +127,15 @@ class CommandSender:
         return self.give("zero")
 
     def home(self, axis: str) -> Acknowledgement:
-        """Move one axis of a disarmed rig to its switch. axis: insertion, roll or knob. The rig's log says how it ends."""
+        """Move one axis of a disarmed rig to its switch. axis: insertion, roll or knob. The rig's log states the result."""
         return self.give("home", axis=axis)
 
     def mark(self, note: str) -> Acknowledgement:
-        """Put a note into log and recording. Needs no lease."""
+        """Write a note into log and recording. Needs no lease."""
         return self.give("mark", note=note)
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """Any command (fields as in `protocol.topics.Command`), under the lease, which is renewed before it ends."""
+        """Send any command (fields as in `protocol.topics.Command`) under the lease, which is renewed in time."""
         try:
             fields = {name: _plain(value) for name, value in fields.items()}
             if action == "stop":
@@ -148,7 +148,7 @@ class CommandSender:
             return Acknowledgement(False, str(error), "malformed")
 
     def _stop(self) -> Acknowledgement:
-        """Waits for no lock and no other command; asks again where no answer arrives."""
+        """Stop without waiting for a lock or another command; repeat the request if no answer arrives."""
         for _ in range(_STOP_TRIES):
             reply = self._send("stop", "none", 0)
             if reply is not None:
@@ -157,7 +157,7 @@ class CommandSender:
 
     @property
     def lease_left_s(self) -> float:
-        """How long the lease lasts if it is not renewed; 0 without one."""
+        """Return the remaining time of the lease (s) if it is not renewed; 0 without a lease."""
         with self._lock:
             return (self._lease_expires_ns - self._now_ns()) * 1e-9 if self._holding() else 0.0
 
@@ -201,7 +201,7 @@ class CommandSender:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and vectors of any library as Python's own."""
+    """Return numbers and vectors of any library as Python's own types."""
     if value is None or isinstance(value, (str, bool)):
         return value
     return float(value) if isinstance(value, SupportsFloat) else tuple(float(part) for part in value)

@@ -35,6 +35,6 @@ def listen() -> None:
                 callback()
 
         def on_end(self, event: Any) -> None:
-            """Do nothing: numba's interface demands this method."""
+            """Do nothing; numba's interface requires this method."""
 
     event.register("numba:compile", CompileListener())

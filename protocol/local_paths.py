@@ -28,22 +28,22 @@ class LocalPaths:
 
     @property
     def zenoh_socket(self) -> Path:
-        """The socket on which the model process accepts zenoh."""
+        """Return the socket on which the model process accepts zenoh."""
         return self.folder / "zenoh.sock"
 
     @property
     def endpoint(self) -> str:
-        """The same as an endpoint of zenoh."""
+        """Return that socket as an endpoint of zenoh."""
         return f"unixsock-stream/{self.zenoh_socket}"
 
     @property
     def stop_socket(self) -> Path:
-        """The socket on which the realtime process takes `stop` and `status`."""
+        """Return the socket on which the realtime process accepts `stop` and `status`."""
         return self.folder / "stop.sock"
 
     @property
     def reply_key(self) -> Path:
-        """The key, new at each start of the realtime process, with which it proves its replies."""
+        """Return the file of the key with which the realtime process authenticates its replies; new at each start."""
         return self.folder / "reply.key"
 
     def prepare(self) -> LocalPaths:

@@ -18,7 +18,7 @@ LEAST_MARGIN_deg = 20.0
 
 
 def _margin_deg(gain: float, corners: tuple[float, ...], delay_s: float) -> float:
-    """Phase margin (degrees) of gain / s prod(1 + corner / s) e^(-s delay), corners in rad/s."""
+    """Return the phase margin (degrees) of gain / s prod(1 + corner / s) e^(-s delay), corners in rad/s."""
     if gain <= 0.0 or not all(math.isfinite(corner) for corner in corners):
         return 90.0 if gain <= 0.0 and not any(corners) else -90.0
     low, high = 1e-6, 1e6
@@ -31,7 +31,7 @@ def _margin_deg(gain: float, corners: tuple[float, ...], delay_s: float) -> floa
 
 
 def position_margin_deg(gain_per_s: float, integral_per_s2: float, delay_s: float) -> float:
-    """Of the position loop. delay_s: from the sampling of a pose to the stage. Without gain but with integral: -90."""
+    """Return the phase margin of the position loop (degrees). delay_s: from pose to stage. -90 with integral but no gain."""
     return _margin_deg(gain_per_s, (_corner(integral_per_s2, gain_per_s),), delay_s)
 
 
@@ -43,13 +43,13 @@ def force_margin_deg(
     stiffness_N_per_m: float,
     delay_s: float,
 ) -> float:
-    """Of the force loop around it, by a force sensor. delay_s: from the force to the stage."""
+    """Return the phase margin (degrees) of the force loop around it, with a force sensor. delay_s: from force to stage."""
     corners = (_corner(integral_per_s2, gain_per_s), _corner(force_integral_m_per_N_s, force_gain_m_per_N))
     return _margin_deg(gain_per_s * force_gain_m_per_N * stiffness_N_per_m, corners, delay_s)
 
 
 def _corner(integral: float, gain: float) -> float:
-    """Where the integral part takes over (rad/s)."""
+    """Return the frequency (rad/s) below which the integral part dominates."""
     if integral <= 0.0:
         return 0.0
     return integral / gain if gain > 0.0 else math.inf

@@ -32,17 +32,17 @@ def bounds(unit: str, low: float, high: float) -> Meta:
 
 
 def doc(text: str) -> Meta:
-    """Declare what a field means."""
+    """Declare a field with its meaning."""
     return Meta(description=text)
 
 
 def columns_of(text: str, columns: tuple[str, ...]) -> Meta:
-    """Declare what a vector means, and the name of the table column that each element makes."""
+    """Declare a vector with its meaning and the table column of each element."""
     return Meta(description=text, min_length=len(columns), max_length=len(columns), extra={"columns": columns})
 
 
 def choice(text: str, choices: tuple[str, ...]) -> Meta:
-    """Declare what a field means that is one of a few words."""
+    """Declare a field with its meaning and its allowed words."""
     return Meta(description=text, pattern=f"^(?:{'|'.join(choices)})\\Z", extra={"choices": choices})
 
 
@@ -256,7 +256,7 @@ def _types(message_class: type[Message]) -> dict[str, Any]:
 
 
 def _fault(message_class: type[Message], name: str, value: Any) -> str:
-    """Return what is wrong with one field, as "found ..., wanted ..."; empty where nothing is."""
+    """Return the fault of one field, as "found ..., wanted ..."; empty if there is none."""
     try:
         msgspec.convert(value, _types(message_class)[name])
     except (ValueError, TypeError, OverflowError):
@@ -275,7 +275,7 @@ def _body_explanation(message_class: type[Message], body: dict[str, Any]) -> str
 
 
 def _explanation(message_class: type[Message], payload: bytes, error: Exception | None) -> str:
-    """Return the one line that says why `payload` is refused."""
+    """Return the reason why `payload` is refused, in one line."""
     try:
         body = _any_decoder.decode(payload)
     except (ValueError, RecursionError, TypeError) as unreadable:

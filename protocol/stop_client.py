@@ -45,7 +45,7 @@ class PathAnswer:
 
 
 def shows_stop(mode: str, safety_action: str) -> bool:
-    """Whether a rig in phase `mode` has obeyed a stop: at rest, or on its way out of contact because of the stop.
+    """Return whether a rig in phase `mode` has obeyed a stop: at rest, or moving out of contact because of the stop.
 
     A retraction that the failsafe demands by itself has the action `retract`, not `stop`.
     """
@@ -127,5 +127,5 @@ def stop_over(
 
 
 def still_asking() -> bool:
-    """Whether a path of `stop_over` in this process has not come to its end yet."""
+    """Return whether a path of `stop_over` in this process is still waiting."""
     return any(thread.name.startswith(_ASKING) for thread in threading.enumerate())

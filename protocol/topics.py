@@ -93,7 +93,7 @@ _BUCKETS = tuple(f"tick_bucket_{bucket:02d}" for bucket in range(HISTOGRAM_BUCKE
 
 
 def histogram_bucket(time_us: float) -> int:
-    """The bucket of `time_us` in the loop's time histograms, 0 .. HISTOGRAM_BUCKETS - 1."""
+    """Return the bucket of `time_us` in the loop's time histograms, 0 to HISTOGRAM_BUCKETS - 1."""
     if time_us < 1.0:
         return 0
     return min(HISTOGRAM_BUCKETS - 1, int(4 * math.log2(time_us)))
@@ -501,7 +501,7 @@ class Alarm(Message, frozen=True, kw_only=True):
 
 
 class SimulatedTruth(Message, frozen=True, kw_only=True):
-    """True values that only a simulator knows. For reports; no controller, estimator or verdict reads them."""
+    """True values of the simulator. For reports only; no controller, estimator or verdict reads them."""
 
     tip_m: Annotated[tuple[Place_m, ...], columns_of("true tip, base frame", _triple("tip", "m"))]
     wall_m: Annotated[tuple[Place_m, ...], columns_of("point of the wall, base frame", _triple("wall", "m"))] | None = None
@@ -552,7 +552,7 @@ _KEY = re.compile(r"seldinger/v(\d+)/([a-z0-9_]{1,32})/(.+)")
 
 
 def key(rig: str, name: str) -> str:
-    """The zenoh key of topic `name` on rig `rig`. Raises ValueError for an unknown topic or a bad rig name."""
+    """Return the zenoh key of topic `name` on rig `rig`. Raises ValueError for an unknown topic or a bad rig name."""
     if name not in TOPICS:
         raise ValueError(f"topic: found {name!r}, wanted one of {', '.join(TOPICS)}")
     if not _RIG.fullmatch(rig):
@@ -561,19 +561,19 @@ def key(rig: str, name: str) -> str:
 
 
 def check_name(name: str) -> str:
-    """`name` if a commander or reader may bear it. Raises ValueError."""
+    """Return `name` if it is allowed for a commander or reader. Raises ValueError."""
     if not _NAME.fullmatch(name):
         raise ValueError(f"commander: found {name[:40]!r}, wanted 1 to 32 of a-z, 0-9, - and _")
     return name
 
 
 def request_key(rig: str, name: str) -> str:
-    """The zenoh key on which commander `name` of rig `rig` asks; `*` for all of them. Raises ValueError."""
+    """Return the zenoh key of the requests of commander `name` of rig `rig`; `*` for all of them. Raises ValueError."""
     return f"{key(rig, 'request')}/{name if name == '*' else check_name(name)}"
 
 
 def topic_of(key_expression: str) -> tuple[str, Topic]:
-    """(rig, topic) of a key. Raises ValueError for a key of another version, an unknown topic or anything else."""
+    """Return (rig, topic) of a key. Raises ValueError for a key of another version, an unknown topic or anything else."""
     match = _KEY.fullmatch(key_expression)
     if not match or match[1] != str(SCHEMA_VERSION) or match[3] not in TOPICS:
         raise ValueError(f"key: found {key_expression[:80]!r}, wanted seldinger/v{SCHEMA_VERSION}/<rig>/<topic>")

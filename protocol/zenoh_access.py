@@ -18,7 +18,7 @@ _TLS = re.compile(r"tls/(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]{1,253}):(\d{1,5})")
 
 @dataclass(frozen=True)
 class Network:
-    """What a rig offers to other machines: where, with whose keys (a folder), and who may read and who command."""
+    """Access of other machines to a rig: endpoints, folder of the keys, and the names of readers and commanders."""
 
     rig: str
     listen: tuple[str, ...]
@@ -28,17 +28,17 @@ class Network:
 
     @property
     def roles(self) -> dict[str, str]:
-        """Name -> role of those whom the rig file lists."""
+        """Return name -> role of the clients that the rig file lists."""
         return dict.fromkeys(self.readers, "reader") | dict.fromkeys(self.commanders, "commander")
 
 
 def common_name(role: str, name: str) -> str:
-    """The common name of a certificate: the authority, not the rig file, says what its holder may be admitted as."""
+    """Return the common name of a certificate; it contains the role, so that the rig file cannot change the role."""
     return f"{role}.{name}"
 
 
 def check_network_endpoint(endpoint: str) -> str:
-    """`endpoint` if it is TLS, on a host and a port. Raises ValueError: nothing else crosses between machines."""
+    """Return `endpoint` if it is TLS with host and port. Raises ValueError, because other machines connect by TLS only."""
     match = _TLS.fullmatch(endpoint)
     if not match or not 0 < int(match[2]) < 65536:
         raise ValueError(f"endpoint: found {endpoint!r}, wanted tls/ADDRESS:PORT")
@@ -78,7 +78,7 @@ def client_settings(endpoint: str, folder: Path) -> dict[str, Any]:
 
 
 def network_settings(network: Network) -> dict[str, Any]:
-    """Configuration keys of zenoh for the session that listens to other machines."""
+    """Return zenoh's configuration keys for the session that listens to other machines."""
     missing = [name for name in (CA_FILE, CERTIFICATE_FILE, KEY_FILE) if not (network.keys / name).is_file()]
     if missing:
         raise ValueError(
@@ -98,7 +98,7 @@ def network_settings(network: Network) -> dict[str, Any]:
 
 
 def readable(rig: str) -> list[str]:
-    """The keys that readers may subscribe to: every topic that is published, each by name, and all at once."""
+    """Return the keys that readers may subscribe to: every published topic by name, and all together."""
     return [key(rig, name) for name, topic in TOPICS.items() if topic.kind != "query"]
 
 

@@ -58,7 +58,7 @@ _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
 def check_endpoint(endpoint: str) -> str:
-    """`endpoint` if it stays on this machine: tcp on a loopback address, or a unix socket. Raises ValueError."""
+    """Return `endpoint` if it stays on this machine: tcp on a loopback address, or a unix socket. Raises ValueError."""
     wanted = f"endpoint: found {endpoint!r}, wanted tcp/127.0.0.1:PORT, tcp/[::1]:PORT or unixsock-stream/PATH"
     if endpoint.startswith("unixsock-stream/") and not re.search(r"[#?;\s]", endpoint) and len(endpoint) > 16:
         return endpoint
@@ -75,7 +75,7 @@ def check_endpoint(endpoint: str) -> str:
 
 
 def configuration(listen: list[str], connect: list[str], network: Network | None = None) -> zenoh.Config:
-    """A zenoh configuration that listens and connects there and nowhere else. Raises ValueError for other endpoints.
+    """Return a zenoh configuration with these endpoints only. Raises ValueError for endpoints outside this machine.
 
     network: what it also listens on for other machines; without it nothing leaves this one.
     """
@@ -97,7 +97,7 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
 
 
 class Publisher:
-    """Publishes one topic, numbered. `put` never blocks: what a reader cannot take in time is dropped.
+    """Publishes one topic, numbered. `put` never blocks: a message that a reader does not read in time is dropped.
 
     refused, complaint: how many messages were not sent because a field was out of bounds, and the newest reason.
     """
@@ -112,7 +112,7 @@ class Publisher:
         )
 
     def put(self, message: Message) -> None:
-        """Publish `message`, or count it as refused: a device that reports nonsense must not end the thread that reads it.
+        """Publish `message`, or count it as refused, so that a wrong value of a device does not end its thread.
 
         Raises:
             TypeError: The message is of another topic's class.
@@ -130,7 +130,7 @@ class Publisher:
 
 
 class Latest:
-    """The newest value of one topic. Older ones are gone; malformed ones are counted, never returned."""
+    """The newest value of one topic. Older ones are dropped; malformed ones are counted and not returned."""
 
     def __init__(self, session: zenoh.Session, rig: str, topic: str) -> None:
         self.topic = TOPICS[topic]
@@ -139,7 +139,7 @@ class Latest:
         self._subscriber = session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(1))
 
     def take(self) -> Message | None:
-        """The newest message since the last call, None where there is none or it is malformed."""
+        """Return the newest message since the last call, None if there is none or it is malformed."""
         sample = self._subscriber.try_recv()
         if sample is None:
             return None
@@ -152,7 +152,7 @@ class Latest:
 
 
 class Everything:
-    """All topics of a rig, in order, for a recorder: deep rings that lose their oldest when it does not keep up."""
+    """All topics of a rig, in order, for a recorder; long queues that drop their oldest messages if it is too slow."""
 
     def __init__(self, session: zenoh.Session, rig: str, depth: int = RECORDER_DEPTH) -> None:
         self.malformed = 0
@@ -162,7 +162,7 @@ class Everything:
         self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth)) for name in names]
 
     def take(self) -> list[tuple[str, Message, bytes]]:
-        """(topic, message, payload) of all that came since the last call, topic by topic."""
+        """Return (topic, message, payload) of all messages since the last call, topic by topic."""
         taken = []
         for subscriber in self._subscribers:
             # No more than a ring holds: a publisher that is faster than this reader must not keep it here.
@@ -271,7 +271,7 @@ class Session:
 
     @classmethod
     def of_rig(cls, rig: Rig) -> Session:
-        """A session that connects to the rig of a rig file on this computer."""
+        """Open a session to the rig of a rig file on this computer."""
         return cls(rig.name, [], rig.connect_endpoints, local=rig.local)
 
     @classmethod
@@ -288,7 +288,7 @@ class Session:
 
     @classmethod
     def remote(cls, rig: str, endpoint: str, keys: Path) -> Session:
-        """A session to a rig on another machine, with the certificate in folder `keys`.
+        """Open a session to a rig on another machine, with the certificate in folder `keys`.
 
         Raises ValueError for an endpoint that is not TLS, OSError where no one answers or the certificate is refused.
         """
@@ -299,15 +299,15 @@ class Session:
         return session
 
     def publisher(self, topic: str) -> Publisher:
-        """A publisher of `topic`."""
+        """Return a publisher of `topic`."""
         return Publisher(self.zenoh, self.rig, topic)
 
     def latest(self, topic: str) -> Latest:
-        """The newest value of `topic`, for who steers by it."""
+        """Return the newest value of `topic`, for a reader that needs only the newest."""
         return Latest(self.zenoh, self.rig, topic)
 
     def everything(self) -> Everything:
-        """All topics, for who records."""
+        """Return all topics, for a recorder."""
         return Everything(self.zenoh, self.rig)
 
     def serve_requests(
@@ -319,7 +319,7 @@ class Session:
         return server
 
     def ask(self, command: Command, timeout_s: float = 1.0) -> Reply | None:
-        """Send `command`, wait for its reply; None where no answer arrives in time: it may or may not have arrived.
+        """Send `command` and wait for its reply; None if no answer arrives in time. The command may still have arrived.
 
         Every program that says it answers requests gets the command: an impostor cannot keep it from the rig. Of the
         replies the first counts that is one to this command and, on the rig's computer, is proved.

@@ -102,5 +102,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Names of the public face."""
+    """Return the names of the public functions and types."""
     return __all__

@@ -16,7 +16,7 @@ OFFSET_JUMP_NS = 50_000_000
 
 
 def axis_limits(rig: Rig) -> tuple[AxisLimits, ...]:
-    """Return the limits of the three axes in steps that the board enforces: above the loop's own by the rounding."""
+    """Return the limits of the three axes in steps that the board enforces: those of the loop, widened by the rounding."""
     limits = []
     for axis in range(3):
         stage = rig.stage(axis)

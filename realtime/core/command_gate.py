@@ -55,7 +55,7 @@ class _Bucket:
 
 
 class CommandGate:
-    """Checks what arrives on `request/NAME`, and passes accepted commands to `execute`. A refused one changes nothing.
+    """Checks commands on `request/NAME`, and passes accepted ones to `execute`. A refused command changes nothing.
 
     Args:
         now_ns: the rig's clock.
@@ -160,7 +160,7 @@ class CommandGate:
         return self._execute(command, now_ns)
 
     def _stale(self, command: Command, now_ns: int) -> tuple[str, str]:
-        """Return a result, and why the command is too old, too new or a repetition; no text when it is none of these."""
+        """Return the result and the reason if the command is too old, too new or a repetition; an empty reason otherwise."""
         if now_ns > command.expires_ns:
             return "expired", f"came {(now_ns - command.expires_ns) * 1e-9:.3f} s after its expiry"
         if command.stamp_ns > now_ns + AHEAD_NS:
@@ -183,7 +183,7 @@ class CommandGate:
         return "accepted", ""
 
     def _unleased(self, command: Command, now_ns: int) -> tuple[str, str]:
-        """Return a result, and why the command's lease does not permit it; no text when it does, or none is needed."""
+        """Return the result and the reason if the command's lease does not permit it; an empty reason otherwise."""
         if command.action in _NEEDS_NO_LEASE:
             return "accepted", ""
         lease = self._lease

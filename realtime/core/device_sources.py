@@ -37,13 +37,13 @@ Sample = TypeVar("Sample")
 
 
 class DeviceSource(Protocol[Sample]):
-    """A device that is open. Samples have times of CLOCK_MONOTONIC, ns, and are in the tracker's or the sensor's frame."""
+    """An open device. Samples have times of CLOCK_MONOTONIC, ns, and are in the tracker's or the sensor's frame."""
 
     def read(self) -> list[Sample]:
-        """Return what has come since the last call; wait for it at most 50 ms. Raises OSError when the device is gone."""
+        """Return the samples since the last call; wait for them at most 50 ms. Raises OSError if the device is gone."""
 
     def close(self) -> None:
-        """Release the device."""
+        """Release the port or socket of the device."""
 
 
 OpenTracker = Callable[[Tracker], DeviceSource[PoseSample]]

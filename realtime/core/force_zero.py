@@ -32,7 +32,7 @@ class ForceZero:
         self._readings_N, self._count, self._newest_ns = np.zeros((READINGS, 3)), 0, 0
 
     def take(self, force_N: Array, arrival_ns: int) -> None:
-        """Take in a reading (sensor frame, (3,) N) as the driver gave it, without any zero."""
+        """Store a reading (sensor frame, (3,) N) as the driver gave it, without any zero."""
         self._readings_N[self._count % READINGS] = force_N
         self._count += 1
         self._newest_ns = arrival_ns

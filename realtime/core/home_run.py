@@ -54,7 +54,7 @@ class HomeRun:
 
     @property
     def text(self) -> str:
-        """How it ended, in one line."""
+        """Return the result of the homing as one line."""
         if self.problem:
             return f"{self.problem}; not homed, the rig is disarmed"
         return (
@@ -84,7 +84,7 @@ class HomeRun:
         return self._come_to_rest(now_ns)
 
     def _check(self, now_ns: int, force_N: float) -> None:
-        """End it where the board is lost or the tip presses."""
+        """End the homing if the board is lost or the tip presses."""
         status, limit_N = self._link.status, self._rig.safety.over_force_N
         if self._link.phase not in (LinkPhase.READY, LinkPhase.CONFIGURE):
             self.end(f"found the board link in phase {self._link.phase.value}, wanted ready")
@@ -94,7 +94,7 @@ class HomeRun:
             self.end(f"found a force of {force_N:.2f} N, wanted at most safety.over_force_N {limit_N}")
 
     def _come_to_rest(self, now_ns: int) -> bytes:
-        """Disarm, wait for rest, and give the board the rig file's limits again."""
+        """Disarm, wait for rest, and send the rig file's limits to the board again."""
         if self._end_ns is None:
             self._end_ns = now_ns
             return self._link.disarm()

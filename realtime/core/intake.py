@@ -9,7 +9,7 @@ from protocol.topics import ForceEstimate
 
 
 def rotation(quaternion_wxyz: tuple[float, ...] | np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (4,), scalar first; (3.15) corrected."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,), scalar first; (3.15) corrected."""
     w, x, y, z = quaternion_wxyz
     return np.array(
         [
@@ -21,7 +21,7 @@ def rotation(quaternion_wxyz: tuple[float, ...] | np.ndarray) -> np.ndarray:
 
 
 def quaternion_product(a: tuple[float, ...] | np.ndarray, b: tuple[float, ...] | np.ndarray) -> np.ndarray:
-    """Hamilton product (4,) of two quaternions, scalar first: the rotation b, then a."""
+    """Return the Hamilton product (4,) of two quaternions, scalar first: the rotation b, then a."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return np.array(
@@ -48,21 +48,21 @@ class Intake:
     def pose(
         self, record: np.record, stamp_ns: int, arrival_ns: int, position_m: np.ndarray, quaternion_wxyz: np.ndarray
     ) -> None:
-        """A tracker pose (tracker frame: position (3,) m, quaternion (4,)) into a POSE record (base frame)."""
+        """Write a tracker pose (tracker frame: position (3,) m, quaternion (4,)) into a POSE record (base frame)."""
         record.count += 1
         record.stamp_ns, record.arrival_ns = stamp_ns, arrival_ns
         record.position_m[:] = self._tracker_rotation @ np.asarray(position_m) + self._tracker_shift_m
         record.quaternion_wxyz[:] = quaternion_product(self._tracker_turn, quaternion_wxyz)
 
     def force(self, record: np.record, stamp_ns: int, arrival_ns: int, force_N: np.ndarray) -> None:
-        """A force reading (sensor frame, (3,) N) into a FORCE record (base frame, force on the tissue)."""
+        """Write a force reading (sensor frame, (3,) N) into a FORCE record (base frame, force on the tissue)."""
         record.count += 1
         record.stamp_ns, record.arrival_ns = stamp_ns, arrival_ns
         record.force_N[:] = self._sensor_rotation @ (np.asarray(force_N) - self.zero_N)
 
     @staticmethod
     def estimate(record: np.record, estimate: ForceEstimate, arrival_ns: int) -> bool:
-        """A force estimate (base frame, on the tissue) into a FORCE record. Return whether it has a force."""
+        """Write a force estimate (base frame, on the tissue) into a FORCE record. Return whether it has a force."""
         force_N, covariance_N2 = estimate.force_N, estimate.covariance_N2
         if not estimate.converged or force_N is None or covariance_N2 is None:
             return False

@@ -15,7 +15,7 @@ from realtime.drivers.net_ft_calibration import NetFtCalibration
 
 @dataclass
 class FromRig:
-    """What has reached the computer: bytes of the board and the tracker, datagrams of the force sensor."""
+    """Data that has reached the computer: bytes of the board and the tracker, datagrams of the force sensor."""
 
     board: bytes = b""
     tracker: bytes = b""
@@ -24,7 +24,7 @@ class FromRig:
 
 @dataclass
 class ToRig:
-    """What the computer sends. `tracker_line` is carried out on the tracker's line before its bytes go."""
+    """Data that the computer sends. `tracker_line` is carried out on the tracker's line before its bytes are sent."""
 
     board: bytes = b""
     tracker: bytes = b""
@@ -33,7 +33,7 @@ class ToRig:
 
 
 class Readings(NamedTuple):
-    """What the sensor drivers made of the bytes that arrived."""
+    """Poses, forces and events that the sensor drivers decoded from the received bytes."""
 
     poses: list[PoseSample]
     forces: list[ForceSample]

@@ -22,7 +22,7 @@ Publish = Callable[[str, Message], None]
 
 
 def _nothing(topic: str, message: Message) -> None:
-    """The default of `publish`."""
+    """Drop the message; the default of `publish`."""
 
 
 class LockstepLoop:
@@ -55,11 +55,11 @@ class LockstepLoop:
 
     @property
     def now_ns(self) -> int:
-        """The computer's clock at the newest period."""
+        """Return the computer's clock (ns) at the newest period."""
         return self.core.now_ns
 
     def step(self, now_ns: int, arriving: FromRig) -> ToRig:
-        """Run one period: what arrived goes in, the tick runs, what is to be sent comes out."""
+        """Run one period: process the received data, run the tick, return the data to send."""
         if self.core.now_ns:
             self.missed_ticks += max(round((now_ns - self.core.now_ns) / self.period_ns) - 1, 0)
         readings = self.sensors.feed(arriving, now_ns)
@@ -76,7 +76,7 @@ class LockstepLoop:
         return self.sensors.outgoing(setpoint + commands, now_ns)
 
     def request(self, name: str, payload: bytes) -> Reply | None:
-        """Answer what commander `name` asks, at the time of the newest period."""
+        """Answer a request of commander `name`, at the time of the newest period."""
         return self._step_core(self.now_ns, Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
     def estimate_at(self, estimate: ForceEstimate) -> None:

@@ -27,7 +27,7 @@ _ZERO_PHASES = (Phase.DISARMED, Phase.HOLD, Phase.STOPPED)
 
 
 class RigPosition(NamedTuple):
-    """Where the rig is after the newest tick.
+    """State of the rig after the newest tick.
 
     phase; tip_m and goal_m (3,), predicted tip and moving goal; stage_unit (3,), the set-point; force_N (3,), on the tissue.
     """
@@ -69,7 +69,7 @@ class OperatorCommands:
 
     @property
     def armed(self) -> bool:
-        """Whether the loop is to be armed."""
+        """Return whether the loop is to be armed."""
         return bool(self._record.armed)
 
     def take_frames(self) -> list[bytes]:
@@ -78,7 +78,7 @@ class OperatorCommands:
         return frames
 
     def set_watched_causes(self, causes: int) -> None:
-        """Hand the causes that the supervision found to the tick: a bit set of `realtime.control.safety`."""
+        """Pass the causes that the supervision found to the tick: a bit set of `realtime.control.safety`."""
         self._record.watch = causes
 
     def execute(self, command: Command, now_ns: int) -> Reply:
@@ -100,7 +100,7 @@ class OperatorCommands:
         return Reply(stamp_ns=now_ns, id=command.id, result="refused" if problem else "accepted", text=problem)
 
     def device_returned(self, device: str, force_source: ForceSource, phase: Phase) -> str:
-        """Disarm, because `device` was lost and is back. Return a line for the log, empty where nothing was armed.
+        """Disarm, because `device` was lost and is back. Return a line for the log, empty if nothing was armed.
 
         A force sensor that the estimate has replaced in contact does not disarm: the loop never lost the force, and uses
         the sensor again when both agree (`force_source.py`). force_source and phase are those of the newest tick.
@@ -192,7 +192,7 @@ class OperatorCommands:
         return ""
 
     def _jog(self, command: Command) -> str:
-        """Start or extend a jog, or say which limit binds."""
+        """Start or extend a jog, or return the limit that forbids it."""
         if not self._record.armed:
             return "jog: found the rig disarmed, wanted armed"
         axis, travel, speed = JogAxis[command.axis.upper()], command.travel_unit or 0.0, command.speed_unit_per_s or 0.0
@@ -222,7 +222,7 @@ class OperatorCommands:
         return ""
 
     def _pressing(self, axis: JogAxis, travel: float, direction: npt.NDArray[np.float64], here: RigPosition) -> str:
-        """Say that the tip presses on something and that this jog does not lead away from it."""
+        """Return the reason if the tip presses on something and this jog does not lead away from it; empty otherwise."""
         force_N = float(np.linalg.norm(here.force_N))
         if force_N <= self._rig.control.contact_force_N:
             return ""
@@ -236,7 +236,7 @@ class OperatorCommands:
         )
 
     def _beyond(self, axis: JogAxis, travel: float, direction: npt.NDArray[np.float64], here: RigPosition) -> str:
-        """Say which limit the jog would pass: workspace and reach for the tip, travel for an axis."""
+        """Return the limit that the jog would exceed: workspace and reach for the tip, travel for an axis; empty if none."""
         if axis is JogAxis.TIP:
             start_m = here.goal_m if here.phase is Phase.JOG else here.tip_m
             return self._reach.problem(tuple(float(value) for value in start_m + travel * direction))
@@ -259,7 +259,7 @@ class OperatorCommands:
         return self._zero_force()
 
     def _home(self, command: Command) -> str:
-        """Start to move an axis to its switch, or say why not. Stop, hold and disarm end it."""
+        """Start to move an axis to its switch, or return the reason against it. Stop, hold and disarm end the motion."""
         axis = AXES.index(command.axis)
         if self._record.armed:
             return "home: found the rig armed, wanted disarmed"

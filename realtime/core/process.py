@@ -30,7 +30,7 @@ _TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command r
 
 
 class RealtimeProcess:
-    """Everything of the process, from `start` to `stop`. Ports as in the rig file, or given here.
+    """The realtime process from `start` to `stop`. Ports are those of the rig file, or given here.
 
     Each thread hands what arrived to the core, one thread at a time; the compiled loop reads the core's records from
     mailboxes and is the only one that writes to the board.
@@ -120,20 +120,20 @@ class RealtimeProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the loop runs and no thread has failed."""
+        """Return whether the loop runs and no thread has failed."""
         return self.loop.alive and self._board.failure is None
 
     @property
     def error(self) -> BaseException | None:
-        """What ended the loop or the board's thread."""
+        """Return the exception that ended the loop or the board's thread, None if none did."""
         return self.loop.error or self._board.failure
 
     def request(self, name: str, payload: bytes) -> Reply | None:
-        """Answer what commander `name` asks; called on a thread of zenoh's."""
+        """Answer a request of commander `name`; called on a thread of zenoh."""
         return self.shared.step(Arrived(requests=[CommandRequest(name, payload)])).replies[0]
 
     def counts(self) -> CommandCounts:
-        """Return who holds the lease, and what became of the commands so far."""
+        """Return the holder of the lease, and the counts of commands by result."""
         return self.core.gate.state()
 
     def log(self, level: str, text: str) -> None:

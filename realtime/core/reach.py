@@ -20,7 +20,7 @@ class TargetReach:
         self._rig, self._kinematics = rig, tick_parameters(rig)[0].kinematics
 
     def problem(self, target_m: Vector) -> str:
-        """Return why the tip cannot go to `target_m` (3,), base frame, as one sentence; empty where it can."""
+        """Return the reason why the tip cannot go to `target_m` (3,), base frame, as one sentence; empty if it can."""
         low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
         for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
             if not least <= value <= most:

@@ -62,7 +62,7 @@ class Tick(NamedTuple):
 
 @dataclass
 class Arrived:
-    """What has arrived since the last step. Each field may be empty.
+    """Data that has arrived since the last step. Each field may be empty.
 
     Attributes:
         ticks: ticks that have run since the last step, in order.
@@ -89,7 +89,7 @@ class Arrived:
 
 @dataclass
 class Leaving:
-    """What leaves after a step.
+    """Data to be sent after a step.
 
     Attributes:
         changed: names of the input records that were filled, for the shell to hand to the tick.
@@ -109,7 +109,7 @@ class Leaving:
 
 
 class RigCore:
-    """Turns what arrived into what leaves, one `step` at a time. Not for two threads at once.
+    """Turns received data into data to be sent, one `step` at a time. Only one thread may use it at a time.
 
     Args:
         rig: the rig file.
@@ -153,7 +153,7 @@ class RigCore:
         self._cause_seen_ns: dict[int, int] = {}
 
     def step(self, now_ns: int, arrived: Arrived) -> Leaving:
-        """Take in what has arrived by `now_ns` (the rig's clock, ns) and return what leaves.
+        """Process the data that has arrived by `now_ns` (the rig's clock, ns) and return the data to be sent.
 
         Past ticks come first: everything below is judged by the phase that the loop is in now.
         """
@@ -262,7 +262,7 @@ class RigCore:
 
     @property
     def _located(self) -> bool:
-        """Whether a pose of the tip has arrived."""
+        """Return whether a pose of the tip has arrived."""
         return bool(self._records["tip"].count > 0)
 
     # --- devices ---
@@ -321,7 +321,7 @@ class RigCore:
             self._log("warning", device, text)
 
     def _standing(self) -> RigPosition:
-        """Return where the rig stands after the newest tick."""
+        """Return the state of the rig after the newest tick."""
         y = self._outputs
         if y is None:
             return RigPosition()
@@ -329,7 +329,7 @@ class RigCore:
         return RigPosition(self.phase, *vectors)
 
     def _zero_force(self) -> str:
-        """Make the force sensor's present load its zero, and log it. Return why it cannot be done, empty when it was."""
+        """Make the force sensor's present load its zero, and log it. Return the reason if it is refused, empty otherwise."""
         try:
             zero_N = self._force_zero.measure(self.now_ns)
         except InputError as error:
@@ -345,7 +345,7 @@ class RigCore:
         return ""
 
     def _silent_sensors(self) -> str:
-        """Return the sensors that the loop needs and that have sent nothing for longer than the failsafe allows."""
+        """Return the names of the sensors that the loop needs and that sent no data for longer than the failsafe allows."""
         limit_ns = round(self.rig.safety.stop_after_s * 1e9)
         by_sensor = self.params[0].force_source == ForceSource.SENSOR
         force, name = ("sensor", "the force sensor") if by_sensor else ("estimate", "the model process")
@@ -369,7 +369,7 @@ class RigCore:
             self._log("warning", "supervision", finding.text)
 
     def _hand_over_causes(self) -> None:
-        """Hand the causes that the supervision has found, and those that are over, to the tick."""
+        """Pass the causes that the supervision has found, and those that have ended, to the tick."""
         if self.supervision.causes != self._watched:
             self._watched = self.supervision.causes
             self.commands.set_watched_causes(self._watched)

@@ -15,7 +15,7 @@ logger = logging.getLogger("seldinger.realtime")
 
 
 class SharedCore:
-    """A RigCore behind a lock, joined with the compiled loop that ticks.
+    """A RigCore with a lock, connected with the compiled loop that ticks.
 
     Args:
         core: the rig's core.
@@ -38,7 +38,7 @@ class SharedCore:
         self._unpublished: list[tuple[str, Message]] = []
 
     def step(self, arrived: Arrived) -> Leaving:
-        """Take the core one step further, with all ticks that have run meanwhile, and publish what comes of it."""
+        """Step the core with all ticks that have run since the last step, and publish its messages."""
         leaving = self.take(arrived)
         with self._publish_lock:
             messages, self._unpublished = self._unpublished, []
@@ -49,7 +49,7 @@ class SharedCore:
         return leaving
 
     def take(self, arrived: Arrived, wait_s: float = -1.0) -> Leaving:
-        """Take the core one step further; its messages wait for the next `step`.
+        """Step the core; its messages wait for the next `step`.
 
         Raises TimeoutError where another thread works in the core for longer than `wait_s` (-1: waits without a limit).
         """
@@ -68,7 +68,7 @@ class SharedCore:
         return leaving
 
     def shut_down(self, wait_s: float) -> None:
-        """Disarm. A core that another thread does not leave within `wait_s` is left as it is."""
+        """Disarm. If another thread uses the core for longer than `wait_s`, leave it as it is."""
         if self._lock.acquire(timeout=wait_s):
             try:
                 self._send(self._core.shut_down())

@@ -30,14 +30,14 @@ MAX_CLIENTS = 32
 
 @dataclass(frozen=True)
 class Peer:
-    """The program that asks, as the kernel knows it."""
+    """The program at the other end of the socket, as the kernel identifies it."""
 
     pid: int
     uid: int
 
     @property
     def commander(self) -> str:
-        """Its name as a commander."""
+        """Return the peer's name as a commander."""
         return f"socket-uid-{self.uid}"
 
     def __str__(self) -> str:
@@ -53,7 +53,7 @@ class _Request(socketserver.StreamRequestHandler):
     server: _Server
 
     def handle(self) -> None:
-        """Answer one line. A client that sends none, or leaves before the answer, is disconnected."""
+        """Answer one line. Disconnect a client that sends no line, or leaves before the answer."""
         with contextlib.suppress(OSError):
             word = self.rfile.readline(LONGEST_REQUEST).strip().decode("ascii", "replace")
             pid, uid, _ = peer_credentials(self.connection)
@@ -82,13 +82,13 @@ class _Server(socketserver.ThreadingUnixStreamServer):
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Close a client's connection."""
+        """Remove a client from the list and close its connection."""
         with self._lock, contextlib.suppress(ValueError):
             self._clients.remove(request)
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """One client's failure ends nothing but its own connection."""
+        """Ignore the failure of one client; only its own connection ends."""
 
 
 class StopListener:
@@ -112,11 +112,11 @@ class StopListener:
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="stop", daemon=True)
 
     def start(self) -> None:
-        """Answer from now on."""
+        """Start the thread that answers."""
         self._thread.start()
 
     def close(self) -> None:
-        """End, and remove the socket where it is still this one."""
+        """Stop the thread, and remove the socket if it is still this one."""
         if self._thread.is_alive():
             self._server.shutdown()
         self._server.server_close()

@@ -44,7 +44,7 @@ class StopPath:
         }
 
     def stop(self, peer: Peer) -> dict[str, Any]:
-        """Stop the rig for the program `peer`; return what was done and whether the rig's state shows it.
+        """Stop the rig for the program `peer`; return the action and whether the rig's state shows it.
 
         If the core does not take the command, because a thread that works in it hangs, the loop is ended: without
         set-points the board stops the stages after its dead-man time.

@@ -23,7 +23,7 @@ HOST_SILENT_NS, HOST_LATE_NS = 250_000_000, 200_000_000
 
 
 class SupervisionFinding(NamedTuple):
-    """What a check found. `cause` is a bit of `realtime.control.safety`, 0 where the finding is only logged."""
+    """Result of a check. `cause` is a bit of `realtime.control.safety`, 0 if the finding is only logged."""
 
     cause: int
     text: str
@@ -39,7 +39,7 @@ class StepCheck:
         self._messages = 0
 
     def restart(self) -> None:
-        """Take the difference at the next status as right; for arming."""
+        """Take the difference at the next status as the reference; for arming."""
         self._difference_at_rest, self._steps, self._messages = None, None, 0
 
     def check(self, position_steps: Vector, encoder_counts: Vector) -> SupervisionFinding | None:
@@ -62,7 +62,7 @@ class StepCheck:
 
 
 class HostCheck:
-    """Whether the model process answers, and in time. Nothing is found before its first answer.
+    """Checks whether the model process answers in time. There is no finding before its first answer.
 
     `causes`, a bit set, holds the failsafe causes that stood at the last `overdue`: none, HOST_SILENT, or HOST_LOST as well.
 
@@ -77,14 +77,14 @@ class HostCheck:
         self.causes = 0
 
     def answered(self, stamp_ns: int, now_ns: int) -> SupervisionFinding | None:
-        """Take in an estimate for a pose of `stamp_ns` that arrived at `now_ns` (ns)."""
+        """Note an estimate for a pose of `stamp_ns` that arrived at `now_ns` (ns)."""
         self._answered_ns = now_ns
         late = now_ns - stamp_ns > HOST_LATE_NS
         limit_ms = HOST_LATE_NS * 1e-6
         return self._new(0, f"estimates are more than {limit_ms:.0f} ms old: the model process is slow" if late else "")
 
     def overdue(self, now_ns: int) -> SupervisionFinding | None:
-        """Return a finding when the last estimate is too long ago, once."""
+        """Return a finding, once, if the last estimate is too old."""
         late_ns = 0 if self._answered_ns is None else now_ns - self._answered_ns
         self.causes = safety.HOST_SILENT if late_ns > HOST_SILENT_NS else 0
         if not self.causes:
@@ -111,12 +111,12 @@ class Supervision:
 
     @property
     def causes(self) -> int:
-        """The bit set of failsafe causes that stand."""
+        """Return the bit set of active failsafe causes."""
         # What a model process that is silent said last says nothing of now.
         return self._lasting | (self.host.causes or self._body_causes)
 
     def restart(self) -> None:
-        """Forget all findings; for arming and clearing, when the operator has seen what was wrong."""
+        """Delete all findings; for arming and clearing, when the operator has seen them."""
         self.steps.restart()
         self._lasting = 0
 
@@ -130,7 +130,7 @@ class Supervision:
         return finding
 
     def host_answered(self, estimate: ForceEstimate, now_ns: int) -> SupervisionFinding | None:
-        """Take in an estimate that arrived at `now_ns`. Return a new finding."""
+        """Note an estimate that arrived at `now_ns`. Return a new finding."""
         self._body_causes = safety.BODY_CONTACT if estimate.body_contact else 0
         return self.host.answered(estimate.stamp_ns, now_ns)
 

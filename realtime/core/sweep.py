@@ -52,14 +52,14 @@ class Sweep:
         return 2.0 * math.pi * self.cycles / self.rate_rad_per_s
 
     def at(self, time_s: float) -> np.ndarray:
-        """Stage positions (3,) `time_s` after its start."""
+        """Return the stage positions (3,) `time_s` after the start."""
         position = np.array(self.centre, float)
         position[self.axis] += self.amplitude * math.sin(self.rate_rad_per_s * time_s)
         return position
 
 
 def check_sweeps(rig: Rig, sweeps: Sequence[Sweep]) -> None:
-    """Raises InputError for a sweep that leaves the travel, or asks for more speed or acceleration than a stage has."""
+    """Check sweeps. Raises InputError if one leaves the travel, or exceeds the speed or acceleration of a stage."""
     for number, sweep in enumerate(sweeps):
         for axis in range(3):
             stage, swing = rig.stage(axis), sweep.amplitude if axis == sweep.axis else 0.0
@@ -120,22 +120,22 @@ class SweepLoop:
 
     @property
     def done(self) -> bool:
-        """Whether it has ended, one way or the other, and the stages stand: brought to rest, or stopped by the board."""
+        """Return whether the sweeps have ended and the stages are at rest, braked or stopped by the board."""
         moving = self.link.armed and bool(np.any(np.abs(self._stage.speed) > 1e-9))
         return (self.finished or bool(self.problem)) and not moving
 
     @property
     def progress(self) -> float:
-        """Share of the sweeps done, 0 to 1."""
+        """Return the share of the sweeps that is done, 0 to 1."""
         return min(max(self.current, 0) / max(len(self.sweeps), 1), 1.0)
 
     def break_off(self, why: str) -> None:
-        """End the sweeps: the stages brake at the next step, and are disarmed when they stand."""
+        """End the sweeps early: the stages brake at the next step, and are disarmed at rest."""
         if not self.finished:
             self.problem = self.problem or why
 
     def step(self, now_ns: int, arriving: FromRig) -> ToRig:
-        """One period: what arrived goes in, what is to be sent comes out."""
+        """Run one period: process the received data, return the data to send."""
         if self._begin_ns < 0:
             self._begin_ns = self._step_ns = now_ns
         self._own_gap(now_ns)
@@ -177,7 +177,7 @@ class SweepLoop:
         return b""
 
     def _own_gap(self, now_ns: int) -> None:
-        """Break off when this loop itself stood still, before a device is reported for it."""
+        """End early if this loop itself stalled, before a device is reported for it."""
         gap_ns, self._step_ns = now_ns - self._step_ns, now_ns
         if self._armed_ns > 0 and gap_ns > self.rig.safety.stop_after_s * 1e9:
             self.break_off(
@@ -205,7 +205,7 @@ class SweepLoop:
             self.break_off(f"board: found it not armed after {ARMED_WITHIN_S:.0f} s, wanted it to obey")
 
     def _follow(self, now_ns: int) -> None:
-        """To the centre of the sweep to come, a rest there, the sine, the next; nothing before the board is armed."""
+        """Move to the centre of the next sweep, rest there, then follow the sine; do nothing before the board is armed."""
         if not self.link.armed:
             return
         if self._start_ns:
@@ -239,7 +239,7 @@ class SweepLoop:
         self.publish("log", Log(stamp_ns=now_ns, level="info", source="sweep", text=text))
 
     def _setpoint(self, now_ns: int) -> bytes:
-        """Stages one period on towards the target (at rest after a problem), and the frame that says so."""
+        """Move the stages by one period towards the target (to rest after a problem) and return the frame for the board."""
         if self._armed_ns <= 0 or not self.link.armed:
             return b""
         period_s = self.period_ns * 1e-9

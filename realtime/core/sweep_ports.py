@@ -32,10 +32,10 @@ class Ports(Protocol):
     """The lines of a rig, as bytes."""
 
     def receive(self) -> FromRig:
-        """What has come since the last call. Raises OSError when the board's line is gone."""
+        """Return the data since the last call. Raises OSError if the board's line is gone."""
 
     def send(self, leaving: ToRig) -> None:
-        """Hand over what is to be sent. Raises OSError when the board's line is gone."""
+        """Send the data. Raises OSError if the board's line is gone."""
 
 
 class RigPorts:
@@ -72,7 +72,7 @@ class RigPorts:
         return line
 
     def receive(self) -> FromRig:
-        """Return what the devices have sent. A tracker or force box that is gone sends nothing, which ends the sweeps."""
+        """Return the data that the devices have sent. A lost tracker or force box sends nothing, which ends the sweeps."""
         arriving = FromRig(board=self._board.read())
         try:
             arriving.tracker = self._tracker.read()
@@ -121,7 +121,7 @@ class RigPorts:
 
 @contextlib.contextmanager
 def _no_collection() -> Iterator[None]:
-    """Without Python's garbage collector: it may stand still for longer than the board waits for a set-point."""
+    """Switch Python's garbage collector off: it may stall for longer than the board waits for a set-point."""
     was = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -133,7 +133,7 @@ def _no_collection() -> Iterator[None]:
 
 
 class Pace(Protocol):
-    """A clock to keep to: `realtime.loop.clock.Clock`, or a world that hands out its own time."""
+    """Interface of a clock: `realtime.loop.clock.Clock`, or a simulated world with its own time."""
 
     def now_ns(self) -> int:
         """Return the clock's time in ns."""

@@ -97,7 +97,7 @@ def state_message(command: np.record, outputs: np.record, located: bool, homing:
 
 
 def witness_text(witness_N: np.ndarray) -> str:
-    """Return what force sensor, estimate and geometry (3,) N say, and which of the first two is the odd one out."""
+    """Return the forces (3,) N of sensor, estimate and geometry as text, and which of the first two differs."""
     sensor_N, estimate_N, geometry_N = (float(force_N) for force_N in witness_N)
     says = f"force sensor {sensor_N:.2f} N, estimate {estimate_N:.2f} N, deflection of the tip {geometry_N:.2f} N"
     off_sensor, off_estimate = abs(sensor_N - geometry_N), abs(estimate_N - geometry_N)

@@ -56,7 +56,7 @@ class _Flight(NamedTuple):
 
 
 class AuroraClient:
-    """The driver's core. Call in turn: `line_actions` (carry them out), `outgoing` (send), `feed` (what was read).
+    """The driver's core. Call in turn: `line_actions` (carry them out), `outgoing` (send), `feed` (received bytes).
 
     It starts by itself, retries without end, and never raises on what the device sends. `take_events`, `phase`
     and `counters` report what happens. All times are the caller's clock in ns.
@@ -84,34 +84,34 @@ class AuroraClient:
 
     @property
     def tracking(self) -> bool:
-        """True while poses are being polled."""
+        """Return whether poses are being polled."""
         return self.phase == "tracking"
 
     @property
     def counters(self) -> AuroraCounters:
-        """A copy of the counters."""
+        """Return a copy of the counters."""
         self._counters.damaged = self._reader.damaged
         return AuroraCounters(**asdict(self._counters))
 
     def take_events(self) -> list[DeviceEvent]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def line_actions(self) -> list[LineAction]:
-        """What to do with the serial line before sending, in order: set the speed, hold a break."""
+        """Return the actions on the serial line before sending, in order: set the speed, send a break."""
         actions, self._actions = self._actions, []
         return actions
 
     @property
     def next_due_ns(self) -> int | None:
-        """When `outgoing` has something to do even if nothing arrives; None: at once."""
+        """Return the time (ns) of the next call of `outgoing` if nothing arrives; None: at once."""
         if not self.tracking:
             return self._deadline_ns
         return self._flight.deadline_ns if self._flight is not None else self._next_poll_ns
 
     def outgoing(self, now_ns: int) -> bytes:
-        """Bytes to send now. Also where time passes: time-outs and retries are decided here."""
+        """Return the bytes to send now. Time-outs and retries are decided here."""
         if self.tracking:
             self._poll(now_ns)
         elif self._session is None:
@@ -123,7 +123,7 @@ class AuroraClient:
         return out
 
     def feed(self, data: bytes, now_ns: int) -> list[PoseSample]:
-        """Poses completed by `data`, which was read at `now_ns`."""
+        """Return the poses completed by `data`, which was read at `now_ns`."""
         samples: list[PoseSample] = []
         for reply in self._reader.feed(data):
             self._counters.replies += 1
@@ -136,13 +136,13 @@ class AuroraClient:
         return samples
 
     def lost(self, now_ns: int, why: str) -> None:
-        """The transport has gone. The client starts from the beginning with the next `outgoing`."""
+        """Note that the transport is gone. The client starts from the beginning with the next `outgoing`."""
         self._fail(why, now_ns, retry_s=0.0)
 
     # Session: the scripts of aurora_session, one reply or time-out at a time.
 
     def event(self, kind: DeviceEventKind, text: str, now_ns: int | None = None) -> None:
-        """Note an event, an error that only repeats the last one once; for the session's scripts."""
+        """Note an event; an error that repeats the last one is noted once. For the session's scripts."""
         self._counters.warnings += kind is DeviceEventKind.WARNING
         self._counters.errors += kind is DeviceEventKind.ERROR
         if kind is DeviceEventKind.ERROR and text == self._last_error:
@@ -151,7 +151,7 @@ class AuroraClient:
         self._events.append(DeviceEvent(self._now_ns if now_ns is None else now_ns, "aurora", kind, text))
 
     def line(self, action: LineAction) -> None:
-        """Ask for a line action; for the session's scripts."""
+        """Request a line action. For the session's scripts."""
         self._baud = action.baud
         self._reader.clear()
         self._actions.append(action)
@@ -266,7 +266,7 @@ class AuroraClient:
         return samples
 
     def _newest_frame(self, frames: list[int], now_ns: int) -> int | None:
-        """The reply's newest frame, unwrapped; None when the counter cannot have come there from where it was."""
+        """Return the reply's newest frame, unwrapped; None if the counter cannot have this value."""
         if not frames:
             return self._frame
         newest = max(_unwrap(frame, self._frame if self._frame is not None else frame) for frame in frames)
@@ -329,7 +329,7 @@ class AuroraClient:
         return 0 < self.config.frozen_after <= run
 
     def _system(self, status: int, now_ns: int) -> None:
-        """Events when the system's status changes; a tool that is plugged in or unplugged is enumerated again."""
+        """Report changes of the system's status; enumerate the tools again after one was plugged in or unplugged."""
         first, risen = self._system_status is None, status & ~(self._system_status or 0)
         self._system_status = status
         if risen:
@@ -341,6 +341,6 @@ class AuroraClient:
 
 
 def _unwrap(frame: int, near: int) -> int:
-    """The counter value congruent to `frame` (mod 2^32) nearest to `near`."""
+    """Return the counter value congruent to `frame` (mod 2^32) that is nearest to `near`."""
     half = FRAME_MODULUS // 2
     return near + (frame - near + half) % FRAME_MODULUS - half

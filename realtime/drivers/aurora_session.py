@@ -86,7 +86,7 @@ class SessionClient(Protocol):
 
 
 class SessionFailed(Exception):
-    """Bringing up went wrong; the text says at which command and why."""
+    """The start of the device failed; the text names the command and the reason."""
 
 
 Script = Generator[SessionStep, str | None, dict[str, ndi.ToolInfo]]
@@ -94,7 +94,7 @@ _Part = Generator[SessionStep, str | None, str]
 
 
 def set_up(client: SessionClient) -> Script:
-    """From an unknown state to tracking. Returns the enabled tools by handle. Raises SessionFailed."""
+    """Bring the device from an unknown state to tracking. Return the enabled tools by handle. Raises SessionFailed."""
     yield from _reset(client)
     yield from _command(client, "initialising", "INIT")
     client.firmware = (yield from _command(client, "initialising", "VER", "0")).split("\n")[0].strip()
@@ -108,7 +108,7 @@ def set_up(client: SessionClient) -> Script:
 
 
 def enumerate_and_start(client: SessionClient, stop_first: bool) -> Script:
-    """Free what was pulled, initialise what is new, enable what is wanted, start tracking. Raises SessionFailed."""
+    """Free unplugged tools, initialise new ones, enable the configured ones, start tracking. Raises SessionFailed."""
     if stop_first:
         yield from _command(client, "reading ports", "TSTOP")
     for handle, _ in ndi.parse_phsr((yield from _command(client, "reading ports", "PHSR", "01"))):
@@ -135,7 +135,7 @@ def enumerate_and_start(client: SessionClient, stop_first: bool) -> Script:
 
 
 def _reset(client: SessionClient) -> Generator[SessionStep, str | None, None]:
-    """A serial break resets the device whatever its speed and mode; where the adapter ignores breaks, send RESET."""
+    """Reset the device by a serial break, at any speed and in any mode; send RESET if the adapter ignores breaks."""
     client.line(LineAction(POWER_UP_BAUD, BREAK_S))
     if (yield SessionStep("resetting", b"", client.config.reset_timeout_s)) == "RESET":
         return
@@ -149,7 +149,7 @@ def _reset(client: SessionClient) -> Generator[SessionStep, str | None, None]:
 
 
 def _initialise_tools(client: SessionClient) -> Generator[SessionStep, str | None, None]:
-    """PINIT until no handle waits: initialising a tool with two sensors brings up a second handle."""
+    """Send PINIT until all handles are initialised: a tool with two sensors creates a second handle."""
     refused: set[str] = set()
     while True:
         waiting = [
@@ -168,7 +168,7 @@ def _initialise_tools(client: SessionClient) -> Generator[SessionStep, str | Non
 
 
 def _command(client: SessionClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
-    """One command and its reply. Silence (a damaged command or reply) is answered by asking again."""
+    """Send one command and return its reply. Without an answer (a damaged command or reply) it is sent again."""
     for _ in range(attempts):
         reply = yield SessionStep(phase, ndi.command(name, parameters), client.config.reply_timeout_s)
         if reply is None:

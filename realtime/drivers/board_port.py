@@ -13,7 +13,7 @@ RETRY_S = 0.2
 
 
 class BoardPort:
-    """An open port. The compiled loop writes to `fileno()` as long as it runs, so the descriptor is never closed.
+    """An open port. The compiled loop writes to `fileno()` while it runs, so the descriptor is never closed.
 
     Args:
         path: the device.
@@ -30,7 +30,7 @@ class BoardPort:
         os.set_blocking(self._port.fileno(), False)
 
     def fileno(self) -> int:
-        """Return the descriptor."""
+        """Return the file descriptor of the port, which stays the same."""
         return self._port.fileno()
 
     def read(self, wait_s: float) -> bytes:
@@ -43,12 +43,12 @@ class BoardPort:
         return data
 
     def disconnect(self) -> None:
-        """Let the descriptor lead nowhere, so that writing to it does no harm."""
+        """Connect the descriptor to nothing, so that writing to it has no effect."""
         with open(os.devnull, "r+b", buffering=0) as nowhere:
             os.dup2(nowhere.fileno(), self.fileno())
 
     def reconnect(self) -> bool:
-        """Open the device again at the same descriptor; False where it is not there."""
+        """Open the device again at the same descriptor; return False if it is not there."""
         try:
             found = open_serial(self._path, self._baud)
         except OSError:

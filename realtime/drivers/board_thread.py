@@ -56,7 +56,7 @@ class BoardThread(threading.Thread):
             logger.exception("the board's thread failed")
 
     def _find_again(self, why: str) -> None:
-        """Report the loss, and wait for the port; the loop ticks on, and what it writes meanwhile is lost."""
+        """Report the loss, and wait for the port. The loop continues to tick; its frames are lost in this time."""
         self._port.disconnect()
         self._on_lost(why)
         while not self._stopping.wait(RETRY_S):

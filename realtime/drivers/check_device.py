@@ -35,7 +35,7 @@ class DeviceReport:
 
     @property
     def good(self) -> bool:
-        """Fit for an experiment."""
+        """Return whether the device is fit for an experiment."""
         return not self.problems
 
 
@@ -168,7 +168,7 @@ def check_net_ft(host: str, seconds: float = 5.0, port: int = RDT_PORT, web_port
 
 
 def _run(thread: SensorThread, samples: list[Any], seconds: float, report: DeviceReport, start_up_s: float) -> bool:
-    """Let the thread collect for `seconds` after its first sample; False when none came.
+    """Let the thread collect for `seconds` after its first sample; return False if none came.
 
     It ends at once where the port or address is not there, or where bringing the device up has failed.
     """
@@ -186,5 +186,5 @@ def _run(thread: SensorThread, samples: list[Any], seconds: float, report: Devic
 
 
 def _absent(thread: SensorThread) -> bool:
-    """The device could not be opened, or its first session has failed."""
+    """Return whether the device could not be opened, or its first session has failed."""
     return thread.failures > 0 or (isinstance(thread, AuroraThread) and thread.client.phase == "waiting")

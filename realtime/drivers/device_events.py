@@ -18,7 +18,7 @@ class DeviceEventKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
-    """One thing worth a line in the log, with the driver's time of it."""
+    """One event for the log, with the driver's time of it."""
 
     stamp_ns: int
     device: str

@@ -18,7 +18,7 @@ class McuClock:
         self._mcu_us: int | None = None
 
     def restart(self) -> None:
-        """Forgets everything (the board was reset)."""
+        """Delete the state, because the board was reset."""
         self._mcu_us = None
         self._clock.reset()
 
@@ -36,21 +36,21 @@ class McuClock:
 
     @property
     def known(self) -> bool:
-        """Whether any stamp has arrived."""
+        """Return whether a stamp has arrived."""
         return self._mcu_us is not None
 
     @property
     def drift(self) -> float:
-        """Growth of the offset in ns per ns of host time."""
+        """Return the growth of the offset in ns per ns of host time."""
         return self._clock.drift
 
     def offset_ns(self, now_ns: int) -> int:
-        """Host time minus board time at `now_ns`. Raises ValueError before the first stamp."""
+        """Return host time minus board time (ns) at `now_ns`. Raises ValueError before the first stamp."""
         if self._mcu_us is None:
             raise ValueError("board clock: found no stamp yet, wanted at least one STATUS")
         stamped_ns = self._clock.time_ns(self._mcu_us)
         return stamped_ns - self._mcu_us * 1000 + round(self.drift * (now_ns - stamped_ns))
 
     def to_mcu_us(self, host_ns: int, now_ns: int) -> int:
-        """Board time (u32, us) of the host time `host_ns`, by the offset at `now_ns`."""
+        """Return the board time (u32, us) of the host time `host_ns`, by the offset at `now_ns`."""
         return (host_ns - self.offset_ns(now_ns)) // 1000 % _WRAP_US

@@ -29,7 +29,7 @@ class GaugeReader(Protocol):
     """Voltages of the six gauges, and of the thermistor where one is wired."""
 
     def read(self) -> tuple[np.ndarray, float]:
-        """All samples since the last call (n, 7: six gauges and the thermistor, V) and their rate (Hz). Raises OSError."""
+        """Return the samples since the last call (n, 7: six gauges and the thermistor, V), rate (Hz). Raises OSError."""
 
     def close(self) -> None:
         """Release the data acquisition card."""
@@ -66,7 +66,7 @@ class Nano17Calibration:
         return self.thermistor_offset_C + self.thermistor_C_per_V * thermistor_V
 
     def wrench(self, gauges_V: np.ndarray, thermistor_V: float = 0.0) -> np.ndarray:
-        """(Fx, Fy, Fz, Tx, Ty, Tz) in N and Nm, sensor frame, of six voltages at the thermistor's temperature."""
+        """Return (Fx, Fy, Fz, Tx, Ty, Tz) in N and Nm, sensor frame, of six voltages at the thermistor's temperature."""
         above_K = self.temperature_C(thermistor_V) - self.reference_C
         signal_V = np.asarray(gauges_V) - self.zero_V - above_K * np.asarray(self.zero_V_per_K)
         return np.asarray(self.matrix @ signal_V * (1.0 + self.gain_per_K * above_K))
@@ -142,16 +142,16 @@ class Nano17Client:
         self.temperature_C = math.nan
 
     def bias(self, samples: int = 200) -> None:
-        """The present load becomes the new zero, as the mean of the next `samples`; only while nothing touches."""
+        """Make the present load the new zero, as the mean of the next `samples`; only without contact."""
         self._bias_sum[:], self._bias_left, self._bias_of = 0.0, samples, samples
 
     def take_events(self) -> list[DeviceEvent]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def feed(self, volts: np.ndarray, rate_hz: float, now_ns: int) -> list[ForceSample]:
-        """Samples in a block (n, 7) whose last row was measured now, at `rate_hz`."""
+        """Return the samples in a block (n, 7) V whose last row was measured now, at `rate_hz`."""
         out = []
         for index, row in enumerate(volts):
             stamp_ns = now_ns - round((len(volts) - 1 - index) * 1e9 / rate_hz)
@@ -216,7 +216,7 @@ class NidaqmxReader:
             raise OSError(f"nano17: {device} does not start ({error})") from error
 
     def read(self) -> tuple[np.ndarray, float]:
-        """All samples since the last call (n, 7) V, and the rate."""
+        """Return all samples since the last call (n, 7) V, and the rate (Hz)."""
         try:
             block = np.array(self._task.read(number_of_samples_per_channel=-1), float).T
         except Exception as error:  # as above
@@ -253,11 +253,11 @@ class Nano17Source:
         return self.client.feed(volts, rate_hz, now_ns)
 
     def take_events(self) -> list[DeviceEvent]:
-        """Return what the readings' checks have found since the last call."""
+        """Return the findings of the checks since the last call."""
         return self.client.take_events()
 
     def close(self) -> None:
-        """Release the card."""
+        """Release the data acquisition card."""
         self._reader.close()
 
 

@@ -128,7 +128,7 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16 of the NDI interface: x^16 + x^15 + x^2 + 1 reflected, start 0."""
+    """Return the CRC-16 of the NDI interface: x^16 + x^15 + x^2 + 1 reflected, start 0."""
     crc = 0
     for byte in data:
         crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
@@ -152,17 +152,17 @@ class NdiReply:
 
 @dataclass
 class ReplyReader:
-    """Cuts the byte stream into replies. Damage is dropped, counted in `damaged`, and the stream found again."""
+    """Divides the byte stream into replies. Damaged bytes are dropped and counted in `damaged`."""
 
     damaged: int = 0
     _buffer: bytearray = field(default_factory=bytearray)
 
     def clear(self) -> None:
-        """Forget what is half received."""
+        """Drop a partly received reply."""
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[NdiReply]:
-        """Replies completed by `data`, in order."""
+        """Return the replies completed by `data`, in order."""
         self._buffer += data
         replies: list[NdiReply] = []
         while self._buffer:
@@ -177,7 +177,7 @@ class ReplyReader:
         return replies
 
     def _next(self) -> tuple[int, NdiReply | None]:
-        """(bytes used, reply or None when these bytes are damage); (0, None) when more bytes are needed."""
+        """Return (bytes used, reply or None if these bytes are damaged); (0, None) if more bytes are needed."""
         buffer = self._buffer
         if buffer[0] == BINARY_START[0]:
             return self._next_binary()
@@ -233,7 +233,7 @@ def describe_system_status(status: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ToolInfo:
-    """PHINF's reply to option 0x0025."""
+    """Description of a tool: PHINF's reply to option 0x0025."""
 
     tool_type: str
     manufacturer: str
@@ -246,7 +246,7 @@ class ToolInfo:
 
 
 def parse_phsr(text: str) -> list[tuple[str, PortStatus]]:
-    """Port handles and their status from PHSR's reply. Raises ProtocolError."""
+    """Return the port handles and their status from PHSR's reply. Raises ProtocolError."""
     count = _hex(text[:2])
     if len(text) != 2 + 5 * count:
         raise ProtocolError(f"PHSR: found {len(text)} characters, wanted {2 + 5 * count} for {count} handles")
@@ -255,7 +255,7 @@ def parse_phsr(text: str) -> list[tuple[str, PortStatus]]:
 
 
 def parse_phinf(text: str) -> ToolInfo:
-    """What PHINF says of a tool with option 0x0025 (33 + 20 + 14 characters). Raises ProtocolError."""
+    """Return the tool described by PHINF's reply to option 0x0025 (33 + 20 + 14 characters). Raises ProtocolError."""
     if len(text) != 67:
         raise ProtocolError(f"PHINF: found {text[:16]!r} of {len(text)} characters, wanted 67")
     return ToolInfo(
@@ -292,7 +292,7 @@ class TrackingReply:
 
 
 def parse_bx(body: bytes) -> TrackingReply:
-    """BX's body (between the header's CRC and the reply's) for options 0x0001 or 0x0801. Raises ProtocolError."""
+    """Parse BX's body (between the header's CRC and the reply's) for options 0x0001 or 0x0801. Raises ProtocolError."""
     tools: list[ToolReply] = []
     try:
         at = 1
@@ -320,7 +320,7 @@ def parse_bx(body: bytes) -> TrackingReply:
 
 
 def parse_tx(text: str) -> TrackingReply:
-    """TX's reply for options 0x0001 or 0x0801, without its CRC. Raises ProtocolError."""
+    """Parse TX's reply for options 0x0001 or 0x0801, without its CRC. Raises ProtocolError."""
     count, rest = _hex(text[:2]), text[2:]
     lines = rest.split("\n")
     if len(lines) != count + 1:

@@ -53,7 +53,7 @@ STATUS_TEXTS = {
 
 
 class NetFtCommand(IntEnum):
-    """RDT commands."""
+    """Commands of RDT requests."""
 
     STOP = 0x0000
     START_REALTIME = 0x0002
@@ -120,7 +120,7 @@ class NetFtCounters:
 
 
 def request(command: NetFtCommand, count: int = 0) -> bytes:
-    """An 8-byte RDT request; `count` records, 0 for without end."""
+    """Return an 8-byte RDT request for `count` records, 0 for an endless stream."""
     return REQUEST.pack(HEADER, command, count)
 
 
@@ -132,12 +132,12 @@ def describe_status(status: int) -> str:
 
 
 def is_fault(status: int) -> bool:
-    """True when a record of this status must not be used."""
+    """Return whether a record with this status must not be used."""
     return bool(status & ~(ERROR_SUMMARY | MONITOR_CONDITION)) or status == ERROR_SUMMARY
 
 
 class NetFtClient:
-    """The driver's core: send what `outgoing`, `start`, `bias` or `stop` return, give every datagram to `feed`.
+    """The driver's core: send the bytes of `outgoing`, `start`, `bias` and `stop`; give every datagram to `feed`.
 
     Requests the stream by itself, and again when no record arrives. Never raises on what arrives.
     """
@@ -162,32 +162,32 @@ class NetFtClient:
 
     @property
     def streaming(self) -> bool:
-        """True while records arrive."""
+        """Return whether records arrive."""
         return self._streaming
 
     @property
     def counters(self) -> NetFtCounters:
-        """A copy of the counters."""
+        """Return a copy of the counters."""
         return NetFtCounters(**asdict(self._counters))
 
     def take_events(self) -> list[DeviceEvent]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def start(self) -> bytes:
-        """The request that starts the stream; the box counts records from 1 again."""
+        """Return the request that starts the stream; the box counts records from 1 again."""
         self._counters.requests += 1
         self._wanted = True
         return request(NetFtCommand.START_REALTIME)
 
     def stop(self) -> bytes:
-        """The request that ends the stream."""
+        """Return the request that ends the stream."""
         self._wanted = self._streaming = False
         return request(NetFtCommand.STOP)
 
     def bias(self) -> bytes:
-        """The request that makes the present load the new zero (software bias); only while nothing touches."""
+        """Return the request that makes the present load the new zero (software bias); only without contact."""
         return request(NetFtCommand.SET_BIAS)
 
     def outgoing(self, now_ns: int) -> bytes:
@@ -203,14 +203,14 @@ class NetFtClient:
         return self.start()
 
     def lost(self, now_ns: int, why: str) -> None:
-        """The stream has ended, or its socket has gone."""
+        """Note that the stream has ended, or its socket is gone."""
         if self._streaming:
             self._event(DeviceEventKind.LOST, why, now_ns)
         self._streaming, self._requested_ns = False, None
         self._restart()
 
     def feed(self, datagram: bytes, now_ns: int) -> ForceSample | None:
-        """The sample in one datagram that arrived at `now_ns`, or None when it must not be used (see `counters`)."""
+        """Return the sample in one datagram that arrived at `now_ns`; None if it must not be used (see `counters`)."""
         if len(datagram) != RECORD.size:
             self._counters.malformed += 1
             return None
@@ -253,7 +253,7 @@ class NetFtClient:
         self.clock.reset()
 
     def _follow(self, sequence: int) -> int | None:
-        """Records lost before this one; None when it is a duplicate, late, or of another stream."""
+        """Return the number of records lost before this one; None if it is a duplicate, late, or of another stream."""
         if self._last is None:
             self._last = sequence
             return 0

@@ -42,7 +42,7 @@ class NetFtCalibration:
 
 
 def parse_calibration(page: bytes) -> NetFtCalibration:
-    """The calibration in a netftapi2.xml page, whatever units the box is set to, in SI.
+    """Read the calibration in a netftapi2.xml page and convert it from the box's units to SI.
 
     Raises ValueError with the element's name when one is missing or not what it should be, or when RDT is disabled.
     """

@@ -49,7 +49,7 @@ _TABLE = _crc_table()
 
 
 def crc64(data: bytes) -> int:
-    """CRC-64 of ECMA-182, as OpenIGTLink uses it."""
+    """Return the CRC-64 of ECMA-182, as OpenIGTLink uses it."""
     value = 0
     for byte in data:
         value = ((value << 8) ^ _TABLE[(value >> 56) ^ byte]) & _MASK
@@ -66,7 +66,7 @@ class Received(NamedTuple):
 
 
 class IgtlReader:
-    """Bytes in, TRANSFORM messages out. Other messages are skipped; damaged ones are counted and skipped.
+    """Decodes bytes into TRANSFORM messages. Other messages are skipped; damaged ones are counted and skipped.
 
     Raises ValueError in `feed` where the bytes are no OpenIGTLink: the connection cannot be used further.
     """
@@ -157,7 +157,7 @@ class OpenIgtLinkTracker:
         self._link.setblocking(False)
 
     def read(self) -> list[PoseSample]:
-        """Return the poses that have come; wait for them at most 50 ms. Raises OSError when the server is gone."""
+        """Return the poses since the last call; wait for them at most 50 ms. Raises OSError if the server is gone."""
         if not select.select([self._link], [], [], WAIT_S)[0]:
             return []
         data = self._link.recv(1 << 16)
@@ -189,13 +189,13 @@ class OpenIgtLinkTracker:
         )
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection to the server."""
         with contextlib.suppress(OSError):
             self._link.close()
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """HOST, HOST:PORT or [IPv6]:PORT as host and port. Raises InputError named tracker.port."""
+    """Return HOST, HOST:PORT or [IPv6]:PORT as host and port. Raises InputError named tracker.port."""
     host, _, port = text.rpartition(":") if text.count(":") == 1 or "]:" in text else (text, "", str(DEFAULT_PORT))
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise InputError("tracker.port", text, f"HOST:PORT of the OpenIGTLink server, such as 127.0.0.1:{DEFAULT_PORT}")

@@ -62,7 +62,7 @@ _PORT_FLAGS = {
 
 
 def flags_of(tool: ndi.ToolReply) -> PoseFlag:
-    """The flags of a handle's state and port status."""
+    """Return the flags of a handle's state and port status."""
     flags = _STATE_FLAGS[tool.state]
     for bit, flag in _PORT_FLAGS.items():
         if tool.status & bit:

@@ -137,7 +137,7 @@ class NetFtThread(SensorThread):
         self._bias_wanted = threading.Event()
 
     def request_bias(self) -> None:
-        """Have the box take the present load as zero."""
+        """Request the box to take the present load as zero."""
         self._bias_wanted.set()
 
     def _serve(self) -> None:
@@ -201,7 +201,7 @@ def _set_baud(fd: int, baud: int) -> None:
 
 
 def _send_quietly(link: socket.socket, data: bytes) -> None:
-    """A last word to a box that may be gone already."""
+    """Send a last request to a box that may be gone; ignore errors."""
     if data:
         try:
             link.send(data)

@@ -46,7 +46,7 @@ class LinkPhase(enum.Enum):
 
 
 class BoardEventKind(enum.Enum):
-    """What happened on the link."""
+    """Kinds of events on the link."""
 
     IDENTIFIED = "identified"
     READY = "ready"
@@ -149,7 +149,7 @@ class StepperBoardLink:
     # --- to the board ---------------------------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> bytes:
-        """Bytes that bring the link further: HELLO, then the limits; again every 100 ms until they are answered.
+        """Return the next bytes of the bring-up: HELLO, then the limits; repeated every 100 ms until they are answered.
 
         A board that holds a fault takes no limits: the operator clears it first.
         """
@@ -194,37 +194,37 @@ class StepperBoardLink:
         self.clock.restart()
 
     def hello(self) -> bytes:
-        """HELLO, after a delimiter that ends whatever was on the line before."""
+        """Return HELLO, after a delimiter that ends earlier bytes on the line."""
         return b"\0" + self._command("HELLO", protocol_hash=PROTOCOL_HASH)
 
     def configure(self, axis: int) -> bytes:
-        """CONFIGURE with the limits of `axis`."""
+        """Return CONFIGURE with the limits of `axis`."""
         return self._command("CONFIGURE", axis=axis, **self.axes[axis]._asdict())
 
     def set_position(self, axis: int, position_steps: int) -> bytes:
-        """SET_POSITION: the present position of `axis` is `position_steps` from now on."""
+        """Return SET_POSITION, which makes `position_steps` the present position of `axis`."""
         return self._command("SET_POSITION", axis=axis, position_steps=position_steps)
 
     def arm(self) -> bytes:
-        """ARM, on the boot count of the last IDENTITY. Raises ValueError unless phase is READY."""
+        """Return ARM with the boot count of the last IDENTITY. Raises ValueError unless phase is READY."""
         if self.phase is not LinkPhase.READY or self.identity is None:
             raise ValueError(f"board link: found phase {self.phase.value}, wanted ready before arm")
         return self._command("ARM", boot_count=self.identity.boot_count)
 
     def disarm(self) -> bytes:
-        """DISARM: decelerate and refuse set-points."""
+        """Return DISARM: the board decelerates and then refuses set-points."""
         return self._command("DISARM")
 
     def clear_fault(self, fault: int) -> bytes:
-        """CLEAR_FAULT for an operator who has seen `fault`; a program never calls it by itself."""
+        """Return CLEAR_FAULT for an operator who has seen `fault`; no program calls it by itself."""
         return self._command("CLEAR_FAULT", fault=fault)
 
     def ping(self) -> bytes:
-        """PING, answered by an ACK event."""
+        """Return PING, which the board answers with an ACK event."""
         return self._command("PING")
 
     def setpoint(self, number: int, execute_us: int, expiry_us: int, position_steps: Sequence[int]) -> bytes:
-        """SETPOINT for callers that do not use protocol.setpoint_encoder; number and times are wrapped to the wire."""
+        """Return SETPOINT, for callers without protocol.setpoint_encoder; number and times are wrapped to the wire."""
         self._setpoint_sequence = self._setpoint_sequence + 1 & 0xFF
         return encode(
             "SETPOINT",
@@ -243,7 +243,7 @@ class StepperBoardLink:
     # --- from the board -------------------------------------------------------------------------------------------
 
     def feed(self, data: bytes, now_ns: int) -> list[LinkEvent]:
-        """Events in what arrived. data: any portion of the stream. now_ns: host time at which it was read."""
+        """Return the events in `data`, any portion of the stream. now_ns: host time at which it was read."""
         events: list[LinkEvent] = []
         for message in self.decoder.feed(data):
             if message.name == "STATUS":
@@ -255,12 +255,12 @@ class StepperBoardLink:
         return events
 
     def mcu_offset_ns(self, now_ns: int) -> int:
-        """Host time minus board time. Raises ValueError before the first STATUS."""
+        """Return host time minus board time (ns). Raises ValueError before the first STATUS."""
         return self.clock.offset_ns(now_ns)
 
     @property
     def armed(self) -> bool:
-        """Whether the board takes set-points, by its last STATUS."""
+        """Return whether the board accepts set-points, by its last STATUS."""
         return self.status is not None and self.status.state in (BoardState.ARMED, BoardState.RUNNING)
 
     def _on_identity(self, message: AnyFrame, now_ns: int) -> list[LinkEvent]:

@@ -11,16 +11,16 @@ class Transport(Protocol):
     """A byte stream that never blocks."""
 
     def read(self) -> bytes:
-        """What has arrived since the last call; empty when nothing has. Raises OSError when the device is gone."""
+        """Return the bytes since the last call, possibly none. Raises OSError if the device is gone."""
 
     def write(self, data: bytes) -> None:
-        """Hands over all of `data`. Raises OSError when the device is gone or does not take it."""
+        """Send all of `data`. Raises OSError if the device is gone or does not accept it."""
 
     def fileno(self) -> int:
-        """Descriptor to wait on, or -1 where there is none."""
+        """Return a descriptor to wait on, or -1 if there is none."""
 
     def close(self) -> None:
-        """Releases the device; a second call does nothing."""
+        """Release the device; a second call does nothing."""
 
 
 class SerialTransport:
@@ -37,21 +37,21 @@ class SerialTransport:
             raise OSError(f"serial port: found {path} that does not open ({error}), wanted a free device") from error
 
     def read(self) -> bytes:
-        """Bytes that have arrived, at most 4096."""
+        """Return the bytes that have arrived, at most 4096."""
         try:
             return os.read(self._port.fileno(), 4096)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> None:
-        """Hands over all of `data`; waits at most 0.5 s for a full output buffer."""
+        """Send all of `data`; wait at most 0.5 s for a full output buffer."""
         try:
             self._port.write(data)
         except serial.SerialException as error:
             raise OSError(f"{self.path}: did not take {len(data)} bytes ({error})") from error
 
     def fileno(self) -> int:
-        """Descriptor of the port."""
+        """Return the file descriptor of the port."""
         return int(self._port.fileno())
 
     def close(self) -> None:
@@ -68,31 +68,31 @@ class PipeTransport:
 
     @classmethod
     def pair(cls) -> "tuple[PipeTransport, PipeTransport]":
-        """Two ends that are connected."""
+        """Return two connected ends."""
         a: deque[bytes] = deque()
         b: deque[bytes] = deque()
         return cls(a, b), cls(b, a)
 
     def read(self) -> bytes:
-        """All that the other end has written since the last call."""
+        """Return all bytes that the other end has written since the last call."""
         data = b"".join(self._incoming)
         self._incoming.clear()
         return data
 
     def write(self, data: bytes) -> None:
-        """Hands `data` to the other end."""
+        """Send `data` to the other end."""
         if data:
             self._outgoing.append(bytes(data))
 
     def fileno(self) -> int:
-        """There is nothing to wait on: -1."""
+        """Return -1: there is nothing to wait on."""
         return -1
 
     def close(self) -> None:
-        """Drops what was not read."""
+        """Drop the bytes that were not read."""
         self._incoming.clear()
 
 
 def open_serial(path: str, baud: int) -> SerialTransport:
-    """Opens the serial port at `path`. Raises OSError with the path when it cannot."""
+    """Open the serial port at `path`. Raises OSError with the path if it cannot be opened."""
     return SerialTransport(path, baud)
