@@ -33,7 +33,7 @@ class Verdict:
 
     @property
     def verdict(self) -> str:
-        """`missing_physics`, `nothing_missing` or `mismatch_not_identified`."""
+        """Return `missing_physics`, `nothing_missing` or `mismatch_not_identified`."""
         return str(self._content["verdict"])
 
     @property

@@ -42,7 +42,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass
 class Location:
-    """One subsystem found at fault."""
+    """One subsystem with a mismatch: where and when."""
 
     subsystem: str
     channels: list[str]

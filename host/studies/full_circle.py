@@ -1,4 +1,4 @@
-"""Run one full circle with MuJoCo: recordings of an arm with concealed physics, the diagnosis, the patched model.
+"""Test diagnosis and correction with MuJoCo: an arm with concealed physics, its diagnosis, the corrected model.
 
     python -m host.studies.full_circle --dir runs/circle --docs docs/diagnosis.md
 

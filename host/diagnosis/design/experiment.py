@@ -47,7 +47,7 @@ class Design:
     def says(self) -> str:
         """Describe the excitation and its predicted separation in one line."""
         held = "".join(f", {name.replace('_', ' ')} at {value:.3g}" for name, value in self.excitation.held)
-        doubt = "" if self.separation > PLAIN else " No motion of the family would tell them apart."
+        doubt = "" if self.separation > PLAIN else " No motion of this family separates them."
         return (
             f"{self.excitation.channel.replace('_', ' ')}: {self.excitation.words}{held}. "
             f"Predicted separation of {self.candidate.name} and {self.other.name}: {self.separation:.3g} in units of "
@@ -62,7 +62,7 @@ def design(problem: Problem, found: Found, standing: list[Standing], progress: C
     out = []
     for stands in standing if all(term.candidate.effect.listed for term in found.best.terms) else ():
         for other in (other for other in stands.alike if other.effect.listed):
-            progress(f"how to tell {stands.candidate.key} from {other.key}", 0.0)
+            progress(f"motion that separates {stands.candidate.key} and {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)
             out += [] if made is None else [made]
@@ -163,7 +163,7 @@ def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | No
 
 
 def asked(problem: Problem) -> tuple[str, ...]:
-    """Channels that a script sets."""
+    """Return the channels that an experiment script sets."""
     return problem.model.inner.scripted
 
 
@@ -230,7 +230,7 @@ def lines(made: list[Design], candidate: Candidate) -> str:
 
 
 def planned(result: Any) -> list[Design]:
-    """Designs of a diagnosis that are worth recording, each excitation once, the most telling first."""
+    """Return the useful designs of a diagnosis, each excitation once, the largest separation first."""
     seen: dict[str, Design] = {}
     for one in sorted((d for d in result.designs if d.separation > PLAIN), key=lambda d: -d.separation):
         seen.setdefault(f"{one.excitation.channel} {one.excitation.words} {one.excitation.held}", one)

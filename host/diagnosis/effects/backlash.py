@@ -23,7 +23,7 @@ EFFECTS = (
         "motion",
         40,
         parameters,
-        "After every reversal the output rests until a gap of {width} is taken up.",
+        "After every reversal the output does not move until the input has crossed a gap of {width}.",
         "y = play(x, width/2)",
         apply,
         family="dry",

@@ -17,7 +17,7 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + p[0] * c.load)
 
 
-SAYS = "Between input and output there is a spring: {source} moves the output, {compliance}."
+SAYS = "There is a spring between input and output: {source} deflects the output by {compliance}."
 EFFECTS = (
     Effect("compliance", "motion", 70, per_load, SAYS, "y = x + compliance*load", apply, side="output", source="load"),
     Effect("compliance", "mix", 20, per_load, SAYS, "y = x + compliance*load", apply, source="load"),

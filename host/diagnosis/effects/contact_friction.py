@@ -24,7 +24,7 @@ EFFECTS = (
         "contact",
         23,
         parameters,
-        "The tip drags on the tissue: tangential force up to {coefficient} of the normal force.",
+        "Friction acts between tip and tissue, up to {coefficient} of the normal force.",
         "|F_t| <= coefficient*F_n",
         apply,
         dissipates=True,

@@ -6,7 +6,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Exponent of the depth."""
+    """Return the parameter `exponent` of the depth."""
     return (Parameter("exponent", "", (0.7, 0.93, 1.07, 1.3, 1.7, 2.2), 0.3, 5.0, log=True),)
 
 
@@ -42,7 +42,7 @@ EFFECTS = (
         "contact",
         20,
         parameters,
-        "The tissue's force goes with depth to the power {exponent}.",
+        "The tissue's force grows with depth to the power {exponent}.",
         "F = k*r*(depth/r)^exponent, r = 1 mm",
         apply,
     ),
@@ -51,7 +51,7 @@ EFFECTS = (
         "force",
         24,
         force,
-        "Beyond {place} a one-sided spring comes in, to the power {exponent}.",
+        "A one-sided spring acts beyond {place}, with deflection to the power {exponent}.",
         "F = stiffness*max(0, x - place)^exponent",
         slots=slots,
     ),

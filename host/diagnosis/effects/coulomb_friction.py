@@ -10,7 +10,7 @@ BRISTLES = 2e-3  # of the travel: friction that builds up over less is dry frict
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Lost motion on either side."""
+    """Return the parameter `lost_motion`, the lag in either direction."""
     return (Parameter("lost_motion", s.unit, (s.need,), 0.0, np.inf, linear=True),)
 
 
@@ -24,7 +24,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """The output stays behind by p[0], whichever way the motion goes."""
+    """Apply a lag of p[0] against the direction of motion."""
     return np.asarray(signal - p[0] * c.moving(c.motion))
 
 
@@ -39,7 +39,7 @@ EFFECTS = (
         "motion",
         45,
         lost,
-        "The output stays behind by {lost_motion}, against the motion, from the first step after a reversal.",
+        "The output lags by {lost_motion}, against the motion, immediately after each reversal.",
         "y = x - lost_motion*sign(v)",
         apply,
         family="dry",

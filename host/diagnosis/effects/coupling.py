@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Gain from the other channel."""
+    """Return the parameter `gain` from the other channel."""
     return (
         Parameter(
             "gain", f"{s.unit}/{s.source_unit}" if s.unit != s.source_unit else "", (s.need / s.source_rms,), linear=True
@@ -27,7 +27,7 @@ EFFECTS = (
         "motion",
         73,
         parameters,
-        "{source} moves this channel too, gain {gain}.",
+        "{source} also moves this channel, with gain {gain}.",
         "y = x + gain*other",
         apply,
         source="other",
@@ -37,7 +37,7 @@ EFFECTS = (
         "mix",
         21,
         parameters,
-        "{source} moves this reading too, gain {gain}.",
+        "{source} also changes this reading, with gain {gain}.",
         "y = x + gain*other",
         apply,
         source="other",

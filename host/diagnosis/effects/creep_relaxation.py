@@ -1,4 +1,4 @@
-"""Creep: deflection or force goes on changing while the input rests (standard linear solid)."""
+"""Creep: deflection or force continues to change while the input rests (standard linear solid)."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply_motion(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Part p[0] of the motion arrives late, with time constant p[1]."""
+    """Let a share p[0] of the motion follow with time constant p[1]."""
     start = c.start / p[0] if abs(p[0]) > 1e-3 else 0.0
     return np.asarray(signal + p[0] * (lag(signal, c.dt_s, p[1], start) - signal))
 
 
 def apply_load(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Slow deflection under load."""
+    """Add p[0] times the load (n,) after a lag with time constant p[1]."""
     return np.asarray(signal + p[0] * lag(c.load, c.dt_s, p[1], c.start / p[0] if p[0] != 0.0 else 0.0))
 
 
@@ -61,7 +61,7 @@ def share(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
-    """Under force the shaft goes on giving way (`force`); or the bend goes on following the knob (`bend`)."""
+    """Let the shaft creep under force (`force`), or the bend follow the knob slowly (`bend`)."""
     if form == "bend":
         return {**state, "kappa": state["kappa"] + p[0] * (lagged_rows(state["kappa"], c.dt_s, p[1]) - state["kappa"])}
     slow = lagged_rows(state["push"], c.dt_s, p[1])
@@ -69,7 +69,7 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """The reading goes on changing after the force has."""
+    """Let the reading continue to change after the force has settled."""
     return np.asarray(signal + p[0] * (lagged_rows(signal, c.dt_s, p[1]) - signal))
 
 
@@ -79,7 +79,7 @@ EFFECTS = (
         "forces",
         84,
         share,
-        "The force sensor's reading creeps: a share {slow_share} arrives over {time_constant}.",
+        "The force sensor's reading creeps: a share of {slow_share} has the time constant {time_constant}.",
         "y = x + slow_share*(lag(x, time_constant) - x)",
         apply_force,
         timed=True,
@@ -90,7 +90,7 @@ EFFECTS = (
         "shape",
         22,
         share,
-        "Under force the shaft goes on giving way over {time_constant}.",
+        "Under force the shaft creeps with a time constant of {time_constant}.",
         "u = C (F + slow_share*lag(F, time_constant))",
         apply_shape,
         timed=True,
@@ -102,7 +102,7 @@ EFFECTS = (
         "motion",
         55,
         of_motion,
-        "A share {slow_share} of the motion arrives slowly, over {time_constant}.",
+        "A share of {slow_share} of the motion follows slowly, with a time constant of {time_constant}.",
         "y = x + slow_share*(lag(x, time_constant) - x)",
         apply_motion,
         timed=True,
@@ -115,7 +115,7 @@ EFFECTS = (
         "motion",
         72,
         of_load,
-        "Under {source} the output goes on giving way over {time_constant}.",
+        "Under {source} the output creeps with a time constant of {time_constant}.",
         "y = x + compliance*lag(load, time_constant)",
         apply_load,
         side="output",
@@ -129,7 +129,7 @@ EFFECTS = (
         "force",
         21,
         force,
-        "Part of the force, {stiffness}, relaxes over {time_constant}.",
+        "Part of the stiffness, {stiffness}, relaxes with a time constant of {time_constant}.",
         "F = stiffness*(x - lag(x, time_constant))",
         slots=slots,
         timed=True,

@@ -43,15 +43,15 @@ def corner(p: Array) -> tuple[str, str]:
     period = math.sqrt(max(inertia, 0.0))
     rings = lag < 2.0 * CRITICAL * period
     total = delay + max(lag, period)
-    dead = "" if delay < SHORT * total else " It begins {delay} late: a dead time."
+    dead = "" if delay < SHORT * total else " It has a dead time of {delay}."
     coefficients = " Coefficients: lag {lag}, inertia {inertia}."
     if rings and period > delay:
         hertz, ratio = 1.0 / (2.0 * math.pi * period), lag / (2.0 * period)
-        return "resonance", f"The output rings at {hertz:.3g} Hz, damping ratio {ratio:.2g}.{dead}"
+        return "resonance", f"The output oscillates at {hertz:.3g} Hz, damping ratio {ratio:.2g}.{dead}"
     if delay > lag:
         if max(lag, period) < SHORT * total:
-            return "latency", "The channel is {delay} late, at every frequency alike."
-        return "latency", f"The channel is {{delay}} late and follows with a second-order lag.{coefficients}"
+            return "latency", "The channel is delayed by {delay} at every frequency."
+        return "latency", f"The channel is delayed by {{delay}} and follows with a second-order lag.{coefficients}"
     slow, fast = _time_constants(lag, inertia)
     if fast is None or fast < SHORT * slow:
         return "rate_lag", f"The output follows with a first-order lag of {slow:.3g} s.{dead}"
@@ -72,7 +72,7 @@ EFFECTS = tuple(
         port,
         62,
         parameters,
-        "The output follows {delay} late with a second-order lag: lag {lag}, inertia {inertia}.",
+        "The output follows with a delay of {delay} and a second-order lag: lag {lag}, inertia {inertia}.",
         "inertia*y'' + lag*y' + y = x(t - delay)",
         apply,
         timed=True,

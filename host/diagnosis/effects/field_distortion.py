@@ -19,7 +19,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def bump(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Pull towards a piece of metal: strength along each axis, place and reach."""
+    """Return the parameters of the pull towards a metal part: strength along each axis, place and reach."""
     pull = tuple(Parameter(f"pull_{a}", "m", (1e-3,), linear=True) for a in "xyz")
     return (
         *pull,
@@ -55,7 +55,7 @@ EFFECTS = (
         "pose",
         84,
         parameters,
-        "The tracker's error depends on place: metal nearby bends its field.",
+        "The tracker's error depends on the position: metal nearby distorts its field.",
         "y = x + B(x)",
         apply,
     ),
@@ -64,7 +64,7 @@ EFFECTS = (
         "pose",
         84,
         bump,
-        "The tracker's error depends on place: metal nearby bends its field.",
+        "The tracker's error depends on the position: metal nearby distorts its field.",
         "y = x + pull*exp(-|x - place|^2/(2 reach^2))",
         apply,
         forms=("bump",),

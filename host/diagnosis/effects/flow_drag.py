@@ -30,7 +30,7 @@ EFFECTS = (
         "shape",
         31,
         parameters,
-        "Flow drags on the exposed shaft and pulses at {frequency}.",
+        "Blood flow exerts a drag on the exposed shaft that pulsates at {frequency}.",
         "dF/ds = steady + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply,
         timed=True,

@@ -55,7 +55,7 @@ def payload(links: int) -> Effect:
         "chain",
         16,
         parameters,
-        "A further mass of {mass} hangs on the last link; its weight and inertia add to every joint's torque.",
+        "An additional mass of {mass} is at the last link; its weight and inertia add to every joint's torque.",
         "torque_j = d/dt(dT/dq_j') - dT/dq_j + dV/dq_j of a point mass at the last link's end",
         payload_torques,
     )
@@ -96,7 +96,7 @@ EFFECTS = (
         "force",
         15,
         on_an_angle,
-        "A weight on an arm pulls with {moment_sine} at a quarter turn and {moment_cosine} at zero.",
+        "A weight on an arm exerts a moment of {moment_sine} at a quarter turn and {moment_cosine} at zero.",
         "M = moment_sine*sin(x) + moment_cosine*cos(x)",
         slots=slots,
     ),

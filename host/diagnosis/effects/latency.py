@@ -38,7 +38,7 @@ def rows(values: Array, c: Context, late: Array) -> Array:
     return shifted_rows(values, c.dt_s, late)
 
 
-SAYS = "The channel is {delay} late, at every frequency alike."
+SAYS = "The channel is delayed by {delay} at every frequency."
 EFFECTS = tuple(
     Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True, remembers=True, shifts="time")
     for port in ("motion", "timing")
@@ -48,7 +48,7 @@ EFFECTS = tuple(
         "pose",
         82,
         parameters,
-        "The tracker's poses are {delay} late.",
+        "The tracker's poses are delayed by {delay}.",
         "y(t) = x(t - delay)",
         apply_pose,
         timed=True,
@@ -59,7 +59,7 @@ EFFECTS = tuple(
         "forces",
         82,
         parameters,
-        "The force readings are {delay} late.",
+        "The force readings are delayed by {delay}.",
         "y(t) = x(t - delay)",
         apply_force,
         timed=True,

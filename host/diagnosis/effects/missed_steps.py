@@ -127,21 +127,22 @@ EFFECTS = tuple(
         seeds=seeds,
     )
     for forms, says, equation in (
-        (("",), "At {instant} the axis lost {jump} and never got it back.", "y = x + jump*(t > instant)"),
+        (("",), "The axis lost {jump} at {instant} and did not recover it.", "y = x + jump*(t > instant)"),
         (
             ("two",),
-            "The axis lost {jump_1} at {instant_1} and {jump_2} at {instant_2}, and never got it back.",
+            "The axis lost {jump_1} at {instant_1} and {jump_2} at {instant_2}, and did not recover them.",
             "y = x + sum_k jump_k*(t > instant_k)",
         ),
         (
             ("three",),
-            "The axis lost {jump_1} at {instant_1}, {jump_2} at {instant_2} and {jump_3} at {instant_3}, for good.",
+            "The axis lost {jump_1} at {instant_1}, {jump_2} at {instant_2} and {jump_3} at {instant_3}, "
+            "and did not recover them.",
             "y = x + sum_k jump_k*(t > instant_k)",
         ),
         (
             ("four",),
             "The axis lost {jump_1} at {instant_1}, {jump_2} at {instant_2}, {jump_3} at {instant_3} and {jump_4} at "
-            "{instant_4}, for good.",
+            "{instant_4}, and did not recover them.",
             "y = x + sum_k jump_k*(t > instant_k)",
         ),
     )

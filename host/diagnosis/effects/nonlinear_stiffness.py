@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Compliance and its cubic part."""
+    """Return the parameters `compliance` and `cubic`."""
     unit = f"{s.unit}/{s.source_unit}"
     return (
         Parameter("compliance", unit, (s.need / s.source_rms,), linear=True),

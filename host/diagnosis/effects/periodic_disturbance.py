@@ -48,7 +48,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"sine": p[0], "cosine": p[1], ("pitch" if form == "place" else "frequency"): p[2]}
 
 
-SAYS = "A periodic disturbance rides on the signal."
+SAYS = "A periodic disturbance is added to the signal."
 
 
 def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -85,7 +85,7 @@ def _wave(c: Context, p: Array) -> Array:
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
-    """Both positions read with a line that no motion makes; turns and forces know nothing of it."""
+    """Add an oscillation that no motion causes to both positions; orientations and forces are unchanged."""
     wave = _wave(c, p)
     return {**run, "tip": run["tip"] + wave, "shaft": run["shaft"] + wave}
 
@@ -101,7 +101,7 @@ EFFECTS = (
         "pose",
         87,
         reading,
-        "The tracker's positions read with a line at {frequency} that no motion makes.",
+        "The tracker's positions contain an oscillation at {frequency} that no motion causes.",
         "x = x + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_pose,
         timed=True,
@@ -113,7 +113,7 @@ EFFECTS = (
         "forces",
         87,
         reading,
-        "The force sensor reads with a line at {frequency} that no contact makes.",
+        "The force readings contain an oscillation at {frequency} that no contact causes.",
         "F = F + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_force,
         timed=True,

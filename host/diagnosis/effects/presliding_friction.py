@@ -88,7 +88,7 @@ EFFECTS = (
         "motion",
         46,
         lost,
-        "The output stays behind by up to {lost_motion}, built up over {distance} after each reversal.",
+        "The output lags by up to {lost_motion}; the lag builds up over {distance} after each reversal.",
         "y = x - lost_motion*z,  dz = (1 - z*sign(dx))*dx/distance; maxwell: four elements; reversal: "
         "z = sign(dx)*(1 - 2*exp(-s/distance)), s since the last reversal",
         apply,
@@ -117,7 +117,7 @@ EFFECTS = (
         "motion",
         46,
         lost,
-        "The output stays behind by up to the sum of four elements that slide one after the other after each reversal; "
+        "The output lags by up to the sum of four elements that slide one after the other after each reversal; "
         "the third after {distance}.",
         "y = x - sum_k z_k,  z_k = clip(z_k + lost_motion_k*dx/d_k, -lost_motion_k, lost_motion_k),  d_k = 3^(k-3)*distance",
         apply,

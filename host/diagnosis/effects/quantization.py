@@ -47,12 +47,12 @@ def from_saw_tooth(evidence: Evidence, parameters: tuple[Parameter, ...], unit: 
 
 
 def of_positions(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
-    """Step of readings in metres."""
+    """Return the parameter `step` (m) with starts from the sawtooth of the residual."""
     return from_saw_tooth(evidence, parameters, "m")
 
 
 def of_forces(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
-    """Step of readings in newtons."""
+    """Return the parameter `step` (N) with starts from the sawtooth of the residual."""
     return from_saw_tooth(evidence, parameters, "N")
 
 
@@ -66,12 +66,12 @@ def stepped(x: Array, step: float) -> Array:
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
-    """Both positions in steps."""
+    """Round both positions to steps of p[0] (m)."""
     return {**run, "tip": stepped(run["tip"], p[0]), "shaft": stepped(run["shaft"], p[0])}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Every component in steps."""
+    """Round every component of the force to steps of p[0] (N)."""
     return stepped(signal, p[0])
 
 
@@ -81,7 +81,7 @@ EFFECTS = (
         "pose",
         90,
         parameters,
-        "The tracker's positions move in steps of {step}.",
+        "The tracker's positions have steps of {step}.",
         "y = step*round(x/step)",
         apply_pose,
         seeds=of_positions,
@@ -91,7 +91,7 @@ EFFECTS = (
         "forces",
         90,
         of_a_force,
-        "The force sensor's readings move in steps of {step}.",
+        "The force sensor's readings have steps of {step}.",
         "y = step*round(x/step)",
         apply_force,
         seeds=of_forces,

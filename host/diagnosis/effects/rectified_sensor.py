@@ -13,12 +13,12 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Magnitude instead of value."""
+    """Replace a share p[0] of the signal by its magnitude."""
     return np.asarray(signal + p[0] * (np.abs(signal) - signal))
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """All components lose their sign."""
+    """Replace a share p[0] of every component by its magnitude."""
     return np.asarray(signal + p[0] * (np.abs(signal) - signal))
 
 
@@ -39,7 +39,7 @@ EFFECTS = (
         "drift",
         90,
         parameters,
-        "The sensor gives the magnitude only: its reading folds at zero.",
+        "The sensor gives the magnitude without the sign.",
         "y = |x|",
         apply,
         natural_bounds=True,

@@ -34,13 +34,13 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def largest(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Largest reading of either sign."""
+    """Return the parameter `limit`, the largest reading of either sign."""
     top = max(abs(s.low), abs(s.high))
     return (Parameter("limit", s.unit, tuple(f * top for f in (0.97, 0.85, 0.7, 0.5)), 0.05 * top, top, step=0.05 * top),)
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Every component clipped."""
+    """Clip every component of the force at p[0] (N)."""
     return np.asarray(np.clip(signal, -p[0], p[0]))
 
 
@@ -61,7 +61,7 @@ def apply_loop(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def of_drive(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Largest drive."""
+    """Return the parameter `limit` of the drive."""
     top = max(abs(s.low), abs(s.high))
     return (
         Parameter("limit", s.unit, tuple(f * top for f in (0.97, 0.9, 0.75, 0.6, 0.4)), 0.05 * top, top, step=0.05 * top),
@@ -69,11 +69,11 @@ def of_drive(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Limit of the controller's output."""
+    """Return the slot of the controller's output limit."""
     return {"drive_limit": p[0]}
 
 
-SAYS = "Beyond {limit} nothing follows."
+SAYS = "The output does not follow beyond {limit}."
 EFFECTS = (
     (
         Effect(
@@ -94,7 +94,7 @@ EFFECTS = (
             "loop",
             34,
             of_drive,
-            "The drive gives no more than {limit}, whatever the controller asks for.",
+            "The output of the drive is limited to {limit}.",
             "u = clip(c, -limit, limit)  inside the loop",
             slots=slots,
             natural_bounds=True,
@@ -120,7 +120,7 @@ EFFECTS = (
             port,
             34,
             parameters,
-            "Beyond {limit} to either side of {middle} nothing follows.",
+            "The output does not follow beyond {limit} to either side of {middle}.",
             "y = clip(x, middle - limit, middle + limit), rounded over the knee",
             apply,
             forms=("both",),

@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def warming(s: Scale) -> Parameter:
-    """Time constant of a warm-up."""
+    """Return the parameter `time_constant` (s) of a warm-up."""
     d = s.duration_s
     return Parameter("time_constant", "s", spread(0.05 * d, 0.7 * d, 3), 0.01 * d, 3 * d, log=True)
 
@@ -24,7 +24,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Additive ramp, or exponential approach."""
+    """Add a ramp, or an exponential approach for the form `warm_up`."""
     if form == "warm_up":
         return np.asarray(signal + p[0] * (1.0 - np.exp(-c.time_s / p[1])))
     return np.asarray(signal + p[0] * c.time_s)
@@ -46,13 +46,13 @@ def _wander(c: Context, p: Array, form: str) -> Array:
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
-    """Both positions wander alike."""
+    """Add the same drift to both positions."""
     wander = _wander(c, p, form)
     return {**run, "tip": run["tip"] + wander, "shaft": run["shaft"] + wander}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """The force reading wanders."""
+    """Add the drift to the force reading."""
     return np.asarray(signal + _wander(c, p, form))
 
 
@@ -62,7 +62,7 @@ EFFECTS = (
         "pose",
         88,
         vector,
-        "The tracker's positions drift with time, whatever moves.",
+        "The tracker's positions drift with time, independent of motion.",
         "y = x + rate*t",
         apply_pose,
         timed=True,
@@ -74,7 +74,7 @@ EFFECTS = (
         "forces",
         88,
         vector,
-        "The force sensor drifts with time, whatever touches.",
+        "The force sensor drifts with time, independent of contact.",
         "y = x + rate*t",
         apply_force,
         timed=True,
@@ -86,7 +86,7 @@ EFFECTS = (
         "drift",
         80,
         parameters,
-        "The reading drifts with time, whatever moves.",
+        "The reading drifts with time, independent of motion.",
         "y = x + rate*t",
         apply,
         timed=True,

@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Relative error of gain."""
+    """Return the parameter `gain_error`, relative."""
     return (Parameter("gain_error", "", (0.02,), -0.9, 3.0, linear=True),)
 
 

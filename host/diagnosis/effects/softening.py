@@ -47,7 +47,7 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def fixed(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Relative change per second."""
+    """Return the parameter `rate`, relative change per second."""
     return (Parameter("rate", "1/s", (0.1 / s.duration_s,), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True),)
 
 
@@ -62,7 +62,7 @@ EFFECTS = (
         "shape",
         21,
         fixed,
-        "The shaft's compliance grows by {rate} of itself as time goes on.",
+        "The shaft's compliance grows over time, by {rate} of its value.",
         "1/EI = (1 + rate*t)/EI_0",
         apply_shape,
         timed=True,
@@ -72,7 +72,7 @@ EFFECTS = (
         "contact",
         25,
         fixed,
-        "The tissue's stiffness changes by {rate} of itself as time goes on.",
+        "The tissue's stiffness changes over time, by {rate} of its value.",
         "k = k_0 (1 + rate*t)",
         apply_contact,
         timed=True,
@@ -82,7 +82,7 @@ EFFECTS = (
         "motion",
         20,
         parameters,
-        "The gain changes by {rate} of itself as time goes on.",
+        "The gain changes over time, by {rate} of its value.",
         "y = x*(1 + rate*t)",
         apply,
         timed=True,
@@ -92,7 +92,7 @@ EFFECTS = (
         "motion",
         20,
         parameters,
-        "The gain changes by {rate} of itself for the distance travelled: it wears.",
+        "The gain changes with the distance travelled (wear), by {rate} of its value.",
         "y = x*(1 + rate*s),  ds = |dx|",
         apply,
         forms=("travel",),
@@ -102,7 +102,7 @@ EFFECTS = (
         "motion",
         20,
         parameters,
-        "The gain changes by {change} of itself, with a time constant of {time_constant}: it runs in.",
+        "The gain changes by {change} of its value with a time constant of {time_constant} (run-in).",
         "y = x*(1 + change*(1 - exp(-t/time_constant)))",
         apply,
         timed=True,
@@ -113,7 +113,7 @@ EFFECTS = (
         "force",
         22,
         parameters,
-        "The stiffness changes by {rate} of itself as time goes on.",
+        "The stiffness changes over time, by {rate} of its value.",
         "F = stiffness*rate*t*x",
         slots=slots,
         timed=True,

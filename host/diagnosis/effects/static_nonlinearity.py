@@ -40,7 +40,7 @@ EFFECTS = (
         "motion",
         31,
         parameters,
-        "The curve from input to output is bent, the same way up and down.",
+        "The relation from input to output is curved, equally in both directions of motion.",
         "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5),  u = (x - middle)/half_range",
         apply,
     ),
@@ -49,7 +49,7 @@ EFFECTS = (
         "motion",
         30,
         parameters,
-        "The curve from input to output is bent more than once, the same way up and down.",
+        "The relation from input to output has several bends, equal in both directions of motion.",
         "y = x + quadratic*(u^2 - 1/3) + cubic*(u^3 - 3u/5) + quartic*T4(u) + quintic*T5(u) + sextic*T6(u),"
         "  u = (x - middle)/half_range",
         apply,

@@ -8,7 +8,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Lost motion per speed."""
+    """Return the parameter `lost_motion_per_speed` (s)."""
     return (Parameter("lost_motion_per_speed", "s", (s.need / max(s.speed, 1e-300),), 0.0, np.inf, linear=True),)
 
 
@@ -21,7 +21,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """The output stays behind in proportion to speed."""
+    """Apply a lag in proportion to the speed."""
     return np.asarray(signal - p[0] * c.rate(c.motion))
 
 
@@ -36,7 +36,7 @@ EFFECTS = (
         "motion",
         50,
         lost,
-        "The output stays behind by {lost_motion_per_speed} times the speed.",
+        "The output lags by {lost_motion_per_speed} times the speed.",
         "y = x - lost_motion_per_speed*v",
         apply,
         timed=True,
@@ -47,7 +47,7 @@ EFFECTS = (
         "force",
         14,
         force,
-        "A force of {coefficient} per speed acts against the motion.",
+        "A force of {coefficient} times the speed acts against the motion.",
         "F = coefficient*v",
         slots=slots,
         timed=True,

@@ -38,7 +38,7 @@ class Fit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Keys of the active candidates."""
+        """Return the keys of the active candidates."""
         return tuple(term.candidate.key for term in self.terms)
 
 
@@ -134,7 +134,7 @@ def jacobian(problem: Problem, terms: tuple[Term, ...], values: Array, base: Arr
 
 
 def robust(r: Array) -> tuple[float, Array]:
-    """Huber cost and square-root weights."""
+    """Return the Huber cost of residuals (n,) and the square roots of their weights (n,)."""
     size = np.abs(r)
     inside = size <= HUBER
     cost = float(np.sum(np.where(inside, 0.5 * r * r, HUBER * size - 0.5 * HUBER**2)))
@@ -235,7 +235,7 @@ def get_starts(problem: Problem) -> list[dict[str, float]]:
 
 
 def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
-    """Puts starts of memory back."""
+    """Set the stored initial states of all recordings again."""
     for segment, start in zip(problem.segments, given, strict=True):
         segment.start.clear()
         segment.start.update(start)

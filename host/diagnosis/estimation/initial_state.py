@@ -1,4 +1,4 @@
-"""The state from which each recording is simulated: measured at its first samples, and as its outputs want it."""
+"""The initial state of each recording: measured at its first samples, and estimated again from its outputs."""
 
 from __future__ import annotations
 

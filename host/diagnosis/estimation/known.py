@@ -46,11 +46,11 @@ class Known(Model):
         return self._inner
 
     def prepare(self, recording: Recording) -> Segment:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         return self._inner.prepare(recording)
 
     def hold_as(self, segments: list[Segment], hold: str) -> None:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         self._inner.hold_as(segments, hold)
         self.hold = hold
 
@@ -73,11 +73,11 @@ class Known(Model):
         return self._inner.simulate(segment, theta[: self.own], self.with_known(theta, active))
 
     def motion(self, segment: Segment, port: Port) -> Array:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         return self._inner.motion(segment, port)
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         return self._inner.needs(segment, port, theta[: self.own], residual)
 
     def simulate_all(self, segments: list[Segment], theta: Array, active: list[ActiveEffect]) -> list[Array]:
@@ -85,15 +85,15 @@ class Known(Model):
         return self._inner.simulate_all(segments, theta[: self.own], self.with_known(theta, active))
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         return self._inner.announce(segments, theta[: self.own])
 
     def settle(self, segment: Segment, theta: Array) -> None:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         self._inner.settle(segment, theta[: self.own])
 
     def noise_of(self, segment: Segment) -> Any:
-        """As the model without effects."""
+        """Call the model without the known effects."""
         return self._inner.noise_of(segment)
 
     def restarts(self, segments: list[Segment]) -> list[Array]:
@@ -110,11 +110,11 @@ class Known(Model):
         return self._inner.slopes(segment, theta[: self.own], self.with_known(theta, active))
 
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:
-        """As the model."""
+        """Call the model with its own parameters."""
         return self._inner.change(segment, theta[: self.own], slopes, candidate, values)
 
     def answer(self, slope: Any, moved: Array) -> Array:
-        """As the model."""
+        """Call the model with its own parameters."""
         return self._inner.answer(slope, moved)
 
 

@@ -83,7 +83,8 @@ def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> l
         if at_bound or wide:
             where = "ended at a bound" if at_bound else "can be anything"
             says = f"The nominal parameter {p.name} {where} from {low:.3g} to {high:.3g} {p.unit}".rstrip()
-            says += " (95 %): these recordings do not show it. Hold it at a known value, or record a motion that needs it."
+            says += " (95 %): these recordings do not determine it. "
+            says += "Hold it at a known value, or record a motion that depends on it."
             found.append(Finding("excitation", p.name, says))
     return found
 

@@ -39,13 +39,13 @@ class RigPatch:
     left_out: list[str] = field(default_factory=list)
 
     def set(self, key: str, value: Any, cause: str) -> None:
-        """Give `section.key` a value."""
+        """Set `section.key` to a value and note the cause."""
         section, _, name = key.partition(".")
         self.data[section][name] = value
         self.changed[key] = f"{self.changed[key]}, {cause}" if key in self.changed else cause
 
     def get(self, key: str) -> Any:
-        """The value of `section.key`."""
+        """Return the value of `section.key`."""
         section, _, name = key.partition(".")
         return self.data[section][name]
 
@@ -95,7 +95,7 @@ def _lines(data: dict[str, Any], name: str = "") -> list[str]:
 
 
 def _calibration(patch: RigPatch, model: RecordedRig, theta: Array) -> None:
-    """Nominal parameters that were fitted."""
+    """Write the fitted nominal parameters into the rig file."""
     fitted = dict(zip([p.name for p in model.parameters], map(float, theta), strict=True))
     known = {p.name: p.grid[0] for p in model.parameters}
     moved = {name for name, value in fitted.items() if value != known[name]}

@@ -50,7 +50,7 @@ class ExportedLink(NamedTuple):
 
 
 def period_of(time_s: Array) -> float:
-    """Median period (s)."""
+    """Return the median period (s)."""
     return float(np.median(np.diff(time_s)))
 
 
@@ -72,7 +72,7 @@ def affected(run: ExportedRun, signal: Array, port: str, side: str = "", moving:
 
 
 def run_links(links: tuple[ExportedLink, ...], run: ExportedRun) -> dict[str, Array]:
-    """Outputs of a transmission."""
+    """Return the outputs (n,) of a transmission, by channel."""
     found = {}
     for link in links:
         signal = affected(run, run.inputs[link.input], link.port, "input", link.input)

@@ -28,7 +28,7 @@ class Gathered:
         return self._define((plain.__module__, plain.__name__))
 
     def text(self) -> str:
-        """Imports and definitions."""
+        """Return imports and definitions as source text."""
         return "\n".join(self.imports) + "\n\n\n" + "\n\n\n".join(self.texts) + "\n"
 
     def _define(self, place: Place) -> str:
@@ -75,7 +75,7 @@ class _Renamed(ast.NodeTransformer):
         self.names = names
 
     def visit_Name(self, node: ast.Name) -> ast.Name:
-        """Rename a use."""
+        """Rename a name where it is used."""
         return ast.copy_location(ast.Name(self.names.get(node.id, node.id), node.ctx), node)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:

@@ -98,7 +98,7 @@ class RecordedRig(Twin):
         self.correct(segment, theta)
 
     def guess(self, segments: list[Segment]) -> Array:
-        """The calibrated values."""
+        """Return the calibrated values of the parameters."""
         return np.array([p.grid[0] for p in self.parameters])
 
 

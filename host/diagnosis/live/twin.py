@@ -43,7 +43,7 @@ class TwinFit:
     error: float  # RMS left, in units of 0.3 mm and 4 mrad
 
     def applied(self, recording: Recording) -> Recording:
-        """`recording` with its inputs as late as the poses are."""
+        """Return `recording` with its inputs delayed as the poses are."""
         return delayed(recording, self.delay_s)
 
 

@@ -176,7 +176,7 @@ class Watch:
         words = (
             f"{subsystem}: probably {effect}, which explains {explained:.0%}"
             + (f" (indistinguishable from {others})" if others else "")
-            + f"; {channel} has left the twin for {since_s:.1f} s"
+            + f"; {channel} has differed from the twin for {since_s:.1f} s"
         )
         return Alarm(
             stamp_ns=now_ns,
@@ -260,7 +260,7 @@ class Bus(Protocol):
     """What `watch` needs of a zenoh session: all that came since the last call."""
 
     def take(self) -> list[tuple[str, Message, bytes]]:
-        """(topic, message, payload)."""
+        """Return (topic, message, payload) of the messages since the last call."""
         ...
 
 

@@ -34,7 +34,7 @@ class Parameter:
 
     @property
     def key(self) -> str:
-        """Name with its unit as the JSON wants it, e.g. `width_m`."""
+        """Return the name with its unit as in the JSON, e.g. `width_m`."""
         unit = self.unit.replace("/", "_per_").replace(" ", "_").replace("^", "").replace(".", "_").strip("_")
         unit = unit.replace("1_per_", "per_")
         return f"{self.name}_{unit}" if unit else self.name
@@ -184,7 +184,7 @@ class Candidate:
 
     @property
     def key(self) -> str:
-        """Readable identity, e.g. `backlash@insertion`."""
+        """Return the identity as text, e.g. `backlash@insertion`."""
         tail = ",".join(part for part in (self.source, self.form) if part)
         return f"{self.effect.id}@{self.port.name}" + (f"({tail})" if tail else "")
 

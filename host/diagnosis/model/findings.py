@@ -120,7 +120,7 @@ def _counted(
     """Whole numbers where a unit says otherwise."""
     for name in counts(recordings, names, columns, units):
         says = f"Column {columns[name]} holds whole numbers only, called {units[name]}: these are probably counts. "
-        says += f"Give what one count is worth (channels.{name}.scale)."
+        says += f"State the value of one count (channels.{name}.scale)."
         findings.append(Finding("unit", columns[name], says))
 
 
@@ -144,7 +144,7 @@ def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str],
         if good.size and float(np.ptp(good)) <= DEAD * max(float(np.max(np.abs(good))), 1e-300):
             says = f"Column {column} has the same value, {good[0]:.4g}, in every sample."
             if name in vital:
-                says += " Without movement of this channel there is nothing to compare with the nominal model."
+                says += " If this channel does not change, it cannot be compared with the nominal model."
                 unusable |= {recording.name for recording in recordings}
             findings.append(Finding("constant", column, says))
     return [recording for recording in recordings if recording.name not in unusable]
@@ -221,7 +221,7 @@ class _Copied:
         return self.noisy or (self.lag == 0.0 and abs(self.gain - 1.0) < EXACT and self.offset == 0.0)
 
     def sentence(self, copy: str, original: str, recording: Recording) -> str:
-        """What is said of it."""
+        """Return the sentence of the finding."""
         if self.gain == 1.0 and self.offset == 0.0:
             says = f"Column {copy} is column {original} in every sample"
         else:
@@ -301,7 +301,7 @@ def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], f
             says = f"Column {output_column} is about {FACTORS[factor]} times what the nominal model says of {input_column}: "
             says += "the unit of one of them is probably another (channels.*.scale)."
             if path.stated:
-                says += f" The diagnosis goes on with {output_column} divided by that."
+                says += f" The diagnosis continues with {output_column} divided by that."
                 recordings = [_with(r, path.output, r.channels[path.output] / factor) for r in recordings]
             findings.append(Finding("unit", output_column, says))
         swapped = abs(gain * path.gain - 1.0) < SAME_FACTOR and abs(path.gain**2 - 1.0) > 5.0 * SAME_FACTOR
@@ -326,7 +326,7 @@ def _causal(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
     lead = round(float(np.median(leads)))
     output_column, input_column = columns[path.output], columns[path.input]
     says = f"Column {output_column} moves {lead * recordings[0].dt_s:.3g} s before column {input_column} that drives it: "
-    says += "their clocks disagree, or the columns are exchanged. The diagnosis goes on with it shifted back."
+    says += "their clocks disagree, or the columns are exchanged. The diagnosis continues with it shifted back."
     findings.append(Finding("clock", output_column, says))
     moved = []
     for recording in recordings:
@@ -387,7 +387,8 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
         crossed = float(np.median([regression(recording, path, exchanged=True)[2] for recording in used]))
         if crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
-            says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. The diagnosis goes on exchanged."
+            says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
+            says += "The diagnosis continues with them exchanged."
             findings.append(Finding("swapped", force_column, says))
             exchanged = []
             for recording in recordings:
@@ -400,7 +401,7 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
     agreement = [float(np.sum(np.sign(c) * rms)) / max(float(np.sum(rms)), 1e-300) for c, rms, _ in straight]
     if explained > 0.5 and max(agreement) < OPPOSITE:
         says = f"Columns {force_column} and {motion_column} have opposite signs: every term of the nominal law comes out "
-        says += f"negative. The diagnosis goes on with {force_column} reversed (channels.*.sign)."
+        says += f"negative. The diagnosis continues with {force_column} reversed (channels.*.sign)."
         findings.append(Finding("sign", force_column, says))
         recordings = [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
     return _in_units(recordings, path, straight, explained, columns, findings)
@@ -428,7 +429,7 @@ def _in_units(
     if factor and np.ptp(np.log(ratios)) < 2.0 * NEAR_FACTOR:
         says = f"{motion_column} over {force_column} is about {FACTORS[factor]} times what the nominal parameters say: "
         says += (
-            f"the unit of one of them is probably another (channels.*.scale). The diagnosis goes on with {motion_column} "
+            f"the unit of one of them is probably another (channels.*.scale). The diagnosis continues with {motion_column} "
         )
         says += "divided by that."
         findings.append(Finding("unit", motion_column, says))
@@ -437,7 +438,7 @@ def _in_units(
         if order.any() and np.all(np.abs(np.log(ratios) - order * np.log(thousands)) < NEAR_FACTOR * np.maximum(order, 1)):
             unit = "milliseconds" if thousands == 1e3 else "microseconds"
             says = f"Nominal mass, damping and stiffness agree with the recordings if time is in {unit}, not in seconds. "
-            says += "The diagnosis goes on so."
+            says += "The diagnosis continues with this."
             findings.append(Finding("unit", "time", says))
             return [
                 replace(r, time_s=r.time_s / thousands, dt_s=r.dt_s / thousands, begin_s=r.begin_s / thousands)
@@ -447,7 +448,7 @@ def _in_units(
 
 
 def _saturated(recordings: list[Recording], paths: list[Pair], columns: dict[str, str], findings: list[Finding]) -> None:
-    """Readings that stay at their largest or smallest value while what drives them goes on."""
+    """Find readings that stay at their largest or smallest value while their input continues to move."""
     for path in paths:
         pairs = [(path.output, path.input), (path.input, path.output)]
         for name, driver in pairs if path.law else pairs[:1]:
@@ -489,7 +490,7 @@ def _excitation(recordings: list[Recording], paths: list[Pair], columns: dict[st
             says += "a decade apart, and steps."
             findings.append(Finding("excitation", name, says))
         if not any(_turns(recording, path.output if path.law else path.input) for recording in recordings):
-            says = f"Column {name} never reverses: backlash and dry friction cannot show in these recordings."
+            says = f"Column {name} never reverses: these recordings cannot show backlash or dry friction."
             findings.append(Finding("excitation", name, says))
 
 

@@ -252,7 +252,7 @@ def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candi
 
 
 def stack(recording: Recording, names: list[str]) -> Array:
-    """Channels `names` as rows."""
+    """Return the channels `names` as rows, (len(names), n)."""
     return np.vstack([recording.channels[name] for name in names])
 
 

@@ -113,7 +113,7 @@ class SimulatorSpec(Request):
 
 
 class LinkSpec(Request):
-    """One motion-in, motion-out transmission."""
+    """One transmission from a motion to a motion ([[link]])."""
 
     subsystem: str = "transmission"
     input: str
@@ -153,7 +153,7 @@ class AxisSpec(Request):
 
 
 class ImpedanceSpec(Request):
-    """Motion in, force out."""
+    """A material or spring: motion is the input, force the output ([impedance])."""
 
     subsystem: str = "impedance"
     input: str
@@ -300,7 +300,7 @@ class EffectSpec(Request):
 
 
 class NominalSpec(Request):
-    """A whole nominal TOML."""
+    """Content of a nominal TOML file."""
 
     name: str
     kind: Literal["transmission", "axis", "impedance", "callable", "linear", "mujoco", "fmu", "rig"]
@@ -331,7 +331,7 @@ class NominalSpec(Request):
     def _section_present(self) -> NominalSpec:
         section = {"transmission": "link"}.get(self.kind, self.kind)
         if not getattr(self, section):
-            raise ValueError(f"kind {self.kind} wants a section [{section}]")
+            raise ValueError(f"kind {self.kind} needs a section [{section}]")
         if self.simulator is None:
             if self.offer:
                 raise ValueError(f"[[offer]] with a kind that runs a simulator, not kind {self.kind}")

@@ -37,5 +37,5 @@ class Overall:
         return report
 
     def end(self) -> None:
-        """Report that all is done."""
+        """Report that the whole job is done."""
         self._report(f"step {self.steps}: done", 1.0)

@@ -92,7 +92,7 @@ def read_table(path: Path, unpacked_limit_bytes: int | None = None) -> dict[str,
         columns = _read(path, limit)
     except _TooLarge:
         found = Description(f"{path.name}, which unpacks to more than {limit / 2**20:.3g} MiB")
-        raise InputError("recording", found, "less; unpack or split a table that is trusted and really so large") from None
+        raise InputError("recording", found, "less; unpack or split the table if it is trusted and that large") from None
     except InputError:
         raise
     # Readers of damaged files raise whatever the damage leads to (RecursionError, SyntaxError, struct.error, ...).

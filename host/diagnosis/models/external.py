@@ -51,7 +51,7 @@ class ExternalModel(SimulatedModel):
 
     @property
     def label(self) -> str:
-        """The function's name."""
+        """Return the name of the function."""
         return self.spec.function if isinstance(self.spec.function, str) else getattr(self.function, "__name__", "function")
 
     def initial_state(self, segment: Segment) -> tuple[list[str], list[float], list[float]]:

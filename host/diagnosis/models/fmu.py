@@ -51,7 +51,7 @@ class FmuModel(SimulatedModel):
 
     @property
     def label(self) -> str:
-        """The file's name."""
+        """Return the name of the FMU file."""
         return self.path.name
 
     def _reference(self, name: str, key: str, causalities: tuple[str, ...]) -> int:

@@ -35,7 +35,7 @@ class MovedSegment(Segment):
 
 
 class ImpedanceModel(Model):
-    """Nominal model of kind `impedance`."""
+    """Nominal model of kind `impedance`: force = m a + c v + k x + ratio load + offset."""
 
     kind = "impedance"
     either_sign = True

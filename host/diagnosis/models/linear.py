@@ -45,7 +45,7 @@ class StateSpace(NamedTuple):
 
 
 class LinearModel(SimulatedModel):
-    """Nominal model of kind `linear`."""
+    """Nominal model of kind `linear`: a transfer function or state space, alone or in a loop."""
 
     kind = "linear"
 

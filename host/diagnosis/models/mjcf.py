@@ -58,7 +58,7 @@ class MujocoModel(SimulatedModel):
 
     @property
     def label(self) -> str:
-        """The model file's name."""
+        """Return the name of the model file."""
         return self.path.name
 
     def _id(self, kind: str, name: str) -> int:

@@ -76,7 +76,7 @@ class TransmissionModel(Model):
         )
 
     def prepare(self, recording: Recording) -> Segment:
-        """Inputs bridged, outputs stacked."""
+        """Return the segment of a recording: missing inputs interpolated, outputs as rows."""
         names = list(dict.fromkeys(name for link in self.links for name in (link.input, *link.load, *link.others)))
         segment = Segment(
             recording,
@@ -147,7 +147,7 @@ class TransmissionModel(Model):
         raise KeyError(port.name)
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """Residual divided by the gain."""
+        """Return the residual (n,) at the input of a link, divided by its gain."""
         at = 0
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
             if port.name == name:

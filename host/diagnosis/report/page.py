@@ -26,7 +26,7 @@ class Line(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One candidate of the table."""
+    """One row of the table of candidates."""
 
     step: str
     name: str
@@ -76,7 +76,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
 
 
 def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
-    """The verdict in one sentence."""
+    """Return the verdict in one sentence."""
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
     data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
     also = f"; data: {', '.join(data)}" if data else ""
@@ -84,7 +84,7 @@ def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
     if verdict["verdict"] == "nothing_missing":
         return "Nothing is missing: the nominal model explains these recordings" + also
     if verdict["verdict"] == "mismatch_not_identified":
-        return "There is a mismatch, and no known effect accounts for it" + also
+        return "There is a mismatch, and no known effect explains it" + also
     return "Missing: " + (names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]) + also
 
 
@@ -95,7 +95,7 @@ def worse_words(verdict: dict[str, Any]) -> str:
 
 
 def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
-    """The sentence below the verdict."""
+    """Return the sentence below the verdict."""
     fit = verdict["fit"]
     unit = fit["unit"]
     if verdict["verdict"] == "nothing_missing":

@@ -19,7 +19,7 @@ def scaled(unit: str, largest: float) -> tuple[float, str]:
 
 
 def short(value: float) -> str:
-    """Three significant digits."""
+    """Return `value` with three significant digits, a dash if it is not finite."""
     return f"{value:.3g}" if math.isfinite(value) else "–"
 
 

@@ -85,14 +85,15 @@ def next_step(result: Diagnosis) -> str:
         return "Diagnose again with a longer time budget: the search was stopped before its end."
     first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) != ("clock", "time")), None)
     if first is not None:
-        return f"Put the data right first ({first.id}: {first.channel}), then diagnose again."
+        return f"Correct the data first ({first.id}: {first.channel}), then diagnose again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]
     if result.designs:
         return f"Record the proposed motion and diagnose again with it: {result.designs[0].says}"
     if result.verdict == "mismatch_not_identified":
         return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
     if unsure:
-        return f"Record a further motion that shows {words(unsure[0]['id'])}, and diagnose again: it is not sure yet."
+        shown = words(unsure[0]["id"])
+        return f"Record a further motion that shows {shown}, and diagnose again: the verdict is not confident yet."
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
     unseen = next((finding for finding in result.findings if finding.id == "excitation"), None)
@@ -100,7 +101,7 @@ def next_step(result: Diagnosis) -> str:
 
 
 def words(effect_id: str) -> str:
-    """Write an id with spaces."""
+    """Return an effect's id with spaces for underscores."""
     return effect_id.replace("_", " ")
 
 
@@ -116,7 +117,7 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
         "effects": [],
         "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
         "worse": [],
-        "next": "Put the data right first, then diagnose again: " + (findings[0].says if findings else ""),
+        "next": "Correct the data first, then diagnose again: " + (findings[0].says if findings else ""),
         "stopped_early": False,
         "seconds": seconds,
     }
@@ -212,7 +213,7 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
     elif ranked and not white:
         figures = result.figures
         share = figures.after[figures.primary] / max(figures.before[figures.primary], 1e-300)
-        ranked[0]["says"] += f" The held-out RMS error is {share:.0%} of what it was, and not yet white noise."
+        ranked[0]["says"] += f" The held-out RMS error is {share:.0%} of what it was, and the residual is not white noise."
     return ranked
 
 

@@ -59,7 +59,7 @@ def joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
-    """Samples that fall into `spans`."""
+    """Return the mask (n,) of the samples within `spans`."""
     mask = np.zeros(time_s.size, dtype=bool)
     for a, b in spans:
         mask |= (time_s >= a) & (time_s <= b)

@@ -40,5 +40,5 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem]) -> list[Fi
     if chosen == stated or not model.hold_stated:
         return []
     says = f"Between its samples column {column} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
-    says += f'The diagnosis goes on so (axis.hold = "{chosen}").'
+    says += f'The diagnosis continues with this (axis.hold = "{chosen}").'
     return [Finding("hold", column, says)]

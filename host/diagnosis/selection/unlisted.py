@@ -37,7 +37,7 @@ class Rest:
 
     @property
     def sure(self) -> bool:
-        """Whether there is a mismatch that the finder knows to be there."""
+        """Return whether a mismatch is certain."""
         return self.above_noise or (self.predicted is not None and self.predicted.sure)
 
 

@@ -385,7 +385,7 @@ class _Sums:
         return np.where(seen, 0.5 * left**2 / np.where(seen, size, 1.0), 0.0)
 
     def sizes(self, chosen: list[int]) -> Array:
-        """Sizes of the forms chosen."""
+        """Return the least-squares sizes of the chosen forms."""
         return np.asarray(np.linalg.lstsq(self.gram[np.ix_(chosen, chosen)], self.pull[chosen], rcond=1e-10)[0])
 
     def absorbed(self, chosen: list[int], sizes: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The oracle of the control study: it knows wall motion and backlash exactly, and obeys the stages' limits."""
+"""The oracle of the control study: it gets the true wall motion and backlash, and obeys the stages' limits."""
 
 from __future__ import annotations
 

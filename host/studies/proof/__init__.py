@@ -1,1 +1,1 @@
-"""The mismatch finder put to the proof: concealed cases, verdicts of a process that sees recordings only, scores."""
+"""Proof of the mismatch finder: concealed cases, verdicts of a process that gets only recordings, scores."""

@@ -192,7 +192,7 @@ def figure_3_5(quick: bool) -> Section:
 
 
 def _rod(catheter: Catheter, outside_m: float, k0: float) -> Array:
-    """Record of the rod of which `outside_m` are outside the sheath; less than the shaft: the rest is inside (3.2.3)."""
+    """Return the rod with `outside_m` outside the sheath; if less than the shaft, the remaining part is inside (3.2.3)."""
     return rod_record(catheter, outside_m - catheter.distal_length_m, k0)
 
 
