@@ -243,7 +243,7 @@ def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
         if segment.begin is not None and coarse.begin is not None:
             segment.begin.values = coarse.begin.values
     again = replace(fit)
-    again.residuals = [segment.y - full.simulate(segment, fit.terms, fit.values) for segment in full.segments]
+    again.residuals = [full.left(segment, fit.terms, fit.values) for segment in full.segments]
     return again
 
 

@@ -33,7 +33,15 @@ def of_load(s: Scale, form: str) -> tuple[Parameter, ...]:
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Stiffness of the branch that relaxes, and its time constant."""
     return (
-        Parameter("stiffness", f"{s.unit}/{s.motion_unit}", (s.need / s.motion_span,), 0.0, np.inf, linear=True),
+        Parameter(
+            "stiffness",
+            f"{s.unit}/{s.motion_unit}",
+            (s.need / s.motion_span,),
+            0.0,
+            np.inf,
+            linear=True,
+            follows="stiffness",
+        ),
         taus(s),
     )
 

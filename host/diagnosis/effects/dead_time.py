@@ -22,7 +22,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     delays = (0.5 * s.dt_s, *spread(2.0 * s.dt_s, max(0.1 * s.duration_s, 4.0 * s.dt_s), 4))
     squares = tuple(lag * lag for lag in spread(0.5 * s.dt_s, max(0.03 * s.duration_s, 4.0 * s.dt_s), 4))
     return (
-        Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s),
+        Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s, dead_time=True),
         Parameter("lag", "s", lags, 0.0, 0.3 * s.duration_s, step=s.dt_s),
         Parameter("inertia", "s2", squares, 0.0, (0.2 * s.duration_s) ** 2, step=s.dt_s**2),
     )

@@ -14,7 +14,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Delay: causal, and no longer than leaves most of the recording to compare."""
     longest = LONGEST * s.duration_s
     delays = (0.05 * s.dt_s, 0.4 * s.dt_s, 2.0 * s.dt_s, *spread(6.0 * s.dt_s, max(0.5 * longest, 7.0 * s.dt_s), 7))
-    return (Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s),)
+    return (Parameter("delay", "s", delays, 0.0, longest, step=s.dt_s, dead_time=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:

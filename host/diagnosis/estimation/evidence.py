@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
+from host.diagnosis.estimation.feedback import freed
 from host.diagnosis.model.model import Segment
 
 Array = npt.NDArray[np.float64]
@@ -65,8 +66,11 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
     is divided by
     the correlation time of what the better model leaves. `noise_sd` (outputs,): standard deviations below which nothing is
-    gained; nor below the scatter that the steps of a reading make.
+    gained; nor below the scatter that the steps of a reading make. Noise that a controller sent back into the input is
+    taken off both (`feedback.py`); shares are of the whole error.
     """
+    raw_before, raw_after = before, after
+    before, after = _freed(segments, before), _freed(segments, after)
     independent, log_ratio, excess, excess_after = (np.zeros(noise_sd.size) for _ in range(4))
     by_output: list[list[float]] = []
     for row in range(noise_sd.size):
@@ -83,7 +87,20 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
     share = float(1.0 - np.exp(-log_ratio[top]))
+    if before is not raw_before:
+        b2, a2, _, _ = _pooled(segments, which, raw_before, raw_after, top)
+        share, excess[top] = 1.0 - a2 / max(b2, 1e-300), max(0.0, 1.0 - noise_sd[top] ** 2 / max(b2, 1e-300))
     return Gain(gain, _p_value(by_output), share, float(excess[top]), independent, log_ratio, excess_after)
+
+
+def _freed(segments: list[Segment], residuals: list[Array]) -> list[Array]:
+    """Residuals without the noise that later input says; the same list where no output is fed back."""
+    if not any(basis is not None for segment in segments for basis in segment.fed_back):
+        return residuals
+    return [
+        np.vstack([freed(segment, row, values) for row, values in enumerate(r)])
+        for segment, r in zip(segments, residuals, strict=True)
+    ]
 
 
 def _p_value(by_output: list[list[float]]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,7 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
+WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Problem:
     columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
     rules: SelectionRules = RULES
     budget: Budget = field(default_factory=Budget)
+    waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""
@@ -76,6 +79,29 @@ class Problem:
             at += len(term.parameters)
         return nominal, active
 
+    def late_s(self, terms: tuple[Term, ...], values: Array) -> float:
+        """Dead time of all terms together (s)."""
+        at, late_s = len(self.model.parameters), 0.0
+        for term in terms:
+            for p, value in zip(term.parameters, values[at : at + len(term.parameters)], strict=True):
+                late_s += max(float(value), 0.0) if p.dead_time else 0.0
+            at += len(term.parameters)
+        return late_s
+
+    def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
+        """First samples (number) that a dead time makes of what was before the recording: nothing can predict them."""
+        late_s = max(self.late_s(terms, values), self.waits_s)
+        return min(math.ceil(late_s / segment.recording.dt_s - 1e-9), segment.n // 2) if late_s > 0.0 else 0
+
+    def left(self, segment: Segment, terms: tuple[Term, ...], values: Array, out: Array | None = None) -> Array:
+        """Measured minus simulated (outputs, n), NaN where nothing was measured or nothing can be predicted.
+
+        out: the simulation, where it is known already.
+        """
+        r = segment.y - (self.simulate(segment, terms, values) if out is None else out)
+        r[:, : self.unseen(segment, terms, values)] = np.nan
+        return np.asarray(r)
+
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
         """Measured minus simulated, NaN outside the requested part (`fit`, `heldout` or `all`)."""
         out = []
@@ -84,17 +110,29 @@ class Problem:
             if not mask.any():
                 out.append(np.full_like(segment.y, np.nan))
                 continue
-            out.append(np.where(mask, segment.y - self.simulate(segment, terms, values), np.nan))
+            out.append(np.where(mask, self.left(segment, terms, values), np.nan))
         return out
 
-    def stacked(self, terms: tuple[Term, ...], values: Array) -> Array:
-        """Weighted residuals of the samples to fit, one vector; missing samples are zero."""
-        rows = []
+    def stacked(self, terms: tuple[Term, ...], values: Array, unseen: float | None = None) -> Array:
+        """Weighted residuals of the samples to fit, one vector; missing samples are zero.
+
+        unseen: of samples that nothing can predict. None: they are zero and the others count so much more that a longer
+        dead time gains and loses nothing by leaving more of them out.
+        """
+        rows, hidden = [], 0
         used = [segment for segment in self.segments if segment.fit.any()]
         for segment, out in zip(used, self.simulate_all(used, terms, values), strict=True):
-            r = (segment.y - out)[:, segment.fit] / self.scale[:, None]
-            rows.append(np.clip(np.nan_to_num(r, nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
-        return np.concatenate(rows)
+            r = (segment.y - out) / self.scale[:, None]
+            first = self.unseen(segment, terms, values)
+            if first:
+                measured = np.isfinite(segment.y[:, :first])
+                hidden += int(np.count_nonzero(measured[:, segment.fit[:first]]))
+                r[:, :first] = np.where(measured, np.nan if unseen is None else unseen, np.nan)
+            rows.append(np.clip(np.nan_to_num(r[:, segment.fit], nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
+        stacked = np.concatenate(rows)
+        if hidden and unseen is None:
+            stacked *= math.sqrt(1.0 + hidden / max(np.count_nonzero(stacked), 1))
+        return stacked
 
 
 def free(parameters: list[Parameter]) -> list[int]:
@@ -109,7 +147,7 @@ def size_of(p: Parameter, value: float) -> float:
     return max(abs(value), max((abs(g) for g in p.grid), default=0.0)) or 1.0
 
 
-def _moved(p: Parameter, value: float, by: float) -> float:
+def moved(p: Parameter, value: float, by: float) -> float:
     """`value` moved by `by` in the parameter's own scale, kept in bounds."""
     new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + by * size_of(p, value)
     return float(min(max(new, p.low), p.high))
@@ -142,7 +180,19 @@ def robust(r: Array) -> tuple[float, Array]:
 
 
 def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: int = 40, tolerance: float = 1e-7) -> Fit:
-    """Values that minimize the Huber cost of the weighted simulation error, from `start`."""
+    """Values that minimize the Huber cost of the weighted simulation error, from `start`.
+
+    A dead time hides the first samples. How many is held while it is fitted: the cost would jump with each of them.
+    """
+    if problem.waits_s == 0.0 and any(p.dead_time for term in terms for p in term.parameters):
+        for _ in range(3):
+            late_s = problem.late_s(terms, start)
+            waits_s = WAIT * late_s + 3.0 * problem.segments[0].recording.dt_s
+            fit = minimize(replace(problem, waits_s=waits_s), terms, start, rounds, tolerance)
+            start = fit.values
+            if problem.late_s(terms, start) <= waits_s:
+                break
+        return fit
     parameters = problem.parameters(terms)
     values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])
     r = problem.stacked(terms, values)
@@ -162,7 +212,7 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
             for place, index in enumerate(moving):
                 p = parameters[index]
                 trial[index] = (
-                    _moved(p, values[index], by[place])
+                    moved(p, values[index], by[place])
                     if p.log
                     else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
                 )
@@ -193,7 +243,7 @@ def reweigh(problem: Problem, fit: Fit) -> None:
     left: list[list[Array]] = [[] for _ in problem.model.outputs]
     for segment in problem.segments:
         if segment.fit.any():
-            r = segment.y - problem.simulate(segment, fit.terms, fit.values)
+            r = problem.left(segment, fit.terms, fit.values)
             for row, rest in zip(r[:, segment.fit], left, strict=True):
                 rest.append(row[np.isfinite(row)])
     for index, rest in enumerate(left):
@@ -212,7 +262,9 @@ def finish(problem: Problem, fit: Fit) -> Fit:
         for term, (candidate, values) in zip(fit.terms, active, strict=True)
     )
     found = problem.simulate_all(problem.segments, fit.terms, fit.values)
-    fit.residuals = [segment.y - out for segment, out in zip(problem.segments, found, strict=True)]
+    fit.residuals = [
+        problem.left(segment, fit.terms, fit.values, out) for segment, out in zip(problem.segments, found, strict=True)
+    ]
     return fit
 
 

@@ -30,6 +30,8 @@ class Parameter:
     step: float = 0.0  # natural size of a signed parameter; 0: the largest of the grid
     vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
     shape: bool = False  # its upper bound is a limit of the form, even where the effect's bounds are natural
+    dead_time: bool = False  # the output's first so many seconds come from what was before the recording
+    follows: str = ""  # nominal parameter whose sign it has: a branch of a spring counts as the spring does
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
     @property

@@ -59,6 +59,7 @@ class Segment:
     resolution: Array | None = None  # (outputs,) standard deviation that the steps of each reading make
     weight: Array | None = None  # (outputs,) scale of each output's residual
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
+    fed_back: list[Array | None] = field(default_factory=list)  # of each output, later input that holds its noise
 
     @property
     def n(self) -> int:

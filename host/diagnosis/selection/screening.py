@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -10,14 +11,30 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, Term, grid_points, jacobian, lines_of, size_of, starts, tuned
+from host.diagnosis.estimation.fit import (
+    FAR,
+    Fit,
+    Problem,
+    Term,
+    free,
+    get_starts,
+    grid_points,
+    jacobian,
+    lines_of,
+    moved,
+    set_starts,
+    size_of,
+    starts,
+    tuned,
+)
 from host.diagnosis.model.dataset import one_clock
-from host.diagnosis.model.effect import Candidate, Evidence, Reading
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Reading
 from host.diagnosis.model.model import scale_of
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
+START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 
@@ -34,8 +51,17 @@ def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
     scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
     parameters = candidate.effect.parameters(scale, candidate.form)
     if problem.model.either_sign and candidate.effect.slots is not None:
-        parameters = tuple(replace(p, low=-np.inf) if p.linear and p.low == 0.0 else p for p in parameters)
+        own = {p.name: float(value) for p, value in zip(problem.model.parameters, fit.values[:n], strict=True)}
+        parameters = tuple(_either(p, own) if p.linear and p.low == 0.0 else p for p in parameters)
     return Term(candidate, parameters)
+
+
+def _either(p: Parameter, nominal: dict[str, float]) -> Parameter:
+    """`p` of a force that may count either way: both signs, or the one of the `nominal` parameter that it follows."""
+    sign = nominal.get(p.follows, 0.0)
+    if sign > 0.0:
+        return p
+    return replace(p, low=-np.inf, high=0.0) if sign < 0.0 else replace(p, low=-np.inf)
 
 
 def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Term, ...], Array]:
@@ -80,7 +106,7 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
 class Screened:
     """A candidate with its promise by projection and the start values that earned it.
 
-    nominal: nominal parameters to start from with each of `begin`, where they are not those of the fit so far.
+    nominal: parameters of all that is fitted already to start from with each of `begin`, where they are not those so far.
     """
 
     candidate: Candidate
@@ -98,6 +124,8 @@ class Point:
     taken: float
     begin: Array
     left: Array
+    values: Array | None = None  # parameters of the terms before it, where they were fitted with it
+    begun: int = 0  # states that recordings begin from, among what took it
 
 
 def screen(
@@ -145,8 +173,10 @@ def screen(
         reference = float(r @ r)
         left = max(float(rest @ rest) - points[0].taken, 1e-300)
         n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
-        promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters)
-        found.append(Screened(candidate, term, drop, float(promise), [point.begin for point in points[:3]]))
+        promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters) - points[0].begun
+        nominal = [point.values for point in points[:2] if point.values is not None]
+        begin = [point.begin for point in points[: len(nominal) or 3]]
+        found.append(Screened(candidate, term, drop, float(promise), begin, nominal))
     return sorted(found, key=lambda item: item.promise, reverse=True)
 
 
@@ -265,10 +295,14 @@ def _scan(
     slopes: Slopes,
     lines: Array,
 ) -> list[Point]:
-    """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`."""
+    """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`.
+
+    A term with memory gets the state that each recording begins from as further unknowns, and pays for them.
+    """
     points: list[Point] = []
     most_taken = 0.0
     linear = [p for p in term.parameters if p.linear]
+    fast = term.candidate.port.name in slopes
     for point in grid_points(tuned(term, lines), max(5, most // max(len(linear), 1))):
         columns = []
         options: list[Any] = [*linear] or [None]
@@ -277,11 +311,19 @@ def _scan(
             if p is not None:
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
-            fast = term.candidate.port.name in slopes
-            columns.append(_fast(problem, terms, trial, slopes) if fast else base - problem.stacked(terms, trial))
+            columns.append(_fast(problem, terms, trial, slopes) if fast else base - _known(problem, terms, trial, base))
+        S = np.zeros((base.size, 0)) if fast else _begun(problem, terms, trial, Q)
+        if not linear and not fast and term.candidate.effect.shifts == "time":
+            found = _absorbed(problem, terms, values, trial, base, S)
+            if found is not None:
+                taken, moved, left = float(rest @ rest - found[1] @ found[1]), found[0], found[1]
+                points.append(Point(taken, trial[values.size :], left, moved, S.shape[1]))
+                most_taken = max(most_taken, taken)
+            continue
         D = np.array(columns)
+        D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
         B = D @ Q
-        G, g = D @ D.T - B @ B.T, D @ rest
+        G, g = D @ D.T - B @ B.T, D @ r
         size = np.sqrt(np.maximum(np.diag(G), 1e-300))
         if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < 1e-10:
             continue
@@ -292,10 +334,68 @@ def _scan(
             )
         elif not 0.2 < a[0] < 5.0:
             continue
-        taken = float(2.0 * a @ g - a @ G @ a)
+        taken = float(2.0 * a @ g - a @ G @ a) + float(rest @ rest - r @ r)
         amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
         left = rest
         if taken > most_taken:
-            most_taken, left = taken, rest - (a @ D - Q @ (B.T @ a))
-        points.append(Point(taken, starts(term, amplitude, point), left))
+            most_taken, left = taken, r - (a @ D - Q @ (B.T @ a))
+        points.append(Point(taken, starts(term, amplitude, point), left, None, S.shape[1]))
     return points
+
+
+def _known(problem: Problem, terms: tuple[Term, ...], trial: Array, base: Array) -> Array:
+    """Residuals of `trial`; those of `base` where a dead time makes them of what was before the recording."""
+    r = problem.stacked(terms, trial, unseen=np.inf)
+    return np.where(r >= FAR, base, r)
+
+
+def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) -> Array:
+    """What the state at a recording's first sample does of the last term's memory: orthonormal columns, one a recording.
+
+    They are orthogonal to `Q` too, so that they and the term share what is left.
+    """
+    candidate = terms[-1].candidate
+    none = np.zeros((Q.shape[0], 0))
+    if not candidate.effect.remembers or candidate.effect.shifts == "rate":
+        return none
+    port, before = candidate.port.name, get_starts(problem)
+    used = [segment for segment in problem.segments if segment.fit.any()]
+    spread = float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
+    r = problem.stacked(terms, trial, unseen=0.0)
+    for segment in used:
+        segment.start[port] = segment.start.get(port, 0.0) + START_STEP * spread
+    change = r - problem.stacked(terms, trial, unseen=0.0)
+    set_starts(problem, before)
+    rows = len(problem.noise)
+    edges = np.cumsum([0] + [rows * int(segment.fit.sum()) for segment in used])
+    columns = np.zeros((change.size, len(used)))
+    for index, (first, last) in enumerate(itertools.pairwise(edges)):
+        columns[first:last, index] = change[first:last]
+    columns -= Q @ (Q.T @ columns)
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 1e-9 * max(np.linalg.norm(change), 1e-300)]
+    return np.asarray(np.linalg.qr(columns)[0]) if columns.shape[1] else none
+
+
+def _absorbed(
+    problem: Problem, terms: tuple[Term, ...], values: Array, trial: Array, base: Array, S: Array
+) -> tuple[Array, Array] | None:
+    """`values` fitted again next to a shift in time, and what is left; None where that is worse than without.
+
+    Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
+    change of the outputs at their present values says nothing then.
+    """
+    r = _known(problem, terms, trial, base)
+    before = problem.parameters(terms[:-1])
+    sizes = [size_of(p, v) for p, v in zip(problem.parameters(terms), trial, strict=True)]
+    J = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes)[:, : len(free(before))]
+    J, aim = J - S @ (S.T @ J), r - S @ (S.T @ r)
+    if not J.shape[1] or not np.all(np.isfinite(J)):
+        return None
+    by = np.linalg.lstsq(J, aim, rcond=1e-10)[0]
+    found = values.copy()
+    for index, step in zip(free(before), by, strict=True):
+        found[index] = moved(before[index], values[index], float(step))
+    r = _known(problem, terms, np.concatenate((found, trial[values.size :])), base)
+    left = r - S @ (S.T @ r)
+    return found, left

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.feedback import find_feedback
 from host.diagnosis.estimation.fit import (
     Fit,
     Problem,
@@ -90,7 +91,9 @@ def fit_nominal(problem: Problem) -> Fit:
         settle(problem, fit.values)
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values)
-    return settled(problem, fit)
+    fit = settled(problem, fit)
+    find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
+    return fit
 
 
 def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Trial:
@@ -172,7 +175,7 @@ def _best_start(problem: Problem, fit: Fit, segment: Segment, port: str, reach: 
 
     def error(start: float) -> float:
         segment.start[port] = start
-        r = (segment.y - problem.simulate(segment, fit.terms, fit.values)) / problem.scale[:, None]
+        r = problem.left(segment, fit.terms, fit.values) / problem.scale[:, None]
         return float(np.nansum(np.minimum(r * r, 16.0)))
 
     old = segment.start.get(port, 0.0)

@@ -1,0 +1,93 @@
+"""Noise that comes back through a controller: what later input of a recording says of the noise in its output.
+
+A controller that reads an output sends its noise into the next input. The new part of that input (what its own past does
+not predict) then holds the noise of a moment before, and an effect that makes the simulated output later, or mixes
+neighbouring samples, can take a part of the noise away without any physics in it. Forssell and Ljung, "Closed-loop
+identification revisited" (Automatica, 1999): a consistent comparison needs the noise that is fed back in the noise model.
+Here the part of the residual that later input foretells is taken off before two models are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.model import Segment
+from host.diagnosis.model.operators import fill
+
+Array = npt.NDArray[np.float64]
+ORDER = 20  # of the prediction of an input from its own past
+LAGS = 30  # later samples of the inputs together; the first later one is left out: it may be how an input is held
+SAMPLES_PER_LAG = 40  # recorded, at least
+MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
+LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
+OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
+
+
+def innovations(x: Array) -> Array:
+    """Return what `x` (n,) does beyond its best linear prediction from the last ORDER samples, zero at its begin."""
+    past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
+    new = x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=None)[0]
+    return np.concatenate((np.zeros(ORDER), new / (np.std(new) + 1e-300)))
+
+
+def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> None:
+    """Set `fed_back` of every segment, of the outputs whose residual is foretold by later `inputs`.
+
+    residuals: (outputs, n) of each segment. `fed_back[row]` is an orthonormal basis (n, lags), or None.
+    """
+    new = [_new_input(segment, inputs) for segment in segments]
+    for segment, u in zip(segments, new, strict=True):
+        segment.fed_back = [_later(u) for _ in range(segment.y.shape[0])]
+    for row in range(segments[0].y.shape[0]):
+        later = _share([segment.fed_back[row] for segment in segments], residuals, row)
+        earlier = _share([_earlier(u) for u in new], residuals, row)
+        if later < LEAST_SHARE or later < OVER_PAST * earlier:
+            for segment in segments:
+                segment.fed_back[row] = None
+
+
+def freed(segment: Segment, row: int, residual: Array) -> Array:
+    """Return `residual` (n,) of output `row` without what later input says of it; missing samples stay missing."""
+    basis = segment.fed_back[row] if segment.fed_back else None
+    if basis is None:
+        return residual
+    return residual - basis @ (basis.T @ np.nan_to_num(residual))
+
+
+def _new_input(segment: Segment, inputs: tuple[str, ...]) -> list[Array]:
+    if not ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES:
+        return []
+    moving = [fill(segment.inputs[name]) for name in inputs if name in segment.inputs and np.ptp(segment.inputs[name]) > 0.0]
+    return [innovations(x) for x in moving]
+
+
+def _later(new: list[Array]) -> Array | None:
+    return _basis(new, lambda u, k: np.concatenate((u[k + 1 :], np.zeros(k + 1))))
+
+
+def _earlier(new: list[Array]) -> Array | None:
+    return _basis(new, lambda u, k: np.concatenate((np.zeros(k), u[: u.size - k])))
+
+
+def _basis(new: list[Array], moved: Callable[[Array, int], Array]) -> Array | None:
+    if not new:
+        return None
+    count = max(1, min(LAGS, new[0].size // SAMPLES_PER_LAG) // len(new))
+    return np.linalg.qr(np.column_stack([moved(u, k) for u in new for k in range(1, count + 1)]))[0]
+
+
+def _share(bases: list[Array | None], residuals: list[Array], row: int) -> float:
+    """Return the share of the residuals' variance that the bases hold, less what chance gives them."""
+    taken = total = 0.0
+    for basis, residual in zip(bases, residuals, strict=True):
+        r = np.nan_to_num(residual[row])
+        n = int(np.count_nonzero(r))
+        if basis is None or n <= 2 * basis.shape[1]:
+            continue
+        power = float(r @ r)
+        total += power
+        taken += float(np.sum((basis.T @ r) ** 2)) - power * basis.shape[1] / n
+    return taken / total if total > 0.0 else 0.0
