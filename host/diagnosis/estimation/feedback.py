@@ -4,7 +4,7 @@ A controller that reads an output sends its noise into the next input. The new p
 not predict) then holds the noise of a moment before, and an effect that makes the simulated output later, or mixes
 neighbouring samples, can take a part of the noise away without any physics in it. Forssell and Ljung, "Closed-loop
 identification revisited" (Automatica, 1999): a consistent comparison needs the noise that is fed back in the noise model.
-Here the part of the residual that later input foretells is taken off before two models are compared.
+Here the part of the residual that later input predicts is taken off before two models are compared.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def innovations(x: Array) -> Array:
 
 
 def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> None:
-    """Set `fed_back` of every segment, of the outputs whose residual is foretold by later `inputs`.
+    """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs`.
 
     residuals: (outputs, n) of each segment. `fed_back[row]` is an orthonormal basis (n, lags), or None.
     """

@@ -113,26 +113,25 @@ class Problem:
             out.append(np.where(mask, self.left(segment, terms, values), np.nan))
         return out
 
-    def stacked(self, terms: tuple[Term, ...], values: Array, unseen: float | None = None) -> Array:
+    def stacked(self, terms: tuple[Term, ...], values: Array, unseen: float = 0.0) -> Array:
         """Weighted residuals of the samples to fit, one vector; missing samples are zero.
 
-        unseen: of samples that nothing can predict. None: they are zero and the others count so much more that a longer
-        dead time gains and loses nothing by leaving more of them out.
+        unseen: of samples that nothing can predict.
         """
-        rows, hidden = [], 0
+        rows = []
         used = [segment for segment in self.segments if segment.fit.any()]
         for segment, out in zip(used, self.simulate_all(used, terms, values), strict=True):
             r = (segment.y - out) / self.scale[:, None]
             first = self.unseen(segment, terms, values)
-            if first:
-                measured = np.isfinite(segment.y[:, :first])
-                hidden += int(np.count_nonzero(measured[:, segment.fit[:first]]))
-                r[:, :first] = np.where(measured, np.nan if unseen is None else unseen, np.nan)
+            r[:, :first] = np.where(np.isfinite(segment.y[:, :first]), unseen, np.nan)
             rows.append(np.clip(np.nan_to_num(r[:, segment.fit], nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
-        stacked = np.concatenate(rows)
-        if hidden and unseen is None:
-            stacked *= math.sqrt(1.0 + hidden / max(np.count_nonzero(stacked), 1))
-        return stacked
+        return np.concatenate(rows)
+
+    def seen_share(self, terms: tuple[Term, ...], values: Array) -> float:
+        """Share of the samples to fit that can be predicted: the others are behind a dead time at a recording's begin."""
+        used = [segment for segment in self.segments if segment.fit.any()]
+        hidden = sum(int(segment.fit[: self.unseen(segment, terms, values)].sum()) for segment in used)
+        return 1.0 - hidden / max(sum(int(segment.fit.sum()) for segment in used), 1)
 
 
 def free(parameters: list[Parameter]) -> list[int]:
@@ -188,7 +187,9 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
         for _ in range(3):
             late_s = problem.late_s(terms, start)
             waits_s = WAIT * late_s + 3.0 * problem.segments[0].recording.dt_s
-            fit = minimize(replace(problem, waits_s=waits_s), terms, start, rounds, tolerance)
+            held = replace(problem, waits_s=waits_s)
+            fit = minimize(held, terms, start, rounds, tolerance)
+            fit.cost /= max(held.seen_share(terms, start), 1e-3)  # that a longer dead time gains nothing by hiding samples
             start = fit.values
             if problem.late_s(terms, start) <= waits_s:
                 break

@@ -52,6 +52,8 @@ class SelectionRules:
     most_refits: int = 2  # times that a step is judged again because a trial led to a better minimum without it
     simpler_fits: int = 3  # simpler shapes of the best candidate that are fitted after it
     wider_fits: int = 4  # other forms that are fitted where one that the data call for ended at a bound
+    joint_first: int = 2  # of them, of unlike families, past which further effects are looked for,
+    joint_second: int = 3  # and how many of these are fitted
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 
     # Indistinguishable: rivals in an effect's place.

@@ -15,15 +15,18 @@ from host.diagnosis.selection.trial import Trial, bound_by, related
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+FitNext = Callable[[Fit, list[dict[str, float]]], list[Trial]]
 
 
 def best_pair(
-    problem: Problem, nominal: Fit, trials: list[Trial], noise_sd: Array, progress: Progress
+    problem: Problem, nominal: Fit, trials: list[Trial], fit_next: FitNext, noise_sd: Array, progress: Progress
 ) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
     """The likeliest pair of refused effects of which each earns its place together with the other; None if there is none.
 
-    trials: effects fitted alone over `nominal`, all refused. Returns the pair's fit, its gain on held-out samples and the
-    starts of memory that it was found with.
+    The effects of a pair are among those fitted alone; or the second is one that shows only past the first.
+
+    trials: effects fitted alone over `nominal`, all refused. fit_next: the best further effects over the fit of a trial.
+    Returns the pair's fit, its gain on held-out samples and the starts of memory that it was found with.
     """
     rules = problem.rules
     singles = _singles(trials, rules.joint_singles)
@@ -44,6 +47,26 @@ def best_pair(
         more = len(fit.values) - len(nominal.values)
         if _earned(problem, fit, a, b, noise_sd) and _enough(problem, held, both, more):
             found.append((both.log_likelihood - rules.parameter_penalty * more, fit, held, starts))
+    for trial in _unlike(singles)[: rules.joint_first]:
+        if problem.budget.spent():
+            break
+        progress(f"fitting a second effect with {trial.candidate.key}", 0.5)
+        seconds = [t for t in fit_next(trial.fit, trial.starts) if len(t.fit.terms) == 2]
+        if seconds:  # past the second the first may have another, simpler form
+            top = max(seconds, key=lambda t: t.both.log_likelihood)
+            set_starts(problem, top.starts)
+            other = _alone(problem, nominal, top.fit)
+            seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
+        for second in seconds:
+            set_starts(problem, second.starts)
+            fit = second.fit
+            held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
+            both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
+            more = len(fit.values) - len(nominal.values)
+            if _enough(problem, held, both, more) and all(
+                _earned_over(problem, fit, _alone(problem, nominal, fit, which), noise_sd) for which in (0, 1)
+            ):
+                found.append((both.log_likelihood - rules.parameter_penalty * more, fit, held, second.starts))
     if not found:
         return None
     _, fit, held, starts = max(found, key=lambda item: item[0])
@@ -56,6 +79,25 @@ def _singles(trials: list[Trial], most: int) -> list[Trial]:
     for trial in sorted(trials, key=lambda trial: -trial.both.log_likelihood):
         kept.setdefault(f"{trial.candidate.effect.id}@{trial.candidate.port.name}", trial)
     return list(kept.values())[:most]
+
+
+def _unlike(singles: list[Trial]) -> list[Trial]:
+    """The likeliest of each family: finer shapes of one friction are one try."""
+    kept: list[Trial] = []
+    for trial in singles:
+        if not any(related(trial.candidate, k.candidate) or related(k.candidate, trial.candidate) for k in kept):
+            kept.append(trial)
+    return kept
+
+
+def _alone(problem: Problem, nominal: Fit, pair: Fit, which: int = 1) -> Fit:
+    """One effect of `pair` without the other, fitted again."""
+    n = len(nominal.values)
+    first = len(pair.terms[0].parameters)
+    own = pair.values[n + first :] if which else pair.values[n : n + first]
+    begin = np.concatenate((pair.values[:n], own))
+    rounds = problem.rules.further_iterations
+    return finish(problem, minimize(problem, (pair.terms[which],), begin, rounds=rounds, tolerance=1e-4))
 
 
 def _fitted(problem: Problem, nominal: Fit, a: Trial, b: Trial) -> Fit:
@@ -73,19 +115,34 @@ def _earned(problem: Problem, fit: Fit, a: Trial, b: Trial, noise_sd: Array) -> 
     """Whether each effect gains enough over the other alone, on samples to fit and on held-out ones, and none is at a
     bound.
     """
-    rules = problem.rules
+    return all(_earned_over(problem, fit, alone.fit, noise_sd) for alone in (a, b))
+
+
+def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> bool:
+    """Whether the pair gains enough over one of its effects `alone`, on samples to fit and on held-out ones."""
     if any(bound_by(fit, term) for term in fit.terms):
         return False
-    for alone in (a, b):
-        more = len(fit.values) - len(alone.fit.values)
-        held = compare(problem.segments, "heldout", alone.fit.residuals, fit.residuals, noise_sd)
-        trained = compare(problem.segments, "fit", alone.fit.residuals, fit.residuals, noise_sd)
-        least = rules.heldout_log_likelihood + more
-        if min(held.log_likelihood, trained.log_likelihood - more) < least or held.p_value > rules.significance:
-            return False
-        if held.share < rules.further_error_reduction:
-            return False
-    return True
+    more = len(fit.values) - len(alone.values)
+    held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd)
+    trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd)
+    both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd)
+    shown = min(held.log_likelihood, trained.log_likelihood - more) >= problem.rules.heldout_log_likelihood + more
+    return held.share >= problem.rules.further_error_reduction and (
+        (shown and held.p_value <= problem.rules.significance) or _pooled(problem, held, both, more)
+    )
+
+
+def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
+    """Whether all samples together are sure where held-out ones are few: as a single effect passes (`trial._together`)."""
+    rules = problem.rules
+    apart = any(segment.heldout.any() and not segment.fit.any() for segment in problem.segments)
+    return (
+        apart
+        and both.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
+        and both.p_value < 0.1 * rules.significance
+        and held.log_likelihood > rules.weak_log_likelihood
+        and held.p_value < rules.weak_significance
+    )
 
 
 def _enough(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
@@ -93,4 +150,5 @@ def _enough(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
     rules = problem.rules
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
-    return sure and held.share > least and held.log_likelihood > rules.heldout_log_likelihood + more
+    shown = sure and held.log_likelihood > rules.heldout_log_likelihood + more
+    return held.share > least and (shown or _pooled(problem, held, both, more))

@@ -303,7 +303,9 @@ def _scan(
     most_taken = 0.0
     linear = [p for p in term.parameters if p.linear]
     fast = term.candidate.port.name in slopes
-    for point in grid_points(tuned(term, lines), max(5, most // max(len(linear), 1))):
+    shifts = not linear and not fast and term.candidate.effect.shifts == "time"
+    each = len(values) + 2 if shifts else max(len(linear), 1)  # simulations of one point
+    for point in grid_points(tuned(term, lines), max(5, most // each)):
         columns = []
         options: list[Any] = [*linear] or [None]
         for p in options:
@@ -313,7 +315,7 @@ def _scan(
             trial = np.concatenate((values, starts(term, amplitude, point)))
             columns.append(_fast(problem, terms, trial, slopes) if fast else base - _known(problem, terms, trial, base))
         S = np.zeros((base.size, 0)) if fast else _begun(problem, terms, trial, Q)
-        if not linear and not fast and term.candidate.effect.shifts == "time":
+        if shifts:
             found = _absorbed(problem, terms, values, trial, base, S)
             if found is not None:
                 taken, moved, left = float(rest @ rest - found[1] @ found[1]), found[0], found[1]
@@ -352,19 +354,19 @@ def _known(problem: Problem, terms: tuple[Term, ...], trial: Array, base: Array)
 def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) -> Array:
     """What the state at a recording's first sample does of the last term's memory: orthonormal columns, one a recording.
 
-    They are orthogonal to `Q` too, so that they and the term share what is left.
+    They are orthogonal to `Q` too, so that they and the term share the residual.
     """
     candidate = terms[-1].candidate
     none = np.zeros((Q.shape[0], 0))
-    if not candidate.effect.remembers or candidate.effect.shifts == "rate":
-        return none
+    if not candidate.effect.remembers or not candidate.effect.timed:
+        return none  # a memory of places, not of times, is soon overwritten
     port, before = candidate.port.name, get_starts(problem)
     used = [segment for segment in problem.segments if segment.fit.any()]
     spread = float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
-    r = problem.stacked(terms, trial, unseen=0.0)
+    r = problem.stacked(terms, trial)
     for segment in used:
         segment.start[port] = segment.start.get(port, 0.0) + START_STEP * spread
-    change = r - problem.stacked(terms, trial, unseen=0.0)
+    change = r - problem.stacked(terms, trial)
     set_starts(problem, before)
     rows = len(problem.noise)
     edges = np.cumsum([0] + [rows * int(segment.fit.sum()) for segment in used])
@@ -372,15 +374,15 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) ->
     for index, (first, last) in enumerate(itertools.pairwise(edges)):
         columns[first:last, index] = change[first:last]
     columns -= Q @ (Q.T @ columns)
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 1e-9 * max(np.linalg.norm(change), 1e-300)]
-    return np.asarray(np.linalg.qr(columns)[0]) if columns.shape[1] else none
+    size = np.sqrt(np.sum(columns**2, axis=0))
+    seen = np.flatnonzero(size > 1e-9 * max(float(np.sqrt(change @ change)), 1e-300))
+    return np.asarray(np.linalg.qr(columns[:, seen])[0]) if seen.size else none
 
 
 def _absorbed(
     problem: Problem, terms: tuple[Term, ...], values: Array, trial: Array, base: Array, S: Array
 ) -> tuple[Array, Array] | None:
-    """`values` fitted again next to a shift in time, and what is left; None where that is worse than without.
+    """`values` fitted again next to a shift in time, and the residual then; None where they cannot be.
 
     Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
     change of the outputs at their present values says nothing then.

@@ -29,7 +29,17 @@ from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.joint import best_pair
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, without
-from host.diagnosis.selection.trial import Trial, at_bound, called_for, good_enough, rank, related, weighty, wider
+from host.diagnosis.selection.trial import (
+    Trial,
+    at_bound,
+    called_for,
+    good_enough,
+    only_sampling,
+    rank,
+    related,
+    weighty,
+    wider,
+)
 from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
@@ -225,7 +235,9 @@ def _grow(
         rank(trials, best)
         trials = _with_simpler(problem, best, trials, ranked, noise_sd)
         trials = with_wider(problem, best, trials, ranked, noise_sd)
-        winner = next((trial for trial in trials if good_enough(trial, best) and weighty(trial, earned)), None)
+        winner = next(
+            (t for t in trials if good_enough(t, best) and weighty(t, earned) and not only_sampling(t, trials)), None
+        )
         if winner is None:
             steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
             break
@@ -338,7 +350,16 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
     if found.best.terms or len(refused) < 2 or problem.budget.spent():
         return
     begun = get_starts(problem)
-    pair = best_pair(problem, found.nominal, refused, noise_sd, progress)
+
+    def fit_next(base: Fit, starts: list[dict[str, float]]) -> list[Trial]:
+        """The likeliest effects past one that was refused, fitted with it."""
+        set_starts(problem, starts)
+        ranked = [item for item in screen(problem, base, candidate_effects, progress) if not item.drop]
+        enough = [item for item in ranked if item.promise > problem.rules.screening_log_likelihood]
+        chosen = _varied(enough, problem.rules, here=2)[: problem.rules.joint_second]
+        return [try_fit(problem, base, item, noise_sd) for item in chosen]
+
+    pair = best_pair(problem, found.nominal, refused, fit_next, noise_sd, progress)
     if pair is None:
         set_starts(problem, begun)
         return
@@ -499,13 +520,17 @@ def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]
     return list(kept.values())
 
 
-def _varied(items: list[Screened], rules: SelectionRules) -> list[Screened]:
-    """The most promising, few of one effect or port so that rivals of other kinds get their chance."""
+def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list[Screened]:
+    """The most promising, few of one effect or port so that rivals of other kinds get their chance.
+
+    here: how many of one port; 0: `fits_per_port`.
+    """
+    most_here = here or rules.fits_per_port
     kept: list[Screened] = []
     for item in items:
         same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
-        here = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
-        if same < 3 and here < rules.fits_per_port:
+        at_port = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
+        if same < 3 and at_port < most_here:
             kept.append(item)
         if len(kept) == rules.fits_per_step:
             break

@@ -110,6 +110,12 @@ def of_sampling(trial: Trial) -> bool:
     return late_s < 1.05 * trial.period_s
 
 
+def only_sampling(trial: Trial, trials: list[Trial]) -> bool:
+    """Whether a delay within one sample does as well at the place of `trial`: how an input was held, under another name."""
+    least = trial.score - trial.rules.heldout_log_likelihood
+    return any(of_sampling(t) and t.candidate.port.name == trial.candidate.port.name and t.score > least for t in trials)
+
+
 def related(simple: Candidate, general: Candidate) -> bool:
     """Whether `general` is a finer shape of `simple`, at the same place."""
     a, b = simple.effect, general.effect
