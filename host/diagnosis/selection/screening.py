@@ -316,11 +316,10 @@ def _scan(
             columns.append(_fast(problem, terms, trial, slopes) if fast else base - _known(problem, terms, trial, base))
         S = np.zeros((base.size, 0)) if fast else _begun(problem, terms, trial, Q)
         if shifts:
-            found = _absorbed(problem, terms, values, trial, base, S)
-            if found is not None:
-                taken, moved, left = float(rest @ rest - found[1] @ found[1]), found[0], found[1]
-                points.append(Point(taken, trial[values.size :], left, moved, S.shape[1]))
-                most_taken = max(most_taken, taken)
+            again = _absorbed(problem, terms, values, trial, base, S)
+            if again is not None:
+                around, left = again
+                points.append(Point(float(rest @ rest - left @ left), trial[values.size :], left, around, S.shape[1]))
             continue
         D = np.array(columns)
         D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
