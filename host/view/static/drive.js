@@ -114,7 +114,7 @@ export class Drive {
     const normal = this.#numbers(["n1", "n2", "n3"]), size = Math.hypot(...normal);
     const wanted = {goto: place, touch: [...place, force, size || NaN], force: [force]}[name] || [];
     if (!wanted.every(Number.isFinite)) {
-      this.controls.say("A number is missing or is none: see the marked fields.", "bad");
+      this.controls.say("A number is missing or not valid: see the marked fields.", "bad");
       return null;
     }
     if (name === "goto") return {point_m: place};
@@ -124,7 +124,7 @@ export class Drive {
 
   // Fill in a point that was picked in the scene; nothing moves before its button is confirmed.
   picked(found) {
-    if (!found) return this.controls.say("No tissue is known there. Type the point, or touch once.", "bad");
+    if (!found) return this.controls.say("The tissue is not known there. Type the point, or touch once.", "bad");
     const values = [...found.point.map(mm => mm.toFixed(1)), ...found.normal.map(part => String(Number(part.toFixed(4))))];
     ["x-mm", "y-mm", "z-mm", "n1", "n2", "n3"].forEach((id, index) => {
       this.holder.querySelector(`#${id}`).value = values[index];
