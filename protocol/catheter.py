@@ -96,7 +96,7 @@ class _CatheterFile(Request):
 
 
 def shipped_catheters() -> list[str]:
-    """Names of the catheters that come with the package."""
+    """Return the names of the catheters that come with the package."""
     return sorted(path.stem for path in CATHETER_FOLDER.glob("*.toml"))
 
 

@@ -25,7 +25,7 @@ class Code(enum.IntEnum):
 
 
 class Phase(Code):
-    """What the rig is doing: the control loop's phase, or homing, which the loop takes no part in."""
+    """State of the rig: the control loop's phase, or homing, in which the loop takes no part."""
 
     DISARMED = 0
     HOLD = 1
@@ -40,7 +40,7 @@ class Phase(Code):
 
 
 class SafetyAction(Code):
-    """What the failsafe demands, weakest first."""
+    """Action that the failsafe demands, weakest first."""
 
     NONE = 0
     WARN = 1
@@ -50,7 +50,7 @@ class SafetyAction(Code):
 
 
 class CommandKind(Code):
-    """What the operator wants of the armed loop. The first five are also the kinds of a target."""
+    """Command of the operator to the armed loop. The first five are also the kinds of a target."""
 
     NONE = 0
     HOLD = 1
@@ -62,7 +62,7 @@ class CommandKind(Code):
 
 
 class JogAxis(Code):
-    """What a jog moves: the tip along a direction, or one axis. The axes are in the order of the rig file."""
+    """Object of a jog: the tip along a direction, or one axis. The axes are in the order of the rig file."""
 
     INSERTION = 0
     ROLL = 1
@@ -71,14 +71,14 @@ class JogAxis(Code):
 
 
 class ForceSource(Code):
-    """Which force closes the loop."""
+    """Source of the force that the loop controls."""
 
     SENSOR = 0
     ESTIMATE = 1
 
 
 class ControlLaw(Code):
-    """Which law moves the joints: the thesis' PI loops, or the predictive law."""
+    """Control law: the thesis' PI loops, or the predictive law."""
 
     THESIS = 0
     PREDICTIVE = 1

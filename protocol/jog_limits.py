@@ -5,7 +5,7 @@ from __future__ import annotations
 from protocol.enums import JogAxis
 from protocol.rig_file import Rig
 
-# Longest way of one jog: m for tip and insertion, rad for roll and knob. Who wants more jogs again, or goes to a point.
+# Longest way of one jog: m for tip and insertion, rad for roll and knob. A longer way needs several jogs, or a target.
 LONGEST_JOG = {JogAxis.TIP: 0.020, JogAxis.INSERTION: 0.020, JogAxis.ROLL: 0.8, JogAxis.KNOB: 0.8}
 # Share of their greatest speed that roll and knob are jogged at, at most.
 SPEED_SHARE = 0.2

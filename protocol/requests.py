@@ -47,13 +47,13 @@ _WANTED = {
 
 
 def wanted_of(error: Mapping[str, Any]) -> str:
-    """Say what is wanted instead of the value that `error`, one of pydantic's, refuses."""
+    """Return what is wanted instead of the value that `error`, one of pydantic's, refuses."""
     pattern = _WANTED.get(error["type"])
     return pattern.format(**error.get("ctx") or {}) if pattern else str(error["msg"]).removeprefix("Value error, ")
 
 
 def validate(model: type[Model], data: Any) -> Model:
-    """`data` checked against `model` (a `Request`). Raises InputError naming the first offending key."""
+    """Check `data` against `model` (a `Request`) and return the result. Raises InputError with the first wrong key."""
     if not isinstance(data, dict):
         raise InputError("request", data, "one JSON object")
     try:
@@ -69,12 +69,12 @@ def validate(model: type[Model], data: Any) -> Model:
 
 
 def first_of(errors: Sequence[Any]) -> Any:
-    """The error to report: an unknown key before the rest, because a misspelt key is unknown and missing at once."""
+    """Return the error to report: an unknown key first, because a misspelt key is unknown and missing at once."""
     return next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
 
 
 def unknown_key(key: str, known: Collection[str]) -> str:
-    """Say what is wanted instead of a key that is not known: the one that it resembles, or all."""
+    """Return what is wanted instead of an unknown key: the one that it resembles, or all."""
     near = difflib.get_close_matches(key, known, 1) or [name for name in known if name.lower() == key.lower()]
     if near:
         return f"no such key; did you mean {near[0]}?"
@@ -92,7 +92,7 @@ def known_keys(model: Any, place: tuple[Any, ...]) -> list[str]:
 
 
 def _sections_in(annotation: Any) -> list[Any]:
-    """The sections that a field's type names, also within lists, dicts and alternatives."""
+    """Return the sections that a field's type names, also within lists, dicts and alternatives."""
     if hasattr(annotation, "model_fields"):
         return [annotation]
     return [inner for part in get_args(annotation) for inner in _sections_in(part)]

@@ -42,7 +42,7 @@ Coordinate = Annotated[float, Field(ge=-3.0, le=3.0)]
 Vector3 = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 
 
-# Of a device's driver (docs/devices.md), and the keys that only a plug-in knows.
+# Of a device's driver (docs/devices.md), and the keys of a plug-in.
 Kind = Annotated[str, Field(pattern=r"^[a-z0-9_]{1,40}$")]
 Options = dict[str, str | bool | int | float]
 
@@ -96,7 +96,7 @@ class RotaryStage(StageSection):
 
 
 class StagesSection(_Section):
-    """The three stepper axes."""
+    """The stepper axes: insertion, roll and knob."""
 
     insertion: InsertionStage
     roll: RotaryStage
@@ -285,7 +285,7 @@ class ControlSection(_Section):
 
 
 class EstimationSection(_Section):
-    """The force estimator of the model process, and how surely it knows the joints and the stiffness.
+    """The force estimator of the model process, and the uncertainty of joints and stiffness.
 
     `*_sd_*`: standard deviations of what lasts; `*_walk_*`: growth of the joints' errors in one second at rest.
     """
@@ -309,7 +309,7 @@ class EstimationSection(_Section):
 
 
 class Safety(_Section):
-    """Limits of force, silence, speed and place. `HARD_*` bound them: no rig file can widen those."""
+    """Limits of force, missing data, speed and place. `HARD_*` bound them: no rig file can widen those."""
 
     over_force_N: Annotated[float, Field(gt=0, le=HARD_MAX_FORCE_N)]
     hold_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
@@ -375,7 +375,7 @@ class NetworkAccess(_Section):
 
 
 class Rig(_Section):
-    """All of it. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
+    """Content of a rig file. Axis order everywhere: insertion (m), roll (rad), knob (rad)."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
     catheter: CatheterSection
@@ -465,22 +465,22 @@ class Rig(_Section):
         return self
 
     def stage(self, axis: int) -> StageSection:
-        """The stage of axis 0 insertion, 1 roll or 2 knob."""
+        """Return the stage of axis 0 insertion, 1 roll or 2 knob."""
         return (self.stages.insertion, self.stages.roll, self.stages.knob)[axis]
 
     @property
     def local(self) -> LocalPaths:
-        """The rig's folder on this computer."""
+        """Return the rig's folder on this computer."""
         return local_paths(self.name, self.zenoh.folder)
 
     @property
     def listen_endpoints(self) -> list[str]:
-        """Where the model process listens for programs of this computer."""
+        """Return the endpoints at which the model process listens for programs of this computer."""
         return [self.local.endpoint, *self.zenoh.listen]
 
     @property
     def connect_endpoints(self) -> list[str]:
-        """Where all other processes connect."""
+        """Return the endpoints to which all other processes connect."""
         return self.zenoh.connect or [self.local.endpoint]
 
     @property
@@ -490,7 +490,7 @@ class Rig(_Section):
         return Network(self.name, tuple(n.listen), Path(n.keys), tuple(n.readers), tuple(n.commanders)) if n.listen else None
 
     def effective(self) -> dict[str, Any]:
-        """The whole effective configuration, for the recording's header."""
+        """Return the whole effective configuration, for the recording's header."""
         return self.model_dump(mode="json")
 
 
@@ -526,7 +526,7 @@ def _describe(error: Any) -> str:
 
 
 def problems_of(data: dict[str, Any]) -> list[str]:
-    """All that is wrong with `data`, one line each; empty for a good rig file."""
+    """Return all mistakes in `data`, one line each; empty for a good rig file."""
     try:
         Rig.model_validate(data)
     except ValidationError as problem:
@@ -535,7 +535,7 @@ def problems_of(data: dict[str, Any]) -> list[str]:
 
 
 def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
-    """`data` as a checked `Rig`. Raises InputError with the first offending key."""
+    """Return `data` as a checked `Rig`. Raises InputError with the first offending key."""
     try:
         return Rig.model_validate(data)
     except ValidationError as problem:
@@ -543,7 +543,7 @@ def parse_rig(data: dict[str, Any], name: str = "rig file") -> Rig:
 
 
 def read_rig_data(path: str | Path) -> dict[str, Any]:
-    """The TOML file `path`, unchecked. Raises InputError where it cannot be read."""
+    """Read the TOML file `path` without checks. Raises InputError if it cannot be read."""
     return read_toml(path)
 
 
@@ -562,7 +562,7 @@ def catheter_problems(rig: Rig) -> list[str]:
 
 
 def load_rig(path: str | Path) -> Rig:
-    """The rig in TOML file `path`, checked as `seldinger rig check` does.
+    """Load the rig in TOML file `path`, checked as `seldinger rig check` does.
 
     Raises InputError (unreadable file, unknown key, value out of its bounds, another catheter).
     """

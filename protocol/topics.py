@@ -117,7 +117,7 @@ Speed_m_per_s = Annotated[float, bounds("m/s", -100.0, 100.0)]
 Force_N = Annotated[float, bounds("N", -1000.0, 1000.0)]
 # What a command may ask for at all; the rig's own limit is lower (protocol.rig_file.HARD_MAX_FORCE_N).
 AllowedForce_N = Annotated[float, bounds("N", 0.0, 1.0)]
-# One jog is short: who wants more commands it again, or goes to a point. The rig bounds both further (`operator_commands`).
+# One jog is short; a longer way needs several jogs, or a target. The rig bounds both further (`operator_commands`).
 JogTravel = Annotated[float, bounds("", -1.0, 1.0)]
 JogSpeed = Annotated[float, bounds("", 0.0, 10.0)]
 Torque_Nm = Annotated[float, bounds("N m", -100.0, 100.0)]

@@ -71,7 +71,7 @@ class AuroraEmulatorConfig:
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """What the device knows of one tool in one frame: flags by name, pose None when missing. Pose in mm."""
+    """State of one tool in one frame: flags by name, pose None if missing. Pose in mm."""
 
     flags: frozenset[str]
     pose: tuple[float, ...] | None
@@ -136,7 +136,7 @@ class Console:
         self.reset()
 
     def reset(self) -> None:
-        """As after switching on."""
+        """Return to the state after switching on."""
         self.mode, self.baud, self.system_status = "power_up", 9600, 0
         self._next_baud: int | None = None
         for port in self.ports.values():

@@ -68,12 +68,12 @@ class AuroraEmulator:
 
     @property
     def tracking(self) -> bool:
-        """True in tracking mode."""
+        """Return whether the device is in tracking mode."""
         return self._console.mode == "tracking"
 
     @property
     def baud(self) -> int:
-        """The device's present serial speed."""
+        """Return the device's present serial speed, baud."""
         return self._console.baud
 
     def set_line(self, baud: int) -> None:
@@ -100,7 +100,7 @@ class AuroraEmulator:
         self._console.system_status |= 0x0080
 
     def plug(self, handle: str) -> None:
-        """Plug the tool in again; it wants PINIT and PENA."""
+        """Plug the tool in again; it needs PINIT and PENA."""
         self.ports[handle].plug()
         self._console.system_status |= 0x0040
 

@@ -38,7 +38,7 @@ def apply(
 
 @njit(cache=True)
 def _with_memory(e, x: float, load: float, curvature: float, time_s: float, dt_s: float) -> float:  # type: ignore[no-untyped-def]
-    """Play, friction, lag and delay."""
+    """Apply the effects with memory: backlash, friction, lag and delay."""
     if e.code == code.BACKLASH:
         return _distributed_play(e, x)
     if e.code == code.DEAD_ZONE:

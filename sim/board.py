@@ -229,7 +229,7 @@ class SimulatedBoard:
 
     @property
     def pid(self) -> int:
-        """Process id of the child."""
+        """Return the process id of the child."""
         return self._child.pid
 
     def __enter__(self) -> Self:

@@ -107,7 +107,7 @@ CHAIN_STATE = np.dtype(
 
 
 def parameters(config: CatheterConfig) -> np.record:
-    """`config` as the kernel's record."""
+    """Return `config` as the kernel's record."""
     p = np.zeros(1, CHAIN_PARAMETERS).view(np.recarray)[0]
     p.rigidity[0], p.rigidity[1] = config.distal_Nm2, config.body_Nm2
     p.distal_m, p.distal_cells = config.distal_length_m, config.distal_cells

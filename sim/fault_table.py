@@ -50,7 +50,7 @@ class FaultKind:
     tail_s: float = 0.6
 
     def draw(self, rng: Rng) -> tuple[float, float]:
-        """A size and a duration."""
+        """Draw a size and a duration (s)."""
         return _drawn(rng, self.size), _drawn(rng, self.seconds)
 
 

@@ -37,7 +37,7 @@ def on_axis(e, x: float, load: float, curvature: float, dt_s: float) -> float:  
 
 @njit(cache=True)
 def _share(e, moved: float) -> float:  # type: ignore[no-untyped-def]
-    """Friction's share of full after `moved` distances: Bouc-Wen for presliding, LuGre for Coulomb's."""
+    """Return the share of full friction after `moved` distances: Bouc-Wen for presliding, LuGre for Coulomb."""
     return bouc_wen(e.s[1], moved) if e.code == code.PRESLIDING_FRICTION else lugre(e.s[1], moved)
 
 

@@ -58,7 +58,7 @@ HEART_STATE = np.dtype(
 
 
 def parameters(config: HeartConfig) -> np.record:
-    """`config` as the kernel's record."""
+    """Return `config` as the kernel's record."""
     p = np.zeros(1, HEART_PARAMETERS).view(np.recarray)[0]
     for name in HEART_PARAMETERS.names or ():
         p[name] = getattr(config, name)

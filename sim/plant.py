@@ -84,7 +84,7 @@ class Plant:
 
     @property
     def time_s(self) -> float:
-        """Time since the start (s)."""
+        """Return the time since the start (s)."""
         return float(self._parts.rig.time_s)
 
     def step(self, dt_s: float, stage_position: Sequence[float] | Array) -> None:

@@ -83,7 +83,7 @@ class RigServer:
         self._running = False
 
     def serve(self) -> None:
-        """Advance the world with CLOCK_MONOTONIC."""
+        """Advance the simulated world with CLOCK_MONOTONIC until it is stopped."""
         manager = ServiceNotifier()
         manager.ready("devices are there")
         begin_ns = last_ns = time.monotonic_ns()

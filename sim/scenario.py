@@ -118,7 +118,7 @@ class Scenario:
                 self._publish(reported, report)
 
     def step(self) -> None:
-        """One period of the loop."""
+        """Run one period of the loop."""
         now_ns = self.world.now_ns + self.loop.period_ns
         arriving = self.world.exchange(now_ns, self._leaving)
         self._leaving = self.loop.step(now_ns, arriving)
@@ -154,7 +154,7 @@ class Scenario:
 
     @property
     def phase(self) -> int:
-        """The loop's phase (`realtime.control.records`)."""
+        """Return the loop's phase (`realtime.control.records`)."""
         return int(self.loop.outputs[0].phase)
 
     def ready(self) -> bool:

@@ -112,7 +112,7 @@ def measure_wrench(effects: Array, rigs: Array, wrench: Array) -> None:
 
 @njit(cache=True)
 def _normalize(q: Array) -> None:
-    """q (4,) to unit length."""
+    """Bring q (4,) to unit length, in place."""
     size = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     for i in range(4):
         q[i] /= size

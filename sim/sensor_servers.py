@@ -126,7 +126,7 @@ class NetFtUdp:
 
 def _page_handler(emulator: NetFtEmulator) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        """Serves the box's one page."""
+        """HTTP handler of the box's web page."""
 
         def do_GET(self) -> None:
             good = self.path.split("?")[0] == "/netftapi2.xml"

@@ -52,7 +52,7 @@ class _Trouble:
         return self.lost - before
 
     def over(self, now_s: float) -> bool:
-        """Whether the rotor follows again."""
+        """Return whether the rotor follows its commands again."""
         return now_s >= self.until_s or abs(self.lost) >= abs(self.steps)
 
 

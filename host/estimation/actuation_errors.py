@@ -1,7 +1,7 @@
 """Errors of the actuation that last from pose to pose: of insertion, curvature and roll, followed by a Kalman filter.
 
 The controller's joints are those of a transmission with backlash and windup. Their errors are unknown at the start and
-change when the joints move. Each pose tells about them as well as about the force. The filter keeps what the poses have
+change when the joints move. Each pose contains information on them and on the force. The filter keeps what the poses have
 told: mean and covariance of the three errors, and lets their uncertainty grow with the travel of the joints and with time.
 
 A backlash that is wider than assumed makes one part of the insertion's error alternate: it is -p while the body is pushed
@@ -29,7 +29,7 @@ _SHORTEST_CROSSING_m = 1e-4  # of the body, between the flanks: the side is seen
 
 @dataclass(frozen=True)
 class ActuationKnowledge:
-    """How surely the joints are known: standard deviations at the start, and how they grow.
+    """Uncertainty of the joints: standard deviations at the start, and their growth.
 
     start (3,): insertion (m), curvature (1/m), roll (rad). by_travel (3,): of each joint's error after one unit of its
     own travel (m, 1/m, rad), growing with the square root of the travel. by_time (3,): the same after one second.
@@ -45,7 +45,7 @@ class ActuationKnowledge:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> ActuationKnowledge:
-        """Return what the rig file states: backlash and how surely it is known, and section [estimation]."""
+        """Return the values of the rig file: backlash, its uncertainty, and section [estimation]."""
         width_m, known = rig.transmission.insertion_backlash_m, rig.estimation
         # At the start the distal end may be anywhere in the backlash. After one width of travel it is at the other flank,
         # whose place is known as surely as the backlash.
@@ -72,7 +72,7 @@ class ActuationErrors:
         self.forget()
 
     def forget(self) -> None:
-        """Return to what is known at the start."""
+        """Return to the state at the start."""
         known = self._known
         self._mean = np.array([0.0, 0.0, 0.0, known.flank_mean_m])
         self._covariance = np.diag(np.square([*known.start, known.flank_m]))
@@ -92,7 +92,7 @@ class ActuationErrors:
 
     @property
     def missing_backlash(self) -> tuple[float, float]:
-        """By how much (m) the backlash is wider than the controller assumes, and the standard deviation of that."""
+        """Return the excess (m) of the backlash over the controller's, and its standard deviation."""
         return 2.0 * float(self._mean[FLANK]), 2.0 * float(np.sqrt(self._covariance[FLANK, FLANK]))
 
     def _now(self) -> Array:
@@ -130,11 +130,11 @@ class ActuationErrors:
         self._side = min(max(self._side + 2.0 * moved_m / crossing_m, -1.0), 1.0)
 
     def learn(self, mean: Array, covariance: Array) -> None:
-        """Take over what a pose has told: mean (3,) and covariance (3, 3) after it."""
+        """Take over the result of a pose: mean (3,) and covariance (3, 3) after it."""
         self.learn_part([INSERTION, CURVATURE, ROLL], mean, covariance)
 
     def learn_part(self, which: list[int], mean: Array, covariance: Array) -> None:
-        """Take over what a pose has told about some of the errors, `which` (k) of them: mean (k,), covariance (k, k).
+        """Take over the result of a pose for some of the errors, `which` (k): mean (k,), covariance (k, k).
 
         The pose's answer replaces what was expected of these errors; the four states follow by their covariance with
         them (Kalman filter, with the measurement already combined with its prior).

@@ -40,7 +40,7 @@ EXPONENT_SD = 0.3
 
 @dataclass(frozen=True)
 class AdaptationConfig:
-    """What is assumed of drift, actuation and contact."""
+    """Assumptions on drift, actuation and contact."""
 
     first_sd: float = 0.1  # of log stiffness before anything was seen, and its most
     drift_per_sqrt_s: float = 0.004  # random walk of log stiffness: 10 % in ten minutes
@@ -58,7 +58,7 @@ class AdaptationConfig:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> AdaptationConfig:
-        """Return what section [estimation] of the rig file states."""
+        """Return the values of section [estimation] of the rig file."""
         known = rig.estimation
         return cls(
             first_sd=known.adaptation_sd,
@@ -70,7 +70,7 @@ class AdaptationConfig:
 
 @dataclass(frozen=True)
 class StiffnessState:
-    """What is known after a sample. `scale` multiplies the nominal stiffness and is within the limit."""
+    """State of the adaptation after a sample. `scale` multiplies the nominal stiffness and is within the limit."""
 
     scale: float
     sd: float  # relative, of the scale in use

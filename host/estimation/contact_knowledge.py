@@ -1,4 +1,4 @@
-"""How surely the contact and the stiffness are known before the poses are seen."""
+"""Prior uncertainty of the contact force and the stiffness."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ContactKnowledge:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> ContactKnowledge:
-        """Return what section [estimation] of the rig file states."""
+        """Return the values of section [estimation] of the rig file."""
         known = rig.estimation
         return cls(
             free_sd_N=known.free_force_sd_N,

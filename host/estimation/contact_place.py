@@ -35,7 +35,7 @@ Model = Callable[[Array], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class ContactEstimate:
-    """A force somewhere along the catheter, and where it acts."""
+    """Estimate of a force along the catheter and of its place."""
 
     force_N: Array  # (3,) tip frame
     covariance_N2: Array  # (3, 3)

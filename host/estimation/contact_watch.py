@@ -146,7 +146,7 @@ class ContactWatch:
         return None
 
     def _tip_alone(self, mean: _Frame) -> _Window | None:
-        """How well one force on the tip explains the mean frame; None where the fit does not settle."""
+        """Return how well one force on the tip explains the mean frame; None if the fit does not converge."""
         insertion, curvature, roll = (float(value) for value in mean.joint)
         free, curvature_sd = self._free_curvature(curvature)
         start = self._knowledge.start
@@ -207,7 +207,7 @@ class ContactWatch:
                 return  # nothing more is needed to explain the poses
 
     def _go_on(self, stamp_ns: int) -> BodyContact | None:
-        """One more part of the examination; the report when it is over."""
+        """Run one more part of the examination; return the report when it is finished."""
         assert self._examination is not None and self._window is not None
         window = self._window
         try:
@@ -227,7 +227,7 @@ class ContactWatch:
 
 
 def _report(stamp_ns: int, window: _Window, found: ContactsEstimate) -> BodyContact:
-    """The message of a contact that explains the poses."""
+    """Return the message of a contact that explains the poses."""
     with_tip = bool(found.tip_force_N.any())
     if found.observable:
         place = "tip and body" if with_tip else "body"
@@ -292,5 +292,5 @@ class WatchedEstimator:
 
 
 def curvature_as_configured(rig: Rig) -> FreeCurvature:
-    """The knob's curve as it stands, where nothing is learned of it."""
+    """Return the curvature of the knob curve without learning."""
     return lambda curvature_per_m: (curvature_per_m, rig.estimation.curvature_sd_per_m)

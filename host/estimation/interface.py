@@ -1,4 +1,4 @@
-"""What every force estimator in the loop is: poses and actuation in, tip force with covariance out."""
+"""Interface of every force estimator in the loop: poses and actuation in, tip force with covariance out."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class TipForce(NamedTuple):
     insertion, curvature, roll and stiffness. What remains of `covariance_N2` is noise, new in each pose.
     A pose that no force explains is not an error: `converged` is false, and `residual` says how far off it is.
     `nominal` is the answer with the stiffness of the catheter's file, where another stiffness is in use. With `body_contact`
-    the poses tell of a contact away from the tip: the force is then not the tip's.
+    the poses show a contact away from the tip: the force is then not that of the tip.
     """
 
     force_N: Array
@@ -66,7 +66,7 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class Reporting(Protocol):
-    """An estimator that has more to say than the force."""
+    """An estimator with further messages in addition to the force."""
 
     def reports(self) -> list[tuple[str, Message]]:
         """Return (topic, message) of what is new since the last call, and forget it."""

@@ -222,7 +222,7 @@ def likelihood(
     for count in range(1, LIKELIHOOD_STEPS + 1):
         sensitivities(shaft, Load(fx, fy, none), measured.pose, kappa, work, out)
         gx, gy = normal_equations(out, measured, fx, fy, row)
-        # the lower limit belongs to a force of 1 kN: it only keeps a direction that the pose cannot see from dividing by 0
+        # the lower limit, of a force of 1 kN, prevents a division by 0 along a direction that the pose does not determine
         xx, yy = row[INFO_XX] + 1e-6, row[INFO_YY] + 1e-6
         determinant = xx * yy - row[INFO_XY] ** 2
         dx = (yy * gx - row[INFO_XY] * gy) / determinant

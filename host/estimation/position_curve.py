@@ -374,7 +374,7 @@ def every_force(p: MeasuredPose, largest_N: float, acceptable: float, forces: Ar
 def force_next_to(p: MeasuredPose, largest_N: float, acceptable: float, x: Array, s: Scratch) -> tuple[bool, float, int]:
     """The force that explains the chord and is nearest to x (3,), the one before, in place. Returns (settled, cost, sweeps).
 
-    The quick search is kept where it stays near; where it leapt, the curve through x tells which answer is next to it.
+    The quick search is kept where it stays near; where it jumped, the curve through x gives the nearest answer.
     """
     before = x.copy()
     settled, cost, sweeps = estimate(p, largest_N, x, s)

@@ -33,7 +33,7 @@ class PcarEstimate(Actuated):
 
 
 class Sensor(Request):
-    """One tracked pose."""
+    """One tracked pose: its place on the catheter, position and orientation."""
 
     offset_m: Station
     position_m: Vector3

@@ -1,4 +1,4 @@
-"""How sure the poses are: the tracker's noise, and the whitening of the residuals of each sensor case."""
+"""Uncertainty of the poses: the tracker's noise, and the whitening of the residuals of each sensor case."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class ActuationPrior:
 
     @classmethod
     def exact(cls) -> ActuationPrior:
-        """The actuation is what it is said to be, to a hundredth of what a tracker shows."""
+        """Return a prior without errors, to a hundredth of what a tracker resolves."""
         return cls(np.zeros(3), np.diag(np.square([1e-5, 0.01, 1e-4])))
 
 
@@ -152,7 +152,7 @@ class _Problem:
     ) -> None:
         rod = rod_record(catheter, insertion_m, curvature_per_m)
         if len(sensors) < 2:
-            raise InputError("sensors", len(sensors), "at least 2, to tell a contact of the body from one of the tip")
+            raise InputError("sensors", len(sensors), "at least 2, to separate a contact of the body from one of the tip")
         self._catheter, self._total_m = catheter, float(rod[6] + rod[7])
         if self._total_m < 3.0 * NEAREST_m:
             raise InputError("insertion_m", insertion_m, f"more than {1e3 * 3.0 * NEAREST_m:.0f} mm outside the sheath")
@@ -278,7 +278,7 @@ class _Problem:
         )
 
     def _notes(self, x: Array, joint: Array, converged: bool, cost: float, place_sd: float, touching_tip: bool) -> list[str]:
-        """What the poses do not determine, in words; empty where both forces and the place are observable."""
+        """Return the quantities that the poses do not determine, in words; empty if all are observable."""
         notes, body_sd = [], np.sqrt(np.linalg.eigvalsh(joint[BODY, BODY]))
         size = float(np.linalg.norm(x[BODY]))
         along = x[BODY] / max(size, 1e-12)

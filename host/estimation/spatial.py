@@ -176,7 +176,7 @@ def estimate_cosserat(  # noqa: PLR0913 - keyword arguments of a public function
     Result: `converged` False where no force explains the poses; several `solutions_N` where cases 1, 3, 5 leave the
     choice open (then force_N is the smallest of them, in cases 1 and 3 of those that grow from zero with their load,
     unless previous_force_N is given).
-    Raises: InputError naming the key. Source: (5.3) to (5.11) with (5.5) put right, weighted by the sensors' noise.
+    Raises: InputError naming the key. Source: (5.3) to (5.11) with (5.5) corrected, weighted by the sensors' noise.
     """
     rod, count = rod_record(catheter, insertion_m, curvature_per_m), checked_case(case)
     if len(sensors) < count:
@@ -204,7 +204,7 @@ def estimate_cosserat(  # noqa: PLR0913 - keyword arguments of a public function
 
 
 class Limits(NamedTuple):
-    """How far one estimate searches."""
+    """Limits of the search of one estimate: largest force and tolerances."""
 
     largest_N: float
     thorough: bool

@@ -56,7 +56,7 @@ class Sensors(NamedTuple):
 
 
 class Search(NamedTuple):
-    """How far one estimate searches."""
+    """Limits of the search of one estimate: largest force and tolerances."""
 
     largest_N: float  # no force above it is considered
     starts: Array  # (n, 3) forces to start from where the first try fails
@@ -83,7 +83,7 @@ class Scratch(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def new_scratch(sensors: int) -> Scratch:
-    """Scratch for that many sensors."""
+    """Return scratch memory for a number of sensors."""
     m = MOST_ROWS
     return Scratch(
         np.zeros(WORK),
@@ -132,7 +132,7 @@ def cost_at(p: MeasuredPose, x: Array, bend: float, tangents: bool, s: Scratch) 
 def cost_on_branch(p: MeasuredPose, force: Array, s: Scratch) -> float:
     """`cost_at` with tangents by a force (3,) in the base frame, of the equilibrium that grows from the unloaded shape.
 
-    Leaves the force as the tip sees it in s.vectors[3]; 1e300 where the branch folds back. The pose is a far smoother
+    Leaves the force in the tip frame in s.vectors[3]; 1e300 where the branch folds back. The pose is a far smoother
     function of this force than of the one in the tip frame where the catheter is soft and pulled.
     """
     out, x = np.zeros((1, ROW)), s.vectors[3]

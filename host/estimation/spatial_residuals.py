@@ -35,7 +35,7 @@ class MeasuredPose(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def quaternion_error(q_measured: Array, q_model: Array, error: Array) -> float:
-    """Set error (3,) = twice the vector part of conj(model) measured; returns its scalar part. (5.5), put right.
+    """Set error (3,) = twice the vector part of conj(model) measured; returns its scalar part. (5.5), corrected.
 
     In the model's own frame; for small angles the rotation vector. The sign is chosen so that the turn is the short one.
     """

@@ -57,7 +57,7 @@ LOSSES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
 
 @dataclass(frozen=True)
 class RobustFit:
-    """Where a search ended."""
+    """Result of a search: parameters, objective and evaluations."""
 
     x: Array
     objective: float

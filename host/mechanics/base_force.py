@@ -65,7 +65,7 @@ def solve_cold(
 def solve_warm(
     rod: Array, force: Array, stations: Array, bend: float, x: Array, out: Array, work: Array
 ) -> tuple[bool, int]:
-    """Equilibrium next to the guess x (3,), the force as the tip saw it before; refined in place. (converged, sweeps).
+    """Equilibrium next to the guess x (3,), a force in the tip frame; refined in place. Returns (converged, sweeps).
 
     Arguments as `solve_cold`. Not converged where the guess is too far off to be sure of the branch: solve cold then.
     """

@@ -61,9 +61,9 @@ CASES_PER_THREAD = 16  # fewer are solved faster than a thread starts
 
 @dataclass(slots=True, eq=False)
 class CosseratSolution:
-    """Shape of the catheter and what is known about the equilibrium. Not converged: poses and Jacobians are NaN.
+    """Shape of the catheter and properties of the equilibrium. Not converged: poses and Jacobians are NaN.
 
-    The Jacobians are worked out when they are first read; they cost about as much as the solution.
+    The Jacobians are computed when they are first read; they cost about as much as the solution.
     """
 
     tip_position_m: Array  # (3,) base frame

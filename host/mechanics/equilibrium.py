@@ -1,4 +1,4 @@
-"""One equilibrium as a caller wants it: roll of the handle, frame of the force, poses of stations, stability; one call.
+"""One equilibrium for a caller: roll of the handle, frame of the force, poses of stations, stability; one call.
 
 Everything between the checked numbers and the result is compiled, because forty small numpy calls cost ten times as
 much as the rod itself.

@@ -25,7 +25,7 @@ UNLOADED = kernels.Load(0.0, 0.0, NO_DRAG)
 
 
 class Status(Enum):
-    """How the solution of the statics ended."""
+    """Result of the solution of the statics."""
 
     CONVERGED = kernels.CONVERGED
     FOLD = kernels.FOLD  # the branch folds back before full load: no answer
@@ -50,7 +50,7 @@ class Arcs:
 
     @property
     def total_length_m(self) -> float:
-        """Length outside the sheath."""
+        """Return the length (m) outside the sheath."""
         return float(self.length_m.sum())
 
 

@@ -46,7 +46,7 @@ class Shaft(NamedTuple):
 
 
 class Load(NamedTuple):
-    """The external load, base frame."""
+    """External load in the base frame: tip force and distributed force."""
 
     force_x: float  # N, at the tip
     force_y: float

@@ -28,7 +28,7 @@ Spatial = TypeVar("Spatial", bound=Request)
 
 
 class Actuated(Request):
-    """Keys that all requests share."""
+    """Keys of every request: catheter and actuation."""
 
     catheter: str
     insertion_m: Insertion
@@ -46,7 +46,7 @@ class PcarSolve(Actuated):
 
 
 class CosseratSolve(Actuated):
-    """Spatial statics."""
+    """Request of spatial statics: tip force in the tip or base frame, stations along the catheter."""
 
     model: Literal["cosserat"]
     force_N: Annotated[list[Component], Field(min_length=3, max_length=3)]

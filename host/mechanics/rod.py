@@ -95,7 +95,7 @@ def _compliances(catheter: Catheter) -> tuple[float, ...]:
 
 @lru_cache(maxsize=64)
 def _inverse(stiffness: CosseratParameters) -> tuple[float, ...]:
-    """1/(N m2), worked out once for each catheter: shaft about e1, e2, e3, then the body."""
+    """1/(N m2), computed once for each catheter: shaft about e1, e2, e3, then the body."""
     p = stiffness
     return tuple(1.0 / value for value in (p.EI1, p.EI2, p.GJ, p.EbI1, p.EbI2, p.GbJ))
 
@@ -104,7 +104,7 @@ def rod_record(catheter: Catheter, insertion_m: float, curvature_per_m: float) -
     """Record (9,) of `cosserat_kernels`: compliances of shaft and body 1/(N m2), exposed lengths m, pre-curvature 1/m.
 
     Arguments: insertion_m, catheter body outside the sheath; negative while part of the shaft is still inside.
-    The pre-curvature belongs to the distal shaft, the body has none (section 3.2.3, put right).
+    The pre-curvature belongs to the distal shaft, the body has none (section 3.2.3, corrected).
     Raises: InputError for a catheter without spatial parameters, a shaft that is all inside, numbers out of range.
     """
     compliances = _compliances(catheter)

@@ -44,7 +44,7 @@ def conjugate(q: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def matrix_into(q: Array, R: Array) -> None:
-    """R (3, 3) = rotation matrix of the unit quaternion q (4,); (3.15) with the element (1, 3) put right."""
+    """R (3, 3) = rotation matrix of the unit quaternion q (4,); (3.15) with the element (1, 3) corrected."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
@@ -53,7 +53,7 @@ def matrix_into(q: Array, R: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def rotation_matrix(q: Array) -> Array:
-    """Rotation matrix (3, 3) of the unit quaternion q (4,); (3.15) with the element (1, 3) put right."""
+    """Rotation matrix (3, 3) of the unit quaternion q (4,); (3.15) with the element (1, 3) corrected."""
     R = np.empty((3, 3))
     matrix_into(q, R)
     return R

@@ -16,7 +16,7 @@ MARK_TOLERANCE_m = 1e-9
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pieces(rod: Array, start: float, end: float, size_N: float) -> int:
+def _parts_between(rod: Array, start: float, end: float, size_N: float) -> int:
     at = 3 if 0.5 * (start + end) < rod[BODY_LENGTH] else 0
     softest = max(rod[at], rod[at + 1], rod[at + 2])
     return int((end - start) * np.sqrt(size_N * softest) / BEND_PER_SEGMENT) + 1
@@ -32,7 +32,7 @@ def cut(rod: Array, marks: Array, size_N: float) -> Array:
     count = 0
     for i in range(marks.shape[0] - 1):
         if marks[i + 1] - marks[i] > MARK_TOLERANCE_m:
-            count += _pieces(rod, marks[i], marks[i + 1], size_N)
+            count += _parts_between(rod, marks[i], marks[i + 1], size_N)
     segments = np.zeros((count, ms.SEGMENT))
     n = 0
     for i in range(marks.shape[0] - 1):
@@ -40,9 +40,9 @@ def cut(rod: Array, marks: Array, size_N: float) -> Array:
         if length <= MARK_TOLERANCE_m:
             continue
         body = 0.5 * (marks[i] + marks[i + 1]) < rod[BODY_LENGTH]
-        pieces = _pieces(rod, marks[i], marks[i + 1], size_N)
-        for _ in range(pieces):
-            segments[n, ms.LENGTH] = length / pieces
+        parts = _parts_between(rod, marks[i], marks[i + 1], size_N)
+        for _ in range(parts):
+            segments[n, ms.LENGTH] = length / parts
             for j in range(3):
                 segments[n, ms.C1 + j] = rod[j + 3] if body else rod[j]
             segments[n, ms.K0] = 0.0 if body else rod[K0]

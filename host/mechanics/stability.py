@@ -42,7 +42,7 @@ def free_end_turns(force: Array, row: Array, T: Array) -> None:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def unstable_modes(rod: Array, force: Array, work: Array) -> int:
-    """Number of unstable modes of the equilibrium with the tip force (3,) in N, as the tip sees it; 0 is stable.
+    """Number of unstable modes of the equilibrium with the tip force (3,) in N, in the tip frame; 0 is stable.
 
     Arguments: rod (9,), force (3,) in the tip frame, held in the base frame when the rod is disturbed; work (672,).
     Between two sections the turns are tied by T2 T1^-1, near the identity unless a conjugate point lies between.

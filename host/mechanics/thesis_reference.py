@@ -1,6 +1,6 @@
 """The seed thesis' own numerical schemes, kept for comparison: Euler with 500 elements, Algorithm 3.1, fsolve-like fits.
 
-Two sweeps: moments and forces from the tip down, (3.18) and (3.19) with their tendon terms put right; then position and
+Two sweeps: moments and forces from the tip down, (3.18) and (3.19) with their tendon terms corrected; then position and
 quaternion from the base up, (3.16) and (3.17) with r'_x put right. Nothing else in the package uses this.
 """
 
@@ -111,7 +111,7 @@ def residual(case: int, length_m: float, positions: Array, quaternions: Array, m
 
 
 def quaternion_error(q_star: Array, q_bar: Array) -> Array:
-    """Difference (3,) of two orientations by (5.5), with q_4(s_0) put right: the vector part of conj(q_star) q_bar."""
+    """Difference (3,) of two orientations by (5.5), with q_4(s_0) corrected: the vector part of conj(q_star) q_bar."""
     return quaternion_product(conjugate(q_star), q_bar)[1:]
 
 

@@ -41,7 +41,7 @@ PASSES = 12
 
 
 class Room(NamedTuple):
-    """Working memory of one solution."""
+    """Working memory of one solution, so that kernels allocate nothing."""
 
     inverse: Array  # (3, 3) of the Newton matrix G
     vectors: Array  # (4, 3)
@@ -66,7 +66,7 @@ def load_number(rod: Array, size_N: float) -> float:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def unloaded_direction(rod: Array, force: Array, out: Array) -> None:
-    """Set out (3,) = the base-frame force (3,) as the unloaded tip sees it."""
+    """Set out (3,) = the base-frame force (3,) in the frame of the unloaded tip."""
     angle = rod[K0] * rod[SHAFT_LENGTH]
     c, s = math.cos(angle), math.sin(angle)
     out[0], out[1], out[2] = force[0], c * force[1] + s * force[2], -s * force[1] + c * force[2]

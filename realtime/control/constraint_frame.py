@@ -24,7 +24,7 @@ def to_base(quaternion_wxyz: ReadFloats, vector: ReadFloats, out: Floats) -> Non
 
 @njit(cache=True)
 def dot(a: ReadFloats, b: ReadFloats) -> float:
-    """Scalar product of two (3,)."""
+    """Return the scalar product of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

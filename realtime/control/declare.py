@@ -28,7 +28,7 @@ class ReadFloats(Protocol):
 
 
 class Ints(Protocol):
-    """A vector of integers."""
+    """A vector of integers, as kernels use it: an array, or a field of a record."""
 
     def __getitem__(self, index: int, /) -> int: ...
 
@@ -83,7 +83,7 @@ def whole(unit: str, doc: str, *shape: int) -> Any:
 
 
 def part(record: type, doc: str) -> Any:
-    """Declare a nested record."""
+    """Declare a field that is a record of its own."""
     return RecordField(record, "", doc)
 
 

@@ -22,7 +22,7 @@ def forget(state: ForcePredictorState) -> None:
 
 @njit(cache=True)
 def apply(config: ForcePredictorParams, state: ForcePredictorState, force: ForceSourceState) -> None:
-    """Take in the reading that `force_source` chose, at the time it was measured, with its own variance.
+    """Process the reading that `force_source` chose, at its time of measurement, with its own variance.
 
     White second derivative of the force, `acceleration_noise_N_per_s2` per square root of Hz: the motion that the pose
     filter expects of the tip, over the compliance.

@@ -79,7 +79,7 @@ def knob_of_curvature(config: KinematicsParams, curvature_per_m: float) -> float
 
 @njit(cache=True)
 def curvature_of_knob(config: KinematicsParams, knob_rad: float) -> float:
-    """Curvature (1/m) that a knob angle (rad) asks for: the fitted curve read the other way round."""
+    """Return the curvature (1/m) of a knob angle (rad): the inverse of the fitted curve."""
     curve = config.knob_of_curvature_rad
     low, high = 0, CURVE_POINTS - 1
     if not (curve[low] < knob_rad < curve[high]):
@@ -146,7 +146,7 @@ def _with_body_out(config: KinematicsParams, lateral_m: float, axial_m: float, b
 
 @njit(cache=True)
 def _faded(radius_m: float, axis_radius_m: float) -> float:
-    """0 up to `axis_radius_m`, 1 from twice that on, smooth between."""
+    """Return a smooth step: 0 up to `axis_radius_m`, 1 from twice that on."""
     share = min(max(radius_m / max(axis_radius_m, 1e-9) - 1.0, 0.0), 1.0)
     return share * share * (3.0 - 2.0 * share)
 

@@ -14,7 +14,7 @@ ACCEPTED, REJECTED, NOTHING_NEW = 1, -1, 0
 
 @njit(cache=True)
 def plausible(config: PredictorParams, state: PredictorState, pose: PoseRecord) -> bool:
-    """Whether a pose may be used: finite, inside the workspace, unit quaternion, not faster than the limit allows."""
+    """Return whether a pose may be used: finite, inside the workspace, unit quaternion, not faster than the limit."""
     norm = 0.0
     for i in range(4):
         norm += pose.quaternion_wxyz[i] ** 2

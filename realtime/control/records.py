@@ -27,9 +27,9 @@ HISTORY_POINTS = 192
 class PoseRecord:
     """A tracker pose, in the base frame."""
 
-    count: int = whole("", "rises by one with each pose")
-    stamp_ns: int = whole("ns", "when it was measured")
-    arrival_ns: int = whole("ns", "when it arrived")
+    count: int = whole("", "count of poses")
+    stamp_ns: int = whole("ns", "time of measurement")
+    arrival_ns: int = whole("ns", "time of arrival")
     position_m: Floats = real("m", "position of the sensor", 3)
     quaternion_wxyz: Floats = real("", "rotation sensor to base, unit, scalar first", 4)
 
@@ -37,21 +37,21 @@ class PoseRecord:
 class Force:
     """A force on the tissue, in the base frame: the sensor's reading, or the model's estimate."""
 
-    count: int = whole("", "rises by one with each reading")
-    stamp_ns: int = whole("ns", "when it was measured; of an estimate: when its pose was")
-    arrival_ns: int = whole("ns", "when it arrived")
+    count: int = whole("", "count of readings")
+    stamp_ns: int = whole("ns", "time of measurement; for an estimate, that of its pose")
+    arrival_ns: int = whole("ns", "time of arrival")
     force_N: Floats = real("N", "force on the tissue", 3)
     covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
     lasting_covariance_N2: Matrix = real("N^2", "its part that estimates shortly after each other share", 3, 3)
     nominal_N: Floats = real("N", "an estimate's force without adaptation of the stiffness; zero for the sensor", 3)
-    nominal_covariance_N2: Matrix = real("N^2", "covariance of that; zero for the sensor", 3, 3)
+    nominal_covariance_N2: Matrix = real("N^2", "covariance of that force; zero for the sensor", 3, 3)
 
 
 class BoardRecord:
     """The stepper board's newest status."""
 
-    count: int = whole("", "rises by one with each status")
-    arrival_ns: int = whole("ns", "when it arrived")
+    count: int = whole("", "count of statuses")
+    arrival_ns: int = whole("ns", "time of arrival")
     mcu_offset_ns: int = whole("ns", "rig's clock minus the board's clock")
     position_steps: Ints = whole("steps", "steps made, by axis", N_AXES)
     encoder_counts: Ints = whole("counts", "encoder, by axis", N_AXES)
@@ -63,7 +63,7 @@ class BoardRecord:
 class CommandRecord:
     """Command of the operator, and causes from the supervision."""
 
-    count: int = whole("", "rises by one with each command that the loop has to act on")
+    count: int = whole("", "count of commands that the loop has to carry out")
     kind: int = whole("", "a CommandKind")
     armed: int = whole("", "1 when the loop is to be armed")
     target_m: Floats = real("m", "requested tip position", 3)
@@ -71,9 +71,9 @@ class CommandRecord:
     force_N: float = real("N", "requested force along the inward normal")
     jog_axis: int = whole("", "a JogAxis: what a jog moves")
     jog_direction: Floats = real("", "unit vector along which a jog moves the tip, base frame", 3)
-    jog_travel: float = real("m, rad", "how far a jog moves")
-    jog_speed: float = real("m/s, rad/s", "how fast a jog moves")
-    clear: int = whole("", "rises by one when the operator clears latched causes")
+    jog_travel: float = real("m, rad", "length of a jog")
+    jog_speed: float = real("m/s, rad/s", "speed of a jog")
+    clear: int = whole("", "count of the operator's clear commands")
     watch: int = whole("", "causes that the supervision found, a bit set of `safety.CAUSES`")
 
 
@@ -97,8 +97,8 @@ class PredictorParams:
 
     acceleration_noise_m_per_s2: float = real("m/s^2", "white acceleration of the tip, per square root of Hz")
     position_noise_m: float = real("m", "noise of the tracker, standard deviation")
-    max_speed_m_per_s: float = real("m/s", "a faster tip is not plausible")
-    gate_sigma: float = real("", "poses further off than this many standard deviations are rejected")
+    max_speed_m_per_s: float = real("m/s", "largest plausible speed of the tip")
+    gate_sigma: float = real("", "limit for the rejection of poses, in standard deviations")
     workspace_min_m: Floats = real("m", "lowest plausible position", 3)
     workspace_max_m: Floats = real("m", "highest plausible position", 3)
 
@@ -108,8 +108,8 @@ class PredictorState:
 
     started: int = whole("", "1 after the first accepted pose")
     seen: int = whole("", "count of the newest pose that was processed")
-    stamp_ns: int = whole("ns", "when the newest accepted pose was measured")
-    accepted_ns: int = whole("ns", "when the newest accepted pose arrived")
+    stamp_ns: int = whole("ns", "time of measurement of the newest accepted pose")
+    accepted_ns: int = whole("ns", "time of arrival of the newest accepted pose")
     position_m: Floats = real("m", "filtered position at stamp_ns", 3)
     velocity_m_per_s: Floats = real("m/s", "filtered velocity at stamp_ns", 3)
     quaternion_wxyz: Floats = real("", "orientation of the newest accepted pose", 4)
@@ -137,11 +137,11 @@ class Beat:
     """Phase and wave of an uneven heart (`beat_phase`)."""
 
     share: Matrix = real("", "probability of each phase and rate", BEAT_PHASES, BEAT_RATES)
-    moved: Matrix = real("", "the same while it is moved on; scratch", BEAT_PHASES, BEAT_RATES)
+    moved: Matrix = real("", "these probabilities during propagation; scratch", BEAT_PHASES, BEAT_RATES)
     wave_m: Floats = real("m", "harmonics of the wave, cosine and sine", 2 * BEAT_HARMONICS)
     projected_m: Floats = real("m", "right side of the wave's normal equations", 2 * BEAT_HARMONICS)
     information: Matrix = real("", "left side of the wave's normal equations", 2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)
-    factor: Matrix = real("", "its Cholesky factor; scratch", 2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)
+    factor: Matrix = real("", "Cholesky factor of `information`; scratch", 2 * BEAT_HARMONICS, 2 * BEAT_HARMONICS)
     moment_m: Tensor = real("m", "moments by rate and harmonic, cosine and sine", BEAT_RATES, BEAT_HARMONICS, 2)
 
 
@@ -149,8 +149,8 @@ class TargetParams:
     """Predictor of the wall (`target_predictor`) for one kind of sample."""
 
     by_phase: int = whole("", "1 to run the phased model, for slow streams of samples")
-    horizon_s: float = real("s", "predictions are scored this far ahead")
-    gate_sigma: float = real("", "samples further off than this many standard deviations of every model are rejected")
+    horizon_s: float = real("s", "horizon at which predictions are scored")
+    gate_sigma: float = real("", "limit for the rejection of samples, in standard deviations of every model")
     stiffness_sd: float = real("", "standard deviation of the relative error of the stiffness at first")
     play_sd_m: float = real("m", "standard deviation of the error of half the backlash at first")
     level_acceleration_m_per_s2: float = real("m/s^2", "drift of the level, per square root of Hz")
@@ -172,24 +172,24 @@ class TargetState:
     score_m2: Floats = real("m^2", "mean square error of each model's predictions", TARGET_MODELS)
     weight: Floats = real("", "weight of each model in the mean", TARGET_MODELS)
     noise_m2: float = real("m^2", "mean variance of the samples")
-    scored_s: float = real("s", "how long predictions were scored since the harmonics began")
+    scored_s: float = real("s", "time for which predictions were scored since the harmonics began")
     shot_ns: int = whole("ns", "time of the states that are being scored")
     shot: Matrix = real("m", "states that are being scored", TARGET_MODELS, TARGET_N)
     heart_found: int = whole("", "1 once the heart's rate is known")
     breath_found: int = whole("", "1 once the breath's rate is known")
     mean_rate: float = real("rad/s", "mean rate of the heart")
-    worse_s: float = real("s", "how long the restless model has been the better one")
+    worse_s: float = real("s", "time for which the restless model has been the better one")
     bank_value: float = real("m", "sum of the samples for the banks")
-    bank_s: float = real("s", "time that they span")
-    bank_n: int = whole("", "how many they are")
+    bank_s: float = real("s", "time span of these samples")
+    bank_n: int = whole("", "number of these samples")
     heart_bank: Bank = part(Bank, "search for the heart's rate")
     breath_bank: Bank = part(Bank, "search for the breath's rate")
     last_heart_Hz: float = real("Hz", "the bank's peak at the last check")
     agreed: int = whole("", "checks in a row with the same peak; negative: wait")
     rejected: int = whole("", "samples rejected since the start; only for telemetry")
-    rejected_s: float = real("s", "how long samples have been rejected in a row")
+    rejected_s: float = real("s", "time for which samples have been rejected in a row")
     beat: Beat = part(Beat, "the phased model's beat")
-    beat_shot_m: Tensor = real("m", "its moments that are being scored", BEAT_RATES, BEAT_HARMONICS, 2)
+    beat_shot_m: Tensor = real("m", "moments of the phased model that are being scored", BEAT_RATES, BEAT_HARMONICS, 2)
     shot_rate: float = real("rad/s", "the mean rate that is being scored")
     row: Floats = real("", "measurement row; scratch", TARGET_N)
     cross: Floats = real("m^2", "covariance times row; scratch", TARGET_N)
@@ -207,7 +207,7 @@ class ForcePredictorState:
     """Prediction of the force for the thesis' law (`force_predictor`)."""
 
     started: int = whole("", "1 after the first reading")
-    stamp_ns: int = whole("ns", "when the newest reading was measured")
+    stamp_ns: int = whole("ns", "time of measurement of the newest reading")
     force_N: float = real("N", "filtered compression at stamp_ns")
     rate_N_per_s: float = real("N/s", "its rate")
     p00: float = real("N^2", "variance of the force")
@@ -236,9 +236,9 @@ class BacklashParams:
     """Backlash of the insertion and slope of the roll (`backlash`)."""
 
     width_m: float = real("m", "width of the gap, from the rig file")
-    caution_m: float = real("m", "how much narrower it is assumed at first")
+    caution_m: float = real("m", "reduction of the assumed width at the start")
     slope: float = real("", "body insertion per handle insertion")
-    threshold_m: float = real("m", "way back that counts as a reversal")
+    threshold_m: float = real("m", "motion back that counts as a reversal")
     roll_slope: float = real("", "distal roll per handle roll")
 
 
@@ -258,7 +258,7 @@ class KinematicsParams:
     distal_length_m: float = real("m", "length of the part that bends")
     insertion_at_home_m: float = real("m", "distal insertion with the handle at home")
     max_curvature_per_m: float = real("1/m", "greatest curvature")
-    axis_radius_m: float = real("m", "below this distance from the axis the roll is held")
+    axis_radius_m: float = real("m", "distance from the axis below which the roll is held")
     knob_of_curvature_rad: Floats = real("rad", "knob over a uniform grid of curvatures", CURVE_POINTS)
 
 
@@ -286,13 +286,13 @@ class HybridState:
     has_last: int = whole("", "1 when last_error is that of the last tick")
     force_integral_N_s: float = real("N s", "integral of the force error")
     goal_m: Floats = real("m", "moving goal of the tip", 3)
-    above_ns: int = whole("ns", "since when the force has been beyond its threshold; 0: it is not")
+    above_ns: int = whole("ns", "time since which the force has been beyond its threshold; 0: it is not")
 
 
 class JogState:
-    """A jog that goes on (`jog`)."""
+    """A jog in progress (`jog`)."""
 
-    left: float = real("m, rad", "way that is left")
+    left: float = real("m, rad", "remaining way")
     target_m: Floats = real("m", "where a jog of the tip ends", 3)
     least_force_N: float = real("N", "least force since the jog began")
 
@@ -305,12 +305,12 @@ class TipOffsetParams:
 
 
 class TipOffsetState:
-    """How far the tip is from the model's free tip (`tip_offset`)."""
+    """Learned difference between the tip and the model's free tip (`tip_offset`)."""
 
     offset_m: Floats = real("m", "measured tip minus the model's free tip", 3)
     touch_offset_m: Floats = real("m", "the offset when contact began", 3)
     learned_s: float = real("s", "time learned from so far, up to the time constant")
-    stamp_ns: int = whole("ns", "when the newest pose that was learned from was measured")
+    stamp_ns: int = whole("ns", "time of measurement of the newest pose that was learned from")
     insertion_error_m: float = real("m", "predicted insertion minus the insertion that explains the poses")
     insertion_learned_s: float = real("s", "time that the insertion was learned from, up to its time constant")
 
@@ -339,7 +339,7 @@ class WallState:
     force: TargetState = part(TargetState, "the wall by its force")
     pose: TargetState = part(TargetState, "the wall by the tip's poses")
     mean_depth_m: float = real("m", "mean depth of the free tip along the inward normal")
-    stamp_ns: int = whole("ns", "when the newest accepted force was measured")
+    stamp_ns: int = whole("ns", "time of measurement of the newest accepted force")
 
 
 class PredictiveParams:
@@ -362,9 +362,9 @@ class PredictiveState:
     goal_speed_m_per_s: float = real("m/s", "speed of the moving goal")
     touch_depth_m: float = real("m", "depth of the free tip when contact began")
     reversal_depth_m: float = real("m", "shortest motion back for which a reversal is planned now")
-    force_setpoint_N: float = real("N", "force to press with now")
-    away_s: float = real("s", "how long the contact has been lost")
-    short_s: float = real("s", "how long the free tip has been as deep as it may be, with too little force")
+    force_setpoint_N: float = real("N", "present force set-point")
+    away_s: float = real("s", "time for which the contact has been lost")
+    short_s: float = real("s", "time for which the free tip has been at its depth limit with too little force")
     speed: Floats = real("m/s, rad/s", "speed of the joint command", N_AXES)
     joint_at_crossing: Floats = real("m, rad, rad", "joint command one planned crossing from now", N_AXES)
     joint_after_crossing: Floats = real("m, rad, rad", "joint command a little later", N_AXES)
@@ -375,7 +375,7 @@ class ForceSourceState:
 
     source: int = whole("", "a ForceSource: which one closes the loop")
     seen: Ints = whole("", "count of the newest reading that was processed", 2)
-    arrival_ns: Ints = whole("ns", "when the newest plausible reading arrived", 2)
+    arrival_ns: Ints = whole("ns", "time of arrival of the newest plausible reading", 2)
     normal_N: Floats = real("N", "its compression", 2)
     noise_N2: float = real("N^2", "variance of the newest estimate along the normal, without its lasting part")
     nominal_N: float = real("N", "compression by the newest estimate without adaptation of the stiffness")
@@ -388,17 +388,17 @@ class ForceSourceState:
     bias_N: float = real("N", "mean of estimate minus sensor")
     difference_N2: float = real("N^2", "recent mean square of their difference")
     usual_difference_N2: float = real("N^2", "usual mean square of their difference")
-    good_s: float = real("s", "how long the sensor has been good")
+    good_s: float = real("s", "time for which the sensor has been good")
     smooth_N: float = real("N", "compression of the source, smoothed if it is the estimate")
     changed: int = whole("", "1 in the tick of a handover; only for telemetry")
     fresh: int = whole("", "1 where the source has a new reading")
-    stamp_ns: int = whole("ns", "when that was measured")
+    stamp_ns: int = whole("ns", "time of its measurement")
     value_N: float = real("N", "its compression")
     spread_N2: float = real("N^2", "its variance")
-    age_from_ns: int = whole("ns", "when it arrived")
+    age_from_ns: int = whole("ns", "time of arrival")
     force_N: Floats = real("N", "its force, base frame", 3)
     reading_N: Floats = real("N", "the sensor's newest reading, base frame", 3)
-    estimate_stamp_ns: int = whole("ns", "when the newest estimate's pose was measured")
+    estimate_stamp_ns: int = whole("ns", "time of measurement of the newest estimate's pose")
     sensor_then: float = real("N", "the sensor's compression at that time, NaN where it is not known")
     new: Ints = whole("", "1 where the sensor, the estimate has a plausible new reading in this tick", 2)
 
@@ -414,11 +414,11 @@ class WitnessState:
     pairs: int = whole("", "pairs that were compared since arming")
     geometry_N: float = real("N", "compression by the tip's deflection; 0 where that is not known")
     reference_m: float = real("m", "measured tip minus free tip, along the outward normal, in free space")
-    reference_s: float = real("s", "time that this was learned from")
-    deflection_m: float = real("m", "how much further it is now")
+    reference_s: float = real("s", "time from which the reference was learned")
+    deflection_m: float = real("m", "present difference from the reference")
     pose_ns: int = whole("ns", "stamp of the newest pose")
-    differ_s: float = real("s", "how long sensor and estimate have disagreed")
-    pressed_s: float = real("s", "how long a stopped catheter has been pressed")
+    differ_s: float = real("s", "time for which sensor and estimate have disagreed")
+    pressed_s: float = real("s", "time for which a stopped catheter has been pressed")
 
 
 class History:
@@ -426,7 +426,7 @@ class History:
 
     head: int = whole("", "newest place of the ring")
     count: int = whole("", "places in use")
-    time_ns: Ints = whole("ns", "when the stages are there", HISTORY_POINTS)
+    time_ns: Ints = whole("ns", "time at which the stages reach the joints", HISTORY_POINTS)
     joint: Matrix = real("m, rad, rad", "joints then, the roll that of the handle", HISTORY_POINTS, N_AXES)
     windup_rad: float = real("rad", "windup of the roll as it is known now, for all of them")
     flank: Floats = real("", "+1 or -1: side of the gap that pushed last", HISTORY_POINTS)
@@ -487,17 +487,17 @@ class State:
     command_seen: int = whole("", "count of the newest command that was acted on")
     cleared: int = whole("", "count of the newest clearing that was acted on")
     home_m: float = real("m", "distal insertion of the body at home, as located at rest")
-    predicted_joint: Floats = real("m, rad, rad", "joints when the stages are where they were sent", N_AXES)
+    predicted_joint: Floats = real("m, rad, rad", "joints when the stages have reached their set-points", N_AXES)
     normal: Floats = real("", "outward normal of the wall, as learned", 3)
     witness: WitnessState = part(WitnessState, "sensor, estimate and geometry compared")
-    free_s: float = real("s", "how long nothing has pressed on a tip that is being retracted")
+    free_s: float = real("s", "time for which nothing has pressed on a tip that is being retracted")
     retract_knob_rad: float = real("rad", "knob where the retraction began")
     history: History = part(History, "predicted joints of the last 0.2 s")
     tip_offset: TipOffsetState = part(TipOffsetState, "offset of the tip")
     windup: RollWindupState = part(RollWindupState, "windup of the roll")
     wall: WallState = part(WallState, "motion of the wall")
     predictive: PredictiveState = part(PredictiveState, "the predictive law")
-    jog: JogState = part(JogState, "the jog that goes on")
+    jog: JogState = part(JogState, "jog in progress")
 
 
 class Outputs:
@@ -506,10 +506,10 @@ class Outputs:
     now_ns: int = whole("ns", "time of this tick")
     valid: int = whole("", "1 when the set-point is to be sent")
     number: int = whole("", "number of the set-point")
-    execute_us: int = whole("us", "board time at which it is reached")
+    execute_us: int = whole("us", "board time at which the set-point is reached")
     expiry_us: int = whole("us", "after execute_us + expiry_us it is never executed")
     position_steps: Ints = whole("steps", "the set-point, by axis", N_AXES)
-    stage_unit: Floats = real("m, rad, rad", "the same in units of the axes", N_AXES)
+    stage_unit: Floats = real("m, rad, rad", "set-point in units of the axes", N_AXES)
     joint: Floats = real("m, rad, rad", "predicted joints, the insertion corrected by the poses", N_AXES)
     tip_m: Floats = real("m", "predicted tip", 3)
     tip_velocity_m_per_s: Floats = real("m/s", "velocity of the tip", 3)

@@ -23,7 +23,7 @@ _FREE_S = 0.5
 
 @njit(cache=True)
 def forget(state: RollWindupState) -> None:
-    """Forget the windup: arming, or a rig that is not armed."""
+    """Reset the windup; for arming, and while the rig is not armed."""
     state.windup_rad = 0.0
 
 

@@ -148,7 +148,7 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
 
 @njit(cache=True)
 def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, forces_rejected: int) -> int:
-    """Return the bit set of all that is wrong at this tick."""
+    """Return the bit set of all causes at this tick."""
     armed = state.phase != PHASE_DISARMED
     flags = 0
     if pose_result == predictor.REJECTED:
@@ -164,7 +164,7 @@ def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, force
 
 @njit(cache=True)
 def _force_flags(params: Params, state: State, now_ns: int, armed: bool) -> int:
-    """Return what is wrong with the force that closes the loop."""
+    """Return the causes that concern the force that closes the loop."""
     flags, limits = 0, params.safety
     force_age_ns = now_ns - state.force.age_from_ns
     force_timeout_ns = limits.force_timeout_ns
@@ -186,7 +186,7 @@ def _force_flags(params: Params, state: State, now_ns: int, armed: bool) -> int:
 
 @njit(cache=True)
 def _witness_flags(params: Params, state: State, inputs: Inputs) -> int:
-    """Return what sensor, estimate and geometry of an armed loop say together, whichever of them closes the loop."""
+    """Return the causes from sensor, estimate and geometry of an armed loop, whichever of them closes the loop."""
     flags, witness = 0, state.witness
     if witnesses.over(params, witness, state.force, inputs):
         flags |= safety.OVER_FORCE
@@ -204,7 +204,7 @@ def _witness_flags(params: Params, state: State, inputs: Inputs) -> int:
 
 @njit(cache=True)
 def _armed_flags(params: Params, state: State, inputs: Inputs) -> int:
-    """Return what is wrong for an armed loop with poses, board and operator; and what the supervision found."""
+    """Return the causes that concern poses, board and operator of an armed loop; and those that the supervision found."""
     limits, now_ns = params.safety, inputs.now_ns
     flags = inputs.command.watch
     in_contact = state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT
@@ -358,7 +358,7 @@ def _start_jog(params: Params, state: State, command: CommandRecord, tip_m: Read
 
 @njit(cache=True)
 def _follow_command(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
-    """Set the phase that a new command wants of the armed loop."""
+    """Set the phase that a new command requests of the armed loop."""
     if command.kind == COMMAND_HOLD:
         _enter(params, state, PHASE_HOLD, tip_m)
     elif command.kind == COMMAND_RETRACT:
@@ -460,7 +460,7 @@ def _control_thesis(params: Params, state: State, command: CommandRecord, tip_m:
 
 @njit(cache=True)
 def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: float) -> None:
-    """Run the predictive law."""
+    """Advance the joint command by the predictive law (`predictive`)."""
     command, law, own, hy = inputs.command, params.predictive, state.predictive, state.hybrid
     offset_m, period_s, depth_m = state.tip_offset.offset_m, params.period_s, params.backlash.threshold_m
     if state.phase == PHASE_POSITION:
@@ -495,7 +495,7 @@ def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: f
 
 @njit(cache=True)
 def _end_jog(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
-    """Hold where a jog is done or meets something. Without a fresh force a jog is as blind as any motion in free space."""
+    """Hold if a jog is done or touches something. Without a recent force a touch is not detected, as in free space."""
     threshold_N = params.hybrid.contact_force_N
     if state.force.source == SOURCE_ESTIMATE:
         threshold_N *= _NOISY_FACTOR
@@ -561,7 +561,7 @@ def _set_setpoint(params: Params, state: State, inputs: Inputs, outputs: Outputs
 
 @njit(cache=True)
 def _report(params: Params, state: State, inputs: Inputs, outputs: Outputs, force_N: float, flags: int) -> None:
-    """Fill what telemetry shows."""
+    """Fill the outputs that only telemetry uses."""
     outputs.now_ns = inputs.now_ns
     for axis in range(N_AXES):
         outputs.joint[axis] = state.predicted_joint[axis]

@@ -18,7 +18,7 @@ NUDGE_m = 1e-5
 
 @njit(cache=True)
 def start(state: TipOffsetState) -> None:
-    """Forget what was learned; for arming."""
+    """Reset the learned values; for arming."""
     state.learned_s = state.insertion_learned_s = state.insertion_error_m = 0.0
     for i in range(3):
         state.offset_m[i] = 0.0

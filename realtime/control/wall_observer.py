@@ -31,13 +31,13 @@ _BACKLASH_S = 2.0
 
 @njit(cache=True)
 def forget(state: WallState) -> None:
-    """Forget the wall: contact begins, or the loop is armed."""
+    """Reset the estimate of the wall: contact begins, or the loop is armed."""
     state.force.started = state.pose.started = 0
 
 
 @njit(cache=True)
 def take_pose(config: WallParams, state: WallState, stamp_ns: int, position_m: ReadFloats, normal: ReadFloats) -> None:
-    """Take in the tip's position (3,) in contact, as of `stamp_ns`: there the tip is on the wall."""
+    """Process the tip's position (3,) in contact, as of `stamp_ns`; it is then on the wall."""
     depth_m = -dot(position_m, normal)
     target_predictor.apply(config.by_pose, state.pose, stamp_ns, depth_m, 0.0, 0.0, config.position_noise_m**2)
 
@@ -52,7 +52,7 @@ def take_force(
     normal: ReadFloats,
     contact_force_N: float,
 ) -> tuple[int, float]:
-    """Take in the newest reading of the force source.
+    """Process the newest reading of the force source.
 
     Without force the wall may be anywhere beyond the tip: then only a prediction of a nearer wall is corrected. The
     variance of an estimate is limited to the recent prediction error.

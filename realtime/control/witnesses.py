@@ -48,7 +48,7 @@ _OVER_SIGMAS = 1.5
 
 @njit(cache=True)
 def start(state: WitnessState) -> None:
-    """Forget everything; for arming."""
+    """Reset the state to unknown; for arming."""
     state.sensor_N = state.estimate_N = state.estimate_sd_N = state.difference_N = 0.0
     state.geometry_N = state.reference_m = state.deflection_m = state.reference_s = 0.0
     state.differ_s = state.pressed_s = 0.0
@@ -62,7 +62,7 @@ def _share(dt_s: float, memory_s: float) -> float:
 
 @njit(cache=True)
 def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -> None:
-    """Take in what `force_source` has accepted in this tick: `force.new` says which of the readings are new."""
+    """Process the readings that `force_source` has accepted in this tick; `force.new` marks the new ones."""
     if force.new[SOURCE_SENSOR] != 0:
         state.sensor_N += _share(period_s, _SENSOR_S) * (force.normal_N[SOURCE_SENSOR] - state.sensor_N)
     if force.new[SOURCE_ESTIMATE] == 0:
@@ -87,7 +87,7 @@ def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -
 def take_pose(
     params: Params, state: WitnessState, inputs: Inputs, joint: ReadFloats, normal: ReadFloats, phase: int
 ) -> None:
-    """Take in an accepted pose with the joints (3,) at its time: how far does the tip stay behind the free tip?"""
+    """Process an accepted pose with the joints (3,) at its time: compute the distance from the free tip to the tip."""
     free_m = free_tip.apply(params.kinematics, joint)
     behind_m = dot(inputs.tip.position_m, normal) - dot(free_m, normal)
     dt_s = min(max((inputs.tip.stamp_ns - state.pose_ns) * 1e-9, 0.0), 0.1)

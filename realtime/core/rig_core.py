@@ -38,7 +38,7 @@ from realtime.drivers.stepper_board import BoardEventKind, StepperBoardLink
 LONGEST_GAP_NS = 10_000_000
 # A cause that comes and goes, as a stale pose may at every frame, is logged again after this time without it.
 CAUSE_QUIET_NS = 1_000_000_000
-# Warnings that are logged: the loop goes on, and the operator has to know.
+# Warnings that are logged: the loop continues, and the operator needs to see them.
 _LOGGED_WARNINGS = safety.STILL_PRESSED | safety.FORCE_UNREACHED | safety.BODY_CONTACT
 # Causes whose log line carries what sensor, estimate and geometry say.
 _FORCE_CAUSES = safety.OVER_FORCE | safety.FORCE_UNDECIDED | safety.FORCE_DISAGREES | _LOGGED_WARNINGS

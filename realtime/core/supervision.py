@@ -112,7 +112,7 @@ class Supervision:
     @property
     def causes(self) -> int:
         """Return the bit set of active failsafe causes."""
-        # What a model process that is silent said last says nothing of now.
+        # The last message of a model process that does not answer is no longer valid.
         return self._lasting | (self.host.causes or self._body_causes)
 
     def restart(self) -> None:

@@ -1,4 +1,4 @@
-"""The nominal model of the catheter rig as the proof's generator knows it: what a rig engineer would calibrate.
+"""The nominal model of the catheter rig in the proof's generator: the one that a rig engineer would calibrate.
 
 Written from the published description of kind `rig` (docs/diagnosis.md), apart from host's twin, so that sizes of planted
 effects can be stated relative to it and a crudely calibrated nominal file can be written next to the recordings.
@@ -96,7 +96,7 @@ def _quaternion_product(a: Array, b: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def chain(p: Array, handle: Array, force: Array, node: Array, weight: Array, shaft_m: float, out: Array) -> None:
+def outputs_of(p: Array, handle: Array, force: Array, node: Array, weight: Array, shaft_m: float, out: Array) -> None:
     """out (n, 17) = tip x, y, z, quaternion, the same of the shaft's sensor, force on the wall.
 
     p (9,) as PARAMETERS; handle (n, 3) m, rad, rad; force (n, 3) recorded (N). Wall normal e3.
@@ -142,9 +142,9 @@ def chain(p: Array, handle: Array, force: Array, node: Array, weight: Array, sha
 
 
 def predict(p: Array, handle: Array, force: Array) -> Array:
-    """Nominal outputs (n, 17) as `chain`, for handle (n, 3) and recorded force (n, 3; NaN counts as none)."""
+    """Nominal outputs (n, 17) as `outputs_of`, for handle (n, 3) and recorded force (n, 3; NaN counts as none)."""
     out = np.empty((len(handle), 17))
-    chain(np.asarray(p, float), np.ascontiguousarray(handle), np.nan_to_num(force), _NODE, _WEIGHT, SHAFT_OFFSET_M, out)
+    outputs_of(np.asarray(p, float), np.ascontiguousarray(handle), np.nan_to_num(force), _NODE, _WEIGHT, SHAFT_OFFSET_M, out)
     return out
 
 

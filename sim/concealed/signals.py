@@ -62,7 +62,7 @@ def _steps(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _walk(rng: np.random.Generator, t: Array) -> Array:
-    """A wandering hand: noise through two slow filters."""
+    """Random motion of a hand: noise through two slow filters."""
     dt = float(np.median(np.diff(t[t > 0.0]))) if np.count_nonzero(t > 0.0) > 2 else 0.025
     a = np.exp(-dt / 0.5)
     x = rng.standard_normal(t.size)
@@ -108,7 +108,7 @@ def lost(rng: np.random.Generator, n: int, share: float, burst: float) -> Array:
 def windows(mismatch: Array, time_s: Array) -> list[list[float]]:
     """Where the moving RMS (0.5 s) of one channel's mismatch (n,) exceeds half of its own 95th percentile.
 
-    Gaps below 0.5 s are closed, pieces below 0.3 s dropped, as docs/diagnosis.md defines windows. Times are time_s's.
+    Gaps below 0.5 s are closed, windows below 0.3 s dropped, as docs/diagnosis.md defines windows. Times are time_s's.
     """
     dt = float(np.median(np.diff(time_s)))
     width = max(1, round(0.5 / dt))
@@ -118,14 +118,14 @@ def windows(mismatch: Array, time_s: Array) -> list[list[float]]:
     if limit <= 0.0:
         return []
     edges = np.flatnonzero(np.diff(np.concatenate(([0], (rms > limit).astype(int), [0]))))
-    pieces = [[float(time_s[i]), float(time_s[min(j, time_s.size - 1)])] for i, j in edges.reshape(-1, 2)]
-    return tidy(pieces)
+    found = [[float(time_s[i]), float(time_s[min(j, time_s.size - 1)])] for i, j in edges.reshape(-1, 2)]
+    return tidy(found)
 
 
-def tidy(pieces: list[list[float]], gap_s: float = 0.5, least_s: float = 0.3) -> list[list[float]]:
+def tidy(spans: list[list[float]], gap_s: float = 0.5, least_s: float = 0.3) -> list[list[float]]:
     """Windows sorted, those nearer than `gap_s` joined, those shorter than `least_s` dropped."""
     joined: list[list[float]] = []
-    for begin, end in sorted(pieces):
+    for begin, end in sorted(spans):
         if joined and begin - joined[-1][1] < gap_s:
             joined[-1][1] = max(joined[-1][1], end)
         else:

@@ -108,7 +108,7 @@ class ConcealedCase:
 
 
 def _system(plan: ConcealedPlan, puzzle: str = "") -> System:
-    """The case's rig or mechanism, with the excitation that its puzzle wants."""
+    """The case's rig or mechanism, with the excitation that its puzzle needs."""
     rng = plan.stream(1)
     if plan.kind == "rig":
         still = {"not_moved": 1}.get(puzzle)

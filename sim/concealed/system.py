@@ -33,7 +33,7 @@ class ScaledEffect:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Planted parameters by name."""
+        """Return the planted parameters by name."""
         return self.effect.make(self.size)
 
 
@@ -167,12 +167,12 @@ def _turned(q: Array, v: Array) -> Array:
 
 
 def rig(case: RigCase) -> System:
-    """The catheter rig of `case`."""
+    """Return the system of a catheter rig."""
     return System("rig", case, concealed_rig.CHANNELS, case.sigma, concealed_rig.FRAME_S)
 
 
 def generic(case: GenericCase) -> System:
-    """The mechanism of `case`."""
+    """Return the system of a plain mechanism."""
     return System(case.kind, case, concealed_generic.OUTPUTS[case.kind], case.sigma, case.period_s)
 
 

@@ -125,8 +125,8 @@ class Twin(RigModel):
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n) of the nominal model, plus what the rod model adds where `correct` was called."""
         assert isinstance(segment, RigSegment)
-        chain = super().simulate(segment, theta, active)
-        return chain if segment.exact is None else np.asarray(chain + segment.exact)
+        nominal = super().simulate(segment, theta, active)
+        return nominal if segment.exact is None else np.asarray(nominal + segment.exact)
 
     def _exact(self, segment: RigSegment, theta: Array) -> Array:
         """Outputs (15, n) by the rod model, NaN where it has no equilibrium."""

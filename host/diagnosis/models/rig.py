@@ -83,7 +83,7 @@ class RigSegment(Segment):
     force: Array = field(default_factory=lambda: np.zeros((3, 0)))  # (3, n) on the wall, base frame
     beyond: Array | None = None  # (3, n) part of the recorded force that simulation and noise do not explain
     reference: tuple[Array, ...] = ()  # of tip and shaft
-    exact: Array | None = None  # (outputs, n) what the rod model says beyond the chain
+    exact: Array | None = None  # (outputs, n) rod model minus the linear model
     kept: dict[Any, tuple[Array, ...]] = field(default_factory=dict)  # shapes of the last two runs
 
 
