@@ -25,7 +25,7 @@ def latency_check(
     seconds: Annotated[float, typer.Option(help="Total time, s; cyclictest, if installed, takes half of it.")] = 20.0,
     hz: Annotated[int, typer.Option(help="Ticks per second, 100 to 4000.")] = 1000,
     json: Json = False,
-    beside: Annotated[
+    subscribers: Annotated[
         str,
         typer.Option(
             "--with",
@@ -43,11 +43,11 @@ def latency_check(
     if not 0 < seconds <= MAX_SECONDS:
         raise InputError("--seconds", seconds, f"more than 0, at most {MAX_SECONDS}")
     if docs is not None:
-        if not beside:
+        if not subscribers:
             raise InputError("--docs", str(docs), "--with too, because only the section on subscribers is on the page")
         writable_file("--docs", docs)
-    if beside:
-        _with_subscribers(beside, seconds, json, docs)
+    if subscribers:
+        _with_subscribers(subscribers, seconds, json, docs)
         return
     from realtime.control.configure import tick_parameters
     from realtime.control.tick import tick

@@ -62,7 +62,7 @@ class Working:
     def __init__(self, stage: str, at_most_s: float | None = None) -> None:
         self._stage, self._at_most_s = stage, at_most_s
         self._done = threading.Event()
-        self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
+        self._thread = threading.Thread(target=self._show_working, name="progress", daemon=True)
 
     def __enter__(self) -> Working:
         self._thread.start()
@@ -72,7 +72,7 @@ class Working:
         self._done.set()
         self._thread.join()
 
-    def _tell(self) -> None:
+    def _show_working(self) -> None:
         live, printed = sys.stderr.isatty(), False
         of = "" if self._at_most_s is None else f" of {self._at_most_s:g} s"
         began_s, wait_s = time.monotonic(), _FIRST_LINE_S

@@ -78,7 +78,7 @@ def run(
         print(f"seldinger: run: {error}", file=sys.stderr)
         raise typer.Exit(1) from None
     report = write_protocol_report(result.as_json(), target.with_suffix(".html"))
-    _tell(result, target, report)
+    _print_result(result, target, report)
     if json:
         write_json({**result.as_json(), "result": str(target), "report": str(report)})
     if not result.good:
@@ -118,7 +118,7 @@ def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
     print("\n".join(rows), file=sys.stderr)
 
 
-def _tell(result: ProtocolResult, target: Path, report: Path) -> None:
+def _print_result(result: ProtocolResult, target: Path, report: Path) -> None:
     """Print a line for each action, and the paths of the files."""
     for item in result.results:
         touch = item.touch

@@ -32,7 +32,7 @@ from host.diagnosis.selection.equivalence import Standing, standings, with_unlis
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.search import Found, search
-from host.diagnosis.selection.unlisted import Rest, explain_rest
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -77,7 +77,7 @@ class Diagnosis:
     located: list[Location]
     figures: Figures
     verdict: str = "nothing_missing"
-    rest: Rest = field(default_factory=lambda: Rest(None, 0.0))
+    remainder: Remainder = field(default_factory=lambda: Remainder(None, 0.0))
     notes: list[str] = field(default_factory=list)
     designs: list[Design] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
@@ -196,24 +196,28 @@ def _diagnosed(
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])
-    rest = explain_rest(problem, found, noise_sd, overall.part(0.7, 0.8))
+    remainder = explain_remainder(problem, found, noise_sd, overall.part(0.7, 0.8))
     overall.part(0.8, 0.85)("comparing rivals in the place of each effect", 0.0)
-    standing = with_unlisted_rival(standings(problem, found, noise_sd), rest)
+    standing = with_unlisted_rival(standings(problem, found, noise_sd), remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
-    result.rest = rest
+    result.remainder = remainder
     result.findings = [*data.findings, *held, *uncertain(problem, found.best, spans)]
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
-    piled = rest.doubtful and len(found.best.terms) > problem.rules.partial_effects
+    piled = remainder.doubtful and len(found.best.terms) > problem.rules.partial_effects
     named = bool(found.best.terms) and not piled
     result.verdict = (
-        "missing_physics" if named else "mismatch_not_identified" if rest.sure or found.best.terms else "nothing_missing"
+        "missing_physics"
+        if named
+        else "mismatch_not_identified"
+        if remainder.sure or found.best.terms
+        else "nothing_missing"
     )
-    if not located and rest.sure and rest.predicted is not None:
-        result.located = [_unexplained(full, found, rest.predicted.subsystem)]
+    if not located and remainder.sure and remainder.predicted is not None:
+        result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
     return result
 

@@ -111,7 +111,7 @@ class Fleet:
                 answers=False,
             )
 
-    def tell_rig(self, line: str) -> None:
+    def send_line(self, line: str) -> None:
         """Send a line to the simulated rig: `unplug board`, `unplug tracker` or `mark NAME` (`sim.rig_server`)."""
         commands = self.processes["rig"].stdin
         assert commands is not None

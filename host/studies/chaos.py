@@ -125,7 +125,7 @@ def run_once(number: int, seed: int, settings: DemoSettings) -> ChaosRun:
 
 def _break(fleet: Fleet, recording: Path, troubles: list[Trouble]) -> None:
     """Break what was drawn, and watch. Stalled processes go on when their time is over."""
-    fleet.tell_rig("mark trouble")
+    fleet.send_line("mark trouble")
     going_on: list[tuple[float, int]] = []
     for trouble in troubles:
         time.sleep(trouble.delay_s)
@@ -137,7 +137,7 @@ def _break(fleet: Fleet, recording: Path, troubles: list[Trouble]) -> None:
                 os.kill(fleet.processes[victim].pid, signal.SIGSTOP)
             going_on.append((time.monotonic() + trouble.stall_s, fleet.processes[victim].pid))
         elif how == "unplugged":
-            fleet.tell_rig(f"unplug {victim}")
+            fleet.send_line(f"unplug {victim}")
         else:
             _fill_disk(fleet.processes["host"].pid, recording)
     end_s = time.monotonic() + WATCHED_S
@@ -158,13 +158,13 @@ def _fill_disk(pid: int, recording: Path) -> None:
 def _stop(fleet: Fleet, operator: Operator, result: ChaosRun) -> None:
     local = operator.session.local
     assert local is not None
-    fleet.tell_rig("mark stop")
+    fleet.send_line("mark stop")
     paths = {"socket": lambda: stop_by_socket(local), "zenoh": operator.commander.stop_by_zenoh}
     answers = stop_over(paths, others_s=2.0)
     result.confirmed = any(answer.confirmed for answer in answers)
     result.answered = [answer.path for answer in answers if answer.answered]
     time.sleep(STOPPED_S)
-    fleet.tell_rig("mark end")
+    fleet.send_line("mark end")
     time.sleep(0.05)
 
 

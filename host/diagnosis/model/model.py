@@ -40,7 +40,7 @@ class Begin:
     measured: Array  # mean before the fit
     spread: Array  # standard deviation before the fit; 0 where the state is known
     values: Array
-    estimated: bool = True  # whether `Model.begin_anew` looks for it
+    estimated: bool = True  # whether `Model.start_again` looks for it
 
 
 @dataclass

@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
 # A packed table may unpack to so much, or to so many times its own size where that is more.
 UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED = 256 * 2**20, 64
-_PIECE_BYTES = 2**20
+_BLOCK_BYTES = 2**20
 _HEAD_BYTES = 4096
 _MAT_COMPRESSED, _MAT_HEAD_BYTES = 15, 128
 
@@ -256,7 +256,7 @@ def _read_mat(path: Path, limit: int) -> dict[str, Array]:
 
 
 def _check_mat(content: bytes, limit: int) -> None:
-    """Unpack the compressed variables of a MATLAB 5 file piece by piece, and keep none. Raises _TooLarge."""
+    """Unpack the compressed variables of a MATLAB 5 file block by block, and keep none. Raises _TooLarge."""
     if content[_MAT_HEAD_BYTES - 2 : _MAT_HEAD_BYTES] not in (b"IM", b"MI"):
         return
     order: Any = "little" if content[_MAT_HEAD_BYTES - 2 : _MAT_HEAD_BYTES] == b"IM" else "big"
@@ -267,7 +267,7 @@ def _check_mat(content: bytes, limit: int) -> None:
         if kind == _MAT_COMPRESSED:
             unpacker, waiting = zlib.decompressobj(), body
             while waiting and not unpacker.eof:
-                total += len(unpacker.decompress(waiting, _PIECE_BYTES))
+                total += len(unpacker.decompress(waiting, _BLOCK_BYTES))
                 waiting = unpacker.unconsumed_tail
                 if total > limit:
                     raise _TooLarge

@@ -127,7 +127,7 @@ def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Po
     """Probabilities at the place of one effect; raw: before calibration."""
     rules = result.problem.rules
     rules = replace(rules, effect_slope=1.0, effect_shift=0.0) if raw else rules
-    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), result.rest.left, rules)
+    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), result.remainder.share, rules)
 
 
 def _none_stated(result: Diagnosis) -> float:
@@ -208,8 +208,8 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
         entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
     white = result.figures.white_after[result.figures.primary] > NOT_WHITE
-    if ranked and result.rest.sure and result.rest.left > PARTLY:
-        ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result.rest.left)}."
+    if ranked and result.remainder.sure and result.remainder.share > PARTLY:
+        ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result.remainder.share)}."
     elif ranked and not white:
         figures = result.figures
         share = figures.after[figures.primary] / max(figures.before[figures.primary], 1e-300)

@@ -15,7 +15,7 @@ from host.diagnosis.selection.posterior import coarse
 from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.search import Found
 from host.diagnosis.selection.trial import Trial, at_bound
-from host.diagnosis.selection.unlisted import Rest, equations_for
+from host.diagnosis.selection.unlisted import Remainder, equations_for
 from host.diagnosis.symbolic.dictionary import equation_at
 
 Array = npt.NDArray[np.float64]
@@ -69,13 +69,13 @@ def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameter
     return name if gain < needed else ""
 
 
-def with_unlisted_rival(standing: list[Standing], rest: Rest) -> list[Standing]:
+def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[Standing]:
     """`standing` where known effects leave more than noise: the strongest may replace an unlisted effect."""
-    if not standing or not rest.doubtful:
+    if not standing or not remainder.doubtful:
         return standing
     first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
     named = standing[first]
-    forms = rest.predicted.forms if rest.predicted is not None else ()
+    forms = remainder.predicted.forms if remainder.predicted is not None else ()
     if not forms or any(not other.effect.listed for other in named.alike):
         return standing
     unknown = equation_at(named.candidate.port, *forms[0])

@@ -72,10 +72,10 @@ def settle(problem: Problem, values: Array) -> None:
     """Lets a model that needs it prepare its recordings for these nominal parameters."""
     for segment in problem.segments:
         problem.model.settle(segment, values)
-    begin_anew(problem, Fit((), values))
+    start_again(problem, Fit((), values))
 
 
-def begin_anew(problem: Problem, fit: Fit) -> None:
+def start_again(problem: Problem, fit: Fit) -> None:
     """Lets a model that runs freely from a measured state find that state again."""
     for segment in problem.segments:
         estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values))
@@ -84,7 +84,7 @@ def begin_anew(problem: Problem, fit: Fit) -> None:
 def refined(problem: Problem, fit: Fit) -> Fit:
     """`fit` brought to its end on all samples, together with the states that recordings begin from."""
     for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
-        begin_anew(problem, fit)
+        start_again(problem, fit)
         fit = minimize(problem, fit.terms, fit.values)
     return finish(problem, fit)
 
@@ -417,7 +417,7 @@ def _detour(
     problem.scale[:] = scale
     for segment in problem.segments:
         segment.weight = problem.scale
-    begin_anew(problem, best.best)
+    start_again(problem, best.best)
     return best
 
 

@@ -25,15 +25,15 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Rest:
-    """What known effects leave. `predicted`: its most predictable part; `left`: share of the nominal mismatch still
-    there.
+class Remainder:
+    """Residual beyond the known effects. `predicted`: its most predictable part; `share`: of the nominal mismatch
+    that remains.
     """
 
     predicted: PredictedPart | None
-    left: float
+    share: float
     doubtful: bool = False  # known effects are named, but they are probably the wrong names
-    above_noise: bool = False  # more is left than noise can be, predicted or not
+    above_noise: bool = False  # the remaining residual is larger than noise, predicted or not
 
     @property
     def sure(self) -> bool:
@@ -41,7 +41,7 @@ class Rest:
         return self.above_noise or (self.predicted is not None and self.predicted.sure)
 
 
-def left_over(problem: Problem, found: Found, noise_sd: Array) -> float:
+def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
     mattered most; noise may be larger than its estimate by `noise_uncertainty`.
     """
@@ -78,31 +78,35 @@ def _power(problem: Problem, residuals: list[Array], row: int) -> float:
     return float(np.mean(together**2)) if together.size else 0.0
 
 
-def explain_rest(problem: Problem, found: Found, noise_sd: Array, progress: Progress) -> Rest:
+def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress: Progress) -> Remainder:
     """Test the remaining residual, and add an equation to `found.best` where one earns its place."""
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
     progress("testing whether the residual is predictable", 0.0)
     places = predict_residual(problem, found.best, noise_sd)
-    rest = _rest(problem, found, noise_sd, places)
+    remainder = _remainder(problem, found, noise_sd, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
-    if not rest.sure or rest.predicted is None or (crowd and rest.left < problem.rules.partial_share / crowd[0][1]):
-        return rest
+    if (
+        not remainder.sure
+        or remainder.predicted is None
+        or (crowd and remainder.share < problem.rules.partial_share / crowd[0][1])
+    ):
+        return remainder
     likely = sorted((p for p in places if p.port is not None and p.sure), key=lambda place: -place.log_likelihood)
     for number, place in enumerate([place.port.name for place in likely if place.port is not None]):
         if not problem.budget.spent() and _equation_instead(
             problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
         ):
-            return _rest(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
-    return replace(rest, doubtful=bool(crowd))
+            return _remainder(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
+    return replace(remainder, doubtful=bool(crowd))
 
 
-def _rest(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Rest:
+def _remainder(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Remainder:
     best = max(places, key=lambda place: (place.sure, place.log_likelihood), default=None)
     explained = fallen(problem, found.nominal.residuals, found.best.residuals, noise_sd)
     predicted_share = best.power / (explained + best.power) if best is not None and best.power > 0.0 else 0.0
-    left = max(left_over(problem, found, noise_sd), predicted_share)
-    return Rest(best, left, above_noise=_above_noise(problem, found, noise_sd))
+    left = max(remaining_share(problem, found, noise_sd), predicted_share)
+    return Remainder(best, left, above_noise=_above_noise(problem, found, noise_sd))
 
 
 def _equation_instead(
@@ -189,7 +193,7 @@ def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: For
 
 
 def _left(problem: Problem, found: Found, fit: Fit, noise_sd: Array) -> float:
-    return left_over(problem, replace(found, best=fit), noise_sd)
+    return remaining_share(problem, replace(found, best=fit), noise_sd)
 
 
 def _better_than_known(problem: Problem, found: Found, noise_sd: Array, winner: Trial, instead: bool) -> bool:

@@ -20,7 +20,7 @@ from host.diagnosis.report.verdict import at_bound
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival
 from host.diagnosis.selection.posterior import calibrated, posterior
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
-from host.diagnosis.selection.unlisted import Rest
+from host.diagnosis.selection.unlisted import Remainder
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart
 from tests.host.diagnosis.test_export import COMMON, KINDS
 
@@ -49,10 +49,10 @@ def test_evidence_is_likelihood_or_agreement_of_blocks(held: Gain, both: Gain, t
 
 def test_what_leaves_a_rest_may_stand_for_what_is_in_no_list() -> None:
     form = Form("angle^2", lambda segment: segment.y[0] ** 2, 2)
-    rest = Rest(PredictedPart("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
+    remainder = Remainder(PredictedPart("cable", BACKLASH.port, 20.0, 1e-3, 0.2, 30.0, ((form, 1.0),)), 0.4, doubtful=True)
     weak, strong = (Standing(BACKLASH, Gain(gain, 1e-9, 0.2), Gain(gain, 1e-9, 0.2), ()) for gain in (10.0, 80.0))
-    assert [[c.name for c in s.alike] for s in with_unlisted_rival([weak, strong], rest)] == [[], ["unlisted@cable"]]
-    assert with_unlisted_rival([weak, strong], replace(rest, doubtful=False)) == [weak, strong]
+    assert [[c.name for c in s.alike] for s in with_unlisted_rival([weak, strong], remainder)] == [[], ["unlisted@cable"]]
+    assert with_unlisted_rival([weak, strong], replace(remainder, doubtful=False)) == [weak, strong]
 
 
 @pytest.mark.parametrize(("shown_in", "rests_on"), [((0,), "r0"), ((0, 2), ""), ((0, 1, 2), "")])
