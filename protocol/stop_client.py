@@ -18,7 +18,7 @@ from protocol.local_paths import LocalPaths
 LONGEST_ANSWER = 4096
 # In this time the rig's own state must show a stop; otherwise it is reported as not confirmed.
 CONFIRM_S = 0.1
-# The realtime process needs CONFIRM_S to see its own state change, and a busy machine some time to answer.
+# The realtime process needs CONFIRM_S to detect its own change of state, and a busy machine some time to answer.
 ANSWER_S = 1.0
 # After the rig has confirmed a stop on one path, the others have so long to answer.
 OTHERS_S = 0.2
@@ -53,7 +53,7 @@ def shows_stop(mode: str, safety_action: str) -> bool:
 
 
 def peer_credentials(connection: socket.socket) -> tuple[int, int, int]:
-    """Return process, user and group id of the program at the other end, as the kernel knows them (SO_PEERCRED)."""
+    """Return process, user and group id of the program at the other end, as the kernel states them (SO_PEERCRED)."""
     pid, uid, gid = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return pid, uid, gid
 

@@ -24,7 +24,7 @@ logger = logging.getLogger("seldinger.requests")
 RECORDER_DEPTH = 4096
 _REQUESTS_WAITING, _REQUESTS_A_TURN, _TURN_S = 256, 32, 0.002
 _SETTINGS: dict[str, Any] = {
-    # Without gossip, peers of one peer never see each other, and a client will not open before its router is up.
+    # Without gossip, peers of one peer never connect to each other, and a client will not open before its router is up.
     # Routers do neither: each passes messages on along the links that exist, and keeps trying those that do not.
     "mode": "router",
     "listen/exit_on_failure": True,

@@ -39,7 +39,7 @@ class CpuStats(NamedTuple):
     step_isr_mean_cycles: float
     idle_share: float
     starts: int  # of the processor: 1, and one more for each reset
-    rx_lost_bytes: int  # for want of room in the receiver
+    rx_lost_bytes: int  # because the receiver's buffer was full
     stack_free_bytes: int  # between the variables and the deepest stack of all starts; 0 on the native board
 
 
@@ -159,7 +159,7 @@ def ensure_built(kind: str, build: Build = USUAL_BUILD) -> Path:
 
 
 class SimulatedBoard:
-    """A simulated board. Time is microseconds since this object was made; it goes on through resets.
+    """A simulated board. Time is microseconds since this object was made; it continues through resets.
 
     kind: "avr" runs the ELF in simavr, "native" the same core compiled for the host, "auto" the better one there is.
     mcu: of MCUS, for avr. build: of the firmware, with other pins or polarities than the usual ones.

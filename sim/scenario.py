@@ -53,7 +53,7 @@ class ContactJob:
 
 @dataclass
 class Outcome:
-    """How it went, as far as the scenario itself can see. The steps (three axes) are taken at rest, before disarming."""
+    """Result of a scenario. The steps (three axes) are taken at rest, before disarming."""
 
     contact: bool = False
     stopped: bool = False

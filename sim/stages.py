@@ -117,7 +117,7 @@ class SimulatedStages:
                 self._next_loss_s[i] += every if every > 0.0 else math.inf
 
     def jam(self, axis: int, steps: float, seconds: float) -> None:
-        """The rotor of `axis` stands, whatever is commanded, until `steps` are lost or `seconds` are over."""
+        """Block the rotor of `axis` against all commands until `steps` are lost or `seconds` are over."""
         self._troubles.append(_Trouble(axis, steps, self._time_s + seconds))
 
     def slip(self, axis: int, steps: float, seconds: float, speed_unit_per_s: float) -> None:

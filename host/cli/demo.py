@@ -101,7 +101,7 @@ def demo(
 
 
 def _with_progress(settings: DemoSettings, wall_clock: bool) -> DemoRun:
-    """Run with a line on standard error that says what goes on."""
+    """Run with a progress line on standard error."""
     from host.run.demo import run_lockstep
     from host.run.wall_clock import run_wall_clock
 

@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar on a terminal; elsewhere a line now and then, so that a log says what goes on."""
+"""Progress on standard error: a bar on a terminal; elsewhere a line now and then, for a log."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Progress:
 
 
 class Working:
-    """Say that a step goes on which cannot tell how much of it is done: how long it has taken, and of how long at most.
+    """Report the time of a step whose progress is not known, and its maximum.
 
     The first line comes after five seconds, then one every ten; on a terminal every second. A step that ends before
     says nothing.

@@ -1,4 +1,4 @@
-"""`seldinger prove`: concealed cases from a seed, blind verdicts, labels opened last, the table with baselines."""
+"""`seldinger prove`: concealed cases from a seed, verdicts without the labels, the table with baselines."""
 
 from __future__ import annotations
 

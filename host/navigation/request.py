@@ -32,7 +32,7 @@ Component_N = Annotated[float, Field(ge=-1.0, le=1.0)]
 LINE_POINTS = 16
 # Spacing of the way's points (m of tip, about) before time is laid over it.
 SPACING_M = 0.003
-# The tip's last piece lies on the tissue when it presses.
+# Length at the tip that lies on the tissue in contact.
 TISSUE_m = 0.005
 DRAWN_SHAPES = 16
 

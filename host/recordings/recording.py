@@ -267,7 +267,7 @@ class RecordingFile:
         """Return the JSON Schema of `topic` as the file has it.
 
         Raises:
-            InputError: The topic is not in the file, or its schema is none that this reader knows.
+            InputError: The topic is not in the file, or its schema is not supported.
         """
         if topic not in self._places:
             known = ", ".join(sorted(self._places)) or "none, the recording is empty"
@@ -332,7 +332,7 @@ class RecordingFile:
     def message(self, topic: str, index: int) -> dict[str, Any] | None:
         """Return message number `index` of `topic`, in the order of recording; nil is absent.
 
-        A message of a topic that this software knows is checked as if it came over the network: None where it is not
+        A message of a known topic is checked as if it came over the network: None where it is not
         what the topic declares. Raises KeyError, IndexError.
         """
         with self.path.open("rb") as stream:

@@ -55,7 +55,7 @@ def unit_texts(settings: UnitSettings, rig: Rig) -> dict[str, str]:
     }
     texts = {}
     for name in settings.names:
-        # Only the control loop speaks to the force box; where its address is a name, the network filter cannot know it.
+        # Only the control loop speaks to the force box; if its address is a name, the network filter cannot allow it.
         # The model process is the one that other machines reach.
         peers = " ".join(rig.network.peers) if "host" in name else ""
         allowed = _addresses([rig.force_sensor.address]) if "realtime" in name else peers

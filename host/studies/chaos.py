@@ -124,7 +124,7 @@ def run_once(number: int, seed: int, settings: DemoSettings) -> ChaosRun:
 
 
 def _break(fleet: Fleet, recording: Path, troubles: list[Trouble]) -> None:
-    """Break what was drawn, and watch. Stalled processes go on when their time is over."""
+    """Break what was drawn, and watch. Stalled processes continue when their time is over."""
     fleet.send_line("mark trouble")
     going_on: list[tuple[float, int]] = []
     for trouble in troubles:

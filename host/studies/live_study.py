@@ -1,7 +1,7 @@
 """Alarms of the live watch in virtual time: false ones, their delay, and the subsystem that they name; for docs/live.md.
 
     python -m host.studies.live_study        # the short form: minutes
-    make live-study                          # 5 hours of each job, 60 planted runs; goes on where it was stopped
+    make live-study                          # 5 hours of each job, 60 planted runs; continues a stopped study
 
 Every run is the simulated rig in lock step: a seed decides it. `--out` keeps one line of JSON for every finished run.
 """

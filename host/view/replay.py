@@ -82,7 +82,7 @@ def origin_ns(recording: RecordingFile) -> int:
 
 
 class Replay:
-    """A `Source`. Time goes on between frames while it plays, times `speed`; it stops at the end.
+    """A `Source`. Time advances between frames while it plays, times `speed`, up to the end.
 
     Raises InputError for a recording without messages, or a speed out of its bounds.
     """

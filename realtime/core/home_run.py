@@ -9,7 +9,7 @@ from realtime.core.board_intake import axis_limits
 from realtime.drivers.homing import Home, Homing, HomingFailed, homing_limits
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
-# A board that says nothing for so long has stopped by its own dead man; the board sends STATUS every 5 ms.
+# A board without messages for so long has stopped by its own dead man; the board sends STATUS every 5 ms.
 _SILENT_NS = 500_000_000
 # Within this time the stages are at rest after DISARM (an axis stops from full speed within 50 ms).
 _REST_NS = 2_000_000_000

@@ -55,7 +55,7 @@ class StopPath:
             while not self._confirmed and time.monotonic_ns() - begin_ns < CONFIRM_S * 1e9:
                 time.sleep(0.001)
                 self._take(Arrived(), _CORE_BUSY_S)
-        except Exception as failure:  # whatever fails in the core, a stop is not lost
+        except Exception as failure:  # a stop is not lost if the core fails in any way
             self._loop.stop()
             busy = isinstance(failure, TimeoutError)
             why = "the core does not answer" if busy else f"the core failed ({type(failure).__name__})"

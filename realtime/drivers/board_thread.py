@@ -51,7 +51,7 @@ class BoardThread(threading.Thread):
                     self._find_again(str(gone))
                 else:
                     self._on_bytes(data)
-        except Exception as failure:  # the process sees `failure` and ends
+        except Exception as failure:  # the process reads `failure` and ends
             self.failure = failure
             logger.exception("the board's thread failed")
 

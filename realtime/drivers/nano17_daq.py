@@ -73,7 +73,7 @@ class Nano17Calibration:
 
 
 def parse_calibration_file(text: bytes) -> Nano17Calibration:
-    """A transducer's `.cal` file (XML: `Calibration` with one `UserAxis` a row of the matrix), in SI whatever its units.
+    """A transducer's `.cal` file (XML: `Calibration` with one `UserAxis` a row of the matrix), converted to SI.
 
     Raises ValueError with what is missing.
     """

@@ -10,7 +10,7 @@ from enum import Enum, IntFlag
 BINARY_START = b"\xc4\xa5"  # 0xA5C4, low byte first
 MAX_BINARY_BYTES = 4096
 MAX_TEXT_BYTES = 4096
-# COMM codes of the serial speeds that a POSIX line can have too (the device also knows 14400 and 1228739).
+# COMM codes of the serial speeds that a POSIX line can have too (the device also has 14400 and 1228739).
 BAUD_CODES = {9600: "0", 19200: "2", 38400: "3", 57600: "4", 115200: "5", 921600: "6", 230400: "A"}
 
 TRANSFORMS = 0x0001  # reply option of BX and TX: transforms and port status

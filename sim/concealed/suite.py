@@ -58,7 +58,7 @@ class ConcealedPlan:
 
     @property
     def id(self) -> str:
-        """Name of the case, which says nothing about it."""
+        """Return the name of the case, which does not reveal its content."""
         return f"case_{self.index:04d}"
 
     def stream(self, number: int) -> np.random.Generator:
@@ -281,7 +281,7 @@ _STANDING_BIAS = ScalableEffect(
 
 
 def _as_is(system: System, effect: ScalableEffect) -> tuple[ScaledEffect, NoiselessRecordings, float, list[Array]]:
-    """`effect` at size 1: whatever it does, the data must not show it."""
+    """Return `effect` at size 1, for a case in which the data do not show it."""
     session = system.run([ScaledEffect(effect, 1.0)])
     return (ScaledEffect(effect, 1.0), session, *measure(system, session))
 

@@ -153,7 +153,7 @@ def trials(problem: Problem, best: Fit) -> list[tuple[Excitation, Problem]]:
 
 
 def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | None:
-    """A problem of one recording whose outputs are what `best` says; None where it says nothing finite."""
+    """Return a problem of one recording with the outputs of `best`; None if they are not finite."""
     segment = problem.model.prepare(recording)
     if not problem.model.inner.on_rig:
         problem.model.settle(segment, best.values[: len(problem.model.parameters)])

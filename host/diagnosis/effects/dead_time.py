@@ -9,7 +9,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
 from host.diagnosis.model.operators import delayed_second_order
 
 CRITICAL = 1.0 / math.sqrt(2.0)  # damping ratio from which on no frequency is amplified
-SHORT = 0.1  # of the dead time and lags together: a part below this is not worth a word
+SHORT = 0.1  # of the dead time and lags together: a part below this is not named
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -26,7 +26,7 @@ def table() -> str:
 
 
 def traits(effects: list[Effect]) -> str:
-    """What the engine knows of these effects, in words; of those that act at several ports, what any of them has."""
+    """Return the traits of these effects in words; an effect at several ports has the traits of all its forms."""
     known = (
         ("memory", any(e.remembers for e in effects)),
         ("needs a rate", any(e.timed for e in effects)),

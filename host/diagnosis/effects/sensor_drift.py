@@ -1,4 +1,4 @@
-"""Sensor drift: a reading that wanders with time, whatever the motion."""
+"""Sensor drift: a reading that drifts with time, independent of motion."""
 
 from __future__ import annotations
 

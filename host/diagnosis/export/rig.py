@@ -179,7 +179,7 @@ def _knob_curve(patch: RigPatch, model: RecordedRig, theta: Array, active: list[
     for side in ("input", "output"):
         for candidate, values in here:
             bent = _passed(candidate, signal, values) if candidate.effect.side == side else None
-            # A rig file wants a curve that never falls; one that does is no knob's.
+            # A rig file needs a curve that never falls.
             if bent is not None and not np.any(np.diff(bent) < -MEMORYLESS * np.ptp(bent)):
                 signal = np.maximum.accumulate(bent)
                 used.add(candidate.key)

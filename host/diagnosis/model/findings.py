@@ -217,7 +217,7 @@ class _Copied:
 
     @property
     def whole(self) -> bool:
-        """Whether the channel says nothing that the other does not say."""
+        """Return whether the channel has no information beyond the other."""
         return self.noisy or (self.lag == 0.0 and abs(self.gain - 1.0) < EXACT and self.offset == 0.0)
 
     def sentence(self, copy: str, original: str, recording: Recording) -> str:
@@ -461,7 +461,7 @@ def _saturated(recordings: list[Recording], paths: list[Pair], columns: dict[str
 
 
 def _clipped(recording: Recording, name: str, driver: str, side: float) -> float:
-    """Share of samples in runs at the extreme reading, in which the driver goes on the same way and comes back."""
+    """Share of samples in runs at the extreme reading, in which the input continues in the same direction and returns."""
     y, x = side * fill(recording.channels[name]), fill(recording.channels[driver])
     if resolution(recording.channels[name], switched=False) > 0.0 or np.ptp(x) == 0.0:
         return 0.0

@@ -279,7 +279,7 @@ def _better_base(problem: Problem, base: Fit, trial: Trial) -> Fit | None:
 
 
 def settled(problem: Problem, fit: Fit) -> Fit:
-    """A nominal fit with its residuals; outputs weighed by it, and memories begun where it wants them."""
+    """A nominal fit with its residuals; outputs weighted by it, and initial states estimated from it."""
     settle(problem, fit.values)
     reweigh(problem, fit)
     finish(problem, fit)

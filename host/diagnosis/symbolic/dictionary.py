@@ -26,7 +26,7 @@ LAGS_S = (0.05, 0.2, 0.6, 2.0, 6.0)
 WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
 MOST_FORMS = 2  # joined to predict_residual
-BEST = 6  # forms that are worth a refit
+BEST = 6  # forms that are fitted again
 NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
 

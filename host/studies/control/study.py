@@ -15,7 +15,7 @@ from host.studies.control import timing as control_timing
 from host.studies.control.runs import IRREGULAR, REGULAR, STILL, WANTED_N, Held, with_control
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
-PLAY_OFF_m = 0.0006  # the thesis knows the backlash to this
+PLAY_OFF_m = 0.0006  # accuracy of the backlash in the thesis
 TRACKER_NOISE_m = 0.0004  # of one axis, for positioning
 # The thesis' law with gains raised for a beating wall, as far as it does not ring on a still one.
 RETUNED = {"force_gain_m_per_N": 0.06, "force_integral_m_per_N_s": 0.03}

@@ -178,7 +178,7 @@ def run_campaign(
     faults: tuple[str, ...] = (),
     progress: Progress = lambda done, runs: None,
 ) -> list[RunResult]:
-    """All runs, in the order of the plan; the same whatever `jobs` is.
+    """Return all runs, in the order of the plan; the same for every number of `jobs`.
 
     Raises ValueError for an unknown fault, BoardUnavailable where the board cannot be built.
     """

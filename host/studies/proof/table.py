@@ -74,7 +74,7 @@ WORLD_TARGETS = {
     "failed": ("0", "0"),
 }
 BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
-LEAST_IN_BIN = 5  # statements below which a bin's frequency says nothing
+LEAST_IN_BIN = 5  # number of statements below which a bin's frequency is not meaningful
 WIDE = 1.34  # a case counts for rho where its own is within this factor
 Table = dict[str, float | int | None]
 

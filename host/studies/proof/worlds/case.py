@@ -187,7 +187,7 @@ class CasePlan:
 
     @property
     def id(self) -> str:
-        """Name of the case, which says nothing about it."""
+        """Return the name of the case, which does not reveal its content."""
         return f"case_{self.index:04d}"
 
     def stream(self, number: int) -> np.random.Generator:

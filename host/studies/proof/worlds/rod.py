@@ -12,7 +12,7 @@ from numba import njit
 
 Array = np.ndarray
 STEPS = 24
-WALL_SMOOTH_M = 2e-6  # depth over which contact sets in, so that Newton's steps see a slope
+WALL_SMOOTH_M = 2e-6  # depth over which contact sets in, so that Newton's method has a slope
 
 
 @njit(cache=True)
