@@ -11,7 +11,9 @@ from typer.testing import CliRunner
 from host.report.figure_page import Section, as_json, write_reproduction
 from host.studies.reproduction import control_hybrid, control_kinematics, control_rig
 from host.studies.reproduction.thesis_control import (
+    PI,
     Gains,
+    Setting,
     contact,
     cost,
     heart,
@@ -67,6 +69,23 @@ def test_too_much_gain_does_not_settle() -> None:
     assert step_figures(hybrid(0.25, 120, Gains().scaled(K_pp=3.0)), 0.25).settling == 120
 
 
+def test_the_pi_form_needs_its_integral_gain_and_is_unstable_with_the_printed_optimum() -> None:
+    slow = Gains(0.25, 0.02, 0.0, 0.0545, 1e-4, 0.0)
+    here, without = (step_figures(hybrid(0.25, 600, slow.scaled(K_ip=k), Setting(form=PI)), 0.25) for k in (1.0, 0.0))
+    assert here.steady_error_N < 0.7 * without.steady_error_N and here.ringing_N < 1e-3
+    assert step_figures(hybrid(0.25, 120, Gains(), Setting(form=PI)), 0.25).ringing_N > 0.02
+
+
+def test_a_figure_on_the_rig_holds_where_one_reading_bears_it_out() -> None:
+    time_s = np.arange(0.0, 10.0, 0.01)
+    none = control_rig.RigRun("one", True, time_s, np.full(1000, 0.1), time_s, time_s, np.zeros((1000, 3)), 0.1)
+    first, second = control_rig.READINGS[:2]
+    figures = [control_rig.Figures(r, {"7.24": [none]}, {"7.24": (r is second, "so")}) for r in (first, second)]
+    section = control_rig._section(figures, "7.24", "Fig. 7.24", "It is so.", "Ours.")
+    assert section.verdict == "holds" and section.says.startswith(f"at 1 of 2 admissible settings: {second.name}")
+    assert [row[2] for row in section.rows] == ["holds", "no", "yes"]
+
+
 def test_contact_rests_where_the_spring_says() -> None:
     run = hybrid(0.2, 60)
     depth_m = run.tip_m[:, 1] - run.wall_m
@@ -119,6 +138,6 @@ def test_sections_of_the_simulated_figures() -> None:
 
 @pytest.mark.slow
 def test_an_experiment_on_the_whole_rig() -> None:
-    run = control_rig.experiment(control_rig.thesis_rig(), control_rig.AXIAL, "one", 0.1, 5.0, 1)
+    run = control_rig.experiment(control_rig.thesis_rig(control_rig.SECOND_READING), control_rig.AXIAL, "one", 0.1, 5.0, 1)
     assert run.contact and abs(run.late().mean() - 0.1) < 0.02
     assert abs(float(run.off_m[run.settled].mean())) < 1e-3 and math.isfinite(run.stage.sum())

@@ -27,9 +27,10 @@ def run(
     sections += control_rig.sections(quick, board, progress)
     held = sum(section.verdict == HOLDS for section in sections)
     lead = (
-        "Chapters 6 and 7. The experiments run on the simulated rig, its firmware and protocols included; the "
-        "simulations "
-        "as the thesis did them. Where the thesis leaves a number out, ours says what was taken."
+        "Chapters 6 and 7. The experiments run on the simulated rig, its firmware and protocols included. The simulations "
+        "(Figs. 7.9 to 7.17) use planar arcs and find the contact by regula falsi; the thesis used its rod, Algorithm 3.1 "
+        "and Newton's method. Where the thesis leaves a number or the form of the law out, each admissible setting is "
+        "tried. The verdict then says where the statement holds."
     )
     page = write_reproduction(
         directory / "reproduction-control.html", f"Control: {held} of {len(sections)} statements hold", lead, sections

@@ -9,26 +9,26 @@ from scipy.optimize import minimize
 
 from host.mechanics import pcar
 from host.report.figure_page import Section, verdict
-from host.report.style import MUTED, ReportFigure
+from host.report.style import MUTED
+from host.studies.reproduction import control_gains
 from host.studies.reproduction.drawing import Panel, PlotLine, panels
 from host.studies.reproduction.thesis_control import PERIOD_S, Gains, Setting, ThesisRun, cost, heart, hybrid, step_figures
 from protocol.catheter import load_catheter
 
 FORCE_N = 0.25
-_NAMES = {
-    "K_pp": "proportional, position",
-    "K_ip": "integral, position",
-    "K_dp": "differential, position",
-    "K_pf": "proportional, force",
-    "K_if": "integral, force",
-    "K_df": "differential, force",
-}
 
 
 def sections(quick: bool) -> list[Section]:
     """Return the sections for figures 7.9 to 7.17."""
     optimum = best_gains(60 if quick else 400)
-    return [_convergence(), *_gain_effects(), _optimum(optimum), _stiffness(optimum), *_heart(), _bode(8 if quick else 24)]
+    return [
+        _convergence(),
+        *control_gains.sections(quick),
+        _optimum(optimum),
+        _stiffness(optimum),
+        *_heart(),
+        _bode(8 if quick else 24),
+    ]
 
 
 def best_gains(evaluations: int) -> Gains:
@@ -90,140 +90,6 @@ def _convergence() -> Section:
         f"{70 + setting.insertion_m * 1e3:.0f} mm "
         "outside: the thesis gives no start, and a whole distal shaft buckles below 0.2 N.",
         verdict(holds),
-        says,
-        (figure,),
-    )
-
-
-def _sweep(base: Gains, name: str, factors: tuple[float, ...]) -> dict[float, ThesisRun]:
-    return {factor: hybrid(FORCE_N, 120, base.scaled(**{name: factor})) for factor in factors}
-
-
-# The thesis prints no gains for Figs. 7.11 and 7.12, which come before its optimum. Its optimum is at the edge of what our
-# setting bears (K_pp 1.25 times as high is unstable), so that the statements are judged at half its K_pp; the optimum's own
-# figures are next to it.
-_JUDGED = Gains().scaled(K_pp=0.5)
-_FACTORS = {
-    "K_pp": (0.25, 0.5, 1.0, 2.5),
-    "K_ip": (1.0, 10.0, 40.0),
-    "K_dp": (0.0, 1.0, 1.5),
-    "K_pf": (0.25, 0.5, 1.0),
-    "K_if": (1.0, 10.0, 40.0),
-    "K_df": (0.0, 1.0, 2.0),
-}
-_BASES = tuple((pp, pf) for pp in (0.1, 0.25, 0.5, 1.0) for pf in (0.25, 0.5, 1.0))
-
-
-def _gain_effects() -> list[Section]:
-    """7.11 and 7.12: each gain times a few factors."""
-    runs = {name: _sweep(_JUDGED, name, values) for name, values in _FACTORS.items()}
-    printed = {name: _sweep(Gains(), name, values) for name, values in _FACTORS.items()}
-    out = []
-    for number, names, title in (
-        ("7.11", ("K_pp", "K_ip", "K_dp"), "position"),
-        ("7.12", ("K_pf", "K_if", "K_df"), "force"),
-    ):
-        figure = panels(
-            f"Gains of the {title} controller",
-            "Force responses for several gains.",
-            f"Each gain alone times the factor, {FORCE_N} N wanted.",
-            [
-                Panel(
-                    "iteration",
-                    "force, N",
-                    [
-                        PlotLine(np.arange(60), np.minimum(run.force_N[:60], 0.6), f"{name} × {factor:g}")
-                        for factor, run in runs[name].items()
-                    ],
-                    level=FORCE_N,
-                )
-                for name in names
-            ],
-            3.0,
-        )
-        out.append(_effect_section(number, names, title, runs, printed, figure))
-    return out
-
-
-def _claims(names: tuple[str, ...], runs: dict[str, dict[float, ThesisRun]]) -> dict[str, bool]:
-    """Each statement of the thesis on these gains, and whether `runs` bear it out."""
-    said: dict[str, bool] = {}
-    for name in names:
-        steps = {factor: step_figures(run, FORCE_N) for factor, run in runs[name].items()}
-        low, high = steps[min(steps)], steps[1.0 if name.startswith("K_p") else max(steps)]
-        if name.startswith("K_p"):
-            said[f"more {name} less overshoot"] = high.overshoot_N < low.overshoot_N
-            if name == "K_pp":
-                said["too much K_pp unstable"] = steps[max(steps)].settling >= 120
-        elif name.startswith("K_i"):
-            said[f"more {name} less steady error"] = high.steady_error_N < low.steady_error_N
-            if name == "K_ip":
-                said["more K_ip less overshoot"] = high.overshoot_N < low.overshoot_N
-        else:
-            said[f"{name} less overshoot"] = steps[1.0].overshoot_N < low.overshoot_N
-    return said
-
-
-def _numbers(names: tuple[str, ...], runs: dict[str, dict[float, ThesisRun]]) -> str:
-    parts = []
-    for name in names:
-        steps = [(factor, step_figures(run, FORCE_N)) for factor, run in runs[name].items()]
-        parts.append(
-            f"{name} × {', '.join(f'{f:g}' for f, _ in steps)}: overshoot "
-            f"{', '.join(f'{step.overshoot_N * 1e3:.0f}' for _, step in steps)} mN, steady error "
-            f"{', '.join(f'{step.steady_error_N * 1e3:.1f}' for _, step in steps)} mN"
-        )
-    return "; ".join(parts)
-
-
-def _integral_overshoots() -> int:
-    """At how many of `_BASES` ten times K_ip lowers the overshoot."""
-    count = 0
-    for pp, pf in _BASES:
-        runs = _sweep(Gains().scaled(K_pp=pp, K_pf=pf), "K_ip", (1.0, 10.0))
-        low, high = (step_figures(runs[factor], FORCE_N).overshoot_N for factor in (1.0, 10.0))
-        count += int(high < low)
-    return count
-
-
-def _effect_section(
-    number: str,
-    names: tuple[str, ...],
-    title: str,
-    runs: dict[str, dict[float, ThesisRun]],
-    printed: dict[str, dict[float, ThesisRun]],
-    figure: ReportFigure,
-) -> Section:
-    claims, there = _claims(names, runs), _claims(names, printed)
-    agree = sum(claims.values())
-    failing = [claim for claim, holds in claims.items() if not holds]
-    thesis = (
-        (
-            "The proportional gain lowers overshoot but is bounded by instability; a higher integral gain lowers "
-            "overshoot and steady "
-            "error; the differential gain lowers overshoot slightly."
-        )
-        if title == "position"
-        else (
-            "The proportional gain lowers overshoot, the integral gain the steady error, the differential gain the "
-            "overshoot slightly."
-        )
-    )
-    says = f"{agree} of {len(claims)} statements" + (f", not: {', '.join(failing)}" if failing else "") + ". "
-    if "more K_ip less overshoot" in failing:
-        says += (
-            f"Ten times K_ip lowers overshoot at {_integral_overshoots()} of {len(_BASES)} pairs of K_pp (0.1 to 1 of "
-            "the printed) and K_pf (0.25 to 1). "
-        )
-    says += _numbers(names, runs) + f". At the printed optimum itself {sum(there.values())} of {len(there)}: "
-    says += _numbers(names, printed) + "."
-    return Section(
-        f"fig_{number}",
-        f"Fig. {number}: gains of the {title} controller",
-        thesis,
-        "Increments; the thesis does not say at which other gains. Judged at its optimum with K_pp halved, since "
-        "the optimum is at the edge of stability in our setting.",
-        verdict(not failing),
         says,
         (figure,),
     )

@@ -1,4 +1,8 @@
-"""Figs. 7.20 to 7.27: hybrid control on the whole simulated rig, firmware and protocols included, in both configurations."""
+"""Figs. 7.20 to 7.27: hybrid control on the whole simulated rig, firmware and protocols included, in both configurations.
+
+The thesis gives the gains (7.6) per iteration, but neither the length of an iteration nor how the law is read. Each
+statement is tried in every reading, and the verdict's line says where it holds.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,9 @@ from numpy.typing import NDArray
 
 from host.report.figure_page import Section, verdict
 from host.report.style import MUTED
+from host.studies.reproduction.admissible import Admissible, Tried
 from host.studies.reproduction.drawing import Panel, PlotLine, panels
+from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
 from protocol.topics import Message
 from sim.board import SimulatedBoard
@@ -23,15 +29,10 @@ Array = NDArray[np.float64]
 # Figures are taken from this share of the time since contact on; how long is held (s): the soft direction takes longer.
 SETTLED_SHARE = 0.6
 HOLD_ACROSS_S, HOLD_ALONG_S = 25.0, 16.0
-# (7.6), per iteration: K_pp 0.083, K_ip 0.006, K_pf 0.1 m/N, K_if 0.003 m/N. The thesis does not state the iteration: at
-# 25 ms our rig runs away along the wall, at 50 ms its roll does, at 100 ms force and position come to rest.
-ITERATION_S = 0.100
-GAINS = {
-    "position_gain_per_s": 0.083 / ITERATION_S,
-    "position_integral_per_s2": 0.006 / ITERATION_S**2,
-    "force_gain_m_per_N": 0.1,
-    "force_integral_m_per_N_s": 0.003 / ITERATION_S,
-}
+# (7.6), per iteration: position (dimensionless) and force (m/N).
+K_PP, K_IP, K_PF, K_IF = 0.083, 0.006, 0.1, 0.003
+# A force counts as held when its mean is this near (share, and N) and its standard deviation below this share of it.
+HELD_SHARE, HELD_N, HELD_SD_SHARE = 0.1, 0.005, 0.2
 # Of the plate with its low-friction tape.
 FRICTION = 0.2
 
@@ -75,10 +76,50 @@ class RigRun(NamedTuple):
         return self.time_s > SETTLED_SHARE * self.time_s.max(initial=0.0)
 
 
-def thesis_rig() -> Rig:
-    """The simulated rig under the thesis' own law, with the gains of its experiments."""
-    data = load_rig(SIMULATED_RIG).effective()
-    data["control"].update(law="thesis", form="incremental", force_added_to="tip", **GAINS)
+class Reading(NamedTuple):
+    """How the law is read: `form` and `force_added_to` of section [control], and the length of an iteration (s)."""
+
+    form: str
+    force_added_to: str
+    iteration_s: float
+
+    @property
+    def name(self) -> str:
+        """Return it in words."""
+        form = "PI form" if self.form == "pi" else "incremental form"
+        return f"{form}, {self.iteration_s * 1e3:.0f} ms, force added to the {self.force_added_to} position"
+
+    def gain(self, gain: str) -> str:
+        """Return the key of the rig file for one of K_pp, K_ip, K_pf, K_if."""
+        return (_PI_KEYS if self.form == "pi" else _INCREMENTAL_KEYS)[gain]
+
+
+_PI_KEYS = {
+    "K_pp": "pi_position_gain",
+    "K_ip": "pi_position_integral_per_s",
+    "K_pf": "pi_force_gain_m_per_N",
+    "K_if": "pi_force_integral_m_per_N_s",
+}
+_INCREMENTAL_KEYS = {
+    "K_pp": "position_gain_per_s",
+    "K_ip": "position_integral_per_s2",
+    "K_pf": "force_gain_m_per_N",
+    "K_if": "force_integral_m_per_N_s",
+}
+# A tracker frame is 25 ms. At 100 ms, the longest iteration with which the incremental form was tried, it comes to rest.
+READINGS = (Reading("pi", "desired", 0.025), Reading("incremental", "tip", 0.025), Reading("incremental", "tip", 0.100))
+# Tried for the second configuration only: in the first, it differs from the first reading by less than the noise.
+SECOND_READING = Reading("pi", "tip", 0.025)
+
+
+def thesis_rig(reading: Reading = READINGS[0]) -> Rig:
+    """The simulated rig under the thesis' own law, with the gains of its experiments. Raises InputError where refused."""
+    data, T = load_rig(SIMULATED_RIG).effective(), reading.iteration_s
+    per_s = {"K_pp": K_PP, "K_ip": K_IP / T, "K_pf": K_PF, "K_if": K_IF / T}
+    if reading.form == "incremental":
+        per_s |= {"K_pp": K_PP / T, "K_ip": K_IP / T**2}
+    gains = {reading.gain(name): value for name, value in per_s.items()}
+    data["control"].update(law="thesis", form=reading.form, force_added_to=reading.force_added_to, **gains)
     return parse_rig(data, "thesis rig")
 
 
@@ -158,14 +199,12 @@ def _cut(
     )
 
 
-def _force_panel(runs: Sequence[RigRun], title: str = "") -> Panel:
-    return Panel(
-        "time since contact, s",
-        "force, N",
-        [PlotLine(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact],
-        title=title,
-        level=runs[0].wanted_N,
-    )
+def _force_panel(runs: Sequence[RigRun], title: str) -> Panel:
+    there = [run for run in runs if run.contact]
+    ends_s = [0.0, max(run.time_s.max(initial=0.0) for run in there)]
+    levels = [PlotLine(ends_s, [wanted_N] * 2, "", MUTED, "--") for wanted_N in sorted({run.wanted_N for run in there})]
+    lines = [PlotLine(run.time_s, _smooth(run.force_N), run.label) for run in there]
+    return Panel("time since contact, s", "force, N", [*lines, *levels], title=title)
 
 
 def _smooth(force_N: Array) -> Array:
@@ -174,125 +213,163 @@ def _smooth(force_N: Array) -> Array:
 
 
 def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
-    """Return whether all runs reached their force, and a sentence about how well."""
+    """Return whether all runs held their force, and a sentence about how well."""
     said, good = [], True
     for run in runs:
         if not run.contact or run.late().size == 0:
             return False, f"{run.label}: no contact"
-        mean, peak = float(run.late().mean()), float(_smooth(run.force_N).max())
-        good &= abs(mean - run.wanted_N) < 0.1 * run.wanted_N + 0.005
+        mean, sd, peak = float(run.late().mean()), float(run.late().std()), float(_smooth(run.force_N).max())
+        good &= abs(mean - run.wanted_N) < HELD_SHARE * run.wanted_N + HELD_N and sd < HELD_SD_SHARE * run.wanted_N
         said.append(
-            f"{run.label}: mean {mean:.3f} of {run.wanted_N} N, sd {run.late().std() * 1e3:.0f} mN, peak "
-            f"{peak:.2f} N, "
+            f"{run.label}: mean {mean:.3f} of {run.wanted_N} N, sd {sd * 1e3:.0f} mN, peak {peak:.2f} N, "
             f"position {np.mean(run.off_m[run.settled]) * 1e3:+.2f} mm off"
         )
     return good, "; ".join(said)
 
 
+class Effect(NamedTuple):
+    """A figure about one gain: factors of it other than 1, the thesis' statement, and which of `_judge`'s figures shows it."""
+
+    number: str
+    gain: str
+    words: str
+    factors: tuple[float, ...]
+    thesis: str
+    kind: str
+
+
+EFFECTS = (
+    Effect("7.22", "K_if", "integral, force", (0.5, 2.0), "A higher integral gain lowers the steady oscillation.", "sd"),
+    # the rig file allows no more of it
+    Effect(
+        "7.23", "K_pf", "proportional, force", (0.25, 0.5), "The proportional gain sets the speed at the beginning.", "rise"
+    ),
+    Effect(
+        "7.24", "K_ip", "integral, position", (0.5, 2.0), "A higher integral gain lowers overshoot and oscillation.", "less"
+    ),
+    Effect(
+        "7.25", "K_pp", "proportional, position", (0.5, 2.0), "A higher gain gives more overshoot and oscillation.", "more"
+    ),
+)
+
+
+class Figures(NamedTuple):
+    """What one reading gives for each figure: its runs, and whether the statement holds with a line about it."""
+
+    reading: Reading
+    runs: dict[str, list[RigRun]]
+    judged: dict[str, tuple[bool, str]]
+
+
 def sections(quick: bool, board: str = "native", progress: Callable[[str], None] = lambda text: None) -> list[Section]:
-    """Return the sections for figures 7.20 to 7.27."""
-    rig = thesis_rig()
-    across_s, along_s = (15.0, 8.0) if quick else (HOLD_ACROSS_S, HOLD_ALONG_S)
-    out = [_first(rig, across_s, board)]
-    progress("first configuration done")
-    out += _gain_effects(rig, across_s, board, quick, progress)
-    out += [_second(rig, along_s, board, 2 if quick else 4), _forces(rig, along_s, board)]
-    progress("second configuration done")
-    return out
-
-
-def _first(rig: Rig, hold_s: float, board: str) -> Section:
-    runs = [experiment(rig, ACROSS, f"experiment {k}", 0.1, hold_s, k, shift, board) for k, shift in ((1, 0.0), (2, 0.006))]
-    held, said = _held(runs)
-    figure = panels(
-        "First configuration",
-        "Force, position and commands.",
-        "Two plates, the second 6 mm closer; below the stages, from contact on.",
-        [
-            _force_panel(runs),
-            Panel(
-                "time since contact, s",
-                "along, mm from target",
-                [PlotLine(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
-                level=0.0,
-            ),
-            Panel(
-                "time since contact, s",
-                "insertion, mm",
-                [PlotLine(run.stage_s, run.stage[:, 0] * 1e3, run.label) for run in runs if run.contact],
-            ),
-            Panel(
-                "time since contact, s",
-                "knob, °",
-                [PlotLine(run.stage_s, np.degrees(run.stage[:, 2]), run.label) for run in runs if run.contact],
-            ),
-        ],
-    )
-    return Section(
-        "fig_7.20_7.21",
-        "Figs. 7.20, 7.21: first configuration",
-        "Force and position are regulated, with minimal overshoot and smooth commands, for two places of the sensor.",
-        "Force across 0.1 N, position along; firmware, protocols, backlash and noise in the loop.",
-        verdict(held),
-        said + ".",
-        (figure,),
-    )
-
-
-def _gain_effects(rig: Rig, hold_s: float, board: str, quick: bool, progress: Callable[[str], None]) -> list[Section]:
-    around, below = ((0.5, 2.0), (0.25, 1.0)) if quick else ((0.5, 1.0, 2.0), (0.25, 0.5, 1.0))
-    plan = [
-        (
-            "7.22",
-            "force_integral_m_per_N_s",
-            "integral, force",
-            "A higher integral gain lowers the steady oscillation.",
-            "sd",
+    """Return the sections for figures 7.20 to 7.27. quick: shorter runs, the first reading of each form."""
+    out = []
+    for reading in READINGS[:2] if quick else (*READINGS, SECOND_READING):
+        out.append(figures(reading, quick, board))
+        progress(f"{reading.name}: done")
+    return [
+        _section(
+            out,
+            "7.20_7.21",
+            "Figs. 7.20, 7.21: first configuration",
+            "Force and position are regulated, with minimal overshoot and smooth commands, for two places of the sensor.",
+            "Force across 0.1 N, position along; two plates, the second 6 mm closer.",
         ),
-        (
-            "7.23",
-            "force_gain_m_per_N",
-            "proportional, force",
-            "The proportional gain sets the speed at the beginning.",
-            "rise",
+        *(
+            _section(
+                out,
+                effect.number,
+                f"Fig. {effect.number}: {effect.words}",
+                effect.thesis,
+                f"{effect.gain} of (7.6) times {', '.join(f'{f:g}' for f in sorted({*effect.factors, 1.0}))}, "
+                "first configuration.",
+            )
+            for effect in EFFECTS
         ),
-        (
-            "7.24",
-            "position_integral_per_s2",
-            "integral, position",
-            "A higher integral gain lowers overshoot and oscillation.",
-            "sd",
+        _section(
+            out,
+            "7.26",
+            "Fig. 7.26: second configuration",
+            "Force 0.1 N along and position across are regulated, with jumps of the position by static friction.",
+            f"Force along the stiff axis; friction {FRICTION} on the plate, which is 0 to 3 mm closer.",
         ),
-        (
-            "7.25",
-            "position_gain_per_s",
-            "proportional, position",
-            "A higher gain gives more overshoot and oscillation.",
-            "more",
+        _section(
+            out,
+            "7.27",
+            "Fig. 7.27: desired forces",
+            "0.2, 0.25 and 0.3 N are reached.",
+            "Force along the axis, the same gains for all.",
         ),
     ]
-    out = []
-    for number, key, words, thesis, kind in plan:
-        factors = below if key == "force_gain_m_per_N" else around  # the rig file allows no more of it
-        runs = [
-            experiment(with_control(rig, **{key: factor}), ACROSS, f"× {factor:g}", 0.1, hold_s, 1, board=board)
-            for factor in factors
-        ]
-        progress(f"{number} done")
-        holds, says = _judge(runs, kind)
-        figure = panels(f"Gain: {words}", "Force for several gains.", f"{key} times the factor.", [_force_panel(runs)], 2.7)
-        out.append(
-            Section(
-                f"fig_{number}",
-                f"Fig. {number}: {words}",
-                thesis,
-                f"{key} = {getattr(rig.control, key):g} times {', '.join(f'{f:g}' for f in factors)}, first configuration.",
-                verdict(holds),
-                says,
-                (figure,),
-            )
-        )
-    return out
+
+
+def figures(reading: Reading, quick: bool, board: str = "native") -> Figures:
+    """Run the experiments of all figures in one reading. Gains that the rig file refuses give no run."""
+    across_s, along_s = (15.0, 8.0) if quick else (HOLD_ACROSS_S, HOLD_ALONG_S)
+    runs: dict[str, list[RigRun]] = {}
+    judged: dict[str, tuple[bool, str]] = {}
+    try:
+        rig = thesis_rig(reading)
+    except InputError as error:
+        numbers = ["7.20_7.21", *(effect.number for effect in EFFECTS), "7.26", "7.27"]
+        return Figures(reading, {number: [] for number in numbers}, dict.fromkeys(numbers, (False, f"refused: {error}")))
+    if reading != SECOND_READING:
+        _first_configuration(rig, reading, across_s, board, runs, judged)
+    count = 2 if quick else 4
+    runs["7.26"] = [
+        experiment(rig, AXIAL, f"experiment {k + 1}", 0.1, along_s, k + 1, 0.001 * k, board) for k in range(count)
+    ]
+    runs["7.27"] = [experiment(rig, AXIAL, f"{force} N", force, along_s, 1, board=board) for force in (0.2, 0.25, 0.3)]
+    for number in ("7.26", "7.27"):
+        judged[number] = _held(runs[number])
+    return Figures(reading, runs, judged)
+
+
+def _first_configuration(
+    rig: Rig,
+    reading: Reading,
+    across_s: float,
+    board: str,
+    runs: dict[str, list[RigRun]],
+    judged: dict[str, tuple[bool, str]],
+) -> None:
+    """Add the runs of figures 7.20 to 7.25 and what they show."""
+    plain = experiment(rig, ACROSS, "experiment 1", 0.1, across_s, 1, board=board)
+    runs["7.20_7.21"] = [plain, experiment(rig, ACROSS, "experiment 2", 0.1, across_s, 2, 0.006, board)]
+    judged["7.20_7.21"] = _held(runs["7.20_7.21"])
+    for effect in EFFECTS:
+        found, refused = {1.0: plain._replace(label="× 1")}, []
+        for factor in effect.factors:
+            try:
+                changed = with_control(rig, **{reading.gain(effect.gain): factor})
+            except InputError as error:
+                refused.append(f"× {factor:g} refused: {error}")
+                continue
+            found[factor] = experiment(changed, ACROSS, f"× {factor:g}", 0.1, across_s, 1, board=board)
+        runs[effect.number] = [found[factor] for factor in sorted(found)]
+        holds, says = _judge(runs[effect.number], effect.kind)
+        judged[effect.number] = holds and not refused, "; ".join([says, *refused])
+
+
+def _section(out: Sequence[Figures], number: str, title: str, thesis: str, ours: str) -> Section:
+    """One figure: where its statement holds, the map of the readings, and the force in each."""
+    settings = Admissible(
+        Tried(one.reading.name, one.judged[number][1], one.judged[number][0]) for one in out if number in one.judged
+    )
+    shown = [one for one in out if any(run.contact for run in one.runs.get(number, []))]
+    curves = [_force_panel(one.runs[number], one.reading.name) for one in shown]
+    caption = "Force since contact, mean over 20 ms; dashed: desired."
+    pictures = (panels(title, "Force in each reading of the law.", caption, curves, 2.7),) if shown else ()
+    return Section(
+        f"fig_{number}",
+        title,
+        thesis,
+        ours,
+        verdict(settings.holds),
+        f"{settings.where}. {settings.tried[0].setting}: {settings.tried[0].found}.",
+        pictures,
+        settings.rows(),
+    )
 
 
 def _judge(runs: Sequence[RigRun], kind: str) -> tuple[bool, str]:
@@ -302,11 +379,15 @@ def _judge(runs: Sequence[RigRun], kind: str) -> tuple[bool, str]:
     peak = [float(_smooth(run.force_N).max() - run.wanted_N) * 1e3 for run in runs]
     rise = [_rise_s(run) for run in runs]
     says = (
-        f"gain {', '.join(run.label for run in runs)}: oscillation {', '.join(f'{v:.1f}' for v in spread)} mN, "
-        "overshoot "
-        f"{', '.join(f'{v:.0f}' for v in peak)} mN, 80 % after {', '.join(f'{v:.2f}' for v in rise)} s."
+        f"gain {', '.join(run.label for run in runs)}: oscillation {', '.join(f'{v:.1f}' for v in spread)} mN, overshoot "
+        f"{', '.join(f'{v:.0f}' for v in peak)} mN, 80 % after {', '.join(f'{v:.2f}' for v in rise)} s"
     )
-    holds = {"sd": spread[-1] <= spread[0], "rise": rise[-1] < rise[0], "more": peak[-1] > peak[0] or spread[-1] > spread[0]}
+    holds = {
+        "sd": spread[-1] < spread[0],
+        "rise": rise[-1] < rise[0],
+        "less": peak[-1] < peak[0] and spread[-1] < spread[0],
+        "more": peak[-1] > peak[0] and spread[-1] > spread[0],
+    }
     return holds[kind], says
 
 
@@ -314,59 +395,3 @@ def _rise_s(run: RigRun) -> float:
     """Time at which 80 % of the requested force are reached; infinite where never."""
     there = np.flatnonzero(_smooth(run.force_N) > 0.8 * run.wanted_N)
     return float(run.time_s[there[0]]) if there.size else float("inf")
-
-
-def _second(rig: Rig, hold_s: float, board: str, count: int) -> Section:
-    runs = [experiment(rig, AXIAL, f"experiment {k + 1}", 0.1, hold_s, k + 1, 0.001 * k, board) for k in range(count)]
-    held, said = _held(runs)
-    figure = panels(
-        "Second configuration",
-        "Force and position.",
-        "The plate 0 to 3 mm closer.",
-        [
-            _force_panel(runs),
-            Panel(
-                "time since contact, s",
-                "across, mm from target",
-                [PlotLine(run.time_s, run.off_m * 1e3, run.label) for run in runs if run.contact],
-                level=0.0,
-            ),
-        ],
-    )
-    return Section(
-        "fig_7.26",
-        "Fig. 7.26: second configuration",
-        "Force 0.1 N along and position across are regulated, with jumps of the position by static friction.",
-        f"Force along the stiff axis; friction {FRICTION} on the plate.",
-        verdict(held),
-        said + ".",
-        (figure,),
-    )
-
-
-def _forces(rig: Rig, hold_s: float, board: str) -> Section:
-    runs = [experiment(rig, AXIAL, f"{force} N", force, hold_s, 1, board=board) for force in (0.2, 0.25, 0.3)]
-    held, said = _held(runs)
-    levels = [PlotLine([0, hold_s], [run.wanted_N] * 2, "", MUTED, "--") for run in runs]
-    figure = panels(
-        "Three forces",
-        "Force for three desired forces.",
-        "Dashed: desired.",
-        [
-            Panel(
-                "time since contact, s",
-                "force, N",
-                [*[PlotLine(run.time_s, _smooth(run.force_N), run.label) for run in runs if run.contact], *levels],
-            )
-        ],
-        3.0,
-    )
-    return Section(
-        "fig_7.27",
-        "Fig. 7.27: desired forces",
-        "0.2, 0.25 and 0.3 N are reached.",
-        "Force along the axis, the same gains for all.",
-        verdict(held),
-        said + ".",
-        (figure,),
-    )

@@ -1,9 +1,8 @@
 """The thesis' control laws on the models it used: planar hybrid control on a rod against a spring (7.3), position control
 (6.4).
 
-Gains are per iteration, as printed; an iteration is PERIOD_S, a tracker frame, which the thesis does not state. The law is
-taken as incremental (the actuators are stepper motors, moved by differences, 6.4.1): each iteration adds the PID of the
-joint error, which is the difference of two calls of the inverse kinematics (Fig. 6.12), to the joint command.
+Gains are per iteration, as printed; an iteration is PERIOD_S, a tracker frame, which the thesis does not state. The joint
+error is the difference of two calls of the inverse kinematics (Fig. 6.12). The law can be read in two forms (`Form`).
 """
 
 from __future__ import annotations
@@ -27,6 +26,22 @@ PERIOD_S = 0.025
 TISSUE_N_PER_M = 1000.0
 
 
+class Form(NamedTuple):
+    """How the law is read.
+
+    pi: the joints are q_0 and the PID of the joint error (chapter 7), in place of moving by it in each iteration (6.4.1).
+    from_desired: the force loop's displacement is added to the desired position (Fig. 7.1), in place of the tip's.
+    """
+
+    name: str
+    pi: bool
+    from_desired: bool
+
+
+INCREMENTAL = Form("incremental form", False, False)
+PI = Form("PI form", True, True)
+
+
 @dataclass(frozen=True)
 class Gains:
     """Of (7.5)'s section, per iteration. Position: dimensionless; force: m/N. The defaults are the thesis' optimum."""
@@ -47,6 +62,8 @@ class Gains:
 class Setting:
     """Where the simulated catheter starts, planar: body insertion (m, negative: in the sheath), bend outside (rad), gap (m).
 
+    And in which form the law controls it.
+
     The thesis gives no numbers. With its steerocath_t a whole distal shaft (70 mm) cannot press 0.2 N across without
     buckling (F L^2 / EI = 5), so 40 mm are outside.
     """
@@ -55,6 +72,7 @@ class Setting:
     insertion_m: float = -0.030
     bend_rad: float = math.radians(45.0)
     gap_m: float = 0.001
+    form: Form = INCREMENTAL
 
     @property
     def curvature_per_m(self) -> float:
@@ -161,6 +179,8 @@ def _run(  # noqa: PLR0913 - a kernel: plain arrays
     rod: _Rod,
     length_m: float,
     gains: Array,
+    pi: bool,
+    from_desired: bool,
     start: Array,
     wall: Array,
     stiffness: Array,
@@ -172,7 +192,7 @@ def _run(  # noqa: PLR0913 - a kernel: plain arrays
 ) -> None:
     q0, q1, guess, touched = start[0], start[1], 0.0, False
     sum_f, last_f, sum_q, last_q = 0.0, 0.0, np.zeros(2), np.zeros(2)
-    goal_x = start[2]
+    goal_x, goal_y, first0, first1 = start[2], start[3], q0, q1
     for k in range(wall.size):
         guess, x, y = contact(rod, q0, q1, wall[k], tissue_N_per_m, rod.EI * stiffness[k], guess)
         force[k], tip[k, 0], tip[k, 1], joint[k, 0], joint[k, 1] = guess, x, y, q0, q1
@@ -183,16 +203,16 @@ def _run(  # noqa: PLR0913 - a kernel: plain arrays
         across = gains[3] * error_f + gains[4] * sum_f + gains[5] * (error_f - last_f)
         last_f = error_f
         a0, a1 = planar_inverse(x, y, length_m, q0)
-        b0, b1 = planar_inverse(goal_x, y + across, length_m, q0)
+        b0, b1 = planar_inverse(goal_x, (goal_y if from_desired else y) + across, length_m, q0)
         for axis in range(2):
             error = b0 - a0 if axis == 0 else b1 - a1
             sum_q[axis] += error
             step = gains[0] * error + gains[1] * sum_q[axis] + (gains[2] * (error - last_q[axis]) if k > 0 else 0.0)
             last_q[axis] = error
             if axis == 0:
-                q0 = min(max(q0 + step, -80.0), 80.0)
+                q0 = min(max((first0 if pi else q0) + step, -80.0), 80.0)
             else:
-                q1 = min(max(q1 + step, 0.005 - length_m), 0.05)
+                q1 = min(max((first1 if pi else q1) + step, 0.005 - length_m), 0.05)
 
 
 def hybrid(
@@ -207,8 +227,9 @@ def hybrid(
 ) -> ThesisRun:
     """The external hybrid controller of Fig. 7.1 against a wall along x, `force_N` across it, the tip's x kept.
 
-    `wall_motion` (m over s, outwards positive), `stiffness` (factor of EI over iterations). `still`: the joints stay where
-    they are, as a catheter left alone. `start_joint` (2,): instead of the setting's start.
+    The desired position is that of the start, the setting's gap in front of the wall. `wall_motion` (m over s, outwards
+    positive), `stiffness` (factor of EI over iterations). `still`: the joints stay where they are, as a catheter left alone.
+    `start_joint` (2,): instead of the setting's start.
     """
     gains, setting = gains or Gains(), setting or Setting()
     catheter = load_catheter(setting.catheter)
@@ -234,7 +255,9 @@ def hybrid(
         rod,
         length_m,
         listed,
-        np.array([*joint, first[0]]),
+        setting.form.pi,
+        setting.form.from_desired,
+        np.array([*joint, *first]),
         np.asarray(wall, float),
         np.asarray(factor, float),
         np.full(iterations, force_N),
