@@ -228,7 +228,7 @@ def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
 
 
 class Effect(NamedTuple):
-    """A figure about one gain: factors of it other than 1, the thesis' statement, and which of `_judge`'s figures shows it."""
+    """A figure about one gain: factors of it but 1, the thesis' statement, and which of `_judge`'s figures shows it."""
 
     number: str
     gain: str
