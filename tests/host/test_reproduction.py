@@ -80,7 +80,7 @@ def test_a_figure_on_the_rig_holds_where_one_reading_bears_it_out() -> None:
     time_s = np.arange(0.0, 10.0, 0.01)
     none = control_rig.RigRun("one", True, time_s, np.full(1000, 0.1), time_s, time_s, np.zeros((1000, 3)), 0.1)
     first, second = control_rig.READINGS[:2]
-    figures = [control_rig.Figures(r, {"7.24": [none]}, {"7.24": (r is second, "so")}) for r in (first, second)]
+    figures = [control_rig.RigFigures(r, {"7.24": [none]}, {"7.24": (r is second, "so")}) for r in (first, second)]
     section = control_rig._section(figures, "7.24", "Fig. 7.24", "It is so.", "Ours.")
     assert section.verdict == "holds" and section.says.startswith(f"at 1 of 2 admissible settings: {second.name}")
     assert [row[2] for row in section.rows] == ["holds", "no", "yes"]

@@ -20,8 +20,8 @@ from host.studies.reproduction.thesis_control import (
     INCREMENTAL,
     PERIOD_S,
     PI,
-    Form,
     Gains,
+    LawForm,
     Setting,
     ThesisStep,
     hybrid,
@@ -49,7 +49,7 @@ STATEMENTS = {
 class Grid(NamedTuple):
     """The other gains that are tried in one form, and iterations (the PI form is slower)."""
 
-    form: Form
+    form: LawForm
     iterations: int
     K_pp: tuple[float, ...]
     K_pf: tuple[float, ...]
@@ -64,22 +64,22 @@ GRIDS = (
 )
 
 
-class Tried(NamedTuple):
+class TriedGains(NamedTuple):
     """One admissible setting: its form and gains, and by figure which statements hold."""
 
-    form: Form
+    form: LawForm
     gains: Gains
     holds: dict[str, tuple[bool, ...]]
 
 
-def tried(grid: Grid) -> list[Tried]:
+def tried(grid: Grid) -> list[TriedGains]:
     """Return every admissible setting of `grid` with what holds there."""
     out = []
     for K_pp, K_pf, K_ip, K_if in itertools.product(grid.K_pp, grid.K_pf, grid.K_ip, grid.K_if):
         gains = Gains(K_pp, K_ip, Gains.K_dp * K_pp / Gains.K_pp, K_pf, K_if, Gains.K_df)
         holds = _statements(gains, grid)
         if holds is not None:
-            out.append(Tried(grid.form, gains, holds))
+            out.append(TriedGains(grid.form, gains, holds))
     return out
 
 
@@ -134,7 +134,7 @@ def sections(quick: bool) -> list[Section]:
     ]
 
 
-def _section(number: str, title: str, names: Sequence[str], thesis: str, settings: dict[str, list[Tried]]) -> Section:
+def _section(number: str, title: str, names: Sequence[str], thesis: str, settings: dict[str, list[TriedGains]]) -> Section:
     said, holds = [], False
     rows: list[tuple[str, ...]] = [("form", "K_pp", "K_pf", "settings at rest", *STATEMENTS[number], "all")]
     for form, there in settings.items():

@@ -76,7 +76,7 @@ class RigRun(NamedTuple):
         return self.time_s > SETTLED_SHARE * self.time_s.max(initial=0.0)
 
 
-class Reading(NamedTuple):
+class LawReading(NamedTuple):
     """How the law is read: `form` and `force_added_to` of section [control], and the length of an iteration (s)."""
 
     form: str
@@ -107,12 +107,16 @@ _INCREMENTAL_KEYS = {
     "K_if": "force_integral_m_per_N_s",
 }
 # A tracker frame is 25 ms. At 100 ms, the longest iteration with which the incremental form was tried, it comes to rest.
-READINGS = (Reading("pi", "desired", 0.025), Reading("incremental", "tip", 0.025), Reading("incremental", "tip", 0.100))
+READINGS = (
+    LawReading("pi", "desired", 0.025),
+    LawReading("incremental", "tip", 0.025),
+    LawReading("incremental", "tip", 0.100),
+)
 # Tried for the second configuration only: in the first, it differs from the first reading by less than the noise.
-SECOND_READING = Reading("pi", "tip", 0.025)
+SECOND_READING = LawReading("pi", "tip", 0.025)
 
 
-def thesis_rig(reading: Reading = READINGS[0]) -> Rig:
+def thesis_rig(reading: LawReading = READINGS[0]) -> Rig:
     """The simulated rig under the thesis' own law, with the gains of its experiments. Raises InputError where refused."""
     data, T = load_rig(SIMULATED_RIG).effective(), reading.iteration_s
     per_s = {"K_pp": K_PP, "K_ip": K_IP / T, "K_pf": K_PF, "K_if": K_IF / T}
@@ -227,7 +231,7 @@ def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
     return good, "; ".join(said)
 
 
-class Effect(NamedTuple):
+class GainEffect(NamedTuple):
     """A figure about one gain: factors of it but 1, the thesis' statement, and which of `_judge`'s figures shows it."""
 
     number: str
@@ -239,24 +243,24 @@ class Effect(NamedTuple):
 
 
 EFFECTS = (
-    Effect("7.22", "K_if", "integral, force", (0.5, 2.0), "A higher integral gain lowers the steady oscillation.", "sd"),
+    GainEffect("7.22", "K_if", "integral, force", (0.5, 2.0), "A higher integral gain lowers the steady oscillation.", "sd"),
     # the rig file allows no more of it
-    Effect(
+    GainEffect(
         "7.23", "K_pf", "proportional, force", (0.25, 0.5), "The proportional gain sets the speed at the beginning.", "rise"
     ),
-    Effect(
+    GainEffect(
         "7.24", "K_ip", "integral, position", (0.5, 2.0), "A higher integral gain lowers overshoot and oscillation.", "less"
     ),
-    Effect(
+    GainEffect(
         "7.25", "K_pp", "proportional, position", (0.5, 2.0), "A higher gain gives more overshoot and oscillation.", "more"
     ),
 )
 
 
-class Figures(NamedTuple):
+class RigFigures(NamedTuple):
     """What one reading gives for each figure: its runs, and whether the statement holds with a line about it."""
 
-    reading: Reading
+    reading: LawReading
     runs: dict[str, list[RigRun]]
     judged: dict[str, tuple[bool, str]]
 
@@ -303,7 +307,7 @@ def sections(quick: bool, board: str = "native", progress: Callable[[str], None]
     ]
 
 
-def figures(reading: Reading, quick: bool, board: str = "native") -> Figures:
+def figures(reading: LawReading, quick: bool, board: str = "native") -> RigFigures:
     """Run the experiments of all figures in one reading. Gains that the rig file refuses give no run."""
     across_s, along_s = (15.0, 8.0) if quick else (HOLD_ACROSS_S, HOLD_ALONG_S)
     runs: dict[str, list[RigRun]] = {}
@@ -312,7 +316,7 @@ def figures(reading: Reading, quick: bool, board: str = "native") -> Figures:
         rig = thesis_rig(reading)
     except InputError as error:
         numbers = ["7.20_7.21", *(effect.number for effect in EFFECTS), "7.26", "7.27"]
-        return Figures(reading, {number: [] for number in numbers}, dict.fromkeys(numbers, (False, f"refused: {error}")))
+        return RigFigures(reading, {number: [] for number in numbers}, dict.fromkeys(numbers, (False, f"refused: {error}")))
     if reading != SECOND_READING:
         _first_configuration(rig, reading, across_s, board, runs, judged)
     count = 2 if quick else 4
@@ -322,12 +326,12 @@ def figures(reading: Reading, quick: bool, board: str = "native") -> Figures:
     runs["7.27"] = [experiment(rig, AXIAL, f"{force} N", force, along_s, 1, board=board) for force in (0.2, 0.25, 0.3)]
     for number in ("7.26", "7.27"):
         judged[number] = _held(runs[number])
-    return Figures(reading, runs, judged)
+    return RigFigures(reading, runs, judged)
 
 
 def _first_configuration(
     rig: Rig,
-    reading: Reading,
+    reading: LawReading,
     across_s: float,
     board: str,
     runs: dict[str, list[RigRun]],
@@ -351,7 +355,7 @@ def _first_configuration(
         judged[effect.number] = holds and not refused, "; ".join([says, *refused])
 
 
-def _section(out: Sequence[Figures], number: str, title: str, thesis: str, ours: str) -> Section:
+def _section(out: Sequence[RigFigures], number: str, title: str, thesis: str, ours: str) -> Section:
     """One figure: where its statement holds, the map of the readings, and the force in each."""
     settings = Admissible(
         Tried(one.reading.name, one.judged[number][1], one.judged[number][0]) for one in out if number in one.judged

@@ -2,7 +2,7 @@
 (6.4).
 
 Gains are per iteration, as printed; an iteration is PERIOD_S, a tracker frame, which the thesis does not state. The joint
-error is the difference of two calls of the inverse kinematics (Fig. 6.12). The law can be read in two forms (`Form`).
+error is the difference of two calls of the inverse kinematics (Fig. 6.12). The law can be read in two forms (`LawForm`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PERIOD_S = 0.025
 TISSUE_N_PER_M = 1000.0
 
 
-class Form(NamedTuple):
+class LawForm(NamedTuple):
     """How the law is read.
 
     pi: the joints are q_0 and the PID of the joint error (chapter 7), in place of moving by it in each iteration (6.4.1).
@@ -38,8 +38,8 @@ class Form(NamedTuple):
     from_desired: bool
 
 
-INCREMENTAL = Form("incremental form", False, False)
-PI = Form("PI form", True, True)
+INCREMENTAL = LawForm("incremental form", False, False)
+PI = LawForm("PI form", True, True)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Setting:
     insertion_m: float = -0.030
     bend_rad: float = math.radians(45.0)
     gap_m: float = 0.001
-    form: Form = INCREMENTAL
+    form: LawForm = INCREMENTAL
 
     @property
     def curvature_per_m(self) -> float:
