@@ -300,7 +300,7 @@ def _retracts_stopped(params: Params, state: State, inputs: Inputs, causes: int)
     """Whether a stop takes the catheter off the tissue first, or a stopped catheter is retracted again.
 
     A catheter that is stopped in contact stays pressed, and a wall that comes nearer presses harder. So a stop in contact
-    is followed by a retraction, and a stopped catheter retracts when it is pressed with half the greatest force. The
+    is followed by a retraction, and a stopped catheter retracts when any witness says that something presses on it. The
     rig file can forbid it (`safety.retract_stopped`); a board that does not move the stages makes it impossible.
     """
     if params.safety.retract_stopped == 0 or causes & safety.BOARD_BITS or inputs.board.ready == 0:
@@ -411,7 +411,8 @@ def _retract(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) ->
     if _retracted(params, state):
         _enter(params, state, PHASE_STOPPED, tip_m)
         return
-    if state.latched & safety.URGENT_BITS == 0:
+    # A stopped catheter that is pressed (`pressed_s`) is pressed by a wall that comes nearer.
+    if state.latched & safety.URGENT_BITS == 0 and state.witness.pressed_s == 0.0:
         hy.joint[0] -= params.safety.retract_speed_m_per_s * period_s
         return
     hy.joint[0] -= params.stage.max_speed[0] * params.backlash.slope * period_s
@@ -661,6 +662,8 @@ def tick(params: Any, state: Any, inputs: Any, outputs: Any) -> None:
     flags = _flags(p, s, u, pose_result, rejected)
     clear = u.command.clear != s.cleared
     s.cleared = u.command.clear
+    if u.command.armed == 0:  # disarming ends a stop of the operator; other causes wait to be cleared
+        s.latched &= ~safety.OPERATOR_STOP
     action, latched = safety.decide(flags, s.latched, clear)
     s.action, s.latched = action, latched
     # 4. Phase, joint command, stages.

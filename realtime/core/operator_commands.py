@@ -11,25 +11,29 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from protocol.enums import CommandKind, ForceSource, JogAxis, Phase
+from protocol.enums import CommandKind, ForceSource, JogAxis, Phase, SafetyAction
 from protocol.errors import InputError
 from protocol.jog_limits import LONGEST_JOG, fastest_jog, unit_of
 from protocol.rig_file import AXES, Rig
 from protocol.serial_frames import Fault
 from protocol.topics import Command, Reply
+from realtime.control import safety
 from realtime.core.home_run import HomeRun
 from realtime.core.reach import TargetReach
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
 _KINDS = {kind.label: kind for kind in CommandKind}
 _JOG_PHASES = (Phase.HOLD, Phase.POSITION, Phase.JOG)
+# A tick this long after a clear has acted on it.
+CLEARED_WITHIN_NS = 20_000_000
 _ZERO_PHASES = (Phase.DISARMED, Phase.HOLD, Phase.STOPPED)
 
 
 class RigPosition(NamedTuple):
     """State of the rig after the newest tick.
 
-    phase; tip_m and goal_m (3,), predicted tip and moving goal; stage_unit (3,), the set-point; force_N (3,), on the tissue.
+    phase; tip_m and goal_m (3,), predicted tip and moving goal; stage_unit (3,), the set-point; force_N (3,), on the tissue;
+    causes, the bit set of `realtime.control.safety` that stands or is latched; now_ns, time of the tick.
     """
 
     phase: Phase = Phase.DISARMED
@@ -37,6 +41,8 @@ class RigPosition(NamedTuple):
     goal_m: npt.NDArray[np.float64] = np.zeros(3)
     stage_unit: npt.NDArray[np.float64] = np.zeros(3)
     force_N: npt.NDArray[np.float64] = np.zeros(3)
+    causes: int = 0
+    now_ns: int = 0
 
 
 class OperatorCommands:
@@ -64,6 +70,8 @@ class OperatorCommands:
         self._standing, self._zero_force = standing, zero_force
         self._frames: list[bytes] = []
         self.homing: HomeRun | None = None
+        self._clears_board = False
+        self._cleared_ns = self._now_ns = 0
         self._reach = TargetReach(rig)
         record.normal[:] = (0.0, 0.0, -1.0)
 
@@ -81,8 +89,22 @@ class OperatorCommands:
         """Pass the causes that the supervision found to the tick: a bit set of `realtime.control.safety`."""
         self._record.watch = causes
 
+    def take_board_status(self) -> bool:
+        """Clear the loop's causes once more when the board is ready and reports no fault; return whether it was so.
+
+        At the time of the command the fault still stood, and a cause that stands is never cleared.
+        """
+        status = self._link.status
+        gone = self._link.phase is LinkPhase.READY and status is not None and status.fault == Fault.NONE
+        if not (self._clears_board and gone):
+            return False
+        self._clears_board = False
+        self._record.clear += 1
+        return True
+
     def execute(self, command: Command, now_ns: int) -> Reply:
         """Carry out `command` at `now_ns` (ns) or refuse it; a refused command changes nothing."""
+        self._now_ns = now_ns
         actions = {
             "arm": self._arm,
             "disarm": self._disarm,
@@ -131,6 +153,11 @@ class OperatorCommands:
             return "arm: found the rig armed, wanted disarmed"
         if self.homing is not None:
             return f"arm: found {self.homing.axis} being homed, wanted the rig disarmed and at rest"
+        standing = self._standing()
+        causes = standing.causes & ~safety.OPERATOR_STOP  # that one ends as the rig is disarmed
+        seen = standing.now_ns > self._cleared_ns + CLEARED_WITHIN_NS
+        if seen and safety.action_of(causes) >= SafetyAction.RETRACT:
+            return f"arm: found {', '.join(safety.names(causes))}, wanted no cause that stops the rig; clear it first"
         silent = self._silent_sensors()
         if silent:
             return f"arm: found nothing from {silent}, wanted fresh readings"
@@ -152,6 +179,8 @@ class OperatorCommands:
         """Clear the loop's latched causes and the board's fault, and leave both disarmed."""
         self.disarm()
         self._record.clear += 1
+        self._cleared_ns = self._now_ns
+        self._clears_board = True
         if self._link.phase in (LinkPhase.RESET, LinkPhase.MISMATCH):
             self._link.restart()
         elif self._link.status is not None and self._link.status.fault != Fault.NONE:

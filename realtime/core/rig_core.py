@@ -273,6 +273,8 @@ class RigCore:
             if event.kind is BoardEventKind.STATUS:
                 take_status(board, self.link, self.now_ns)
                 self._leaving.changed.add("board")
+                if self.commands.take_board_status():
+                    self._command_changed()
                 if self.phase not in (Phase.DISARMED, Phase.HOMING) and board.ready:
                     self._report(self.supervision.status(board.position_steps, board.encoder_counts))
                 continue
@@ -326,7 +328,8 @@ class RigCore:
         if y is None:
             return RigPosition()
         vectors = (np.array(values, float) for values in (y.tip_m, y.goal_m, y.stage_unit, y.force_N))
-        return RigPosition(self.phase, *vectors)
+        tip_m, goal_m, stage_unit, force_N = vectors
+        return RigPosition(self.phase, tip_m, goal_m, stage_unit, force_N, int(y.cause), int(y.now_ns))
 
     def _zero_force(self) -> str:
         """Make the force sensor's present load its zero, and log it. Return the reason if it is refused, empty otherwise."""

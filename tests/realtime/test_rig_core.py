@@ -198,6 +198,18 @@ def test_lost_steps_are_judged_by_the_phase_of_the_newest_tick(core: Bench) -> N
     assert core.inputs[0].command.count == count, "a finding is no new command"
 
 
+def test_arming_is_refused_while_a_cause_stops_the_rig(core: Bench) -> None:
+    """The board would be live, the loop would not: its dead man would then latch another fault."""
+    core.armed()
+    assert core.ask("disarm").result == "accepted"
+    core.run(30, safety.OVER_FORCE, SafetyAction.RETRACT)
+    reply = core.ask("arm")
+    assert reply.result == "refused" and "over_force" in reply.text and "clear it first" in reply.text
+    assert not core.core.commands.armed and core.peer.heard[-1] != "ARM"
+    core.run(30, safety.OPERATOR_STOP, SafetyAction.STOP)
+    assert core.ask("arm").result == "accepted", "a stop ends as the rig is disarmed"
+
+
 def test_a_refused_arm_does_not_forget_what_the_supervision_found(core: Bench) -> None:
     core.armed()
     core.counts = np.array([10_000, 0, 0])

@@ -99,6 +99,20 @@ def test_a_wrong_adapted_force_is_compared_with_the_sensor_too(adapted: float) -
     assert rig.run(0.75, 0.2, 0.2, adapted) == 2
 
 
+@pytest.mark.parametrize(
+    ("sensor_N", "estimate_N", "retracts"),
+    [(0.2, 0.2, True), (0.0, 0.35, True), (0.2, 0.0, True), (0.1, 0.1, False), (0.0, 0.0, False)],
+)
+def test_a_stopped_catheter_is_pressed_by_the_word_of_one_witness(
+    sensor_N: float, estimate_N: float, retracts: bool
+) -> None:
+    """A dead sensor must not leave a stopped catheter to a wall that comes nearer."""
+    rig = Witnesses()
+    rig.run(1.0, sensor_N, estimate_N)
+    found = [witnesses.standing(rig.params, rig.state.witness, rig.inputs, 1e-3) for _ in range(20)]
+    assert found[-1] == retracts and not found[0]
+
+
 def test_what_is_below_the_limit_is_not_too_much() -> None:
     rig = Witnesses()
     rig.run(5.0, 0.45, 0.45)

@@ -82,6 +82,16 @@ def test_a_jog_of_the_tip_moves_it_that_way_at_that_speed_and_ends(driven: Drive
     assert np.linalg.norm(driven.tip_m - start_m - moved_m) < 0.0003, "it ends by itself"
 
 
+def test_a_stop_ends_with_disarm_and_arm(driven: Driven) -> None:
+    assert driven.run.command("stop").accepted
+    driven.run.run(1.0)
+    assert driven.run.command("disarm").accepted
+    driven.run.run(0.1)
+    assert driven.run.command("arm").accepted
+    driven.run.run(0.2)
+    assert driven.run.phase == Phase.HOLD
+
+
 def test_a_jog_of_each_axis_moves_that_axis_alone(driven: Driven) -> None:
     for axis, name, travel, speed, tolerance in (
         (0, "insertion", -0.002, 0.005, 0.0004),
@@ -165,3 +175,15 @@ def test_a_mark_is_a_line_of_the_log_and_needs_no_lease(driven: Driven) -> None:
     assert driven.run.commander.give("mark", note="sheath moved").accepted
     assert driven.logged("mark") == ["sheath moved"]
     assert "note" in driven.run.commander.give("mark", note=" ").reason
+
+
+def test_one_clear_after_a_fault_of_the_board_is_enough(driven: Driven) -> None:
+    """The fault still stands at the time of the command. The last test: a reset board does not know its position."""
+    driven.run.world.board.reset()
+    driven.run.run(1.0)
+    assert not driven.run.command("arm").accepted
+    assert driven.run.command("clear_fault").accepted
+    driven.run.run(1.0)
+    assert int(driven.run.loop.outputs[0].action) == 0 and driven.run.command("arm").accepted
+    driven.run.run(0.2)
+    assert driven.run.phase == Phase.HOLD
