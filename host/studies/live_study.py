@@ -66,7 +66,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """What names the run in the file of finished ones (a doubled run's size follows from another run)."""
+        """Return the key of the run in the file of finished ones (a doubled run's size follows from another run)."""
         return "|".join((self.part, self.planted, self.job, str(self.seed), f"{self.seconds:g}"))
 
 
@@ -210,7 +210,7 @@ def table(rows: Sequence[LiveRow]) -> str:
 
 
 def quiet_line(rows: Sequence[LiveRow]) -> str:
-    """How often there was an alarm without an effect, by job."""
+    """Return a line with the number of alarms without an effect, by job."""
     parts = []
     for job in dict.fromkeys(row.task.job for row in rows):
         mine = [row for row in rows if row.task.job == job]
@@ -232,7 +232,7 @@ def doubled_line(rows: Sequence[LiveRow]) -> str:
 
 
 def planted_line(rows: Sequence[LiveRow]) -> str:
-    """How often the alarm named a wrong subsystem."""
+    """Return a line with the number of alarms that named a wrong subsystem."""
     reported = [row for row in rows if row.first]
     wrong = [row for row in reported if row.first and row.first["subsystem"] != row.task.planted.partition("@")[2]]
     listed = ", ".join(f"{r.task.planted} as {r.first['subsystem']}" for r in wrong if r.first)

@@ -1,4 +1,4 @@
-"""What an hour of recording leaves in memory: this project's writer and the mcap package's, on the same messages.
+"""Memory after an hour of recording: this project's writer and the mcap package's, on the same messages.
 
 `python -m host.studies.recorder_memory` prints bytes for each hour. Every second one chunk with a message of each
 of three topics. What a writer keeps depends on the chunks and the topics in them, not on the messages in a chunk.

@@ -126,7 +126,7 @@ def _slice(process: RealtimeProcess, kind: str, seconds: float, measured: dict[s
 
 
 def _reference(process: RealtimeProcess, seconds: float, found: Study) -> None:
-    """What this machine gives a program that only wakes, with the loop's priority on the loop's processor."""
+    """Measure the lateness of a program that only wakes, with the loop's priority on the loop's processor."""
     granted = process.loop.granted
     try:
         histogram = run_cyclictest(process.rig.control.loop_hz, seconds, granted.cpu, granted.priority or None)

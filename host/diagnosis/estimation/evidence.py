@@ -1,4 +1,4 @@
-"""What a model gains on held-out samples when residuals are coloured: sample size, log-likelihood, paired blocks."""
+"""Gain of a model on held-out samples with coloured residuals: sample size, log-likelihood, paired blocks."""
 
 from __future__ import annotations
 

@@ -102,11 +102,11 @@ class Known(Model):
         return [np.concatenate([theta, given]) for theta in self._inner.restarts(segments)]
 
     def sensitivity(self, segment: Segment, theta: Array, axis: str, active: list[ActiveEffect]) -> Array:
-        """As the model with the known effects at work."""
+        """Call the model with the known effects active."""
         return self._inner.sensitivity(segment, theta[: self.own], axis, self.with_known(theta, active))
 
     def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
-        """As the model with the known effects at work."""
+        """Call the model with the known effects active."""
         return self._inner.slopes(segment, theta[: self.own], self.with_known(theta, active))
 
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:

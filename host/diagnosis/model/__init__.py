@@ -1,1 +1,1 @@
-"""What is compared: the nominal model's file, recordings, ports, candidate effects and their operators."""
+"""Inputs of a diagnosis: the nominal model's file, recordings, ports, candidate effects and their operators."""

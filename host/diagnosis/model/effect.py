@@ -1,4 +1,4 @@
-"""What an effect module is: an id, the ports it may act at, its parameters with bounds, and what it does to a signal."""
+"""Interface of an effect module: an id, its ports, its parameters with bounds, and its action on a signal."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the residual shows at a port before an effect is fitted: one array (n,) a recording, samples to fit alone."""
+    """The residual at a port before an effect is fitted: one array (n,) for each recording, only samples to fit."""
 
     time_s: tuple[Array, ...]
     need: tuple[Array, ...]  # displacement or force that the port would need, NaN where nothing was measured

@@ -1,4 +1,4 @@
-"""What every nominal model offers the finder: outputs, ports, parameters, and one free-run simulation."""
+"""Interface of every nominal model: outputs, ports, parameters, and one free-run simulation."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class Model(ABC):
         return [self.simulate(segment, theta, active) for segment in segments]
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
-        """What a diagnosis will cost where simulations take long; nothing where they do not."""
+        """Return the expected cost of a diagnosis if simulations take long; empty if they do not."""
         return ""
 
     def settle(self, segment: Segment, theta: Array) -> None:  # noqa: B027 - most models have nothing to settle
@@ -150,7 +150,7 @@ class Model(ABC):
         raise NotImplementedError(f"{self.kind}: outputs do not answer sample by sample")
 
     def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, Any]:
-        """What `change` needs, by port, for the ports at which a candidate can be screened without a simulation."""
+        """Return the data for `change`, by port, for ports whose candidates can be screened without a simulation."""
         return {}
 
     def change(self, segment: Segment, theta: Array, slopes: dict[str, Any], candidate: Candidate, values: Array) -> Array:

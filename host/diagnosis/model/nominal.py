@@ -33,7 +33,7 @@ class SegmentSpec(Request):
 
 
 class DataSpec(Request):
-    """Where the recordings are, their time line, and the split."""
+    """Files of the recordings, their time, and the split into fitted and held-out ones."""
 
     files: list[str] = []
     time: str | None = None
@@ -92,7 +92,7 @@ class StateSpec(Request):
 
 
 class SimulatorSpec(Request):
-    """What every kind that runs a simulator has: channels that go in and come out, ports, and states at the first sample.
+    """Common section of kinds that run a simulator: input and output channels, ports, and initial states.
 
     `ports`: channel -> subsystem in the verdict; channels without one belong to `subsystem`.
     """
@@ -348,7 +348,7 @@ class NominalSpec(Request):
 
     @property
     def folder(self) -> str:
-        """Where the TOML lies: its function is looked for there."""
+        """Return the folder of the TOML file, in which its function is searched."""
         return self._folder
 
     @property

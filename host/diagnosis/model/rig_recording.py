@@ -114,7 +114,7 @@ def knob_gain(rig: Rig) -> float:
 
 
 def staleness(time_s: Array, commands: Array, encoders: Array, lead_s: float) -> float:
-    """How old (s) the encoders' readings are at their stamps: a command is executed lead_s after its own.
+    """Return the age (s) of the encoder readings at their stamps: a command is executed lead_s after its own.
 
     From the recorded commands and encoders (3, n) alone, by their changes; 0 where no stage has moved.
     """

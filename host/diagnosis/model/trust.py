@@ -11,7 +11,7 @@ from protocol.errors import Description, InputError
 
 
 def code_of(spec: NominalSpec) -> str:
-    """What `spec` runs, in words for a warning; nothing if it runs no code."""
+    """Return a description of the code that `spec` runs, for a warning; empty if it runs no code."""
     path = code_path(spec)
     if spec.callable is not None and isinstance(spec.callable.function, str):
         return f"the Python function {spec.callable.function} ({path or 'an installed module'})"

@@ -55,7 +55,7 @@ class ExternalModel(SimulatedModel):
         return self.spec.function if isinstance(self.spec.function, str) else getattr(self.function, "__name__", "function")
 
     def initial_state(self, segment: Segment) -> tuple[list[str], list[float], list[float]]:
-        """As every simulator; nothing for a function of three arguments."""
+        """Return the initial state as for every simulator; nothing for a function of three arguments."""
         return super().initial_state(segment) if self.takes_initial else ([], [], [])
 
     def run(

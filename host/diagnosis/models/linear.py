@@ -214,7 +214,7 @@ class LinearModel(SimulatedModel):
         return np.array(changed) - np.array(out)
 
     def prepare(self, recording: Any) -> Segment:
-        """As every simulator; sizes inside the loop are those of the nominal model."""
+        """Prepare a recording as every simulator does; sizes inside the loop are those of the nominal model."""
         segment = super().prepare(recording)
         for name in self.inside:
             segment.units[name] = segment.units[f"output:{name}"] = self.inside_units[name]

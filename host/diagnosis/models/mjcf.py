@@ -139,7 +139,7 @@ def put(model: Any, values: dict[str, float]) -> None:
 
 
 def read_joint(model: Any, sensor: int) -> tuple[str, int] | None:
-    """What a sensor reads of a joint (position or speed) and the joint; None for another sensor."""
+    """Return the quantity that a sensor reads of a joint (position or speed) and the joint; None for another sensor."""
     import mujoco
 
     kinds = {mujoco.mjtSensor.mjSENS_JOINTPOS: "position", mujoco.mjtSensor.mjSENS_JOINTVEL: "speed"}
@@ -188,7 +188,7 @@ def rolled(
 def offer(
     effect: str, parameter: str, subsystem: str, off: float, high: float, tried: tuple[float, ...], unit: str
 ) -> OfferSpec:
-    """What the file offers of one attribute, from nothing to `high`."""
+    """Return the offer of one attribute of the file, from nothing to `high`."""
     values = [off + value for value in tried]
     return OfferSpec(id=effect, parameter=parameter, subsystem=subsystem, off=off, high=high, tried=values, unit=unit)
 

@@ -374,7 +374,7 @@ class RigModel(Model):
         )
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """What the port would have to add: least squares over the pose rows by the port's sensitivity; residual
+        """Return the signal that the port lacks: least squares over the pose rows by the port's sensitivity; the residual
         itself at the sensors.
         """
         if port.name in AXES:

@@ -39,7 +39,7 @@ class Loads(NamedTuple):
 
 
 class ShaftBuild(NamedTuple):
-    """What the shaft is made of.
+    """Properties of the shaft.
 
     flex: (n,) 1/EI, 1/(N m^2). twist_ratio: EI/GJ. distal: length (m) of the arc when it is fully out. offset: distance (m)
     of the second sensor behind the tip.

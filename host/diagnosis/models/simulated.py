@@ -76,7 +76,7 @@ class StepResponse:
 
 @dataclass(frozen=True)
 class SimulatorRun:
-    """What goes into one simulation. inputs: (n,) by channel."""
+    """Arguments of one simulation. inputs: (n,) by channel."""
 
     inputs: dict[str, Array]
     parameters: dict[str, float]
@@ -282,7 +282,7 @@ class SimulatedModel(Model):
         return out
 
     def _force(self, segment: Segment, output: str, active: list[ActiveEffect]) -> Array | float:
-        """What the effects along motions add to `output`, which reads a force."""
+        """Return the sum (n,) of the effects along motions on `output`, which reads a force."""
         total: Array | float = 0.0
         for name, (force, motion) in self.forced.items():
             here = [effect for effect in active if effect[0].port.name == name]
@@ -291,7 +291,7 @@ class SimulatedModel(Model):
         return total
 
     def _payload(self, segment: Segment, active: list[ActiveEffect]) -> Array | float:
-        """What a mass at the end of the arm adds to every torque (outputs, n)."""
+        """Return the torques (outputs, n) of a mass at the end of the arm."""
         total: Array | float = 0.0
         for candidate, values in active:
             if candidate.port.kind == "chain" and candidate.effect.apply is not None:
@@ -318,7 +318,7 @@ class SimulatedModel(Model):
         return {} if begin is None else dict(zip(begin.names, map(float, begin.values), strict=True))
 
     def run_of(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> SimulatorRun:
-        """What the simulator is given for one recording."""
+        """Return the arguments of the simulator for one recording."""
         begin = self._begin_of(segment)
         given = {}
         for name in self.section.inputs:
@@ -365,7 +365,7 @@ class SimulatedModel(Model):
         return self.kind
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
-        """What the diagnosis costs in simulations, from one simulation of each recording that is fitted."""
+        """Return the cost of the diagnosis in simulations, from one simulation of each fitted recording."""
         used = [segment for segment in segments if segment.fit.any()]
         self.simulate_all(used[:1], theta, [])  # compiles or loads what later runs have
         before, spent = (self.calls, self.call_s) if len(used) > 1 else (0, 0.0)

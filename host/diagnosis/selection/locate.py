@@ -37,8 +37,8 @@ def moving_rms(values: Array, dt_s: float) -> Array:
 
 
 def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
-    """Where the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`); short gaps closed,
-    short segments dropped.
+    """Return the time spans in which the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`);
+    short gaps are closed, short spans dropped.
     """
     rms = moving_rms(fill(mismatch), dt_s)
     high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
@@ -67,7 +67,7 @@ def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
 
 
 def mismatch_of(problem: Problem, nominal: Fit, best: Fit) -> list[Array]:
-    """What the effects add to the refitted nominal model, per segment (outputs, n); else the nominal residual."""
+    """Return extended minus refitted nominal model per segment (outputs, n); the nominal residual without effects."""
     if not best.terms:
         return nominal.residuals
     return [n - b for n, b in zip(nominal.residuals, best.residuals, strict=True)]

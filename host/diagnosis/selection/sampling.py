@@ -1,4 +1,4 @@
-"""How a recorded input runs between its samples: a discrete nominal parameter, chosen before any physics is."""
+"""The input between its samples: a discrete nominal parameter, chosen before any physics is."""
 
 from __future__ import annotations
 

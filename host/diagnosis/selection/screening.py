@@ -295,7 +295,7 @@ def _scan(
     slopes: Slopes,
     lines: Array,
 ) -> list[Point]:
-    """What the term does at each grid point; `rest` is orthogonal to the columns of `Q`.
+    """Compute the response of the term at each grid point; `rest` is orthogonal to the columns of `Q`.
 
     A term with memory gets the state that each recording begins from as further unknowns, and pays for them.
     """

@@ -82,7 +82,7 @@ def with_control(rig: Rig, section: str = "control", **values: object) -> Rig:
 
 
 def _silent(topic: str, message: Message) -> None:
-    """What the loop publishes is not needed: the study looks at the world."""
+    """Ignore the loop's messages: the study reads the simulated world."""
 
 
 def _scenario(

@@ -186,7 +186,7 @@ def _latency(runs: _Runs) -> dict[str, Any]:
 
 
 def _limits(runs: _Runs) -> dict[str, Any]:
-    """What a play known wrongly costs, one seed."""
+    """Return the errors with a wrong backlash width, one seed."""
     table: dict[str, Any] = {}
     play_m, seed = runs.rig.transmission.insertion_backlash_m, runs.settings.seeds[0]
     for name, off_m in (("narrower", -PLAY_OFF_m), ("wider", PLAY_OFF_m)):

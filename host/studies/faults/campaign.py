@@ -224,7 +224,7 @@ def run_on_rig(plans: list[RunPlan], seed: int, board_kind: str) -> Iterator[Run
 
 
 def _nothing(topic: str, message: Message) -> None:
-    """What is published on the way to the fault is of no interest."""
+    """Ignore messages before the fault."""
 
 
 def _bring_to(run: FaultyScenario, phase: str) -> bool:

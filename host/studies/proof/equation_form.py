@@ -44,7 +44,7 @@ def candidates(equation: str) -> list[str]:
 
 
 def _rest(x: Array, base: Array) -> Array:
-    """What linear regression on `base` leaves of x."""
+    """Return the residual of x after linear regression on `base`."""
     if not np.all(np.isfinite(x)):
         raise ValueError("equation: found a value that is not finite")
     x = np.broadcast_to(x, (len(base),)).astype(float)

@@ -57,7 +57,7 @@ def _recording(result: Diagnosis, axes: Axes) -> None:
 
 
 def _left(result: Diagnosis, verdict: dict[str, Any], before: Axes, after: Axes) -> None:
-    """What the refitted nominal model and the extended one leave of the output that shows the mismatch best."""
+    """Return the residuals of both models (refitted nominal, extended) for the output with the largest mismatch."""
     segment, index, row = shown(result)
     unit, sigma = result.model.outputs[row].unit, result.full.noise[row].sigma
     scale, unit = (1e3, f"m{unit}") if unit in ("m", "rad", "N") else (1.0, unit)

@@ -107,7 +107,7 @@ SETS = (
 
 @dataclass(frozen=True)
 class SetResult:
-    """What came out for one set; errors in its unit."""
+    """Results for one data set; errors in its unit."""
 
     name: str
     verdict: str

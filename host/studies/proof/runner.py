@@ -32,7 +32,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run is. `folder` keeps all that is made, so that the same call takes up where the last one stopped.
+    """Settings of a run. All results are kept in `folder`, so that the same call continues a stopped run.
 
     Attributes:
         cases: how many in each world.

@@ -23,7 +23,7 @@ _UNITS = {"m", "rad", "N", "Nm", "s", "Hz", "per", "m2", "m3", "N2", "s2", "squa
 
 @dataclass(frozen=True)
 class Facts:
-    """What one case contributes to the table; None where the case has no say."""
+    """Contributions of one case to the table; None for a figure to which the case does not contribute."""
 
     category: str
     rho: float
@@ -115,7 +115,7 @@ def _confident(
 def _stated(
     label: Label, verdict: dict[str, Any], effects: list[dict[str, Any]], names: list[set[str]], calibrate: Calibration
 ) -> tuple[tuple[float, bool], ...]:
-    """What the verdict says with a probability: that its first effect is there, that none of the vocabulary is missing."""
+    """Return a verdict's statements with a probability: its first effect is there; none of the vocabulary is missing."""
     out = []
     if effects and isinstance(effects[0].get("probability"), (int, float)):
         out.append((calibrate("effect", effects[0]), any(str(effects[0].get("id")) in n for n in names)))

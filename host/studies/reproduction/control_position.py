@@ -82,7 +82,7 @@ def _paths(runs: list[Navigation]) -> Section:
 
 
 def _overshoot_mm(run: Navigation) -> float:
-    """How far the tip goes past the goal, along the line from its start to the goal (mm)."""
+    """Return the distance (mm) of the tip beyond the goal, along the line from its start to the goal."""
     way = run.goal_m - run.tip_m[0]
     past = (run.tip_m - run.goal_m) @ way / np.linalg.norm(way)
     return float(max(past.max(), 0.0) * 1e3)

@@ -77,7 +77,7 @@ class RigRun(NamedTuple):
 
 
 class LawReading(NamedTuple):
-    """How the law is read: `form` and `force_added_to` of section [control], and the length of an iteration (s)."""
+    """Reading of the law: `form` and `force_added_to` of section [control], and the length of an iteration (s)."""
 
     form: str
     force_added_to: str
@@ -258,7 +258,7 @@ EFFECTS = (
 
 
 class RigFigures(NamedTuple):
-    """What one reading gives for each figure: its runs, and whether the statement holds with a line about it."""
+    """Results of one reading for each figure: its runs, and whether the statement holds, with a line about it."""
 
     reading: LawReading
     runs: dict[str, list[RigRun]]

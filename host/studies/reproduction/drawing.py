@@ -80,6 +80,6 @@ def _draw(axes: Any, part: Panel, narrow: bool, alone: bool) -> None:
 
 
 def _columns(labels: Sequence[str], wide: bool) -> int:
-    """As many legend columns as fit over the axes."""
+    """Return the number of legend columns that fit over the axes."""
     longest = max((len(label) for label in labels), default=0)
     return max(1, min(len(labels), (44 if wide else 26) // (longest + 6)))

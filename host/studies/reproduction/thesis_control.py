@@ -27,7 +27,7 @@ TISSUE_N_PER_M = 1000.0
 
 
 class LawForm(NamedTuple):
-    """How the law is read.
+    """Reading of the law.
 
     pi: the joints are q_0 and the PID of the joint error (chapter 7), in place of moving by it in each iteration (6.4.1).
     from_desired: the force loop's displacement is added to the desired position (Fig. 7.1), in place of the tip's.

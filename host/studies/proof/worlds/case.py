@@ -1,4 +1,4 @@
-"""What the worlds share: plans from a seed, sizes scaled to a wanted rho, noise, files, and the sealed labels."""
+"""Common parts of the worlds: plans from a seed, sizes scaled to a given rho, noise, files, and the sealed labels."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class SeparateRecordings:
 
 @dataclass(frozen=True)
 class CasePlan:
-    """What a case is to be. `turn` counts within its category, `attempt` the redraws."""
+    """Plan of a case. `turn` counts within its category, `attempt` the redraws."""
 
     world: str
     seed: int

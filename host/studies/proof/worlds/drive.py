@@ -19,7 +19,7 @@ _STATES = 8  # x, v, actuator, second mass x and v, three Maxwell branches
 
 
 class Actuator(NamedTuple):
-    """What the command goes through: delay, dead zone, limit, lag, and a gain that differs with the sign; 0 for none."""
+    """Effects on a command: delay, dead zone, limit, lag, and a gain that differs with the sign; 0 for none."""
 
     delay_s: float = 0.0
     dead_N: float = 0.0
