@@ -26,6 +26,7 @@ IRREGULAR = 0.2  # largest deviation of a period from the median one that counts
 OPPOSITE = -0.7  # correlation with what the model says, below which the sign is opposite
 EXPLAINED = 0.9  # share of the variance that a regression has to explain to say that columns are exchanged,
 BETTER = 0.1  # and largest ratio of what it leaves unexplained to what the labelled order does
+WRONG_WAY = 3e-4  # share that the labelled order leaves at least: in a closed loop either order leaves only noise
 EXACT = 1e-7  # residual over span below which a channel is a copy of another
 NOISY = 1e-6  # noise over span, from which on two channels cannot be alike by chance
 LEADS = 2  # samples by which an output may not come before its input
@@ -174,8 +175,10 @@ def _stamps(column: str | None, recordings: list[Recording], findings: list[Find
         says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."
         findings.append(Finding("clock", "time", says))
     if column is not None and periods and min(periods) >= SLOW_s:
-        says = f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples: it is probably in "
-        says += "milliseconds or microseconds. Every rate and time constant below is in its unit, not in seconds."
+        says = (
+            f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples. If it is in milliseconds or "
+        )
+        says += "microseconds, every rate and time constant below is in that unit, not in seconds: set its scale."
         findings.append(Finding("unit", column, says))
 
 
@@ -383,7 +386,7 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
     straight = [regression(recording, path) for recording in used]
     explained = float(np.median([part[2] for part in straight]))
     force_column, motion_column = columns[path.input], columns[path.output]
-    if 1.0 - explained > EXACT:
+    if 1.0 - explained > WRONG_WAY:
         crossed = float(np.median([regression(recording, path, exchanged=True)[2] for recording in used]))
         if crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "

@@ -30,7 +30,7 @@ class Condition:
 
 def moving_rms(values: Array, dt_s: float) -> Array:
     """RMS of `values` (n,) over half a second around each sample."""
-    width = max(3, round(AVERAGE_S / dt_s) | 1)
+    width = max(3, min(round(AVERAGE_S / dt_s), values.size - 2) | 1)  # some recordings are shorter than the average
     power = np.convolve(np.where(np.isfinite(values), values, 0.0) ** 2, np.ones(width), mode="same")
     count = np.convolve(np.isfinite(values).astype(float), np.ones(width), mode="same")
     return np.sqrt(power / np.maximum(count, 1.0))
@@ -84,7 +84,7 @@ def features(problem: Problem, segment: Segment) -> dict[str, Array]:
         found[f"size of {name}"] = np.abs(values)
         found[f"place of {name}"] = values
         if segment.recording.timed:
-            width = max(3, round(0.05 / dt) | 1)
+            width = max(3, min(round(0.05 / dt), values.size - 2) | 1)
             found[f"speed of {name}"] = np.abs(np.gradient(np.convolve(values, np.ones(width) / width, mode="same"), dt))
     if segment.recording.timed:
         found["time"] = segment.recording.time_s

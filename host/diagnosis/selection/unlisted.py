@@ -124,13 +124,13 @@ def _equation_instead(
     trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
     rank(trials, base)
-    winner = next((trial for trial in trials if _earned(trial)), None)
+    winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
     if evolve and (winner is None or _left(problem, found, winner.fit, noise_sd) > problem.rules.partial_share):
         evolved = search_equation(problem, base, port)
         trials += [_tried(problem, base, noise_sd, target, form, 1.0) for form in evolved]
         forms += evolved
         rank(trials, base)
-        winner = next((trial for trial in trials if _earned(trial)), None)
+        winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
     if winner is None or not _better_than_known(problem, found, noise_sd, winner, bool(there)):
         return False
     if _left(problem, found, winner.fit, noise_sd) > problem.rules.equation_residual_share:
@@ -182,6 +182,12 @@ def _earned(trial: Trial) -> bool:
         and gain.p_value < rules.equation_significance
         and gain.share > max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
     )
+
+
+def _only_sampling(problem: Problem, trial: Trial) -> bool:
+    """Whether an equation shifts its port's own input by no more than a sample: how the input was held, not physics."""
+    own = problem.columns.get(problem.model.moves.get(trial.candidate.port.name, ""), "")
+    return trial.candidate.effect.equation == f"rate({own})" and abs(trial.fit.values[-1]) < 1.05 * trial.period_s
 
 
 def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: Form, size: float) -> Trial:

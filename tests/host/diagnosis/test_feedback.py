@@ -11,6 +11,7 @@ from host.diagnosis import diagnose
 from host.diagnosis.estimation.feedback import find_feedback, freed
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
+from host.diagnosis.selection.locate import windows
 
 RATE_HZ = 400.0
 STIFFNESS, DAMPING = 150.0, 2.0
@@ -61,3 +62,9 @@ def test_only_noise_that_comes_back_is_taken_off(through: float, share: float) -
     find_feedback([segment], [noise[None, :]], ("u",))
     left = float(np.var(freed(segment, 0, noise)) / np.var(noise))
     assert left == pytest.approx(share, abs=0.05)
+
+
+def test_windows_of_a_recording_shorter_than_their_average() -> None:
+    t = np.arange(2000) * 1e-5
+    mismatch = np.where(t > 0.01, 1.0, 0.0)
+    assert windows(mismatch, t, 1e-5) == []

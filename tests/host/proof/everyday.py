@@ -128,6 +128,38 @@ def spring(number: int, coulomb_N: float = 0.0, mass_kg: float = 0.0) -> Columns
     return {"t": t, "x": x, "f": force + 0.02 * rng.standard_normal(t.size)}
 
 
+def oven(number: int) -> Columns:
+    """Heater power in steps (W), and the temperature behind a first-order lag of 180 s, every 5 s for an hour."""
+    rng, t = stream(number), np.arange(0.0, 3600.0, 5.0)
+    power = np.repeat(rng.uniform(0.0, 100.0, 30), 24)
+    keep = float(np.exp(-5.0 / 180.0))
+    warm = lfilter([0.0, 1.0 - keep], [1.0, -keep], power, zi=[power[0]])[0]
+    return {"t": t, "W": power, "C": 25.0 + 0.6 * warm + 0.05 * rng.standard_normal(t.size)}
+
+
+def oven_nominal() -> dict[str, Any]:
+    """Nominal model of the oven: a gain."""
+    return {
+        "name": "oven",
+        "kind": "transmission",
+        "data": {"time": "t"},
+        "channels": {"W": {"column": "W", "unit": "W"}, "C": {"column": "C", "unit": "K"}},
+        "link": [{"subsystem": "oven", "input": "W", "output": "C"}],
+    }
+
+
+def pressed_in_a_loop(number: int) -> Columns:
+    """A spring whose set-point a servo corrects by the noisy force, two samples late: every 5 ms for 20 s."""
+    rng, t = stream(number), np.arange(0.0, 20.0, 0.005)
+    wanted, noise = 0.01 * tones(rng, t, 1.0, 5), 0.02 * rng.standard_normal(t.size)
+    x, slow = np.zeros(t.size), 0.0
+    for k in range(t.size):
+        if k > 2:
+            slow += 0.05 * (wanted[k] - (150.0 * x[k - 2] + noise[k - 2]) / 150.0)
+        x[k] = wanted[k] + 0.3 * slow
+    return {"t": t, "x": x, "f": 150.0 * x + noise}
+
+
 def axis_nominal(
     hold: str = "linear", reads: str = "position", terms: Sequence[str] = (), **parameters: Any
 ) -> dict[str, Any]:

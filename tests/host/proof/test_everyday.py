@@ -417,6 +417,36 @@ case(
     parameters=(("gain", 0.4),),
 )
 
+# --- other fields: a thermal lag, a magnet, a servo on noise, three seconds of data ---
+case("an oven's lag", lambda: ([make.oven(1), make.oven(2)], make.oven_nominal()), truth=("rate_lag",))
+case(
+    "a magnet: stiffness below zero, and dry friction",
+    lambda: (
+        [_changed_by(make.spring(k, coulomb_N=0.3), lambda c: {"f": c["f"] - 350.0 * c["x"]}) for k in (1, 2)],
+        make.spring_nominal(),
+    ),
+    truth=("coulomb_friction",),
+)
+case(
+    "a servo that reacts to the noise of the force",
+    lambda: ([make.pressed_in_a_loop(k) for k in (1, 2, 3)], make.spring_nominal()),
+    parameters=(("stiffness", 150.0),),
+)
+case(
+    "sixty rows",
+    lambda: ([make.gear(k, 3.0, rate_Hz=20.0) for k in (1, 2)], make.gear_nominal()),
+    parameters=(("gain", 0.4),),
+)
+case(
+    "whole numbers",
+    lambda: (
+        [{k: v if k == "t" else np.round(4096 * v).astype(int) for k, v in make.gear(n).items()} for n in (1, 2)],
+        make.gear_nominal(),
+    ),
+    findings=("unit",),
+    parameters=(("gain", 0.4),),
+)
+
 # What the finder says where it must not, one line a case.
 FAILS: dict[str, str] = {}
 SLOW = {  # over 3 s of processor time
