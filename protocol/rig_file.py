@@ -121,6 +121,7 @@ class TransmissionSection(_Section):
     roll_slope: Annotated[float, Field(gt=0.05, le=2)]
     knob_rad: list[Annotated[float, Field(ge=-50, le=50)]]
     curvature_per_m: list[Annotated[float, Field(ge=-200, le=200)]]
+    wire_turning_rad: Annotated[float, Field(ge=0, le=20)] = 0.0
 
     @model_validator(mode="after")
     def _monotone_curve(self) -> TransmissionSection:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from protocol.catheter import load_catheter
 from protocol.enums import ControlLaw, ForceSource
 from protocol.rig_file import Rig
 from realtime.control.inverse_kinematics import fitted_knob_curve
@@ -103,6 +104,14 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.ndarray:
         caution_m=control.play_caution_m if control.law == "predictive" else 0.0,
         threshold_m=control.reversal_threshold_m,
         roll_slope=rig.transmission.roll_slope,
+    )
+    constitutive = load_catheter(rig.catheter.name).constitutive
+    _fill(
+        p.wire,
+        friction=constitutive.friction_coefficient if constitutive else 0.0,
+        turning_rad=rig.transmission.wire_turning_rad,
+        distal_length_m=rig.catheter.distal_length_m,
+        wire_share=rig.estimation.curvature_exponent,
     )
     _fill(
         p.kinematics,

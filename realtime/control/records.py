@@ -13,6 +13,8 @@ HEART_HARMONICS, BREATH_HARMONICS = 3, 2
 TARGET_N = 2 + 2 * (HEART_HARMONICS + BREATH_HARMONICS) + 4
 TARGET_MODELS = 4
 BANK_POINTS = 24
+# Cells of the distal shaft with a tension of the pull-wire each.
+WIRE_CELLS = 5
 # The grid of `beat_phase`.
 BEAT_PHASES, BEAT_RATES, BEAT_HARMONICS = 48, 15, 3
 # Readings of the force sensor that are kept for a comparison with a late estimate.
@@ -252,6 +254,27 @@ class BacklashState:
     width_m: float = real("m", "width of the gap, as learned")
 
 
+class WireParams:
+    """Friction of the pull-wire (`wire_friction`)."""
+
+    friction: float = real("", "coefficient of friction mu between wire and sheath; 0: none")
+    turning_rad: float = real("rad", "total bend of the body between handle and distal shaft")
+    distal_length_m: float = real("m", "length of the part that bends")
+    wire_share: float = real(
+        "", "of the path at the knob that stretches the wire; 1: the knob sets the tension; 0: the bend"
+    )
+
+
+class WireState:
+    """Friction of the pull-wire (`wire_friction`)."""
+
+    direction: float = real("", "+1 or -1: direction in which the curvature is to change")
+    extreme_per_m: float = real("1/m", "furthest requested curvature in this direction")
+    curvature_per_m: float = real("1/m", "predicted unloaded curvature")
+    side: float = real("", "+1 or -1: wire that is pulled")
+    tension: Floats = real("1/m", "tension of each cell of the distal shaft: the curvature that it gives", WIRE_CELLS)
+
+
 class KinematicsParams:
     """Unloaded catheter (`inverse_kinematics`, `free_tip`)."""
 
@@ -453,6 +476,7 @@ class Params:
     setpoint_expiry_us: int = whole("us", "a set-point later than this is not executed")
     stage: StageParams = part(StageParams, "stages")
     backlash: BacklashParams = part(BacklashParams, "backlash and slopes")
+    wire: WireParams = part(WireParams, "friction of the pull-wire")
     kinematics: KinematicsParams = part(KinematicsParams, "unloaded catheter")
     hybrid: HybridParams = part(HybridParams, "the thesis' law")
     predictor: PredictorParams = part(PredictorParams, "tip predictor")
@@ -479,6 +503,7 @@ class State:
     predictor: PredictorState = part(PredictorState, "tip predictor")
     stage: StageState = part(StageState, "stages")
     backlash: BacklashState = part(BacklashState, "backlash")
+    wire: WireState = part(WireState, "friction of the pull-wire")
     hybrid: HybridState = part(HybridState, "joint command, goal, the thesis' law")
     force: ForceSourceState = part(ForceSourceState, "force sensor and estimate")
     force_predictor: ForcePredictorState = part(ForcePredictorState, "prediction of the force, thesis' law")
@@ -539,6 +564,7 @@ BANK, BEAT = dtype_of(Bank), dtype_of(Beat)
 TARGET_PARAMS, TARGET_STATE = dtype_of(TargetParams), dtype_of(TargetState)
 STAGE_PARAMS, STAGE_STATE = dtype_of(StageParams), dtype_of(StageState)
 BACKLASH_PARAMS, BACKLASH_STATE = dtype_of(BacklashParams), dtype_of(BacklashState)
+WIRE_PARAMS, WIRE_STATE = dtype_of(WireParams), dtype_of(WireState)
 FORCE_PREDICTOR_STATE, FORCE_SOURCE_STATE = dtype_of(ForcePredictorState), dtype_of(ForceSourceState)
 HYBRID_PARAMS, HYBRID_STATE = dtype_of(HybridParams), dtype_of(HybridState)
 HISTORY = dtype_of(History)

@@ -24,6 +24,7 @@ from realtime.control import (
     target_predictor,
     tip_offset,
     wall_observer,
+    wire_friction,
     witnesses,
 )
 from realtime.control.codes import (
@@ -230,7 +231,7 @@ def _predict_joint(params: Params, state: State) -> None:
     insertion_m = backlash.follow(params.backlash, state.backlash, state.stage.position[0])
     state.predicted_joint[0] = insertion_m + state.home_m
     state.predicted_joint[1] = backlash.distal_roll(params.backlash, state.stage.position[1]) + state.windup.windup_rad
-    state.predicted_joint[2] = state.stage.position[2]
+    state.predicted_joint[2] = wire_friction.follow(params.wire, params.kinematics, state.wire, state.stage.position[2])
 
 
 @njit(cache=True)
@@ -245,7 +246,7 @@ def _locate(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> 
     forward_m = (state.stage.position[0] - 0.5 * backlash.first_width(config)) * config.slope
     backlash.start(config, state.backlash, forward_m)
     joint[1] = backlash.distal_roll(config, state.stage.position[1])
-    joint[2] = state.stage.position[2]
+    joint[2] = wire_friction.start(params.wire, params.kinematics, state.wire, state.stage.position[2])
     joint[0] = forward_m + params.kinematics.insertion_at_home_m
     joint[0] = inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint)[0]
     state.home_m = joint[0] - forward_m
@@ -524,7 +525,7 @@ def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, fo
 
 @njit(cache=True)
 def _move_stages(params: Params, state: State, plan_reversals: bool) -> None:
-    """Move the stages: joint command -> handle (inverses of backlash and slope) -> limited motion."""
+    """Move the stages: joint command -> handle (inverses of backlash, slope and wire friction) -> limited motion."""
     period_s, hy, gap, own = params.period_s, state.hybrid, params.backlash, state.predictive
     if state.phase == PHASE_STOPPED or state.phase == PHASE_DISARMED:
         for axis in range(N_AXES):
@@ -532,16 +533,17 @@ def _move_stages(params: Params, state: State, plan_reversals: bool) -> None:
         return
     body_m = hy.joint[0] - state.home_m
     roll_rad = backlash.roll(gap, hy.joint[1] - state.windup.windup_rad)
+    knob_rad = wire_friction.apply(params.wire, params.kinematics, state.wire, hy.joint[2])
     if plan_reversals:
         crossing_m, after_m = own.joint_at_crossing[0] - state.home_m, own.joint_after_crossing[0] - state.home_m
         handle_m = backlash.apply_ahead(gap, state.backlash, body_m, crossing_m, after_m, own.reversal_depth_m)
         stage_limiter.follow(params.stage, state.stage, 0, handle_m, own.speed[0] / gap.slope, period_s)
         stage_limiter.follow(params.stage, state.stage, 1, roll_rad, backlash.roll(gap, own.speed[1]), period_s)
-        stage_limiter.follow(params.stage, state.stage, 2, hy.joint[2], own.speed[2], period_s)
+        stage_limiter.follow(params.stage, state.stage, 2, knob_rad, own.speed[2], period_s)
         return
     stage_limiter.apply(params.stage, state.stage, 0, backlash.apply(gap, state.backlash, body_m), period_s)
     stage_limiter.apply(params.stage, state.stage, 1, roll_rad, period_s)
-    stage_limiter.apply(params.stage, state.stage, 2, hy.joint[2], period_s)
+    stage_limiter.apply(params.stage, state.stage, 2, knob_rad, period_s)
 
 
 @njit(cache=True)

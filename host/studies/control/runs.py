@@ -164,10 +164,13 @@ def random_goals(rig: Rig, count: int, seed: int) -> Array:
     return np.array(goals)
 
 
-def go_to(rig: Rig, goals: Array, seed: int, within_s: float = 2.0, seconds: float = 2.5) -> Reached:
-    """The tip to each of `goals` (n, 3) in turn, `seconds` each; judged by the true tip. Empty if not armed."""
+def go_to(rig: Rig, goals: Array, seed: int, within_s: float = 2.0, seconds: float = 2.5, **plant: Any) -> Reached:
+    """The tip to each of `goals` (n, 3) in turn, `seconds` each; judged by the true tip. Empty if not armed.
+
+    plant: parts of `sim.plant.PlantConfig` that are not the default ones, other than the wall, which is far away.
+    """
     wall = replace(PlantConfig().tissue, point_m=FAR_AWAY_M)
-    run = _scenario(rig, seed, tissue=wall)
+    run = _scenario(rig, seed, tissue=wall, **plant)
     rows: list[tuple[float, ...]] = []
     if not run.arm():
         return Reached(*np.zeros((4, 0)))
