@@ -20,6 +20,7 @@ def test_everything_is_proved() -> None:
     assert prove(FIRMWARE_DIR) == (0, [])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("source", "check", "instead", "what"),
     [
