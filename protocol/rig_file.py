@@ -51,7 +51,7 @@ class StageSection(_Section):
     """One stepper axis; insertion and the rotating ones have bounds of their own."""
 
     steps_per_unit: Positive
-    encoder_counts_per_step: Annotated[float, Field(ge=0.01, le=1000)] = 1.0
+    encoder_counts_per_step: Annotated[float, Field(ge=0.02, le=200)] = 1.0
     max_speed_unit_per_s: Positive
     max_accel_unit_per_s2: Positive
     min_unit: float
@@ -64,6 +64,10 @@ class StageSection(_Section):
     def _ordered(self) -> StageSection:
         if self.min_unit >= self.max_unit:
             raise ValueError("min_unit below max_unit")
+        if not self.home_end and not self.min_unit <= 0.0 <= self.max_unit:
+            raise ValueError(
+                "min_unit at most 0 and max_unit at least 0, for an axis that counts from where it is switched on"
+            )
         if self.max_speed_unit_per_s * self.steps_per_unit > 20_000:
             raise ValueError("at most 20000 steps/s (max_speed_unit_per_s * steps_per_unit), the board's step timer")
         if self.max_speed_unit_per_s / self.max_accel_unit_per_s2 > 0.045:
@@ -310,17 +314,20 @@ class EstimationSection(_Section):
 
 
 class Safety(_Section):
-    """Limits of force, missing data, speed and place. `HARD_*` bound them: no rig file can widen those."""
+    """Limits of force, missing data, speed and place. `HARD_*` bound them: no rig file can widen those.
 
-    over_force_N: Annotated[float, Field(gt=0, le=HARD_MAX_FORCE_N)]
+    Lower bounds: below them a retraction leads nowhere, or every pose is refused; such a value is one in another unit.
+    """
+
+    over_force_N: Annotated[float, Field(ge=0.05, le=HARD_MAX_FORCE_N)]
     hold_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
     stop_after_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
     force_timeout_s: Annotated[float, Field(gt=0, le=HARD_STOP_AFTER_S)]
-    retract_speed_m_per_s: Annotated[float, Field(gt=0, le=0.05)]
-    retract_distance_m: Annotated[float, Field(gt=0, le=0.05)]
+    retract_speed_m_per_s: Annotated[float, Field(ge=0.005, le=0.05)]
+    retract_distance_m: Annotated[float, Field(ge=0.003, le=0.05)]
     retract_stopped: bool = True
-    host_lost_after_s: Annotated[float, Field(gt=0, le=10)] = 2.0
-    max_tip_speed_m_per_s: Annotated[float, Field(gt=0, le=1)]
+    host_lost_after_s: Annotated[float, Field(ge=0.25, le=10)] = 2.0
+    max_tip_speed_m_per_s: Annotated[float, Field(ge=0.02, le=1)]
     workspace_min_m: Vector3
     workspace_max_m: Vector3
 
@@ -397,6 +404,24 @@ class Rig(_Section):
             raise ValueError(
                 f"transmission.catheter: found {self.transmission.catheter}, wanted {self.catheter.name}, as "
                 "catheter.name: it was calibrated with another catheter"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _insertion_moves(self) -> Rig:
+        """Check that the insertion can do what approach and retraction ask: else a speed or travel is in another unit."""
+        stage, least_m = self.stages.insertion, self.safety.retract_distance_m
+        for key, speed in (
+            ("safety.retract_speed_m_per_s", self.safety.retract_speed_m_per_s),
+            ("control.approach_speed_m_per_s", self.control.approach_speed_m_per_s),
+        ):
+            if stage.max_speed_unit_per_s < speed:
+                found = stage.max_speed_unit_per_s
+                raise ValueError(f"stages.insertion.max_speed_unit_per_s: found {found:g}, wanted at least {key} {speed:g}")
+        if stage.max_unit - stage.min_unit < 2.0 * least_m:
+            raise ValueError(
+                f"stages.insertion: found a travel of {stage.max_unit - stage.min_unit:g} m, wanted at least twice "
+                f"safety.retract_distance_m {least_m:g}"
             )
         return self
 

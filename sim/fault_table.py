@@ -139,6 +139,36 @@ def _scaled(force_N: tuple[float, ...] | None, size: float) -> tuple[float, ...]
     return None if force_N is None else tuple(size * component for component in force_N)
 
 
+def _force_turned(run: FaultyScenario, size: float, seconds: float) -> None:
+    """Swap two axes of the sensor: along the catheter with one across it."""
+    read, across = run.world.plant.measured_wrench, _axis(size) % 2
+    order = [2, 1, 0] if across == 0 else [0, 2, 1]
+
+    def turned() -> tuple[np.ndarray, np.ndarray]:
+        force_N, torque_Nm = read()
+        return force_N[order], torque_Nm[order]
+
+    run.world.plant.measured_wrench = turned  # type: ignore[method-assign]
+
+
+def _tracker_moved(run: FaultyScenario, size: float, seconds: float) -> None:
+    """Move the field generator along the catheter's axis: every pose is off by `size`."""
+    run.world._tracker_shift_m[2] += size
+
+
+def _wall_nearer(run: FaultyScenario, size: float, seconds: float) -> None:
+    """Move the whole wall by `size` towards the catheter's base within `seconds`, as a patient who moves does."""
+    plant = run.world.plant
+    step, start_m, begin_s = plant.step, float(plant._wall_point[2]), plant.time_s
+
+    def moving(dt_s: float, stage_position: np.ndarray) -> None:
+        share = min((plant.time_s - begin_s) / seconds, 1.0)
+        plant._wall_point[2] = start_m - size * share
+        step(dt_s, stage_position)
+
+    plant.step = moving  # type: ignore[method-assign, assignment]
+
+
 def _host(state: str) -> Inject:
     def inject(run: FaultyScenario, size: float, seconds: float) -> None:
         run.host = state
@@ -355,6 +385,36 @@ FAULTS: tuple[FaultKind, ...] = (
         within_s=0.6,
         must_detect=_never,
         large=_estimate_off,
+    ),
+    FaultKind(
+        "force_turned",
+        "two axes of the force sensor swapped",
+        _force_turned,
+        (0.0, 1.99),
+        "axis",
+        seconds=(1.5, 1.5),
+        within_s=0.6,
+        must_detect=_never,
+        large=_sensor_off,
+    ),
+    FaultKind(
+        "tracker_moved",
+        "the field generator moved along the catheter: all poses are off by so much",
+        _tracker_moved,
+        (-0.02, 0.02),
+        "m",
+        seconds=(1.5, 1.5),
+        must_detect=_never,
+    ),
+    FaultKind(
+        "wall_nearer",
+        "the patient moves: the whole wall comes nearer",
+        _wall_nearer,
+        (0.001, 0.004),
+        "m",
+        seconds=(0.2, 1.0),
+        must_detect=_never,
+        tail_s=1.0,
     ),
     FaultKind("force_saturated", "the gauges at their limit", _on_force("saturated")),
     FaultKind("force_unplugged", "no record of the force sensor", _on_force("silent")),

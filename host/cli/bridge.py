@@ -15,7 +15,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile
 from protocol.errors import InputError
-from protocol.rig_file import SIMULATED_RIG, load_rig
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 bridge = typer.Typer(
     help="Send the running rig's poses and forces to other systems: OpenIGTLink, ROS 2.", no_args_is_help=True
@@ -48,6 +48,7 @@ def igtl(
             ) from None
         with contextlib.closing(served):
             _say(f"rig {read.name} over OpenIGTLink at {address}:{port}  (Ctrl-C ends it)")
+            _note_missing_rig(read)
             if json:
                 write_json({"address": address, "port": port})
                 sys.stdout.flush()
@@ -75,6 +76,7 @@ def ros2(
         ) as served:
             names = [f"/{namespace}/{topic.name}" for topic in PUBLISHED.values()]
             _say(f"rig {connection.rig.name} to ROS 2 by {router}: {', '.join(names)}  (Ctrl-C ends it)")
+            _note_missing_rig(connection.rig)
             if json:
                 write_json({"topics": names, "commands": commands})
                 sys.stdout.flush()
@@ -83,6 +85,14 @@ def ros2(
 
 def _say(text: str) -> None:
     print(f"seldinger bridge: {text}", file=sys.stderr, flush=True)
+
+
+def _note_missing_rig(rig: Rig) -> None:
+    """Say that the rig does not run yet: the bridge serves nothing until it does."""
+    from host.run.connection import may_run
+
+    if not may_run(rig):
+        _say(f"no rig {rig.name} runs at {rig.local.folder} yet; its messages are served once it does")
 
 
 def _until_signal() -> threading.Event:

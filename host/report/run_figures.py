@@ -87,7 +87,7 @@ class RunFigures:
             time_s, wanted_N = self._seconds(state["stamp_ns"]), state["target_force_N"]
             show = (time_s >= from_s) & (time_s <= to_s)
             axes.plot(time_s[show], wanted_N[show], color=WANTED, linewidth=1.3, linestyle=(0, (4, 2)), label="set-point")
-        axes.set_xlim(from_s, to_s)
+        axes.set_xlim(from_s, max(to_s, from_s + 1e-3))  # a contact of a single message has no length
         axes.set_xlabel("time, s")
         axes.set_ylabel("force into the wall, N")
 
