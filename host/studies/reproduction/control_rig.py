@@ -33,6 +33,8 @@ HOLD_ACROSS_S, HOLD_ALONG_S = 25.0, 16.0
 K_PP, K_IP, K_PF, K_IF = 0.083, 0.006, 0.1, 0.003
 # A force counts as held when its mean is this near (share, and N) and its standard deviation below this share of it.
 HELD_SHARE, HELD_N, HELD_SD_SHARE = 0.1, 0.005, 0.2
+# The position counts as held when its mean is this near to the target (m).
+HELD_m = 1e-3
 # Of the plate with its low-friction tape.
 FRICTION = 0.2
 
@@ -217,16 +219,18 @@ def _smooth(force_N: Array) -> Array:
 
 
 def _held(runs: Sequence[RigRun]) -> tuple[bool, str]:
-    """Return whether all runs held their force, and a sentence about how well."""
+    """Return whether all runs held force and position, and a sentence about how well."""
     said, good = [], True
     for run in runs:
         if not run.contact or run.late().size == 0:
             return False, f"{run.label}: no contact"
+        off_m = float(np.mean(run.off_m[run.settled]))
         mean, sd, peak = float(run.late().mean()), float(run.late().std()), float(_smooth(run.force_N).max())
         good &= abs(mean - run.wanted_N) < HELD_SHARE * run.wanted_N + HELD_N and sd < HELD_SD_SHARE * run.wanted_N
+        good &= abs(off_m) < HELD_m
         said.append(
             f"{run.label}: mean {mean:.3f} of {run.wanted_N} N, sd {sd * 1e3:.0f} mN, peak {peak:.2f} N, "
-            f"position {np.mean(run.off_m[run.settled]) * 1e3:+.2f} mm off"
+            f"position {off_m * 1e3:+.2f} mm off"
         )
     return good, "; ".join(said)
 
