@@ -362,7 +362,7 @@ def test_the_guard_names_what_it_refuses() -> None:
     def problem(**scope: Any) -> str:
         return guard._problem({"type": "http", "method": "GET", "headers": [(b"host", b"127.0.0.1:8447")], **scope})
 
-    assert problem() == "" and "reading" in problem(method="POST")
+    assert problem() == "" and "read-only" in problem(method="POST")
     assert "Host" in problem(headers=[]) and "Host" in problem(headers=[(b"host", b"localhost:8447")] * 2)
 
 

@@ -525,7 +525,7 @@ def test_a_point_is_picked_on_the_tissue_and_moves_nothing_by_itself(rig: tuple[
     assert fake.asked[0]["point_m"] == pytest.approx([mm / 1000 for mm in picked[1]])
     # At the upper edge of the scene the ray meets the plane of the tissue far away or never.
     page.mouse.dblclick(across, page.locator("#scene").bounding_box()["y"] + 12)
-    open_page.wait(lambda: "No tissue" in open_page.text("#answer"))
+    open_page.wait(lambda: "tissue is not known" in open_page.text("#answer"))
     assert open_page.complaints == []
 
 

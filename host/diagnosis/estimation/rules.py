@@ -27,12 +27,14 @@ class SelectionRules:
     decisive_log_likelihood: float = 25.0  # or: gain that needs no agreement of blocks, since few episodes may hold it
     least_error_reduction: float = 0.015  # share of some output's held-out error that has to go: idealization takes less
     least_excess_reduction: float = 0.10  # and share of what is above noise
+    least_amount: float = 0.01  # of the least amount tried first: an effect of less is its initial state alone
     further_error_reduction: float = 0.05  # of a further effect: a residual of idealized formulas is not an effect
     further_likelihood_ratio: float = 0.2  # and least gain over that of the effects before it,
     large_error_reduction: float = 0.3  # but for one that takes this share of the residual, in either part,
     large_log_likelihood: float = 25.0  # and gains so much in either: its own evidence is enough
     refinement_error_reduction: float = 0.15  # a finer form has to take this share to be preferred to a simpler one
-    refinement_tolerance: float = 0.02  # part of the gain that a simpler form may lack
+    refinement_tolerance: float = 0.02  # part of the gain that a simpler form may lack,
+    reduced_form_tolerance: float = 0.1  # and where the richer form's further parameters ended at zero
 
     # Search effort: how many candidates are fitted, never how long.
     screening_log_likelihood: float = 3.0  # projected gain from which a candidate is fitted

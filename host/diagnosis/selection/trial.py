@@ -65,6 +65,17 @@ def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
     return term.candidate.effect.dissipates and len(parts) > 1 and min(parts) < 0.0 < max(parts)
 
 
+def vanished(term: Term, values: npt.NDArray[np.float64], rules: SelectionRules) -> bool:
+    """Whether the amounts of an effect that cannot be negative went to zero: only the state that it began from remains.
+
+    A mode that takes part with no share of the motion can still ring down from the first sample on. What it then explains
+    is an initial state that the nominal model lacks.
+    """
+    amounts = [(p, float(value)) for p, value in zip(term.parameters, values, strict=True) if p.linear and p.low == 0.0]
+    alone = len(amounts) == sum(p.linear for p in term.parameters)
+    return bool(amounts) and alone and all(abs(v) < rules.least_amount * min(map(abs, p.grid)) for p, v in amounts)
+
+
 def rank(trials: list[Trial], base: Fit) -> None:
     """Sorts trials by their likelihood on all samples, with one effective sample size for all, that of the trial with
     the least error.
@@ -85,15 +96,26 @@ def rank(trials: list[Trial], base: Fit) -> None:
     near = top.score - max(
         rules.heldout_log_likelihood, rules.refinement_tolerance * top.score, min(coarse, 0.3 * top.score)
     )
+    # A form whose further parameters ended at zero is the form without them, which may have begun a fit less luckily.
+    same, much = len(top.fit.values) - _zeros(top.fit), (1.0 - rules.reduced_form_tolerance) * top.score
     simpler = [
         t
         for t in trials
-        if len(t.fit.values) < len(top.fit.values) and t.score > near and related(t.candidate, top.candidate)
+        if len(t.fit.values) < len(top.fit.values)
+        and (t.score > near or (len(t.fit.values) <= same and t.score > much))
+        and related(t.candidate, top.candidate)
     ]
     if simpler:
         best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
         trials.remove(best)
         trials.insert(0, best)
+
+
+def _zeros(fit: Fit) -> int:
+    """Number of parameters of the last effect that ended at a lower bound of zero."""
+    parameters = fit.terms[-1].parameters
+    own = fit.values[len(fit.values) - len(parameters) :]
+    return sum(p.low == 0.0 and value <= 1e-9 * max(map(abs, p.grid)) for p, value in zip(parameters, own, strict=True))
 
 
 def of_sampling(trial: Trial) -> bool:
@@ -140,7 +162,9 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
     samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
-    return not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
+    fit = trial.fit
+    gone = vanished(fit.terms[-1], fit.values[len(fit.values) - len(fit.terms[-1].parameters) :], trial.rules)
+    return not gone and not at_bound(fit) and not of_sampling(trial) and called_for(trial, base)
 
 
 def called_for(trial: Trial, base: Fit) -> bool:
