@@ -113,21 +113,18 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     begins = [np.concatenate((values, b)) for b in item.begin[: 2 if any(not p.linear for p in item.term.parameters) else 1]]
     if item.nominal:
         begins = [np.concatenate(both) for both in zip(item.nominal, item.begin, strict=True)]
-    first = get_starts(problem)
-    fits = []
-    for memory in _memories(first, item.term.candidate):
-        set_starts(problem, memory)
-        for begin in begins:
-            fit = minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4)
-            fits.append((fit, memory))
-    fit, memory = min(fits, key=lambda pair: pair[0].cost)
-    set_starts(problem, memory)
+    fits = [
+        minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4) for begin in begins
+    ]
+    fit = min(fits, key=lambda f: f.cost)
     fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
     if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
-    fit = _restart(problem, finish(problem, fit), fit.terms[-1].candidate)
+    fit = finish(problem, fit)
+    begun = get_starts(problem)
+    fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
-    set_starts(problem, first)
+    set_starts(problem, begun)
     heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
     trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)
@@ -144,17 +141,6 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         problem.rules,
         any(segment.heldout.any() and not segment.fit.any() for segment in problem.segments),
     )
-
-
-def _memories(first: list[dict[str, float]], candidate: Candidate) -> list[list[dict[str, float]]]:
-    """Starts of memory to fit from: those that the model so far needs, and for a memory of time equilibrium as well.
-
-    What a model needs at first says little where it is far off: a gain fitted without a slow lag was a quarter of its own.
-    """
-    port, effect = candidate.port.name, candidate.effect
-    if not (effect.remembers and effect.timed and any(start.get(port, 0.0) for start in first)):
-        return [first]
-    return [first, [{**start, port: 0.0} for start in first]]
 
 
 def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:

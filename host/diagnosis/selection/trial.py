@@ -102,7 +102,7 @@ def rank(trials: list[Trial], base: Fit) -> None:
         t
         for t in trials
         if len(t.fit.values) < len(top.fit.values)
-        and (t.score > near or (len(t.fit.values) <= same and t.score > much))
+        and (t.score > near or (len(t.fit.values) <= same and t.candidate.name == top.candidate.name and t.score > much))
         and related(t.candidate, top.candidate)
     ]
     if simpler:
