@@ -318,8 +318,9 @@ def _scan(
         if shifts:
             again = _absorbed(problem, terms, values, trial, base, S)
             if again is not None:
-                around, left = again
-                points.append(Point(float(rest @ rest - left @ left), trial[values.size :], left, around, S.shape[1]))
+                found, left = again
+                taken = float(rest @ rest - left @ left)
+                points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1]))
             continue
         D = np.array(columns)
         D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
@@ -381,22 +382,26 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) ->
 def _absorbed(
     problem: Problem, terms: tuple[Term, ...], values: Array, trial: Array, base: Array, S: Array
 ) -> tuple[Array, Array] | None:
-    """`values` fitted again next to a shift in time, and the residual then; None where they cannot be.
+    """All parameters fitted again from a shift in time at a grid point, and the residual then; None where they cannot be.
 
     Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
-    change of the outputs at their present values says nothing then.
+    change of the outputs at their present values says nothing then. The shift itself moves as well where that leaves less:
+    a delay of a part of a sample lies between the points of the grid.
     """
     r = _known(problem, terms, trial, base)
-    before = problem.parameters(terms[:-1])
-    sizes = [size_of(p, v) for p, v in zip(problem.parameters(terms), trial, strict=True)]
-    J = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes)[:, : len(free(before))]
-    J, aim = J - S @ (S.T @ J), r - S @ (S.T @ r)
-    if not J.shape[1] or not np.all(np.isfinite(J)):
+    parameters = problem.parameters(terms)
+    sizes = [size_of(p, v) for p, v in zip(parameters, trial, strict=True)]
+    J, aim = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes), r - S @ (S.T @ r)
+    J -= S @ (S.T @ J)
+    before = len(free(problem.parameters(terms[:-1])))
+    if not np.all(np.isfinite(J)):
         return None
-    by = np.linalg.lstsq(J, aim, rcond=1e-10)[0]
-    found = values.copy()
-    for index, step in zip(free(before), by, strict=True):
-        found[index] = moved(before[index], values[index], float(step))
-    r = _known(problem, terms, np.concatenate((found, trial[values.size :])), base)
-    left = r - S @ (S.T @ r)
-    return found, left
+    ends = []
+    for columns in (before, J.shape[1]):
+        by = np.linalg.lstsq(J[:, :columns], aim, rcond=1e-10)[0]
+        found = trial.copy()
+        for index, step in zip(free(parameters), by, strict=False):
+            found[index] = moved(parameters[index], trial[index], float(step))
+        left = _known(problem, terms, found, base)
+        ends.append((found, left - S @ (S.T @ left)))
+    return min(ends, key=lambda end: float(end[1] @ end[1]))
