@@ -68,8 +68,9 @@ ACTIONS = (
 )  # fmt: skip
 TARGETS = tuple(kind.label for kind in CommandKind if kind not in (CommandKind.STOP, CommandKind.JOG))
 JOG_AXES = ("none", *JogAxis.labels())
-# A step of a plan: computed, being executed; or the plan has ended, whether its goal was reached or not.
-STEP_STATUS = ("planned", "executing", "ended")
+# A step of a plan: computed, being executed; the goal under the contact force that the request states; or the plan has
+# ended, whether its goal was reached or not.
+STEP_STATUS = ("planned", "executing", "loaded", "ended")
 RESULTS = ("accepted", "refused", "expired", "replayed", "malformed")
 
 _XYZ_m = ("x_m", "y_m", "z_m")
@@ -475,9 +476,18 @@ class PlannedStep(Message, frozen=True, kw_only=True):
     plan: Annotated[Text, doc("number of the protocol's step that carries out the plan")]
     step: Annotated[U8, doc("number of the step, from 0")]
     steps: Annotated[U8, doc("number of drawn steps of the plan")]
-    status: Annotated[str, choice("state of the step; ended closes the plan", STEP_STATUS)]
+    status: Annotated[
+        str, choice("state of the step; loaded is the goal under the contact force; ended closes the plan", STEP_STATUS)
+    ]
     time_s: Annotated[Duration_s, doc("planned time of the step, from the start of the plan")]
     load_N: Annotated[AllowedForce_N, doc("force of the puncture on the catheter in this step")] = 0.0
+    contact_force_N: Annotated[
+        tuple[Force_N, ...], columns_of("planned force on the tissue, with status loaded", _FORCE)
+    ] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     shape_m: Annotated[
         tuple[Place_m, ...], columns_of("planned centre line from the sheath's exit to the tip, base frame", _SHAPE)
     ]

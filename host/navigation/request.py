@@ -107,11 +107,19 @@ class PlannedShape(NamedTuple):
     load_N: float
 
 
+class PressedShape(NamedTuple):
+    """The catheter that presses at the goal: centre line (SHAPE_POINTS, 3) m, and the force (3,) N on the tissue."""
+
+    points_m: Array
+    contact_force_N: Array
+
+
 class PlanAnswer(NamedTuple):
     """A plan: one row for each period, at rest at both ends.
 
     `clearance_m` is the smallest on the path, measured from the catheter's surface. `puncture_force_N` is the greatest with
-    which the puncture bends the catheter on the path. `shapes` are some rows as pictures draw them, evenly spaced in time.
+    which the puncture bends the catheter on the path. `shapes` are some rows as pictures draw them, evenly spaced in time;
+    `pressed` is the goal under the request's contact force.
     """
 
     time_s: Array
@@ -123,9 +131,16 @@ class PlanAnswer(NamedTuple):
     waypoints: int
     puncture_force_N: float
     shapes: tuple[PlannedShape, ...] = ()
+    pressed: PressedShape | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the plan as JSON: samples by column name, SI units."""
+        """Return the plan as JSON: samples by column name, SI units; `pressed` only for a request with a contact force."""
+        pressing = self.pressed
+        pressed = (
+            {}
+            if pressing is None
+            else {"pressed": {"contact_force_N": pressing.contact_force_N, "shape_m": pressing.points_m}}
+        )
         return {
             "found": True,
             "duration_s": float(self.time_s[-1]),
@@ -137,6 +152,7 @@ class PlanAnswer(NamedTuple):
             "stage": {"insertion_m": self.stage[:, 0], "roll_rad": self.stage[:, 1], "knob_rad": self.stage[:, 2]},
             "joint": {"insertion_m": self.joint[:, 0], "roll_rad": self.joint[:, 1], "curvature_per_m": self.joint[:, 2]},
             "tip_m": self.tip_m,
+            **pressed,
         }
 
 
@@ -183,11 +199,10 @@ class _World:
         assert line is not None
         return self._touches(line.points_m)
 
-    def refused_pressed(self, joint: Array, goal_m: Array, contact_force_N: Array) -> str:
-        """Why the catheter cannot press at the goal, reached from `joint` free; "" if it can.
+    def pressed_line(self, joint: Array, goal_m: Array, contact_force_N: Array) -> LoadedLine | None:
+        """Return the catheter that presses at the goal, reached from `joint` free; None if there is no such shape.
 
-        The tip stays at the goal while the base goes on, so another joint is looked for, where the loaded tip is there. The
-        last TISSUE_m are left out: they lie on the tissue.
+        The tip stays at the goal while the base goes on, so another joint is looked for, where the loaded tip is there.
         """
 
         def tip(at: Array) -> Array:
@@ -195,8 +210,16 @@ class _World:
             return np.full(3, np.nan) if line is None else line.points_m[-1]
 
         at = aimed(tip, joint, goal_m, self.reach.scale_m)
-        line = None if at is None else pressed(self.catheter, self.reach, at, contact_force_N, 2 * LINE_POINTS)
-        if at is None or line is None or not shape.within(self.reach, at):
+        if at is None or not shape.within(self.reach, at):
+            return None
+        return pressed(self.catheter, self.reach, at, contact_force_N, 2 * LINE_POINTS)
+
+    def refused_pressed(self, line: LoadedLine | None, goal_m: Array) -> str:
+        """Return why the catheter cannot press at the goal with the shape `line`; empty if it can.
+
+        The last TISSUE_m are left out: they lie on the tissue.
+        """
+        if line is None:
             return "no shape of the catheter that presses there with this force"
         kept = np.linalg.norm(line.points_m - goal_m, axis=1) > TISSUE_m
         why = self._touches(line.points_m[kept]) if np.count_nonzero(kept) > 1 else ""
@@ -270,7 +293,10 @@ def _goals(request: PlanRequest, rig: Rig, world: _World) -> list[Array]:
     reasons = [world.refused(joint) for joint in reachable]
     if request.contact_force_N is not None:
         force = np.array(request.contact_force_N)
-        reasons = [why or world.refused_pressed(joint, goal, force) for joint, why in zip(reachable, reasons, strict=True)]
+        reasons = [
+            why or world.refused_pressed(world.pressed_line(joint, goal, force), goal)
+            for joint, why in zip(reachable, reasons, strict=True)
+        ]
     free = [joint for joint, why in zip(reachable, reasons, strict=True) if not why]
     if not free:
         raise InputError("goal_m", request.goal_m, f"a goal that is reached free; there is {reasons[0]}")
@@ -290,7 +316,27 @@ def _timed(way: Array, world: _World, rig: Rig, request: PlanRequest) -> PlanAns
     tips = np.array([np.full(3, np.nan) if line is None else line.points_m[-1] for line in lines])
     force_N = max((line.force_N for line in lines if line is not None), default=0.0)
     asked = world.surroundings.questions
-    return PlanAnswer(timed.time_s, timed.stage, joint, tips, float(clear), asked, len(way), force_N, _shapes(lines))
+    return PlanAnswer(
+        timed.time_s,
+        timed.stage,
+        joint,
+        tips,
+        float(clear),
+        asked,
+        len(way),
+        force_N,
+        _shapes(lines),
+        _pressed_at(way[-1], world, request),
+    )
+
+
+def _pressed_at(joint: Array, world: _World, request: PlanRequest) -> PressedShape | None:
+    """Return the catheter under the request's contact force at the goal, for the `joint` that the path ends with."""
+    if request.contact_force_N is None or not any(request.contact_force_N):
+        return None
+    force_N = np.array(request.contact_force_N)
+    line = world.pressed_line(joint, np.array(request.goal_m), force_N)
+    return None if line is None else PressedShape(_drawn(line), force_N)
 
 
 def _shapes(lines: list[LoadedLine | None]) -> tuple[PlannedShape, ...]:
@@ -299,10 +345,14 @@ def _shapes(lines: list[LoadedLine | None]) -> tuple[PlannedShape, ...]:
     for row in np.unique(np.linspace(0, len(lines) - 1, DRAWN_SHAPES).round().astype(int)):
         line = lines[row]
         if line is not None:
-            at = np.linspace(0, len(line.points_m) - 1, SHAPE_POINTS)
-            points = [np.interp(at, np.arange(len(line.points_m)), line.points_m[:, axis]) for axis in range(3)]
-            shapes.append(PlannedShape(int(row), np.column_stack(points), line.force_N))
+            shapes.append(PlannedShape(int(row), _drawn(line), line.force_N))
     return tuple(shapes)
+
+
+def _drawn(line: LoadedLine) -> Array:
+    """Return SHAPE_POINTS points (SHAPE_POINTS, 3) m of the line, both ends included."""
+    at = np.linspace(0, len(line.points_m) - 1, SHAPE_POINTS)
+    return np.column_stack([np.interp(at, np.arange(len(line.points_m)), line.points_m[:, axis]) for axis in range(3)])
 
 
 def joints_at(rig: Rig, stage: Array) -> Array:

@@ -57,6 +57,7 @@ MEANINGS: dict[tuple[str, str], Meaning] = {
     ("command", "force_N"): Meaning("along the normal", f"{ON_TISSUE}, commanded"),
     ("command", "direction"): Meaning(BASE, "unit vector of a jog of the tip"),
     ("plan", "load_N"): Meaning("in the bending plane", "of the puncture on the catheter, planned"),
+    ("plan", "contact_force_N"): Meaning(BASE, f"{ON_TISSUE}, planned"),
     ("plan", "shape_m"): Meaning(BASE, "centre line of the catheter, planned"),
     ("sim/truth", "tip_m"): Meaning(BASE, "tip, true"),
     ("sim/truth", "wall_m"): Meaning(BASE, "point of the wall, true"),

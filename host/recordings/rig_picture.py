@@ -96,14 +96,22 @@ class Picture:
             return
         if self._plan is None or (self._plan["id"], len(self._plan["shapes"])) != (body["plan"], body["steps"]):
             self._plan = {"id": body["plan"], "step": -1, "shapes": [None] * body["steps"], "loads": [0.0] * body["steps"]}
+            self._plan["pressed"] = None
         self._plan["stamp_ns"] = body["stamp_ns"]
-        self._plan["shapes"][body["step"]] = np.round(np.reshape(body["shape_m"], (-1, 3)), 4).tolist()
+        points = np.round(np.reshape(body["shape_m"], (-1, 3)), 4).tolist()
+        if body["status"] == "loaded":
+            self._plan["pressed"] = {"shape": points, "force": _list(body["contact_force_N"], 3)}
+            return
+        self._plan["shapes"][body["step"]] = points
         self._plan["loads"][body["step"]] = _rounded(body["load_N"], 3)
         if body["status"] == "executing":
             self._plan["step"] = body["step"]
 
     def _planned(self) -> dict[str, Any] | None:
-        """The plan that is carried out: its id, the step now (-1 before the first), shapes (m) and loads (N) by step."""
+        """The plan that is carried out: its id, the step now (-1 before the first), shapes (m) and loads (N) by step.
+
+        `pressed` is the goal under the planned contact force: shape (m) and force (N) on the tissue; None without one.
+        """
         if self._plan is None or self.now_ns - self._plan["stamp_ns"] > PLAN_LASTS_NS:
             return None
         return {name: value for name, value in self._plan.items() if name != "stamp_ns"}

@@ -269,9 +269,11 @@ class _Run:
                 self._show_step(action, len(action.path.shapes) - 1, "ended")
 
     def _show_step(self, action: Action, number: int, status: str) -> None:
-        """Publish step `number` of the plan's drawn steps."""
+        """Publish step `number` of the plan's drawn steps; with status loaded, the shape that presses at the goal."""
         assert action.path is not None
-        shape = action.path.shapes[number]
+        shape, pressed = action.path.shapes[number], action.path.pressed if status == "loaded" else None
+        points_m = shape.points_m if pressed is None else pressed.points_m
+        force_N = (0.0, 0.0, 0.0) if pressed is None else tuple(float(value) for value in pressed.contact_force_N)
         self._driven.publish_step(
             PlannedStep(
                 stamp_ns=self._now.stamp_ns,
@@ -281,7 +283,8 @@ class _Run:
                 status=status,
                 time_s=float(action.path.time_s[shape.row]),
                 load_N=min(shape.load_N, 1.0),
-                shape_m=tuple(float(value) for value in shape.points_m.ravel()),
+                contact_force_N=force_N,
+                shape_m=tuple(float(value) for value in points_m.ravel()),
             )
         )
 
@@ -290,6 +293,8 @@ class _Run:
         tips, times = path.tip_m, path.time_s
         for number in range(len(path.shapes)):
             self._show_step(action, number, "planned")
+        if path.shapes and path.pressed is not None:
+            self._show_step(action, len(path.shapes) - 1, "loaded")
         if path.shapes:
             self._show_step(action, 0, "executing")
         step, step_times = 0, np.array([times[shape.row] for shape in path.shapes])

@@ -265,3 +265,17 @@ def test_the_pressed_shape_at_the_goal_is_checked(rig: Rig, reach: shape.Reach) 
     assert plan(request(goal, [ball], start=start, clearance_m=0.0), rig) is not None
     with pytest.raises(InputError, match=r"^goal_m.*presses"):
         plan(request(goal, [ball], start=start, clearance_m=0.0, contact_force_N=force.tolist()), rig)
+
+
+def test_the_answer_holds_the_shape_that_presses_at_the_goal(rig: Rig, reach: shape.Reach) -> None:
+    goal = tip_at(reach, -0.050, 0.0, 14.0)
+    start = {"insertion_m": -0.052, "roll_rad": 0.0, "curvature_per_m": 13.0}
+    free = plan(request(goal, start=start), rig)
+    answer = plan(request(goal, start=start, contact_force_N=[0.0, 0.0, 0.1]), rig)
+    assert free is not None and free.pressed is None and "pressed" not in free.as_json()
+    assert answer is not None and answer.pressed is not None
+    points, last = answer.pressed.points_m, answer.shapes[-1].points_m
+    assert points.shape == (SHAPE_POINTS, 3) and np.linalg.norm(points[-1] - goal) < 1e-4
+    # Same tip, another way to it: 0.1 N bends this catheter by more than half a millimetre.
+    assert max(to_line_m(point, last) for point in points) > 0.5e-3
+    assert answer.as_json()["pressed"]["contact_force_N"].tolist() == [0.0, 0.0, 0.1]

@@ -196,6 +196,22 @@ def test_the_steps_of_a_plan_are_published_and_the_one_being_executed_is_named(t
     assert picture.frame()["plan"] is None
 
 
+def test_the_loaded_goal_of_a_plan_is_published_with_its_force(tmp_path: Path) -> None:
+    (tmp_path / "way.json").write_text(json.dumps({**WAY, "contact_force_N": [0.0, 0.0, 0.1]}), encoding="utf-8")
+    rig = ScriptedRig()
+    assert performed(tmp_path, HEAD + PLAN, rig).good
+    loaded = [step for step in rig.published if step.status == "loaded"]
+    assert len(loaded) == 1 and loaded[0].contact_force_N == (0.0, 0.0, 0.1)
+    assert loaded[0].shape_m[-3:] == pytest.approx(WAY["goal_m"], abs=2e-4)
+    last = next(step for step in rig.published if step.step == loaded[0].step and step.status == "planned")
+    assert loaded[0].shape_m != last.shape_m
+    picture = Picture({}, {})
+    for step in rig.published[:-1]:
+        picture.take("plan", msgspec.to_builtins(step))
+    pressed = picture.frame()["plan"]["pressed"]
+    assert pressed["force"] == [0.0, 0.0, 0.1] and len(pressed["shape"]) == 12
+
+
 def test_a_plan_that_fails_on_the_way_is_closed_too(tmp_path: Path) -> None:
     (tmp_path / "way.json").write_text(json.dumps(WAY), encoding="utf-8")
     rig = ScriptedRig()

@@ -367,7 +367,10 @@ def planned(step: int) -> dict[str, Any]:
     for number in range(8):
         bend_m = 0.014 - 0.004 * number
         shapes.append([[0.0, bend_m * (i / 11) ** 2, (0.021 + 0.0008 * number) * i / 11] for i in range(12)])
-    return {"id": "2", "step": step, "shapes": shapes, "loads": [0.0] * 5 + [0.02, 0.05, 0.08]}
+    # The tip stays, the shaft gives way to the tissue.
+    bulged = [[x, y + 0.0025 * math.sin(math.pi * i / 11), z] for i, (x, y, z) in enumerate(shapes[-1])]
+    pressed = {"shape": bulged, "force": [0.0, 0.0, 0.2]}
+    return {"id": "2", "step": step, "shapes": shapes, "loads": [0.0] * 5 + [0.02, 0.05, 0.08], "pressed": pressed}
 
 
 def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake, OpenPage], tmp_path: Path) -> None:
@@ -393,6 +396,14 @@ def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake
         "seldinger.scene.plan.children.filter((m, i) => i % 2 === 0).map(m => m.geometry.parameters.radius)"
     )
     assert [number for number, radius in enumerate(thickness) if radius == max(thickness)] == [6]
+    # The loaded goal: another colour, with the force and its value.
+    assert page.locator("#legend-loaded").is_visible()
+    assert "Planned force at the goal 0.20 N." in open_page.text("#scene-note")
+    assert near(pictures[1], "#a3127f") > 150
+    fake.state = replace(fake.state, plan={**planned(6), "pressed": None})
+    open_page.wait(lambda: page.evaluate("seldinger.scene.pressed.children.length") == 0)
+    page.wait_for_timeout(100)
+    assert near(open_page.picture_of("#scene-card"), "#a3127f") < 20 and page.locator("#legend-loaded").is_hidden()
     fake.state = replace(fake.state, plan=None)
     open_page.wait(lambda: page.evaluate("seldinger.scene.plan.children.length") == 0)
     assert open_page.complaints == []

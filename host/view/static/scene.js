@@ -14,16 +14,18 @@ function colors() {
 }
 
 function label(text, color) {
-  const canvas = document.createElement("canvas");
-  canvas.width = canvas.height = 64;
+  const canvas = document.createElement("canvas"), font = "600 34px system-ui, sans-serif";
   const g = canvas.getContext("2d");
-  g.font = "600 34px system-ui, sans-serif";
+  g.font = font;
+  canvas.width = Math.max(64, Math.ceil(g.measureText(text).width) + 8);
+  canvas.height = 64;
+  g.font = font;  // a new size resets the context
   g.textAlign = "center";
   g.textBaseline = "middle";
   g.fillStyle = `#${color.getHexString()}`;
-  g.fillText(text, 32, 32);
+  g.fillText(text, canvas.width / 2, 32);
   const sprite = new THREE.Sprite(new THREE.SpriteMaterial({map: new THREE.CanvasTexture(canvas), depthWrite: false}));
-  sprite.scale.set(4.2, 4.2, 1);
+  sprite.scale.set(4.2 * canvas.width / 64, 4.2, 1);
   return sprite;
 }
 
@@ -111,8 +113,9 @@ export class Scene {
     this.catheter = new THREE.Group();
     world.add(this.catheter);
     this.plan = new THREE.Group();
+    this.pressed = new THREE.Group();
     this.drawnPlan = "";
-    world.add(this.plan);
+    world.add(this.plan, this.pressed);
     this.#wall(world);
     this.#target(world);
     this.force = new Arrow(color("force"), 1);
@@ -184,7 +187,7 @@ export class Scene {
   // The plan that is carried out: a thin line for each step, fainter where it is done, thick with a ball for the step now.
   // A step that a puncture bends is in the force's colour.
   #planned(plan) {
-    const key = plan ? JSON.stringify([plan.id, plan.step, plan.shapes.map(Boolean)]) : "";
+    const key = plan ? JSON.stringify([plan.id, plan.step, plan.shapes.map(Boolean), plan.pressed]) : "";
     if (key === this.drawnPlan) return;
     this.drawnPlan = key;
     for (const part of this.plan.children) { part.geometry.dispose(); part.material.dispose(); }
@@ -200,6 +203,24 @@ export class Scene {
       ball.position.copy(points[points.length - 1]);
       this.plan.add(ball);
     });
+    this.#pressing(plan?.pressed);
+  }
+
+  // The goal under the planned contact force: the loaded shape, the force of the tip on the tissue, and its value.
+  #pressing(pressed) {
+    this.pressed.traverse(part => { part.geometry?.dispose(); part.material?.map?.dispose(); part.material?.dispose(); });
+    this.pressed.clear();
+    if (!pressed) return;
+    const color = this.color("loaded"), points = pressed.shape.map(vector), tip = points[points.length - 1];
+    const tube = new THREE.TubeGeometry(new THREE.CatmullRomCurve3(points), 32, this.radius * 0.6, 10);
+    // Wider than a step and transparent: both are seen where the load changes little.
+    const skin = new THREE.MeshStandardMaterial({color, transparent: true, opacity: 0.6, roughness: 0.6, depthWrite: false});
+    const arrow = new Arrow(color, 1), value = label(`${Math.hypot(...pressed.force).toFixed(2)} N`, color);
+    arrow.point(tip, pressed.force);
+    // To the left of the arrow's middle: above its head it would often lie outside the picture.
+    value.position.copy(tip).addScaledVector(new THREE.Vector3(...pressed.force), 0.5 * MM_PER_N);
+    value.center.set(1.12, 0.5);
+    this.pressed.add(new THREE.Mesh(tube, skin), arrow.group, value);
   }
 
   show(drawn, mode, plan = null) {

@@ -114,8 +114,11 @@ function draw() {
   if (page.scene && !page.scene.broken) {
     page.scene.show(frame.scene, frame.mode, frame.plan);
     const gap = frame.scene.gap_m;
+    const pressed = frame.plan?.pressed;
     element("legend-plan").hidden = !frame.plan;
-    const step = frame.plan ? `Plan, step ${frame.plan.step + 1} of ${frame.plan.shapes.length}. ` : "";
+    element("legend-loaded").hidden = !pressed;
+    const step = frame.plan ? `Plan, step ${frame.plan.step + 1} of ${frame.plan.shapes.length}. ` +
+      (pressed ? `Planned force at the goal ${Math.hypot(...pressed.force).toFixed(2)} N. ` : "") : "";
     write(element("scene-note"), step + "Grid 10 mm; force arrow 5 mm for 0.1 N." + (gap === null ? "" : ` Model and tracker differ by ${(gap * 1000).toFixed(1)} mm at the tip.`));
   }
   link(live ? (frame.silent_s !== null && frame.silent_s <= 1 ? "live" : "no data") : "recording", !live || (frame.silent_s !== null && frame.silent_s <= 1) ? "good" : "bad");
