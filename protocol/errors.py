@@ -49,8 +49,13 @@ def one_of(key: str, value: object, allowed: Collection[str]) -> str:
     """Return `value` if it is one of `allowed`. Raises InputError named `key`."""
     if not isinstance(value, str) or value not in allowed:
         found = value if isinstance(value, str) else str(value)
-        raise InputError(key, found, " or ".join(allowed) if len(allowed) < 4 else "one of " + ", ".join(allowed))
+        raise InputError(key, found, any_of(allowed))
     return value
+
+
+def any_of(allowed: Collection[str]) -> str:
+    """Return the words of `allowed` as what an error wants."""
+    return " or ".join(allowed) if len(allowed) < 4 else "one of " + ", ".join(allowed)
 
 
 def _short(value: object, limit: int = 80) -> str:

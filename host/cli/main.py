@@ -17,7 +17,7 @@ import typer
 
 from host.cli.extras import missing_extra
 from protocol import compile_notice
-from protocol.errors import Description, InputError
+from protocol.errors import Description, InputError, any_of
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -205,7 +205,7 @@ def _refusal(error: Exception) -> str:
         return said
     name = str(context.info_name)  # type: ignore[union-attr]
     what = Description("nothing") if found is None else found[1]
-    return str(InputError(name, what, " or ".join(group) if len(group) < 4 else f"one of {', '.join(group)}"))
+    return str(InputError(name, what, any_of(group)))
 
 
 class _Standard(io.RawIOBase):

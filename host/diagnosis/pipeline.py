@@ -31,6 +31,7 @@ from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.sampling import hold_between_samples
+from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, search
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder
 from host.diagnosis.symbolic.dictionary import lay_out
@@ -305,17 +306,11 @@ def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
     """
     if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
         return mismatch_of(full, found.nominal_full, found.best_full)
-    n = len(full.model.parameters)
-    terms, values, at = [], list(found.best.values[:n]), n
-    for term in found.best.terms:
-        part = found.best.values[at : at + len(term.parameters)]
-        at += len(term.parameters)
-        if term.candidate.port.subsystem != subsystem:
-            terms.append(term)
-            values += list(part)
+    here = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.subsystem == subsystem)
+    terms, values = without(found.best, full, here)
     out = []
     for segment, r in zip(full.segments, found.best_full.residuals, strict=True):
-        change = (segment.y - r) - full.simulate(segment, tuple(terms), np.array(values))
+        change = (segment.y - r) - full.simulate(segment, terms, values)
         out.append(change - np.nanmean(change, axis=1, keepdims=True))
     return out
 

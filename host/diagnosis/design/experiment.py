@@ -76,7 +76,7 @@ def rival_fit(problem: Problem, found: Found, candidate: Candidate, other: Candi
         return None
     terms, values = without(found.best, problem, (candidate.key,))
     term = trial.fit.terms[-1]
-    start = trial.fit.values[-len(term.parameters) :]
+    start = trial.fit.values_of(term)
     return minimize(problem, (*terms, term), np.concatenate((values, start)), rounds=8, tolerance=1e-4)
 
 

@@ -43,6 +43,12 @@ class Fit:
         """Return the keys of the active candidates."""
         return tuple(term.candidate.key for term in self.terms)
 
+    def values_of(self, term: Term) -> Array:
+        """Return the values of `term`, which is one of `terms` itself, not one equal to it."""
+        place = next(index for index, other in enumerate(self.terms) if other is term)
+        first = len(self.values) - sum(len(other.parameters) for other in self.terms[place:])
+        return self.values[first : first + len(term.parameters)]
+
 
 @dataclass
 class Problem:
@@ -56,6 +62,11 @@ class Problem:
     rules: SelectionRules = RULES
     budget: Budget = field(default_factory=Budget)
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
+
+    @property
+    def apart(self) -> bool:
+        """Return whether whole recordings are held out, not blocks between the fitted ones."""
+        return any(segment.heldout.any() and not segment.fit.any() for segment in self.segments)
 
     def parameters(self, terms: tuple[Term, ...]) -> list[Parameter]:
         """All parameters of a structure, nominal first."""
@@ -81,12 +92,7 @@ class Problem:
 
     def late_s(self, terms: tuple[Term, ...], values: Array) -> float:
         """Dead time of all terms together (s)."""
-        at, late_s = len(self.model.parameters), 0.0
-        for term in terms:
-            for p, value in zip(term.parameters, values[at : at + len(term.parameters)], strict=True):
-                late_s += max(float(value), 0.0) if p.dead_time else 0.0
-            at += len(term.parameters)
-        return late_s
+        return sum(max(float(value), 0.0) for p, value in zip(self.parameters(terms), values, strict=True) if p.dead_time)
 
     def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
         """First samples (number) that a dead time makes of what was before the recording: nothing can predict them."""

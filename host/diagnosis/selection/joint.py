@@ -11,7 +11,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, minimize, set_starts
 from host.diagnosis.selection.screening import above_noise
-from host.diagnosis.selection.trial import Trial, bound_by, related
+from host.diagnosis.selection.trial import Trial, bound_by, related, sure_together
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -42,11 +42,9 @@ def best_pair(
         starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
         set_starts(problem, starts)
         fit = _fitted(problem, nominal, a, b)
-        held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
-        both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
-        more = len(fit.values) - len(nominal.values)
-        if _earned(problem, fit, a, b, noise_sd) and _enough(problem, held, both, more):
-            found.append((both.log_likelihood - rules.parameter_penalty * more, fit, held, starts))
+        passed = _passed(problem, nominal, fit, noise_sd)
+        if passed is not None and all(_earned_over(problem, fit, alone.fit, noise_sd) for alone in (a, b)):
+            found.append((*passed, fit, starts))
     for trial in _unlike(singles)[: rules.joint_first]:
         if problem.budget.spent():
             break
@@ -59,17 +57,14 @@ def best_pair(
             seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
         for second in seconds:
             set_starts(problem, second.starts)
-            fit = second.fit
-            held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
-            both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
-            more = len(fit.values) - len(nominal.values)
-            if _enough(problem, held, both, more) and all(
+            fit, passed = second.fit, _passed(problem, nominal, second.fit, noise_sd)
+            if passed is not None and all(
                 _earned_over(problem, fit, _alone(problem, nominal, fit, which), noise_sd) for which in (0, 1)
             ):
-                found.append((both.log_likelihood - rules.parameter_penalty * more, fit, held, second.starts))
+                found.append((*passed, fit, second.starts))
     if not found:
         return None
-    _, fit, held, starts = max(found, key=lambda item: item[0])
+    _, held, fit, starts = max(found, key=lambda item: item[0])
     return fit, held, starts
 
 
@@ -92,10 +87,7 @@ def _unlike(singles: list[Trial]) -> list[Trial]:
 
 def _alone(problem: Problem, nominal: Fit, pair: Fit, which: int = 1) -> Fit:
     """One effect of `pair` without the other, fitted again."""
-    n = len(nominal.values)
-    first = len(pair.terms[0].parameters)
-    own = pair.values[n + first :] if which else pair.values[n : n + first]
-    begin = np.concatenate((pair.values[:n], own))
+    begin = np.concatenate((pair.values[: len(nominal.values)], pair.values_of(pair.terms[which])))
     rounds = problem.rules.further_iterations
     return finish(problem, minimize(problem, (pair.terms[which],), begin, rounds=rounds, tolerance=1e-4))
 
@@ -111,15 +103,10 @@ def _fitted(problem: Problem, nominal: Fit, a: Trial, b: Trial) -> Fit:
     return finish(problem, minimize(problem, terms, fit.values, rounds=rules.further_iterations, tolerance=1e-4))
 
 
-def _earned(problem: Problem, fit: Fit, a: Trial, b: Trial, noise_sd: Array) -> bool:
-    """Whether each effect gains enough over the other alone, on samples to fit and on held-out ones, and none is at a
-    bound.
-    """
-    return all(_earned_over(problem, fit, alone.fit, noise_sd) for alone in (a, b))
-
-
 def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> bool:
-    """Whether the pair gains enough over one of its effects `alone`, on samples to fit and on held-out ones."""
+    """Whether the pair gains enough over one of its effects `alone`, on samples to fit and on held-out ones, and none of
+    the two is at a bound.
+    """
     if any(bound_by(fit, term) for term in fit.terms):
         return False
     more = len(fit.values) - len(alone.values)
@@ -133,22 +120,17 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> boo
 
 
 def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
-    """Whether all samples together are sure where held-out ones are few: as a single effect passes (`trial._together`)."""
-    rules = problem.rules
-    apart = any(segment.heldout.any() and not segment.fit.any() for segment in problem.segments)
-    return (
-        apart
-        and both.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
-        and both.p_value < 0.1 * rules.significance
-        and held.log_likelihood > rules.weak_log_likelihood
-        and held.p_value < rules.weak_significance
-    )
+    return problem.apart and sure_together(problem.rules, held, both, more)
 
 
-def _enough(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
-    """Whether the pair passes what a single effect has to."""
-    rules = problem.rules
+def _passed(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> tuple[float, Gain] | None:
+    """Score of a pair and its gain on held-out samples; None if it does not pass what a single effect has to."""
+    rules, more = problem.rules, len(fit.values) - len(nominal.values)
+    held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
+    both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
     shown = sure and held.log_likelihood > rules.heldout_log_likelihood + more
-    return held.share > least and (shown or _pooled(problem, held, both, more))
+    if not (held.share > least and (shown or _pooled(problem, held, both, more))):
+        return None
+    return both.log_likelihood - rules.parameter_penalty * more, held

@@ -67,14 +67,8 @@ def _either(p: Parameter, nominal: dict[str, float]) -> Parameter:
 def without(fit: Fit, problem: Problem, drop: tuple[str, ...]) -> tuple[tuple[Term, ...], Array]:
     """Terms and values of `fit` but for the candidates named in `drop`."""
     n = len(problem.model.parameters)
-    terms, values, at = [], list(fit.values[:n]), n
-    for term in fit.terms:
-        part = fit.values[at : at + len(term.parameters)]
-        at += len(term.parameters)
-        if term.candidate.key not in drop:
-            terms.append(term)
-            values += list(part)
-    return tuple(terms), np.array(values)
+    terms = tuple(term for term in fit.terms if term.candidate.key not in drop)
+    return terms, np.concatenate([fit.values[:n], *(fit.values_of(term) for term in terms)])
 
 
 def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:

@@ -139,7 +139,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         bool(item.drop),
         problem.segments[0].recording.dt_s,
         problem.rules,
-        any(segment.heldout.any() and not segment.fit.any() for segment in problem.segments),
+        problem.apart,
     )
 
 

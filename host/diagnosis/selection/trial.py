@@ -37,10 +37,7 @@ def at_bound(fit: Fit) -> bool:
 
 def bound_by(fit: Fit, term: Term) -> bool:
     """As `at_bound`, of any of its terms; friction whose parts have both signs has left what is physical too."""
-    place = next(index for index, other in enumerate(fit.terms) if other is term)
-    after = sum(len(other.parameters) for other in fit.terms[place:])
-    first = len(fit.values) - after
-    values = fit.values[first : first + len(term.parameters)]
+    values = fit.values_of(term)
     if _drives(term, values):
         return True
     natural = term.candidate.effect.natural_bounds
@@ -65,13 +62,15 @@ def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
     return term.candidate.effect.dissipates and len(parts) > 1 and min(parts) < 0.0 < max(parts)
 
 
-def vanished(term: Term, values: npt.NDArray[np.float64], rules: SelectionRules) -> bool:
-    """Whether the amounts of an effect that cannot be negative went to zero: only the state that it began from remains.
+def vanished(fit: Fit, rules: SelectionRules) -> bool:
+    """Whether the amounts of the last effect, which cannot be negative, went to zero: only its initial state remains.
 
     A mode that takes part with no share of the motion can still ring down from the first sample on. What it then explains
     is an initial state that the nominal model lacks.
     """
-    amounts = [(p, float(value)) for p, value in zip(term.parameters, values, strict=True) if p.linear and p.low == 0.0]
+    term = fit.terms[-1]
+    own = zip(term.parameters, fit.values_of(term), strict=True)
+    amounts = [(p, float(value)) for p, value in own if p.linear and p.low == 0.0]
     alone = len(amounts) == sum(p.linear for p in term.parameters)
     return bool(amounts) and alone and all(abs(v) < rules.least_amount * min(map(abs, p.grid)) for p, v in amounts)
 
@@ -113,9 +112,9 @@ def rank(trials: list[Trial], base: Fit) -> None:
 
 def _zeros(fit: Fit) -> int:
     """Number of parameters of the last effect that ended at a lower bound of zero."""
-    parameters = fit.terms[-1].parameters
-    own = fit.values[len(fit.values) - len(parameters) :]
-    return sum(p.low == 0.0 and value <= 1e-9 * max(map(abs, p.grid)) for p, value in zip(parameters, own, strict=True))
+    term = fit.terms[-1]
+    own = zip(term.parameters, fit.values_of(term), strict=True)
+    return sum(p.low == 0.0 and value <= 1e-9 * max(map(abs, p.grid)) for p, value in own)
 
 
 def of_sampling(trial: Trial) -> bool:
@@ -127,7 +126,7 @@ def of_sampling(trial: Trial) -> bool:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
     term = trial.fit.terms[-1]
-    own = zip(term.parameters, trial.fit.values[-len(term.parameters) :], strict=True)
+    own = zip(term.parameters, trial.fit.values_of(term), strict=True)
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
     return late_s < 1.05 * trial.period_s
 
@@ -162,9 +161,8 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
     samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
-    fit = trial.fit
-    gone = vanished(fit.terms[-1], fit.values[len(fit.values) - len(fit.terms[-1].parameters) :], trial.rules)
-    return not gone and not at_bound(fit) and not of_sampling(trial) and called_for(trial, base)
+    gone = vanished(trial.fit, trial.rules)
+    return not gone and not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
 
 
 def called_for(trial: Trial, base: Fit) -> bool:
@@ -184,13 +182,17 @@ def _alone(trial: Trial, more: int) -> bool:
 
 
 def _together(trial: Trial, more: int) -> bool:
-    gain, rules = trial.both, trial.rules
+    enough = trial.both.share > _least(trial, trial.both)
+    return enough and sure_together(trial.rules, trial.heldout, trial.both, more)
+
+
+def sure_together(rules: SelectionRules, heldout: Gain, both: Gain, more: int) -> bool:
+    """Whether all samples together are sure where held-out ones are few. more: number of further parameters."""
     return (
-        gain.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
-        and gain.p_value < 0.1 * rules.significance
-        and gain.share > _least(trial, gain)
-        and trial.heldout.log_likelihood > rules.weak_log_likelihood
-        and trial.heldout.p_value < rules.weak_significance
+        both.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
+        and both.p_value < 0.1 * rules.significance
+        and heldout.log_likelihood > rules.weak_log_likelihood
+        and heldout.p_value < rules.weak_significance
     )
 
 

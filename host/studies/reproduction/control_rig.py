@@ -87,7 +87,7 @@ class LawReading(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return it in words."""
+        """Return form, length of an iteration and place of the force, as the tables name the reading."""
         form = "PI form" if self.form == "pi" else "incremental form"
         return f"{form}, {self.iteration_s * 1e3:.0f} ms, force added to the {self.force_added_to} position"
 
