@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import BOARDS, Board, Docs, Jobs, Json, Seed, checked_jobs, checked_seed, within, writable_file
+from host.cli.options import (
+    BOARDS,
+    Board,
+    Docs,
+    Jobs,
+    Json,
+    Seed,
+    checked_jobs,
+    checked_seed,
+    within,
+    writable_file,
+    writable_folder,
+)
 from host.cli.progress import Progress
 from protocol.errors import one_of
 
@@ -25,10 +38,14 @@ def faults(
     fault: Annotated[
         list[str] | None, typer.Option(help="Fault to inject; may be given several times. Default: all.")
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for finished runs; the same call goes on where it was stopped.")
+    ] = None,
     docs: Docs = None,
 ) -> None:
     """Inject faults in approach, contact and hold. Exit status 1 when a run broke a rule."""
-    from host.studies.faults.campaign import by_fault, run_campaign
+    from host.studies.faults.campaign import by_fault, plan_runs, run_campaign
+    from host.studies.faults.finished import FinishedRuns
     from host.studies.faults.report import page_section
     from host.studies.reliability_page import write_section
     from sim.board import BoardUnavailable
@@ -42,13 +59,20 @@ def faults(
         one_of("--fault", name, [row.name for row in FAULTS])
     if docs is not None:
         writable_file("--docs", docs)
+    names = tuple(fault or ())
+    kept = None
+    if out is not None:
+        settings = {"runs": runs, "seed": seed, "board": board, "faults": list(names)}
+        kept = FinishedRuns(writable_folder("--out", out), settings, plan_runs(runs, seed, names))
     try:
         with Progress() as bar:
 
-            def progress(done: int, total: int) -> None:
-                bar("faults", done / total, f"{done}/{total}")
+            def progress(result: RunResult, done: int) -> None:
+                if kept is not None:
+                    kept.add(result)
+                bar("faults", done / runs, f"{done}/{runs}")
 
-            results = run_campaign(runs, seed, processes, board, tuple(fault or ()), progress)
+            results = run_campaign(runs, seed, processes, board, names, kept.results if kept else (), progress)
     except (BoardUnavailable, RuntimeError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         raise typer.Exit(1) from None

@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from host.cli.faults import faults as command
-from host.studies.faults.campaign import RunPlan, RunResult, by_fault, plan_runs, run_campaign, violations
+from host.studies.faults.campaign import RunPlan, RunResult, by_fault, judged, plan_runs, run_campaign, violations
+from host.studies.faults.finished import FinishedRuns
 from host.studies.reliability_page import fuzz_section, write_section
 from protocol.errors import InputError
 from protocol.serial_codec import StreamDecoder
@@ -51,6 +52,29 @@ def test_what_is_drawn_stays_in_the_tables_limits() -> None:
         fault = BY_NAME[plan.fault]
         assert fault.size[0] <= plan.size <= fault.size[1] * (1 + 1e-12)
         assert fault.seconds[0] * (1 - 1e-12) <= plan.seconds <= fault.seconds[1] * (1 + 1e-12)
+
+
+def test_a_stopped_campaign_goes_on_and_refuses_another_one(tmp_path: Path) -> None:
+    plans, settings = plan_runs(3, 7), {"runs": 3, "seed": 7}
+    first = FinishedRuns(tmp_path, settings, plans)
+    hard = judged(plans[1], {"outcome": {**GOOD, "peak_force_N": 0.8}, "recording_readable": True, "recording_lost_s": 0.0,
+                             "unhandled": ""})  # fmt: skip
+    assert hard.violations
+    first.add(hard)
+    with (tmp_path / "runs.jsonl").open("a") as file:
+        file.write('{"index": 2, "outc')  # the computer went down
+    again = FinishedRuns(tmp_path, settings, plans)
+    assert again.results == [hard]
+    again.add(dataclasses.replace(hard, plan=plans[0]))
+    assert [result.plan.index for result in FinishedRuns(tmp_path, settings, plans).results] == [1, 0]
+    with pytest.raises(InputError, match="of another campaign"):
+        FinishedRuns(tmp_path, {"runs": 4, "seed": 7}, plans)
+
+
+def test_finished_runs_are_not_made_again() -> None:
+    plans = plan_runs(2, 5, ("none",))
+    finished = [dataclasses.replace(result(fault="none"), plan=plan) for plan in plans]
+    assert run_campaign(2, 5, faults=("none",), finished=finished) == finished
 
 
 def test_an_unknown_fault_is_refused() -> None:

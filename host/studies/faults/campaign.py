@@ -9,7 +9,7 @@ import resource
 import signal
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -45,7 +45,7 @@ RUN_TIMEOUT_S = 300  # of real time; a run takes a few seconds
 KNOWN_STIFFNESS = 0.1
 OVER_FORCE_SHARE = 0.9  # of the limit: a true force from which on an alarm is right
 DISK_ROOM = 20_000  # bytes left on the full disk
-Progress = Callable[[int, int], None]
+Progress = Callable[["RunResult", int], None]
 
 
 @dataclass(frozen=True)
@@ -176,26 +176,33 @@ def run_campaign(
     jobs: int = 1,
     board: str = "native",
     faults: tuple[str, ...] = (),
-    progress: Progress = lambda done, runs: None,
+    finished: Sequence[RunResult] = (),
+    progress: Progress = lambda result, done: None,
 ) -> list[RunResult]:
     """Return all runs, in the order of the plan; the same for every number of `jobs`.
 
+    finished: runs of the same campaign that are not made again.
+    progress: gets each further run and the number of runs that are finished.
     Raises ValueError for an unknown fault, BoardUnavailable where the board cannot be built.
     """
-    plans = plan_runs(runs, seed, faults)
+    results = list(finished)
+    there = {result.plan.index for result in results}
+    plans = [plan for plan in plan_runs(runs, seed, faults) if plan.index not in there]
     of_rig = [[plan for plan in plans if plan.rig == rig] for rig in sorted({plan.rig for plan in plans})]
-    results: list[RunResult] = []
+    for result in _runs_of(of_rig, seed, jobs, board):
+        results.append(result)
+        progress(result, len(results))
+    return sorted(results, key=lambda result: result.plan.index)
+
+
+def _runs_of(of_rig: list[list[RunPlan]], seed: int, jobs: int, board: str) -> Iterator[RunResult]:
     if jobs <= 1:
         for group in of_rig:
-            for result in run_on_rig(group, seed, board):
-                results.append(result)
-                progress(len(results), runs)
-    else:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            for future in as_completed([pool.submit(_all_on_rig, group, seed, board) for group in of_rig]):
-                results += future.result()
-                progress(len(results), runs)
-    return sorted(results, key=lambda result: result.plan.index)
+            yield from run_on_rig(group, seed, board)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_all_on_rig, group, seed, board) for group in of_rig]):
+            yield from future.result()
 
 
 def _all_on_rig(plans: list[RunPlan], seed: int, board: str) -> list[RunResult]:
@@ -266,11 +273,17 @@ def _forked(run: FaultyScenario, board: ForkableBoard, plan: RunPlan, drawn: Rig
         said = pipe.read()
     _, status = os.waitpid(child, 0)
     if status != 0 or not said:
-        said = json.dumps({"outcome": {}, "readable": False, "lost_s": 0.0, "unhandled": f"run ended with status {status}"})
+        failed = f"run ended with status {status}"
+        said = json.dumps({"outcome": {}, "recording_readable": False, "recording_lost_s": 0.0, "unhandled": failed})
     answered = json.loads(said)
     if answered["outcome"]:
         answered["outcome"] |= {"limit_N": drawn.limit_N(run.loop.rig), "stiffness": drawn.stiffness}
-    result = RunResult(plan, answered["outcome"], answered["readable"], answered["lost_s"], answered["unhandled"], ())
+    return judged(plan, answered)
+
+
+def judged(plan: RunPlan, answered: dict[str, Any]) -> RunResult:
+    """Return the run of `plan` with the rules that it broke. answered: the other fields of the result."""
+    result = RunResult(plan, violations=(), **answered)
     return replace(result, violations=tuple(violations(result)))
 
 
@@ -308,7 +321,12 @@ def _inject(run: FaultyScenario, plan: RunPlan) -> dict[str, Any]:
         run.watchers = []
         recording.close()
         readable, lost_s = _read_back(path, end_ns)
-    return {"outcome": asdict(watcher.close()), "readable": readable, "lost_s": lost_s, "unhandled": unhandled}
+    return {
+        "outcome": asdict(watcher.close()),
+        "recording_readable": readable,
+        "recording_lost_s": lost_s,
+        "unhandled": unhandled,
+    }
 
 
 def _read_back(path: Path, end_ns: int) -> tuple[bool, float]:
