@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,11 +12,15 @@ from pydantic import Field
 from protocol.errors import InputError
 from protocol.requests import Request, validate
 from protocol.text_files import read_toml
+from protocol.usual_values import CATHETER, unusual, warn_of
 
 CATHETER_FOLDER = Path(__file__).resolve().parent / "catheters"
 LENGTH_TOLERANCE_m = 1e-9
 
-Positive = Annotated[float, Field(gt=0.0)]
+# Bounds that no catheter, sheath or guidewire reaches: beyond them a value is in another unit.
+Length_m = Annotated[float, Field(ge=0.001, le=1.0)]
+Diameter_m = Annotated[float, Field(ge=0.0002, le=0.02)]
+Stiffness_N_m2 = Annotated[float, Field(ge=1e-7, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 
 
@@ -67,17 +71,17 @@ class Catheter:
 
 
 class _PcarFile(Request):
-    EI_N_m2: list[Positive] = Field(min_length=2)
-    distal_arcs_m: list[Positive] = Field(min_length=1)
+    EI_N_m2: list[Stiffness_N_m2] = Field(min_length=2)
+    distal_arcs_m: list[Annotated[float, Field(gt=0.0, le=1.0)]] = Field(min_length=1)
 
 
 class _CosseratFile(Request):
-    EI1_N_m2: Positive
-    EI2_N_m2: Positive
-    GJ_N_m2: Positive
-    EbI1_N_m2: Positive
-    EbI2_N_m2: Positive
-    GbJ_N_m2: Positive
+    EI1_N_m2: Stiffness_N_m2
+    EI2_N_m2: Stiffness_N_m2
+    GJ_N_m2: Stiffness_N_m2
+    EbI1_N_m2: Stiffness_N_m2
+    EbI2_N_m2: Stiffness_N_m2
+    GbJ_N_m2: Stiffness_N_m2
 
 
 class _ConstitutiveFile(Request):
@@ -87,9 +91,9 @@ class _ConstitutiveFile(Request):
 
 class _CatheterFile(Request):
     name: str = Field(min_length=1)
-    distal_length_m: Positive
-    diameter_m: Positive
-    pull_wire_offset_m: Positive
+    distal_length_m: Length_m
+    diameter_m: Diameter_m
+    pull_wire_offset_m: Annotated[float, Field(gt=0.0, le=0.01)]
     pcar: _PcarFile | None = None
     cosserat: _CosseratFile | None = None
     constitutive: _ConstitutiveFile | None = None
@@ -114,6 +118,9 @@ def load_catheter(name_or_path: str | Path) -> Catheter:
     Raises:
         InputError: an unknown name, an unreadable file, an unknown or missing key, or a value out of its range; names it.
 
+    Warns:
+        UnusualValue: a value of a file that is probably in another unit.
+
     Source:
         Thesis, Tables 2.1 and 3.2, for the catheters that ship; each file says where its values come from.
 
@@ -125,13 +132,28 @@ def load_catheter(name_or_path: str | Path) -> Catheter:
     path = CATHETER_FOLDER / f"{text}.toml" if text in shipped else Path(text)
     if text not in shipped and path.suffix != ".toml":
         raise InputError("catheter", text, f"one of {', '.join(shipped)}, or the path of a .toml file")
-    return catheter_from_table(read_toml(path, "catheter", "a readable catheter TOML file"))
+    catheter = catheter_from_table(read_toml(path, "catheter", "a readable catheter TOML file"))
+    if text not in shipped:
+        warn_of(unusual_parameters(catheter), text)
+    return catheter
+
+
+def unusual_parameters(catheter: Catheter) -> list[str]:
+    """Return a line for each accepted parameter that is probably in another unit, for a warning."""
+    parameters = asdict(catheter)
+    if catheter.cosserat is not None:
+        parameters["cosserat"] = {f"{name}_N_m2": value for name, value in parameters["cosserat"].items()}
+    return unusual(parameters, CATHETER)
 
 
 def catheter_from_table(data: dict[str, object]) -> Catheter:
     """The catheter of one parsed TOML table. Raises InputError, naming the key."""
     file = validate(_CatheterFile, data)
     pcar = cosserat = constitutive = None
+    if file.pull_wire_offset_m > 0.5 * file.diameter_m:
+        raise InputError(
+            "pull_wire_offset_m", file.pull_wire_offset_m, f"at most half of diameter_m, {0.5 * file.diameter_m:g}"
+        )
     if file.pcar is not None:
         _check_arcs(file)
         pcar = PcarParameters(tuple(file.pcar.EI_N_m2), tuple(file.pcar.distal_arcs_m))

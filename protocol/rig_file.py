@@ -18,6 +18,7 @@ from protocol.requests import first_of, known_keys, unknown_key, wanted_of
 from protocol.text_files import read_toml
 from protocol.topics import check_name
 from protocol.unit_slips import hint_of
+from protocol.usual_values import NET_FT, RIG, unusual, warn_of
 from protocol.zenoh_access import Network, check_network_endpoint
 
 AXES = ("insertion", "roll", "knob")
@@ -587,12 +588,19 @@ def catheter_problems(rig: Rig) -> list[str]:
     ]
 
 
+def unusual_values(rig: Rig) -> list[str]:
+    """Return a line for each accepted value that is probably in another unit, for a warning."""
+    ranges = RIG | NET_FT if rig.force_sensor.kind == "net_ft" else RIG
+    return unusual(rig.effective(), ranges)
+
+
 def load_rig(path: str | Path) -> Rig:
-    """Load the rig in TOML file `path`, checked as `seldinger rig check` does.
+    """Load the rig in TOML file `path`, checked as `seldinger rig check` does; warn (UnusualValue) of unusual values.
 
     Raises InputError (unreadable file, unknown key, value out of its bounds, another catheter).
     """
     rig = parse_rig(read_rig_data(path), str(path))
     for problem in catheter_problems(rig):
         raise InputError.from_sentence(f"{path}: {problem}")
+    warn_of(unusual_values(rig), str(path))
     return rig

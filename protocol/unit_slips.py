@@ -10,7 +10,10 @@ from typing import Any
 _ENDINGS: tuple[tuple[str, str, dict[str, float]], ...] = (
     ("_m_per_s2", "m/s2", {"mm/s2": 1e-3}),
     ("_m_per_s", "m/s", {"mm/s": 1e-3}),
+    ("_m_per_N_s", "m/(N s)", {"mm/(N s)": 1e-3}),
     ("_m_per_N", "m/N", {"mm/N": 1e-3}),
+    ("_N_per_s", "N/s", {"mN/s": 1e-3}),
+    ("_N_m2", "N m2", {"N mm2": 1e-6}),
     ("_per_m", "1/m", {"1/mm": 1e3}),
     ("_hz", "Hz", {"kHz": 1e3}),
     ("_rad", "rad", {"degrees": math.pi / 180.0}),
@@ -43,6 +46,21 @@ def hint(place: tuple[Any, ...], value: object, fits: Callable[[float], bool]) -
     for unit, size in sizes.items():
         if fits(value * size):
             return f"; in {si}: {value:g} {unit} is {value * size:.6g}"
+    return ""
+
+
+def reverse_hint(place: tuple[Any, ...], value: float, fits: Callable[[float], bool]) -> str:
+    """Say that `value` looks like one that was converted twice, or that a smaller unit would explain it.
+
+    Args and fits as in `hint`.
+
+    Returns:
+        "; 2.5e-05 s is 0.025 ms", or nothing where no unit explains the value.
+    """
+    si, sizes = _units(place)
+    for unit, size in sizes.items():
+        if fits(value / size):
+            return f"; {value:g} {si} is {value / size:.6g} {unit}"
     return ""
 
 

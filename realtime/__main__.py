@@ -7,6 +7,7 @@ import logging
 import signal
 import sys
 import threading
+import warnings
 from pathlib import Path
 from types import FrameType
 
@@ -34,8 +35,12 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
     try:
+        with warnings.catch_warnings(record=True) as unusual:
+            rig = load_rig(options.rig)
+        for warning in unusual:
+            logging.getLogger("rig").warning(str(warning.message))
         process = RealtimeProcess(
-            load_rig(options.rig),
+            rig,
             board_port=options.board_port,
             tracker_port=options.tracker_port,
             force_port=options.force_port,

@@ -9,15 +9,17 @@ import os
 import re
 import signal
 import sys
+import warnings
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 
 from host.cli.extras import missing_extra
 from protocol import compile_notice
 from protocol.errors import Description, InputError, any_of
+from protocol.usual_values import UnusualValue
 
 # command -> (module, function, one line for the overview)
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -261,6 +263,24 @@ def _open_standard_streams() -> None:
             setattr(sys, name, text)
 
 
+_python_shows = warnings.showwarning
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print an unusual value of a rig or catheter file as one line; other warnings as Python does."""
+    if issubclass(category, UnusualValue):
+        print(f"seldinger: warning: {_one_line(str(message))}", file=sys.stderr)
+    else:
+        _python_shows(message, category, filename, lineno, file, line)
+
+
 def _one_line(text: str) -> str:
     """Return `text` on one line, without the characters that would steer a terminal."""
     return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in " ".join(text.split()))
@@ -320,6 +340,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, _interrupt)
     argv = sys.argv[1:]
     _open_standard_streams()
+    warnings.showwarning = _show_warning
     compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
         status = _run(argv)

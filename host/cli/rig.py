@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +11,9 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json
-from protocol.rig_file import Rig, catheter_problems, parse_rig, problems_of, read_rig_data
+from protocol.catheter import load_catheter, unusual_parameters
+from protocol.rig_file import Rig, catheter_problems, parse_rig, problems_of, read_rig_data, unusual_values
+from protocol.usual_values import UnusualValue
 
 rig = typer.Typer(help="Check a rig file; show the effective configuration.", no_args_is_help=True)
 
@@ -26,8 +29,29 @@ def check(
     json: Json = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only mistakes.")] = False,
 ) -> None:
-    """Check FILE and show its effective configuration. Exit status 2 and a line for each mistake."""
+    """Check FILE and show its effective configuration. Exit status 2 and a line for each mistake.
+
+    An accepted value that is probably in another unit gets a warning, with exit status 0.
+    """
     data = read_rig_data(file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnusualValue)  # printed below, and part of the JSON
+        _refuse_mistakes(file, data)
+        good = parse_rig(data, str(file))
+        of_catheter = unusual_parameters(load_catheter(good.catheter.name))
+    suspect = [*unusual_values(good), *(f"{good.catheter.name}: {line}" for line in of_catheter)]
+    if json:
+        write_json({"file": str(file), "good": True, "unusual": suspect, "configuration": good.effective()})
+    elif not quiet:
+        _show(good, data)
+    for line in suspect:
+        print(f"seldinger: warning: {file}: {line}", file=sys.stderr)
+    if not quiet and not json:
+        print(f"{good.name}: good" + (f", {len(suspect)} unusual" if suspect else ""), file=sys.stderr)
+
+
+def _refuse_mistakes(file: Path, data: dict[str, Any]) -> None:
+    """Print a line for each mistake in the rig file; exit with status 2 if there is one."""
     problems = problems_of(data)
     if not problems:
         read = parse_rig(data, str(file))
@@ -40,11 +64,6 @@ def check(
         print(f"seldinger: {file}: {problem}", file=sys.stderr)
     if problems:
         raise typer.Exit(2)
-    good = parse_rig(data, str(file))
-    if json:
-        write_json({"file": str(file), "good": True, "configuration": good.effective()})
-    elif not quiet:
-        _show(good, data)
 
 
 def _rows(section: dict[str, Any], given: Any, prefix: str = "") -> list[tuple[str, str, str]]:
@@ -66,4 +85,3 @@ def _show(good: Rig, data: dict[str, Any]) -> None:
     for row in _rows(good.effective(), data):
         table.add_row(*row)
     Console(highlight=False).print(table)
-    print(f"{good.name}: good", file=sys.stderr)

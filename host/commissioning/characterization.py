@@ -18,9 +18,10 @@ from host.recordings.header import header_of
 from host.recordings.recording import RecordingFile
 from host.recordings.writer import RecordingWriter
 from protocol.errors import InputError
-from protocol.rig_file import Rig, load_rig, parse_rig
+from protocol.rig_file import Rig, load_rig, parse_rig, unusual_values
 from protocol.text_files import read_toml
 from protocol.topics import Message
+from protocol.usual_values import warn_of
 from realtime.core.lines import FromRig
 from realtime.core.sweep import Sweep, SweepLoop, check_sweeps
 from sim.board import SimulatedBoard
@@ -331,6 +332,7 @@ def load_calibrated_rig(rig_file: str | Path, calibration_file: str | Path | Non
             f"{calibration_file}: transmission.catheter: found {of!r}, wanted {wanted!r}, the rig's: "
             "it was calibrated with another catheter"
         )
+    warn_of((line for line in unusual_values(rig) if line.startswith("transmission.")), str(calibration_file))
     return rig
 
 

@@ -15,6 +15,8 @@ from realtime.drivers.stepper_board import FAULT_ADVICE, BoardEventKind, BoardSt
 from realtime.drivers.transport import Transport, open_serial
 
 STATUS_HZ, BRING_UP_S = 200.0, 5.0
+# A box states its counts with at least six digits.
+COUNTS_TOLERANCE = 1e-3
 
 
 def check_tracker(rig: Rig, port: str, seconds: float) -> DeviceReport:
@@ -42,7 +44,25 @@ def check_force_box(rig: Rig, address: str, seconds: float, udp_port: int, web_p
             seconds,
             rig.force_sensor.kind,
         )
-    return check_net_ft(address or rig.force_sensor.address, seconds, udp_port, web_port)
+    report = check_net_ft(address or rig.force_sensor.address, seconds, udp_port, web_port)
+    report.problems += _count_problems(rig, report)
+    return report
+
+
+def _count_problems(rig: Rig, report: DeviceReport) -> list[str]:
+    """Compare the rig file's counts, with which the control loop converts every force, with those of the box."""
+    sensor, problems = rig.force_sensor, []
+    for key, own, quantity in (
+        ("counts_per_N", sensor.counts_per_newton, "newton"),
+        ("counts_per_Nm", sensor.counts_per_newton_metre, "newton_metre"),
+    ):
+        of_box = report.figures.get(key)
+        if isinstance(of_box, float) and abs(own / of_box - 1.0) > COUNTS_TOLERANCE:
+            problems.append(
+                f"force_sensor.counts_per_{quantity}: found {own:g}, wanted {of_box:g}, which the box has; "
+                f"{'forces' if quantity == 'newton' else 'torques'} are read {of_box / own:.4g} times as large as they are"
+            )
+    return problems
 
 
 def check_board(rig: Rig, port: str, seconds: float) -> DeviceReport:

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 from types import FrameType
 
@@ -17,6 +18,7 @@ from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter
 from protocol.rig_file import load_rig
 from protocol.topics import Log
+from protocol.usual_values import UnusualValue
 from protocol.zenoh_session import Session
 from realtime.loop.service_notify import ServiceNotifier
 
@@ -118,6 +120,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int)
     options = parser.parse_args(arguments)
     stop = _stop_on_signals()
+    warnings.simplefilter("ignore", UnusualValue)  # the realtime process reports them
     try:
         rig = load_rig(options.rig)
         estimator = load_estimator(options.estimator, rig)

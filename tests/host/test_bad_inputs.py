@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from host.cli import main as command_line
+from protocol.catheter import CATHETER_FOLDER
 from protocol.rig_file import SIMULATED_RIG
 
 RIG = SIMULATED_RIG.read_text(encoding="utf-8")
@@ -69,6 +70,15 @@ def rig(old: str, new: str) -> str:
     """The simulated rig's file with `old` replaced by `new`."""
     assert old in RIG, old
     return RIG.replace(old, new, 1)
+
+
+CATHETER = (CATHETER_FOLDER / "blazer_prime_xp.toml").read_text(encoding="utf-8")
+
+
+def catheter(old: str, new: str) -> str:
+    """The catheter file of the simulated rig with `old` replaced by `new`."""
+    assert old in CATHETER, old
+    return CATHETER.replace(old, new, 1)
 
 
 def solve(**changes: object) -> str:
@@ -191,6 +201,15 @@ FILES: dict[str, str | bytes] = {
     "rig-counts.toml": rig("encoder_counts_per_step = 1.0", "encoder_counts_per_step = 1000.0"),
     "rig-digits.toml": rig("loop_hz = 1000 ", "loop_hz = 1" + "0" * 5000),
     "rig-length.toml": rig("distal_length_m = 0.110", "distal_length_m = 110.0"),
+    # catheter files
+    "catheter-mm.toml": catheter("distal_length_m = 0.110", "distal_length_m = 110.0"),
+    "catheter-french.toml": catheter("diameter_m = 0.00233", "diameter_m = 7.0"),
+    "catheter-stiff.toml": catheter("EI1_N_m2 = 0.1902e-3", "EI1_N_m2 = 190.2"),
+    "catheter-offset.toml": catheter("pull_wire_offset_m = 0.0007", "pull_wire_offset_m = 0.007"),
+    "catheter-nan.toml": catheter("EI1_N_m2 = 0.1902e-3", "EI1_N_m2 = nan"),
+    "catheter-text.toml": catheter("diameter_m = 0.00233", 'diameter_m = "7 F"'),
+    "catheter-key.toml": catheter("diameter_m", "diametre_m"),
+    "catheter-arcs.toml": catheter("distal_arcs_m = [0.011,", "distal_arcs_m = [11.0,"),
     # protocols and scripts
     "protocol-key.toml": PROTOCOL + "[tolerence]\nforce_N = 0.1\n",
     "protocol-step.toml": PROTOCOL.replace('"goto"', '"fly"'),
@@ -543,6 +562,20 @@ CASES: list[Case] = [
             ("counts", "encoder_counts_per_step"),
         )
         for words in (("rig", "check", f"rig-{name}.toml"), ("demo", "--rig", f"rig-{name}.toml"))
+    ),
+    # catheter files
+    *(
+        (("calibrate", "shapes.json", "--catheter", f"catheter-{name}.toml"), text)
+        for name, text in (
+            ("mm", "110 mm is 0.11"),
+            ("french", "7 mm is 0.007"),
+            ("stiff", "190.2 N mm2 is 0.0001902"),
+            ("offset", "at most half of diameter_m"),
+            ("nan", "cosserat.EI1_N_m2"),
+            ("text", "diameter_m"),
+            ("key", "did you mean diameter_m?"),
+            ("arcs", "distal_arcs_m"),
+        )
     ),
     # protocols and scripts
     (("run", "--dry-run", "protocol-key.toml"), "did you mean tolerance?"),

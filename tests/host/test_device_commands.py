@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from host.cli.check_device import check_device
 from host.cli.flash import flash
+from host.commissioning import device_check
 from host.commissioning import firmware_flash as flash_module
 from host.commissioning.board_inputs import input_lines, input_problems
 from host.commissioning.firmware_flash import avrdude_command, built
@@ -21,6 +22,7 @@ from protocol.board_pins import definitions
 from protocol.errors import InputError
 from protocol.rig_file import Pins, load_rig, parse_rig, problems_of, read_rig_data
 from protocol.serial_frames import InputBit
+from realtime.drivers.check_device import DeviceReport
 from sim.board import BUILD_DIR
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S, until
@@ -186,3 +188,19 @@ def test_the_call_of_avrdude_names_part_loader_and_file() -> None:
     command = avrdude_command("atmega328p", "/dev/ttyUSB0", Path("f.elf"))
     assert command[:3] == ["avrdude", "-p", "m328p"] and command[-1] == "flash:w:f.elf:e"
     assert "57600" in avrdude_command("atmega328p", "/dev/ttyUSB0", Path("f.elf"), 57600)
+
+
+def test_counts_of_the_rig_file_that_are_not_those_of_the_box_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = read_rig_data(RIG_FILE)
+    data["force_sensor"]["counts_per_newton"] = 1000.0  # the box has 1e6: every force would be 1000 times too large
+    of_box: dict[str, Any] = {"counts_per_N": 1e6, "counts_per_Nm": 1e9}
+
+    def box(*_: Any) -> DeviceReport:
+        return DeviceReport("net_ft", dict(of_box))
+
+    monkeypatch.setattr(device_check, "check_net_ft", box)
+    report = device_check.check_force_box(parse_rig(data), "", 1.0, 1, 1)
+    assert not report.good and len(report.problems) == 1
+    assert "force_sensor.counts_per_newton: found 1000, wanted 1e+06" in report.problems[0]
+    assert "forces are read 1000 times as large" in report.problems[0]
+    assert device_check.check_force_box(load_rig(RIG_FILE), "", 1.0, 1, 1).good
