@@ -71,11 +71,18 @@ class Driver:
 
     def failed(self, text: str) -> typer.Exit:
         """Note that the command was accepted but not completed; the exit status is 1."""
-        state = self.state
-        why = f"; safety: {state.cause}" if state is not None and state.cause else ""
+        why = self.why()
         self.result |= {"done": False, "text": text + why}
         self.say(text + why)
         return typer.Exit(1)
+
+    def why(self) -> str:
+        """Return the end of a sentence with the first cause of what holds the rig back; empty if nothing does."""
+        state = self.state
+        if state is None or state.safety_action in ("none", "warn"):
+            return ""
+        cause = self.rig.first_cause()
+        return f"; first cause: {cause}" if cause else f"; safety: {state.cause}"
 
     def finish(self) -> None:
         """Print the result as one JSON object on standard output, if `--json` is given."""
@@ -109,8 +116,9 @@ def driving(
                 connection.take()
             yield driver
         except CommandRefused as refused:
-            driver.result |= {"accepted": False, "text": refused.acknowledgement.reason}
-            print(f"seldinger: {refused}", file=sys.stderr)
+            why = driver.why()
+            driver.result |= {"accepted": False, "text": refused.acknowledgement.reason + why}
+            print(f"seldinger: {refused}{why}", file=sys.stderr)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             connection.hold()

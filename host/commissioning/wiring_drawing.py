@@ -142,5 +142,7 @@ def drawings() -> dict[str, str]:
 
 
 if __name__ == "__main__":
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/pictures")
+    folder.mkdir(parents=True, exist_ok=True)
     for file_name, text in drawings().items():
-        (Path(sys.argv[1] if len(sys.argv) > 1 else "docs/pictures") / file_name).write_text(text, encoding="utf-8")
+        (folder / file_name).write_text(text, encoding="utf-8")

@@ -54,6 +54,13 @@ class RigConnection:
         for topic in ("state", "commander", "board"):
             self._reader(topic)
 
+    def first_cause(self) -> str:
+        """Listen for a second; return the first cause of what holds the rig back, and its remedy; empty if nothing does."""
+        from host.run.rig_status import read_status
+
+        found = read_status(self._session, self.rig.name)
+        return f"{found.cause} {found.remedy}" if found.cause else ""
+
     def latest(self, topic: str) -> Message | None:
         """Return the newest message of a topic, None where none has come since the connection or the first call.
 

@@ -34,6 +34,7 @@ AURORA, NET_FT = "aurora", "net_ft"
 SILENT_S = 1.0
 
 Sample = TypeVar("Sample")
+T = TypeVar("T")
 
 
 class DeviceSource(Protocol[Sample]):
@@ -90,14 +91,29 @@ class SourceThread(SensorThread, Generic[Sample]):
         self._kind, self._open, self._callback = kind, open_source, callback
         self._flows, self._flowed, self._reported = False, False, ""
 
+    def _driver(self, what: str, call: Callable[[], T]) -> T:
+        """Call into the driver. Raises OSError for anything that it raises: a plug-in's fault is reported like a loss."""
+        try:
+            return call()
+        except OSError:
+            raise
+        except InputError as error:
+            raise OSError(f"{self._kind}: {error}") from error
+        except Exception as error:
+            said = " ".join(str(error).split())
+            raise OSError(
+                f"{self._kind}: {what} failed with {type(error).__name__}: {said}; check its section of the rig file "
+                "(port, options), then the driver"
+            ) from error
+
     def _serve(self) -> None:
-        source = self._open()
+        source = self._driver("open", self._open)
         # What a source's own checks have found, where it has any.
         take_events: Callable[[], list[DeviceEvent]] = getattr(source, "take_events", list)
         try:
             newest_ns = self._now_ns()
             while not self._halt.is_set():
-                samples = source.read()
+                samples = self._driver("read", source.read)
                 now_ns = self._now_ns()
                 if samples:
                     newest_ns = now_ns

@@ -180,6 +180,8 @@ def _run(thread: SensorThread, samples: list[Any], seconds: float, report: Devic
         time.sleep(seconds)
     thread.stop()
     report.problems += [event.text for event in report.events if event.kind is DeviceEventKind.ERROR]
+    if thread.error is not None:
+        report.problems.append(f"{report.device}: ended by {type(thread.error).__name__}: {thread.error}")
     if not samples and not report.problems:
         report.problems.append(f"no sample within {start_up_s:g} s")
     return bool(samples)

@@ -34,7 +34,7 @@ class SerialTransport:
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=0.5, exclusive=True)
         except serial.SerialException as error:
-            raise OSError(f"serial port: found {path} that does not open ({error}), wanted a free device") from error
+            raise OSError(_not_opened(path, error)) from error
 
     def read(self) -> bytes:
         """Return the bytes that have arrived, at most 4096."""
@@ -57,6 +57,18 @@ class SerialTransport:
     def close(self) -> None:
         """Close the serial port."""
         self._port.close()
+
+
+def _not_opened(path: str, error: serial.SerialException) -> str:
+    """Say why the port at `path` does not open, and what to do."""
+    if path.startswith("pty:"):
+        return (
+            f"serial port: found {path} that does not open, wanted a device such as /dev/serial/by-id/...; pty: stands for "
+            "a port of the simulated rig, which its own process opens"
+        )
+    # pyserial's sentence repeats the path and the number of the error.
+    said = os.strerror(error.errno) if error.errno else str(error)
+    return f"serial port: found {path} that does not open ({said}), wanted a free device"
 
 
 class PipeTransport:

@@ -204,3 +204,10 @@ def test_counts_of_the_rig_file_that_are_not_those_of_the_box_are_reported(monke
     assert "force_sensor.counts_per_newton: found 1000, wanted 1e+06" in report.problems[0]
     assert "forces are read 1000 times as large" in report.problems[0]
     assert device_check.check_force_box(load_rig(RIG_FILE), "", 1.0, 1, 1).good
+
+
+def test_a_port_of_the_simulated_rig_is_named_as_such() -> None:
+    report = device_check.check_board(load_rig(RIG_FILE), "", 0.1)
+    assert len(report.problems) == 1 and "pty: stands for a port of the simulated rig" in report.problems[0]
+    absent = device_check.check_board(load_rig(RIG_FILE), "/dev/ttyACM99", 0.1)
+    assert "found /dev/ttyACM99 that does not open (No such file or directory), wanted a free device" in absent.problems[0]

@@ -202,18 +202,46 @@ def test_a_session_from_arm_to_disarm(rig: VirtualRig, tmp_path: Path) -> None:
     assert said("hold")["accepted"] and said("clear")["accepted"]
 
 
-def test_the_status_puts_the_first_cause_first() -> None:
-    state = RigState(
+def stopped_state() -> RigState:
+    """The state of a rig that a silent board has stopped."""
+    return RigState(
         stamp_ns=1,
         mode="stopped",
         safety_action="stop",
-        cause="no status from the stepper board",
+        cause="no status from the stepper board; no pose for longer than the limit: stopped",
         tip_m=(0.0, -0.01, 0.02),
         force_N=0.01,
         pose_age_ns=20_000_000,
         poses_rejected=0,
         forces_rejected=0,
     )
+
+
+class StoppedRig:
+    """A connection to a rig that has stopped, with its first cause."""
+
+    def __init__(self, cause: str) -> None:
+        self._cause = cause
+
+    def latest(self, topic: str) -> RigState:
+        return stopped_state()
+
+    def first_cause(self) -> str:
+        return self._cause
+
+
+def test_a_motion_that_fails_states_the_first_cause_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    driver = drive.Driver(StoppedRig("The computer stood still for 812 ms. End other programs."), "goto", json=False)  # type: ignore[arg-type]
+    driver.failed("not reached: 10.7 mm off, phase stopped")
+    said = capsys.readouterr().err
+    assert said.endswith("phase stopped; first cause: The computer stood still for 812 ms. End other programs.\n")
+    assert "no pose" not in said and driver.result["text"] in said
+    unknown = drive.Driver(StoppedRig(""), "goto", json=False)  # type: ignore[arg-type]
+    assert unknown.why().startswith("; safety: no status from the stepper board")
+
+
+def test_the_status_puts_the_first_cause_first() -> None:
+    state = stopped_state()
     status = RigStatus(
         rig="lab", newest={"state": state}, cause="The loop was late.", remedy="Close other programs.", followed=("Then.",)
     )

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from host.commissioning.device_check import check_force_box, check_tracker
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, parse_rig, read_rig_data
-from realtime.core.device_sources import FORCE_SENSORS, TRACKERS, force_thread, tracker_thread
-from realtime.drivers.device_events import DeviceEventKind
+from realtime.core.device_sources import FORCE_SENSORS, TRACKERS, SourceThread, force_thread, tracker_thread
+from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.nano17_daq import Nano17Source, open_force_sensor
 from tests.waiting import until
 
@@ -133,3 +134,44 @@ def test_a_box_without_its_counts_is_refused() -> None:
     del data["force_sensor"]["counts_per_newton"]
     with pytest.raises(InputError, match=r"force_sensor\.counts_per_newton"):
         parse_rig(data)
+
+
+@pytest.mark.usefixtures("lab_devices")
+@pytest.mark.parametrize(
+    ("section", "changes", "says"),
+    [
+        ("tracker", {"port": "abc"}, "udp_text: open failed with ValueError: invalid literal for int()"),
+        ("force_sensor", {"options": {}}, "udp_text: open failed with KeyError: 'port'"),
+    ],
+)
+def test_a_fault_of_a_plug_in_is_one_line_of_the_device_check(
+    section: str, changes: dict[str, object], says: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rig = rig_with(section, kind="udp_text", **changes)
+    report = check_tracker(rig, "", 1.0) if section == "tracker" else check_force_box(rig, "", 1.0, 1, 1)
+    assert len(report.problems) == 1 and report.problems[0].startswith(says), report.problems
+    assert "check its section of the rig file" in report.problems[0] and "Traceback" not in capfd.readouterr().err
+
+
+def test_a_driver_that_fails_while_it_reads_is_opened_again() -> None:
+    class Failing:
+        """A source whose second reading divides by zero."""
+
+        count = 0
+
+        def read(self) -> list[int]:
+            self.count += 1
+            return [1 // (self.count % 2)]
+
+        def close(self) -> None:
+            closed.append(True)
+
+    samples: list[int] = []
+    events: list[DeviceEvent] = []
+    closed: list[bool] = []
+    thread: SourceThread[int] = SourceThread("mine", Failing, samples.append, events.append)
+    thread.start()
+    assert until(lambda: len(samples) > 1)
+    thread.stop()
+    assert thread.error is None and closed
+    assert any("mine: read failed with ZeroDivisionError" in event.text for event in events)
