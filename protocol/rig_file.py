@@ -162,6 +162,25 @@ class Tracker(_Section):
     base_from_tracker_wxyz: Quaternion
 
     @model_validator(mode="after")
+    def _addressed(self) -> Tracker:
+        """Check the address and the names of the tools: a mistake there would be a tracker that never sends."""
+        if not self.port.strip():
+            raise ValueError("port that is not empty, such as /dev/serial/by-id/...")
+        if not self.tip_handle.strip() or self.tip_handle == self.shaft_handle:
+            raise ValueError("tip_handle and shaft_handle of two different tools")
+        if self.kind == "aurora":
+            for key, handle in (("tip_handle", self.tip_handle), ("shaft_handle", self.shaft_handle)):
+                if not re.fullmatch(r"[0-9A-F]{2}", handle):
+                    raise ValueError(
+                        f'{key} of two characters 0 to 9 and A to F, as the Aurora numbers its tools, such as "0A"'
+                    )
+        if self.kind == "openigtlink":
+            found = re.fullmatch(r"(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?", self.port)
+            if found is None or not 0 < int(found[2] or 1) < 65536:
+                raise ValueError("port: HOST:PORT of the OpenIGTLink server, such as 127.0.0.1:18944")
+        return self
+
+    @model_validator(mode="after")
     def _unit(self) -> Tracker:
         if abs(math.hypot(*self.base_from_tracker_wxyz) - 1) > 1e-3:
             raise ValueError("base_from_tracker_wxyz of unit length")
@@ -191,6 +210,14 @@ class ForceSensorSection(_Section):
         if isinstance(data, dict) and data.get("kind", "net_ft") != "net_ft":
             return {"counts_per_newton": 1.0, "counts_per_newton_metre": 1.0, **data}
         return data
+
+    @model_validator(mode="after")
+    def _addressed(self) -> ForceSensorSection:
+        if not self.address.strip():
+            raise ValueError("address that is not empty")
+        if self.kind == "net_ft" and not re.fullmatch(r"[A-Za-z0-9._:-]+", self.address):
+            raise ValueError("address of the box: a host name or IP address alone, such as 192.168.1.1")
+        return self
 
     @model_validator(mode="after")
     def _unit(self) -> ForceSensorSection:
@@ -240,7 +267,7 @@ class Pins(_Section):
 class BoardSection(_Section):
     """The stepper board: its serial port, how far ahead set-points are sent, how long they hold, its pins."""
 
-    port: str
+    port: Annotated[str, Field(min_length=1)]
     baud: Annotated[int, Field(gt=9600, le=1_000_000)]
     setpoint_lead_s: Annotated[float, Field(ge=0.001, le=0.004)]
     setpoint_expiry_s: Annotated[float, Field(ge=0.001, le=0.02)]

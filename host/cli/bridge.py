@@ -44,7 +44,7 @@ def igtl(
             served = IgtlBridge(session, (address, port))
         except OSError as error:
             raise InputError(
-                "--port", f"{address}:{port}", f"an address and a free port ({error.strerror or error})"
+                "--address, --port", f"{address}:{port}", f"an address and a free port ({error.strerror or error})"
             ) from None
         with contextlib.closing(served):
             _say(f"rig {read.name} over OpenIGTLink at {address}:{port}  (Ctrl-C ends it)")

@@ -22,9 +22,10 @@ def play(
     json: Json = False,
 ) -> None:
     """Show a recording in a browser: play, pause, seek."""
+    within("--speed", speed, 0.05, 50.0)
+    # Loaded after the check: the server takes seconds.
     from host.view.serve import check_port, page_address, serve_recording
 
-    within("--speed", speed, 0.05, 50.0)
     check_port(port)
     opened = open_recording(recording, unpack_limit)
     if json:

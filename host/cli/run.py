@@ -46,9 +46,6 @@ def run(
     json: Json = False,
 ) -> None:
     """Run a protocol: go to points, touch, follow a line on the wall, wait. Exit status 1 if a step failed or is off."""
-    from host.report.protocol_report import write_protocol_report
-    from host.run import protocol_file, protocol_run
-
     one_of("--board", board, BOARDS)
     checked_seed(seed)
     effects = checked_effects(effect)
@@ -59,6 +56,10 @@ def run(
     loaded = load_rig(rig)
     if not dry_run:
         writable_folder("--out", directory)
+    # Loaded after the checks: models take seconds.
+    from host.report.protocol_report import write_protocol_report
+    from host.run import protocol_file, protocol_run
+
     steps = protocol_file.read_protocol(protocol, loaded)
     checked = protocol_file.dry_run(steps, loaded)
     earlier = () if resume is None else protocol_run.read_result(resume, steps)

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import WAITING, Picture
 from host.view.source import refusal
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 from protocol.requests import Request
 from protocol.text_files import read_json
 
@@ -67,7 +67,8 @@ def read_findings(source: str) -> Findings:
         ]
         return Findings(verdict=data["verdict"], says=[effect["says"] for effect in data["effects"]], windows=windows)
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(source, f"{type(error).__name__}: {error}", "the JSON that `seldinger diagnose` writes") from None
+        what = f"no key {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise InputError(source, Description(what), "the JSON that `seldinger diagnose` writes") from None
 
 
 def origin_ns(recording: RecordingFile) -> int:

@@ -98,7 +98,7 @@ class SourceThread(SensorThread, Generic[Sample]):
         except OSError:
             raise
         except InputError as error:
-            raise OSError(f"{self._kind}: {error}") from error
+            raise OSError(str(error)) from error
         except Exception as error:
             said = " ".join(str(error).split())
             raise OSError(

@@ -74,8 +74,9 @@ def parse_calibration(page: bytes) -> NetFtCalibration:
 
 def fetch_calibration(host: str, port: int = 80, timeout_s: float = 2.0) -> NetFtCalibration:
     """Read the page from the box's web server. Raises OSError when it cannot be reached, ValueError as above."""
-    connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
+    connection = None
     try:
+        connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
         connection.request("GET", "/netftapi2.xml")
         response = connection.getresponse()
         page = response.read(MAX_PAGE_BYTES + 1)
@@ -83,7 +84,8 @@ def fetch_calibration(host: str, port: int = 80, timeout_s: float = 2.0) -> NetF
         found = getattr(bad, "strerror", None) or str(bad) or type(bad).__name__
         raise OSError(f"http://{host}:{port}/netftapi2.xml: found no web page ({found}), wanted the box's own") from bad
     finally:
-        connection.close()
+        if connection is not None:
+            connection.close()
     if response.status != 200:
         raise OSError(f"{host}:{port}/netftapi2.xml: found HTTP status {response.status}, wanted 200")
     return parse_calibration(page)

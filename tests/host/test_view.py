@@ -169,7 +169,7 @@ def test_windows_of_a_diagnosis_are_placed_on_the_recordings_time(recording: Pat
     assert [(window["from"], window["to"]) for window in hello["windows"]] == [(0.1, 0.2), (0.4, 0.5)]
     assert hello["says"] == ["Play of 3 mm."] and hello["verdict"] == "missing_physics"
     report.write_text('{"verdict": "nothing_missing"}')
-    with pytest.raises(InputError, match="seldinger diagnose"):
+    with pytest.raises(InputError, match="found no key 'located', wanted the JSON that `seldinger diagnose` writes"):
         read_findings(str(report))
     with pytest.raises(InputError, match="--speed"):
         player(recording, speed=0.0)
