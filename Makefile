@@ -96,7 +96,7 @@ prove-worlds: setup
 	@$(BIN)/seldinger prove --cases 100 --seed $(SEED) --world all
 
 live-study: setup
-	@$(BIN)/python -m host.studies.live_study --quiet-hours 5 --planted 60 --doubled --out runs/live --docs docs/live.md
+	@$(BIN)/python -m host.studies.live_study --jobs press round hand --quiet-hours 5 --fresh-hours 5 --planted 60 --doubled --out runs/live --docs docs/live.md
 
 faults: setup
 	@$(BIN)/seldinger faults --runs 2000 --seed 1 --jobs 2 --docs docs/reliability.md

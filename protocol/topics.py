@@ -506,7 +506,8 @@ class Alarm(Message, frozen=True, kw_only=True):
     channel: Annotated[Text, doc("output with the largest mismatch")]
     score: Annotated[Score, doc("mismatch relative to its limit; above 1 is an alarm")]
     explained: Annotated[Share, doc("share of the mismatch that the cause explains")]
-    since_ns: Annotated[Stamp_ns, doc("time of the first abnormal window, on the rig's clock")]
+    probability: Annotated[Share, doc("probability of the cause among those that were fitted; 0: not known")] = 0.0
+    since_ns: Annotated[Stamp_ns, doc("estimated begin of the mismatch, on the rig's clock")]
     words: Annotated[Text, doc("alarm in one sentence")]
 
 

@@ -240,13 +240,15 @@ class FrameCollector:
         if lost < 0:
             return 0
         for _ in range(min(lost, self.rows.maxlen or 0)):
-            self.stamps_ns.append(self.stamps_ns[-1] + self.period_ns)
-            self.rows.append(np.full(len(COLUMNS), np.nan))
-        self.stamps_ns.append(tip.stamp_ns)
-        self.rows.append(
-            np.array([*self._handle(tip.stamp_ns), *_numbers(tip), *_numbers(shaft), *self._force(tip.stamp_ns)])
-        )
+            self.append(self.stamps_ns[-1] + self.period_ns, np.full(len(COLUMNS), np.nan))
+        stamp_ns = tip.stamp_ns
+        self.append(stamp_ns, np.array([*self._handle(stamp_ns), *_numbers(tip), *_numbers(shaft), *self._force(stamp_ns)]))
         return lost + 1
+
+    def append(self, stamp_ns: int, row: Array) -> None:
+        """Add a finished row (columns,): of a frame, or of a recording that is watched again."""
+        self.stamps_ns.append(stamp_ns)
+        self.rows.append(row)
 
     def _handle(self, stamp_ns: int) -> list[float]:
         """Handle (3,) at `stamp_ns`, straight between messages."""
@@ -263,7 +265,12 @@ class FrameCollector:
         return list(after[1:])
 
     def _force(self, stamp_ns: int) -> list[float]:
-        near = [force for stamp, force in self._forces if abs(stamp - stamp_ns) <= FORCE_HALF_NS]
+        near = []
+        for stamp, force in reversed(self._forces):  # in the order of their stamps, newest first
+            if stamp < stamp_ns - FORCE_HALF_NS:
+                break
+            if stamp <= stamp_ns + FORCE_HALF_NS:
+                near.append(force)
         return [float(value) for value in np.mean(near, axis=0)] if near else [np.nan] * 3
 
     def recording(self, first: int, last: int | None = None) -> Recording:

@@ -1,11 +1,11 @@
-"""Watching a running rig: windows held against the twin, and an alarm with subsystem and probable cause when they part."""
+"""Watch a running rig: compare it with its twin, and raise an alarm with subsystem and probable cause."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.live.charts import Charts, ChartSettings, Usual
 from host.diagnosis.live.twin import FrameCollector, Twin, TwinFit
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.screening import screen
@@ -23,7 +24,8 @@ from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 Array = npt.NDArray[np.float64]
 POSE_ROWS = 12
 SMALLEST_SHARE = 0.1  # of the mismatch that a cause has to explain to be named
-AS_GOOD = 1.15  # error relative to the best cause's with which another still counts
+LEAST_PROBABILITY = 0.05  # of a cause that is listed as possible
+CALM, CALM_S = 0.5, 10.0  # a mismatch is over once the score has been below CALM for CALM_S: the next one is reported again
 IDLE_S = 0.02
 REST_S = 0.005
 SECOND_NS = 1_000_000_000
@@ -31,42 +33,59 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """learn_s of motion calibrate the twin; then every every_s the last window_s are looked at.
+    """learn_s of motion calibrate the twin; then every every_s (s) the new rows are added to the charts (`charts.py`).
 
-    level, shift: how far RMS (as a factor) and mean (in spreads of a mean over a window) may go before an alarm;
-    settle_s: so long it has to last; a cause is then sought in all that was received since.
-    suspects: candidates fitted before one is named.
+    cause_s: the rows since a change began are collected for this time (s) before its cause is sought in them.
+    lead_rows: rows before the new ones that are simulated too, because delay and filters reach back.
+    suspects: candidates fitted before one is named. inflation: of the errors' variance, because no cause describes a rig
+    exactly (see `probabilities`).
     """
 
     learn_s: float = 10.0
-    window_s: float = 3.0
-    every_s: float = 0.5
-    level: float = 1.45
-    shift: float = 6.0
-    settle_s: float = 5.0
+    every_s: float = 0.25
+    cause_s: float = 2.0
+    lead_rows: int = 6
     suspects: int = 8
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """What was usual while learning, per output row: mean and RMS of the residual, spread of its mean over a window."""
-
-    mean: Array
-    rms: Array
-    spread: Array
+    inflation: float = 80.0
+    charts: ChartSettings = field(default_factory=ChartSettings)
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A cause that was fitted to the window: effect@subsystem, share of the mismatch explained, parameters."""
+    """A cause that was fitted to the rows since the change.
+
+    name: effect@subsystem. error: weighted sum of squares that it leaves. explained: share of the mismatch that it explains.
+    """
 
     name: str
+    error: float
     explained: float
     parameters: int
+    probability: float = 0.0  # among the causes that were fitted
+
+
+def probabilities(suspects: list[Suspect], samples: int, inflation: float) -> list[Suspect]:
+    """Return `suspects` with their probabilities, the likeliest first.
+
+    A cause weighs exp(-(error - least error) / (2 phi inflation)) samples^(-parameters/2): the Bayesian information
+    criterion (Schwarz 1978) of a quasi-likelihood (McCullagh and Nelder 1989, ch. 9). phi, the mean square that the best
+    cause leaves, is at least the usual one. `samples`: squares in the errors.
+    """
+    least = min((s.error for s in suspects), default=0.0)
+    phi = max(1.0, least / samples)
+    cost = [0.5 * (s.error - least) / phi / inflation + 0.5 * s.parameters * math.log(samples / inflation) for s in suspects]
+    weight = np.exp(np.min(cost, initial=np.inf) - np.array(cost))
+    judged = [replace(s, probability=float(w / np.sum(weight))) for s, w in zip(suspects, weight, strict=True)]
+    return sorted(judged, key=lambda s: -s.probability)
+
+
+def is_armed(state: RigState) -> bool:
+    """Return whether the rig follows commands in this state."""
+    return state.mode not in ("disarmed", "homing", "stopped")
 
 
 class Watch:
-    """Receives the rig's messages; `look` gives an alarm when the last window is no longer what the twin expects.
+    """Receives the rig's messages; `look` gives an alarm when the residual is no longer what was usual.
 
     All time is the rig's own (stamps of its poses), so that recorded messages and virtual time do as well as a live rig.
     """
@@ -78,27 +97,33 @@ class Watch:
         self.frames = FrameCollector(rig, max(self.settings.learn_s, 30.0))
         self.candidate_effects = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
         self.calibration: TwinFit | None = None
-        self.baseline: Baseline | None = None
+        self.charts: Charts | None = None
         self._armed_at_ns: int | None = None
         self._next_ns = 0
-        self._since_ns: int | None = None
+        self._taken_ns = 0  # stamp of the newest row that the charts have taken
+        self._since_ns: int | None = None  # begin of the mismatch that is being reported
+        self._calm_ns = 0  # time from which on the score is small
         self.reported = False
         self.score = 0.0
 
     def receive(self, topic: str, message: Message) -> None:
         """Take in one message of the rig."""
         if isinstance(message, RigState):
-            armed = message.mode not in ("disarmed", "homing", "stopped")
-            if not armed:
+            if is_armed(message):
+                self.arm(message.stamp_ns)
+            else:
                 self._armed_at_ns = None
-            elif self._armed_at_ns is None:
-                self._armed_at_ns = message.stamp_ns
         self.frames.receive(topic, message)
+
+    def arm(self, stamp_ns: int) -> None:
+        """Note that the rig is armed, the first time at `stamp_ns`."""
+        if self._armed_at_ns is None:
+            self._armed_at_ns = stamp_ns
 
     @property
     def phase(self) -> str:
         """What is being done: waiting, learning or watching."""
-        return "watching" if self.baseline else "learning" if self._armed_at_ns is not None else "waiting"
+        return "watching" if self.charts else "learning" if self._armed_at_ns is not None else "waiting"
 
     def look(self) -> Alarm | None:
         """Call often; every `every_s` of the rig's time something is done. An alarm comes once for each mismatch."""
@@ -107,7 +132,7 @@ class Watch:
         if not stamps or stamps[-1] < self._next_ns or self._armed_at_ns is None:
             return None
         self._next_ns = stamps[-1] + round(self.settings.every_s * SECOND_NS)
-        if self.baseline is None:
+        if self.charts is None:
             if stamps[-1] - self._armed_at_ns >= self.settings.learn_s * SECOND_NS:
                 self._learn()
             return None
@@ -121,12 +146,9 @@ class Watch:
         recording = self.frames.recording(-self._rows(self.settings.learn_s))
         self.calibration = self.twin.calibrate(recording, self._rest)
         segment, residual = self._residual(-self._rows(self.settings.learn_s))
-        residual = residual[:, segment.n // 4 :]  # the approach differs from what follows
-        mean, rms = np.nanmean(residual, axis=1), np.sqrt(np.nanmean(residual**2, axis=1))
-        blocks = np.array_split(residual, max(3, round(0.75 * self.settings.learn_s)), axis=1)
-        spread = np.std([np.nanmean(block, axis=1) for block in blocks], axis=0) / np.sqrt(self.settings.window_s)
-        least = rms / np.sqrt(self._rows(self.settings.window_s))
-        self.baseline = Baseline(mean, np.maximum(rms, 1e-9), np.maximum(spread, least))
+        usual = Usual.of(residual[:, segment.n // 4 :])  # the approach differs from what follows
+        self.charts = Charts(usual, self.frames.period_ns * 1e-9, self.settings.charts)
+        self._taken_ns = self.frames.stamps_ns[-1]
 
     def _residual(self, first: int) -> tuple[Segment, Array]:
         """Rows from `first` on as a segment of the twin, and measured minus expected (12, n)."""
@@ -138,88 +160,102 @@ class Watch:
         return segment, (segment.y - expected)[:POSE_ROWS]
 
     def _compare(self) -> Alarm | None:
-        """The last window against the baseline."""
-        assert self.baseline is not None
-        score = self._score(self._residual(-self._rows(self.settings.window_s))[1])
-        self.score = float(np.max(score))
-        now_ns = self.frames.stamps_ns[-1]
-        if not np.max(score) > 1.0:
+        """New rows are added to the charts. A change is reported once, as soon as its cause can be sought."""
+        charts, period_ns, now_ns = self.charts, self.frames.period_ns, self.frames.stamps_ns[-1]
+        assert charts is not None
+        new = min(round((now_ns - self._taken_ns) / period_ns), len(self.frames.rows))
+        self._taken_ns = now_ns
+        lead = min(new + self.settings.lead_rows, len(self.frames.rows))
+        charts.take(self._residual(-lead)[1][:, -new:])
+        self.score = float(np.max(charts.score))
+        if self.score > CALM:
+            self._calm_ns = now_ns
+        if self._since_ns is None:
+            if self.score <= 1.0:
+                return None
+            self._since_ns = now_ns - (charts.samples - charts.since) * period_ns
+        elif self.reported and now_ns - self._calm_ns > CALM_S * SECOND_NS:
             self._since_ns, self.reported = None, False
             return None
-        if self._since_ns is None:
-            self._since_ns = now_ns
-        since_s = (now_ns - self._since_ns) * 1e-9
-        if since_s < self.settings.settle_s or self.reported:
+        if self.reported or now_ns - self._since_ns < self.settings.cause_s * SECOND_NS:
             return None
         self.reported = True
-        return self._alarm(score, since_s)
+        return self._alarm(charts, self._since_ns)
 
-    def _score(self, residual: Array) -> Array:
-        """How far each row (12,) is beyond what is allowed: above 1 is an alarm."""
-        b, s = self.baseline, self.settings
-        assert b is not None
-        good = np.mean(np.isfinite(residual), axis=1) > 0.3
-        filled = np.where(good[:, None], residual, 0.0)
-        level = np.sqrt(np.nanmean(filled**2, axis=1)) / b.rms / s.level
-        shift = np.abs(np.nanmean(filled, axis=1) - b.mean) / b.spread / s.shift
-        return np.where(good, np.maximum(level, shift), 0.0)
-
-    def _alarm(self, score: Array, since_s: float) -> Alarm:
-        now_ns, row = self.frames.stamps_ns[-1], int(np.argmax(score))
-        suspects = self._suspects(self._residual(-self._rows(since_s))[0])
+    def _alarm(self, charts: Charts, since_ns: int) -> Alarm:
+        now_ns, row = self.frames.stamps_ns[-1], int(np.argmax(charts.score))
+        since_s = (now_ns - since_ns) * 1e-9
         channel = self.twin.outputs[row].channel
-        first, explained = (
-            (suspects[0].name, suspects[0].explained) if suspects else (f"unlisted@{self.twin.outputs[row].subsystem}", 0.0)
-        )
-        effect, _, subsystem = first.partition("@")
-        others = ", ".join(s.name for s in suspects[1:])
-        words = (
-            f"{subsystem}: probably {effect}, which explains {explained:.0%}"
-            + (f" (indistinguishable from {others})" if others else "")
-            + f"; {channel} has differed from the twin for {since_s:.1f} s"
-        )
+        suspects = self._suspects(self._residual(-self._rows(since_s))[0])
+        first = suspects[0] if suspects else Suspect(f"unlisted@{self.twin.outputs[row].subsystem}", 0.0, 0.0, 0)
+        effect, _, subsystem = first.name.partition("@")
         return Alarm(
             stamp_ns=now_ns,
             subsystem=subsystem,
             effect=effect,
             channel=channel,
-            score=float(score[row]),
-            explained=float(np.clip(explained, 0.0, 1.0)),
-            since_ns=now_ns - round(since_s * SECOND_NS),
-            words=words,
+            score=float(charts.score[row]),
+            explained=float(np.clip(first.explained, 0.0, 1.0)),
+            probability=float(np.clip(first.probability, 0.0, 1.0)),
+            since_ns=since_ns,
+            words=words(suspects, channel, since_ns * 1e-9),
         )
 
     def _suspects(self, segment: Segment) -> list[Suspect]:
-        """Causes that explain the window about as well as any does, the one with the fewest parameters first."""
-        b, calibration = self.baseline, self.calibration
-        assert b is not None and calibration is not None
-        segment.y[:POSE_ROWS] -= b.mean[:, None]
-        scale = np.concatenate([b.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
+        """Causes that were fitted to the rows since the change, the likeliest first; none if no cause explains enough."""
+        charts, calibration = self.charts, self.calibration
+        assert charts is not None and calibration is not None
+        segment.y[:POSE_ROWS] -= charts.usual.mean[:, None]
+        scale = np.concatenate([charts.usual.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
         segment.weight = scale
         problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
         ranked = screen(problem, fit, self.candidate_effects, lambda what, part: self._rest())[: self.settings.suspects]
-        before = float(np.sum(problem.stacked((), calibration.theta) ** 2))
+        squares = problem.stacked((), calibration.theta) ** 2
+        samples, before = int(np.count_nonzero(squares)), float(np.sum(squares))
+        mismatch = max(before - samples, 1e-9)  # beyond the usual residual
         found: dict[str, Suspect] = {}
         for item in ranked:
             self._rest()
-            tried = minimize(
-                problem, (item.term,), np.concatenate((calibration.theta, item.begin[0])), rounds=6, tolerance=1e-3
-            )
-            left = float(np.sum(problem.stacked(tried.terms, tried.values) ** 2)) / max(before, 1e-12)
-            suspect = Suspect(item.candidate.name, 1.0 - left, len(item.term.parameters))
+            begin = np.concatenate((calibration.theta, item.begin[0]))
+            tried = minimize(problem, (item.term,), begin, rounds=6, tolerance=1e-3)
+            error = float(np.sum(problem.stacked(tried.terms, tried.values) ** 2))
+            suspect = Suspect(item.candidate.name, error, (before - error) / mismatch, len(item.term.parameters))
             if suspect.name not in found or found[suspect.name].parameters > suspect.parameters:
                 found[suspect.name] = suspect
-        most = max((s.explained for s in found.values()), default=0.0)
-        if most < SMALLEST_SHARE:
+        if max((s.explained for s in found.values()), default=0.0) < SMALLEST_SHARE:
             return []
-        as_good = [s for s in found.values() if 1.0 - s.explained <= AS_GOOD * (1.0 - most)]
-        return sorted(as_good, key=lambda s: (s.parameters, -s.explained))
+        return probabilities(list(found.values()), samples, self.settings.inflation)
+
+
+def words(suspects: list[Suspect], channel: str, since_s: float) -> str:
+    """Return the alarm in words: since when, where, the probable cause, its probability, and what is also possible.
+
+    suspects: the likeliest first; none if no known cause explains the mismatch. since_s: on the rig's clock (s).
+    """
+    began = f"since {since_s:.1f} s, {channel} differs from the twin"
+    if not suspects:
+        return f"{began}; no known effect explains it"
+    first = suspects[0]
+    effect, _, subsystem = first.name.partition("@")
+    text = (
+        f"{subsystem}: probably {_plain(effect)} (probability {first.probability:.2f}, "
+        f"explains {min(first.explained, 1.0):.0%} of the mismatch); {began}"
+    )
+    others = [s for s in suspects[1:] if s.probability >= LEAST_PROBABILITY]
+    return text + "".join(
+        f"{', ' if k else '; also possible: '}{_plain(s.name)} ({s.probability:.2f})" for k, s in enumerate(others)
+    )
+
+
+def _plain(name: str) -> str:
+    effect, at, subsystem = name.partition("@")
+    return effect.replace("_", " ") + at + subsystem
 
 
 def warm_up(rig: Rig) -> None:
     """Runs everything once on made-up rows, so that kernels are compiled before the rig is listened to."""
-    watcher = Watch(rig, LiveSettings(learn_s=4.0, window_s=2.0, settle_s=0.5))
+    watcher = Watch(rig, LiveSettings(learn_s=4.0, cause_s=0.5))
     period_ns = watcher.frames.period_ns
     watcher.receive(
         "state", RigState(stamp_ns=0, mode="hold", safety_action="none", cause="", poses_rejected=0, forces_rejected=0)

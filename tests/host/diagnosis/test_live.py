@@ -1,4 +1,4 @@
-"""The live watch on messages of a plant: silent without an effect, an alarm with the right place within 10 s of one."""
+"""The live watch on messages of a plant: no alarm without an effect, one with the right subsystem within 3 s of one."""
 
 from collections.abc import Iterator
 
@@ -7,68 +7,21 @@ import pytest
 
 from host.diagnosis.live.twin import FrameCollector
 from host.diagnosis.live.watch import Watch, watch
+from host.studies.live_study import by_hand
 from protocol.rig_file import SIMULATED_RIG, load_rig
-from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
+from protocol.topics import Alarm, Message, Pose
 from protocol.zenoh_session import Session
 from sim.effects import PlantedEffect, parse
-from sim.plant import Plant, PlantConfig
 from tests.waiting import free_port, until
 
 RIG = load_rig(SIMULATED_RIG)
 ON_S, END_S = 15.0, 24.0
-STEP_NS = 1_000_000
 Heard = tuple[int, str, Message]
 
 
 def messages(effects: tuple[PlantedEffect, ...], seconds: float, seed: int = 1) -> Iterator[Heard]:
     """What a rig under a hand that moves all axes in front of the wall and onto it would publish, with its arrival (ns)."""
-    plant = Plant(PlantConfig(tool_offsets_m=(0.0, RIG.tracker.shaft_sensor_offset_m), effects=effects), seed)
-    rng, frame = np.random.default_rng(seed), 0
-    yield 0, "state", RigState(stamp_ns=0, mode="hold", safety_action="none", cause="", poses_rejected=0, forces_rejected=0)
-    for now in range(STEP_NS, round(seconds * 1e9), STEP_NS):
-        t = now * 1e-9
-        begin = min(t, 1.0)
-        handle = begin * np.array(
-            [0.003 * np.sin(2.0 * t) + 0.001 * np.sin(5.3 * t), 0.5 * np.sin(1.1 * t), 0.6 + 0.12 * np.sin(0.9 * t)]
-        )
-        plant.step(1e-3, handle)
-        ms = now // STEP_NS
-        if ms % 5 == 0:
-            a, b, c = map(float, handle)
-            yield (
-                now,
-                "stage",
-                Stage(
-                    stamp_ns=now,
-                    command_insertion_m=a,
-                    command_roll_rad=b,
-                    command_knob_rad=c,
-                    encoder_insertion_m=a,
-                    encoder_roll_rad=b,
-                    encoder_knob_rad=c,
-                ),
-            )
-            force = plant.measured_wrench()[0] + 1e-3 * rng.standard_normal(3)
-            yield now, "force/sensor", ForceSensor(stamp_ns=now, arrival_ns=now, force_N=tuple(map(float, force)))
-        if ms % 25 == 0:
-            for tool, topic in enumerate(("pose/tip", "pose/shaft")):
-                yield now + 30 * STEP_NS, topic, _pose(plant, tool, now, frame, rng)
-            frame += 1
-
-
-def _pose(plant: Plant, tool: int, now: int, frame: int, rng: np.random.Generator) -> Pose:
-    shown = plant.measured_pose(tool)
-    position = shown.position_m + 2.9e-4 * rng.standard_normal(3)
-    quaternion = shown.quaternion_wxyz + 1.75e-3 * rng.standard_normal(4)
-    quaternion /= np.linalg.norm(quaternion)
-    return Pose(
-        stamp_ns=now,
-        arrival_ns=now + 30 * STEP_NS,
-        frame=frame,
-        missing=rng.random() < 0.02,
-        position_m=tuple(map(float, position)),
-        quaternion_wxyz=tuple(map(float, quaternion)),
-    )
+    return by_hand(RIG, effects, seconds, seed)
 
 
 def alarms(effects: tuple[PlantedEffect, ...], seconds: float = END_S, seed: int = 1) -> list[Alarm]:
@@ -95,13 +48,16 @@ def test_silent_where_nothing_is_missing() -> None:
         ("base_motion@base:rise_s=1", "base_motion"),
     ],
 )
-def test_alarm_within_ten_seconds_of_the_effect(planted: str, cause: str) -> None:
+def test_alarm_within_three_seconds_of_the_effect(planted: str, cause: str) -> None:
     found = alarms((parse(f"{planted},start_s={ON_S}"),))
     assert len(found) == 1
-    alarm = found[0]
-    assert ON_S < alarm.stamp_ns * 1e-9 < ON_S + 10.0 and alarm.score > 1.0
+    alarm, rise_s = found[0], 1.0 if "rise_s" in planted else 0.0
+    assert ON_S < alarm.stamp_ns * 1e-9 < ON_S + 3.0 + rise_s and alarm.score > 1.0
     assert alarm.subsystem == parse(planted).port and alarm.effect == cause, alarm.words
-    assert ON_S < alarm.since_ns * 1e-9 < ON_S + 3.0
+    assert ON_S - 0.5 < alarm.since_ns * 1e-9 < ON_S + 3.0  # an estimate, which may be early
+    assert alarm.words.startswith(
+        f"{alarm.subsystem}: probably {cause.replace('_', ' ')} (probability {alarm.probability:.2f}"
+    )
 
 
 def test_the_twin_is_only_held_against_an_armed_rig() -> None:
