@@ -8,20 +8,24 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from host.mechanics.cosserat import solve_cosserat
 from host.report.figure_page import Section, as_json, write_reproduction
 from host.studies.reproduction import control_hybrid, control_kinematics, control_rig
 from host.studies.reproduction.thesis_control import (
+    CATHETER,
     PI,
+    STARTS,
     Gains,
     Setting,
-    contact,
+    ThesisRun,
     cost,
     heart,
     hybrid,
-    planar_inverse,
     step_figures,
 )
-from host.studies.reproduction.thesis_position import unloaded_tip
+from host.studies.reproduction.thesis_inverse import branch_bends, fitted_polynomials, polynomial_inverse, unit_tip
+from host.studies.reproduction.thesis_plant import Instant, contact_by_algorithm_3_1, plant_model, rest
+from protocol.catheter import load_catheter
 from protocol.errors import InputError
 
 SECTION = Section("fig_1", "Fig. 1", "It is so.", "So it is <here>.", "holds", "1 of 1.")
@@ -70,10 +74,10 @@ def test_too_much_gain_does_not_settle() -> None:
 
 
 def test_the_pi_form_needs_its_integral_gain_and_is_unstable_with_the_printed_optimum() -> None:
-    slow = Gains(0.25, 0.02, 0.0, 0.0545, 1e-4, 0.0)
-    here, without = (step_figures(hybrid(0.25, 600, slow.scaled(K_ip=k), Setting(form=PI)), 0.25) for k in (1.0, 0.0))
+    slow, pi = Gains(0.25, 0.02, 0.0, 0.0545, 1e-4, 0.0), Setting(form=PI)
+    here, without = (step_figures(hybrid(0.25, 600, slow.scaled(K_ip=k), pi), 0.25) for k in (1.0, 0.0))
     assert here.steady_error_N < 0.7 * without.steady_error_N and here.ringing_N < 1e-3
-    assert step_figures(hybrid(0.25, 120, Gains(), Setting(form=PI)), 0.25).ringing_N > 0.02
+    assert step_figures(hybrid(0.25, 120, Gains(), pi), 0.25).settling == 120
 
 
 def test_a_figure_on_the_rig_holds_where_one_reading_bears_it_out() -> None:
@@ -86,23 +90,65 @@ def test_a_figure_on_the_rig_holds_where_one_reading_bears_it_out() -> None:
     assert [row[2] for row in section.rows] == ["holds", "no", "yes"]
 
 
-def test_contact_rests_where_the_spring_says() -> None:
+@pytest.mark.parametrize(("insertion_m", "curvature"), [(-0.03, 7.0), (-0.02, 30.0), (0.0, -12.0), (0.008, 20.0)])
+def test_the_unloaded_rod_is_the_unloaded_arcs(insertion_m: float, curvature: float) -> None:
+    at = Instant(curvature, insertion_m, 1.0, 1.0)
+    rod, arcs = (rest(plant_model(CATHETER, is_rod), at, at, np.zeros(3)) for is_rod in (True, False))
+    assert rod.force_N == arcs.force_N == 0.0
+    assert (rod.x, rod.y) == pytest.approx((arcs.x, arcs.y), abs=1e-9)
+
+
+@pytest.mark.parametrize("start", STARTS, ids=lambda start: start.name)
+@pytest.mark.parametrize("more_curvature", [5.0, 12.0, 20.0])
+def test_newtons_contact_lies_on_the_tissue(start: Setting, more_curvature: float) -> None:
+    at = Instant(start.curvature_per_m + more_curvature, start.insertion_m, start.tip_m[1] + start.gap_m, 1.1)
+    carried = np.zeros(3)
+    found = rest(plant_model(CATHETER, True), at, at, carried)
+    assert found.found and found.force_N > 1e-3
+    assert found.y - at.wall_m - found.force_N / 1000.0 == pytest.approx(0.0, abs=1e-9)
+    # The same force, laid on the rod of the product, leads the tip to the same place; stiffness scales as the force does.
+    alone = solve_cosserat(load_catheter(CATHETER), at.insertion_m, at.curvature, (0.0, found.force_N / at.stiffness, 0.0))
+    assert (alone.tip_position_m[2], -alone.tip_position_m[1]) == pytest.approx((found.x, found.y), abs=1e-8)
+    assert alone.tip_position_m[0] == pytest.approx(0.0, abs=1e-9)
+    # From there it is followed to the next instant as from the unloaded shape.
+    ahead = at._replace(curvature=at.curvature + 3.0, insertion_m=at.insertion_m + 0.001)
+    followed, fresh = rest(plant_model(CATHETER, True), ahead, at, carried), np.zeros(3)
+    assert followed.force_N == pytest.approx(rest(plant_model(CATHETER, True), ahead, ahead, fresh).force_N, abs=1e-7)
+
+
+def test_algorithm_3_1_in_newtons_method_finds_the_same_contact() -> None:
+    at = Instant(Setting().curvature_per_m + 15.0, -0.028, Setting().tip_m[1] + 0.001, 1.0)
+    found = rest(plant_model(CATHETER, True), at, at, np.zeros(3))
+    coarse, fine = (contact_by_algorithm_3_1(plant_model(CATHETER, True), at, n, e) for n, e in ((500, 1e-3), (4000, 1e-9)))
+    assert coarse.found and fine.found and found.force_N > 0.05
+    assert abs(coarse.force_N - found.force_N) < 0.01 * found.force_N
+    assert abs(fine.force_N - found.force_N) < 0.001 * found.force_N
+
+
+def test_without_contact_the_tip_is_free_and_a_run_without_equilibrium_fails() -> None:
     run = hybrid(0.2, 60)
-    depth_m = run.tip_m[:, 1] - run.wall_m
-    pressed = run.force_N > 0
-    assert np.allclose(depth_m[pressed] * 1000.0, run.force_N[pressed], atol=1e-5)
-    assert np.all(depth_m[~pressed] <= 1e-9)
-    assert contact.__doc__ is not None
+    assert run.force_N[0] == 0.0 and run.tip_m[0] == pytest.approx(Setting().tip_m, abs=1e-9)
+    assert np.all(np.isfinite(run.force_N)) and not run.failed
+    lost = ThesisRun(np.array([0.1, np.inf]), np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2))
+    assert lost.failed and step_figures(lost, 0.1).ringing_N == math.inf
 
 
-@pytest.mark.parametrize("bend", [-2.0, -0.5, 1e-9, 0.3, 2.2])
-@pytest.mark.parametrize("body", [-0.03, 0.0, 0.02])
-def test_planar_inverse_undoes_the_arc(bend: float, body: float) -> None:
-    length = 0.07
-    out_m = min(length, length + body)
-    tip = unloaded_tip(np.array([body, 0.0]), bend / out_m, length)
-    curvature, found = planar_inverse(tip[2], -tip[1], length, bend / out_m)
-    assert found == pytest.approx(body, abs=1e-7) and curvature * out_m == pytest.approx(bend, abs=1e-6)
+def test_polynomials_reach_the_printed_error() -> None:
+    bend = branch_bends(1)
+    fitted = np.polynomial.polynomial.polyval(unit_tip(bend)[1], fitted_polynomials()[1])
+    rms_per_m = float(np.sqrt(np.mean((fitted - bend) ** 2))) / 0.070
+    assert round(rms_per_m, 2) == 0.26
+
+
+@pytest.mark.parametrize("bend", [-4.5, -2.8, -2.0, -0.5, 1e-9, 0.3, 2.0, 3.0, 5.0])
+@pytest.mark.parametrize("body_m", [0.0, 0.02])
+def test_the_polynomial_inverse_undoes_the_arc(bend: float, body_m: float) -> None:
+    length_m = 0.07
+    along, across = (length_m * float(value) for value in unit_tip(np.array(bend)))
+    curvature, found = polynomial_inverse(fitted_polynomials(), along + body_m, across, length_m, bend / length_m)
+    assert curvature == pytest.approx(bend / length_m, abs=0.5)
+    # (7.1) is exact for the curvature that was found.
+    assert found == pytest.approx(along + body_m - length_m * float(np.sinc(curvature * length_m / np.pi)), abs=1e-9)
 
 
 def test_heart_is_in_hertz() -> None:
@@ -112,7 +158,7 @@ def test_heart_is_in_hertz() -> None:
 
 
 def test_the_search_of_gains_does_not_get_worse() -> None:
-    assert cost(control_hybrid.best_gains(25)) <= cost(Gains()) + 1e-12
+    assert cost(control_hybrid.best_gains(Setting(), 25)) <= cost(Gains()) + 1e-12
 
 
 def test_sections_of_the_simulated_figures() -> None:
@@ -122,6 +168,7 @@ def test_sections_of_the_simulated_figures() -> None:
         "fig_7.6",
         "fig_7.7",
         "fig_7.8",
+        "fig_7.3",
         "fig_7.9_7.10",
         "fig_7.11",
         "fig_7.12",
@@ -131,7 +178,7 @@ def test_sections_of_the_simulated_figures() -> None:
         "fig_7.16",
         "fig_7.17",
     }
-    for name in ("fig_7.5", "fig_7.8", "fig_7.9_7.10", "fig_7.13", "fig_7.16"):
+    for name in ("fig_7.3", "fig_7.5", "fig_7.6", "fig_7.8", "fig_7.9_7.10", "fig_7.13", "fig_7.16"):
         assert sections[name].verdict == "holds", sections[name].says
     assert all(section.pictures for section in sections.values())
 

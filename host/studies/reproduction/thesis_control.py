@@ -1,8 +1,8 @@
-"""The thesis' control laws on the models it used: planar hybrid control on a rod against a spring (7.3), position control
-(6.4).
+"""The thesis' hybrid controller (Fig. 7.1) on the plants of its simulations (7.3): a rod, or arcs, against a spring.
 
 Gains are per iteration, as printed; an iteration is PERIOD_S, a tracker frame, which the thesis does not state. The joint
-error is the difference of two calls of the inverse kinematics (Fig. 6.12). The law can be read in two forms (`LawForm`).
+error is the difference of two calls of the inverse kinematics by polynomials (Fig. 6.12, 7.3.2). The law can be read in two
+forms (`LawForm`).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from host.mechanics import pcar_kernels as kernels
-from host.mechanics.pcar import NO_DRAG, arcs_of
-from protocol.catheter import load_catheter
-from realtime.control import inverse_kinematics
+from host.studies.reproduction.thesis_inverse import fitted_polynomials, polynomial_inverse, unit_tip
+from host.studies.reproduction.thesis_plant import Instant, PlantModel, plant_model, rest
 
 Array = NDArray[np.float64]
+CATHETER = "steerocath_t"
 PERIOD_S = 0.025
-TISSUE_N_PER_M = 1000.0
+# Bounds of the commanded joints: curvature either way (1/m), shaft outside and body outside at most (m).
+MOST_CURVATURE_per_m, LEAST_OUTSIDE_m, MOST_BODY_m = 80.0, 0.005, 0.05
 
 
 class LawForm(NamedTuple):
@@ -60,28 +60,55 @@ class Gains:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where the simulated catheter starts, planar: body insertion (m, negative: in the sheath), bend outside (rad), gap (m).
+    """What the thesis does not give: the start (body outside in m, negative: in the sheath; bend outside in rad; gap in m).
 
-    And in which form the law controls it.
+    And the form of the law. rod: the rod of chapter 3 is the plant, else the circular arcs.
 
-    The thesis gives no numbers. With its steerocath_t a whole distal shaft (70 mm) cannot press 0.2 N across without
-    buckling (F L^2 / EI = 5), so 40 mm are outside.
+    With its steerocath_t a whole distal shaft (70 mm) outside cannot press 0.25 N across from a bend below 240 degrees, and
+    Algorithm 3.1 does not converge for it. So part of the shaft is in the sheath (section 3.2.3), and the length of the part
+    outside at the start is the length in the inverse kinematics.
     """
 
-    catheter: str = "steerocath_t"
     insertion_m: float = -0.030
-    bend_rad: float = math.radians(45.0)
+    bend_rad: float = math.radians(15.0)
     gap_m: float = 0.001
     form: LawForm = INCREMENTAL
+    rod: bool = True
+
+    @property
+    def name(self) -> str:
+        """Return the start in words."""
+        return f"{self.length_m * 1e3:.0f} mm outside, bent by {math.degrees(self.bend_rad):.0f} degrees"
+
+    @property
+    def length_m(self) -> float:
+        """Return the length of the distal shaft outside at the start, in m."""
+        return plant_model(CATHETER, self.rod).length_m + min(self.insertion_m, 0.0)
 
     @property
     def curvature_per_m(self) -> float:
         """Return the curvature at the start in 1/m."""
-        return self.bend_rad / (load_catheter(self.catheter).distal_length_m + self.insertion_m)
+        return self.bend_rad / self.length_m
+
+    @property
+    def tip_m(self) -> Array:
+        """Return the unloaded tip (2,) at the start in m, along and across."""
+        along, across = unit_tip(np.array(self.bend_rad))
+        return self.length_m * np.array([along, across]) + [max(self.insertion_m, 0.0), 0.0]
+
+
+# Starts from which 0.25 N can be reached, and that Algorithm 3.1 can solve: shaft outside (m) and bend (degrees).
+STARTS = tuple(
+    Setting(outside_m - 0.070, math.radians(bend_deg))
+    for outside_m, bend_deg in ((0.040, 15.0), (0.040, 30.0), (0.040, 45.0), (0.050, 15.0))
+)
 
 
 class ThesisRun(NamedTuple):
-    """A row an iteration: force across (N), tip (m), joints (curvature 1/m, insertion m), wall (m)."""
+    """A row an iteration: force across (N), tip (m), joints (curvature 1/m, insertion m), wall (m).
+
+    From the iteration on in which the plant has no equilibrium, force and tip are not finite.
+    """
 
     force_N: Array
     tip_m: Array
@@ -93,126 +120,69 @@ class ThesisRun(NamedTuple):
         """Return the time of each row (n,) in s."""
         return np.asarray(PERIOD_S * np.arange(self.force_N.size), np.float64)
 
-
-class _Rod(NamedTuple):
-    """Arc lengths outside are cut from `distal` (m); `EI` body first (N m2)."""
-
-    distal: Array
-    EI: Array
+    @property
+    def failed(self) -> bool:
+        """Return whether the plant had no equilibrium at some iteration."""
+        return not np.isfinite(self.force_N).all()
 
 
-@njit(cache=True)
-def _shape(  # noqa: PLR0913 - a kernel: plain arrays
-    rod: _Rod,
-    curvature: float,
-    insertion_m: float,
-    force_N: float,
-    EI: Array,
-    length: Array,
-    kappa0: Array,
-    kappa: Array,
-    work: Array,
-) -> tuple[int, float, float]:
-    """(status, x, y) of the tip under (0, -force)."""
-    inside = max(0.0, -insertion_m)
-    length[0], kappa0[0] = max(0.0, insertion_m), 0.0
-    for i in range(rod.distal.size):
-        length[i + 1] = max(0.0, rod.distal[i] - inside)
-        inside = max(0.0, inside - rod.distal[i])
-        kappa0[i + 1] = curvature
-    external = kernels.Load(0.0, -force_N, NO_DRAG)
-    status, _, share = kernels.load_path(kernels.Shaft(length, EI, np.zeros_like(EI), kappa0), external, kappa, work)
-    x, y, _ = kernels.evaluate(length, kappa, external, share, work)
-    return status, x, y
+class _Controller(NamedTuple):
+    """Gains (6,), the form of the law, the polynomials (3, 10) and their length (m), and the desired position (2,) m."""
+
+    gains: Array
+    pi: bool
+    from_desired: bool
+    coefficients: Array
+    length_m: float
+    goal_m: Array
 
 
-@njit(cache=True)
-def contact(
-    rod: _Rod, curvature: float, insertion_m: float, wall_m: float, tissue_N_per_m: float, EI: Array, guess_N: float
-) -> tuple[float, float, float]:
-    """Force (N) with which the tip rests at the depth that the spring asks for, and the tip (m); Fig. 7.3, by regula falsi.
+class _Course(NamedTuple):
+    """Of each iteration: wall (m), factor of the stiffness, desired force (N)."""
 
-    A shape that folds under a force counts as too much of it.
-    """
-    n = rod.EI.size
-    length, kappa0, kappa, work = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((kernels.ROWS, n))
-    _, x, y = _shape(rod, curvature, insertion_m, 0.0, EI, length, kappa0, kappa, work)
-    if y <= wall_m:
-        return 0.0, x, y
-    low, high, low_gap, high_gap = 0.0, max(0.02, 1.5 * guess_N), y - wall_m, 0.0
-    for _ in range(30):
-        status, x, y = _shape(rod, curvature, insertion_m, high, EI, length, kappa0, kappa, work)
-        high_gap = y - wall_m - high / tissue_N_per_m
-        if status != 0 or high_gap <= 0.0:
-            break
-        low, low_gap, high = high, high_gap, 2.0 * high
-    for k in range(60):
-        share = low_gap / (low_gap - high_gap) if status == 0 and k % 3 != 2 else 0.5
-        middle = low + min(max(share, 0.01), 0.99) * (high - low)
-        status_here, x, y = _shape(rod, curvature, insertion_m, middle, EI, length, kappa0, kappa, work)
-        gap = y - wall_m - middle / tissue_N_per_m
-        if status_here != 0 or gap <= 0.0:
-            high, high_gap, status = middle, gap, status_here
-        else:
-            low, low_gap = middle, gap
-        if high - low < 1e-7 or (status_here == 0 and abs(gap) < 1e-9):
-            return middle, x, y
-    return low, x, y
+    wall_m: Array
+    stiffness: Array
+    wanted_N: Array
 
 
-@njit(cache=True)
-def planar_inverse(x: float, y: float, length_m: float, last_curvature: float) -> tuple[float, float]:
-    """Curvature (1/m) and insertion (m) of the unloaded tip at (x, y), (7.1) and (7.2); the fold's side of the last one."""
-    bend = 2.0 * math.atan2(abs(y), x)
-    chord = math.hypot(x, y)
-    out_m = chord if bend < 1e-9 else chord * 0.5 * bend / math.sin(0.5 * bend)
-    if out_m <= length_m:
-        return math.copysign(bend / out_m, y), out_m - length_m
-    beyond = abs(last_curvature) * length_m > inverse_kinematics.FOLD_BEND
-    bend = inverse_kinematics.bend_of_reach(abs(y) / length_m, beyond)
-    along = length_m * (1.0 if bend < 1e-6 else math.sin(bend) / bend)
-    return math.copysign(bend / length_m, y), x - along
-
-
-@njit(cache=True)
-def _run(  # noqa: PLR0913 - a kernel: plain arrays
-    rod: _Rod,
-    length_m: float,
-    gains: Array,
-    pi: bool,
-    from_desired: bool,
-    start: Array,
-    wall: Array,
-    stiffness: Array,
-    wanted: Array,
-    tissue_N_per_m: float,
-    force: Array,
-    tip: Array,
-    joint: Array,
-) -> None:
-    q0, q1, guess, touched = start[0], start[1], 0.0, False
+@njit(cache=True, nogil=True)
+def _run(model: PlantModel, law: _Controller, start: Array, course: _Course, run: ThesisRun) -> None:
+    """Fill force, tip and joints of `run`, beginning with the joints start (2,)."""
+    q0, q1, touched, carried = start[0], start[1], False, np.zeros(3)
     sum_f, last_f, sum_q, last_q = 0.0, 0.0, np.zeros(2), np.zeros(2)
-    goal_x, goal_y, first0, first1 = start[2], start[3], q0, q1
-    for k in range(wall.size):
-        guess, x, y = contact(rod, q0, q1, wall[k], tissue_N_per_m, rod.EI * stiffness[k], guess)
-        force[k], tip[k, 0], tip[k, 1], joint[k, 0], joint[k, 1] = guess, x, y, q0, q1
-        error_f = wanted[k] - guess
+    measured, gains = q0, law.gains
+    before = Instant(q0, q1, course.wall_m[0], course.stiffness[0])
+    run.force_N[:], run.tip_m[:] = np.inf, np.nan
+    for k in range(course.wall_m.size):
+        run.joint[k, 0], run.joint[k, 1] = q0, q1
+        at = Instant(q0, q1, course.wall_m[k], course.stiffness[k])
+        found = rest(model, at, before, carried)
+        before = at
+        if not found.found:
+            run.joint[k:, 0], run.joint[k:, 1] = q0, q1
+            return
+        run.force_N[k], run.tip_m[k, 0], run.tip_m[k, 1] = found.force_N, found.x, found.y
+        error_f = course.wanted_N[k] - found.force_N
         if not touched:
             touched, last_f = True, error_f
         sum_f += error_f
         across = gains[3] * error_f + gains[4] * sum_f + gains[5] * (error_f - last_f)
         last_f = error_f
-        a0, a1 = planar_inverse(x, y, length_m, q0)
-        b0, b1 = planar_inverse(goal_x, (goal_y if from_desired else y) + across, length_m, q0)
+        measured, a1 = polynomial_inverse(law.coefficients, found.x, found.y, law.length_m, measured)
+        goal = (law.goal_m[1] if law.from_desired else found.y) + across
+        b0, b1 = polynomial_inverse(law.coefficients, law.goal_m[0], goal, law.length_m, measured)
         for axis in range(2):
-            error = b0 - a0 if axis == 0 else b1 - a1
+            error = b0 - measured if axis == 0 else b1 - a1
             sum_q[axis] += error
             step = gains[0] * error + gains[1] * sum_q[axis] + (gains[2] * (error - last_q[axis]) if k > 0 else 0.0)
             last_q[axis] = error
             if axis == 0:
-                q0 = min(max((first0 if pi else q0) + step, -80.0), 80.0)
+                q0 = min(max((start[0] if law.pi else q0) + step, -MOST_CURVATURE_per_m), MOST_CURVATURE_per_m)
             else:
-                q1 = min(max((first1 if pi else q1) + step, 0.005 - length_m), 0.05)
+                q1 = min(max((start[1] if law.pi else q1) + step, LEAST_OUTSIDE_m - model.length_m), MOST_BODY_m)
+
+
+_POLYNOMIALS = fitted_polynomials()
 
 
 def hybrid(
@@ -232,41 +202,17 @@ def hybrid(
     `start_joint` (2,): instead of the setting's start.
     """
     gains, setting = gains or Gains(), setting or Setting()
-    catheter = load_catheter(setting.catheter)
-    arcs = arcs_of(catheter, 0.001, setting.curvature_per_m)
-    assert catheter.pcar is not None
-    rod = _Rod(np.array(catheter.pcar.distal_arcs_m), np.array(arcs.EI_N_m2))
-    length_m = catheter.distal_length_m
-    out_m = length_m + setting.insertion_m
-    first = np.array(
-        [
-            out_m * np.sinc(setting.bend_rad / np.pi),
-            out_m * 0.5 * setting.bend_rad * np.sinc(setting.bend_rad / (2 * np.pi)) ** 2,
-        ]
-    )
     number = np.arange(iterations, dtype=np.float64)
     motion = wall_motion(np.asarray(PERIOD_S * number, np.float64)) if wall_motion else np.zeros(iterations)
-    wall = first[1] + setting.gap_m + motion
-    factor = stiffness(number) if stiffness else np.ones(iterations)
-    joint = np.array([setting.curvature_per_m, setting.insertion_m]) if start_joint is None else start_joint
+    wall = np.asarray(setting.tip_m[1] + setting.gap_m + motion, float)
+    factor = np.asarray(stiffness(number) if stiffness else np.ones(iterations), float)
+    joint = np.array([setting.curvature_per_m, setting.insertion_m]) if start_joint is None else np.array(start_joint)
     listed = np.zeros(6) if still else np.array([gains.K_pp, gains.K_ip, gains.K_dp, gains.K_pf, gains.K_if, gains.K_df])
-    force, tip, joints = np.zeros(iterations), np.zeros((iterations, 2)), np.zeros((iterations, 2))
-    _run(
-        rod,
-        length_m,
-        listed,
-        setting.form.pi,
-        setting.form.from_desired,
-        np.array([*joint, *first]),
-        np.asarray(wall, float),
-        np.asarray(factor, float),
-        np.full(iterations, force_N),
-        TISSUE_N_PER_M,
-        force,
-        tip,
-        joints,
-    )
-    return ThesisRun(force, tip, joints, np.asarray(wall, float))
+    form = setting.form
+    law = _Controller(listed, form.pi, form.from_desired, _POLYNOMIALS, setting.length_m, setting.tip_m)
+    run = ThesisRun(np.zeros(iterations), np.zeros((iterations, 2)), np.zeros((iterations, 2)), wall)
+    _run(plant_model(CATHETER, setting.rod), law, joint, _Course(wall, factor, np.full(iterations, force_N)), run)
+    return run
 
 
 def heart(
@@ -276,9 +222,9 @@ def heart(
     return beat_m * np.sin(2 * np.pi * beat_Hz * time_s) + respiration_m * np.sin(2 * np.pi * respiration_Hz * time_s)
 
 
-def cost(gains: Gains, forces_N: tuple[float, ...] = (0.1, 0.2, 0.3), iterations: int = 40) -> float:
-    """J of (7.4), as printed: summed over iterations, mean over forces (N)."""
-    return float(np.mean([np.abs(hybrid(force, iterations, gains).force_N - force).sum() for force in forces_N]))
+def cost(gains: Gains, setting: Setting | None = None) -> float:
+    """J of (7.4), as printed: summed over 40 iterations, mean over 0.1, 0.2 and 0.3 N (in N)."""
+    return float(np.mean([np.abs(hybrid(force, 40, gains, setting).force_N - force).sum() for force in (0.1, 0.2, 0.3)]))
 
 
 class ThesisStep(NamedTuple):
@@ -292,7 +238,9 @@ class ThesisStep(NamedTuple):
 
 
 def step_figures(run: ThesisRun, force_N: float) -> ThesisStep:
-    """Of `run` with `force_N` wanted; settling is the run's length where it never settles."""
+    """Of `run` with `force_N` wanted; settling is the run's length where it never settles. All infinite for a failed run."""
+    if run.failed:
+        return ThesisStep(math.inf, run.force_N.size, math.inf, math.inf)
     outside = np.flatnonzero(np.abs(run.force_N - force_N) > 0.05 * force_N)
     late = run.force_N[-max(8, run.force_N.size // 10) :]
     return ThesisStep(
