@@ -9,6 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from host.mechanics.cosserat import solve_cosserat
+from host.mechanics.rod import rod_record
+from host.mechanics.thesis_reference import algorithm_3_1
 from host.report.figure_page import Section, as_json, write_reproduction
 from host.studies.reproduction import control_hybrid, control_kinematics, control_rig
 from host.studies.reproduction.thesis_control import (
@@ -131,6 +133,14 @@ def test_without_contact_the_tip_is_free_and_a_run_without_equilibrium_fails() -
     assert np.all(np.isfinite(run.force_N)) and not run.failed
     lost = ThesisRun(np.array([0.1, np.inf]), np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2))
     assert lost.failed and step_figures(lost, 0.1).ringing_N == math.inf
+
+
+@pytest.mark.parametrize("bend_deg", [15.0, 45.0, 90.0])
+def test_a_whole_shaft_outside_loses_contact_before_the_desired_force(bend_deg: float) -> None:
+    whole = Setting(insertion_m=0.0, bend_rad=math.radians(bend_deg))
+    assert step_figures(hybrid(0.25, 120, None, whole), 0.25).settling == 120
+    rod = rod_record(load_catheter(CATHETER), 0.0, whole.curvature_per_m)
+    assert not algorithm_3_1(rod, np.array([0.0, 0.25, 0.0]), 0.0, 500, 1e-3).converged
 
 
 def test_polynomials_reach_the_printed_error() -> None:

@@ -47,7 +47,7 @@ ITERATIONS = {INCREMENTAL: 60, PI: 600}
 LITTLE_OVERSHOOT = 0.2
 
 
-class Case(NamedTuple):
+class AdmissibleCase(NamedTuple):
     """One admissible setting: plant, start and form of the law, and the gains with their name."""
 
     setting: Setting
@@ -59,12 +59,12 @@ class Case(NamedTuple):
         """Return form and gains in words."""
         return f"{self.setting.form.name}, {self.gains_name}"
 
-    def on_arcs(self) -> Case:
+    def on_arcs(self) -> AdmissibleCase:
         """Return the same with the circular arcs as the plant."""
         return self._replace(setting=replace(self.setting, rod=False))
 
 
-class Judged(NamedTuple):
+class JudgedCase(NamedTuple):
     """Whether a statement holds in one case, and what was found."""
 
     holds: bool
@@ -78,8 +78,8 @@ class Statement(NamedTuple):
     title: str
     thesis: str
     ours: str
-    judge: Callable[[Case], Judged]
-    picture: Callable[[Case], ReportFigure]
+    judge: Callable[[AdmissibleCase], JudgedCase]
+    picture: Callable[[AdmissibleCase], ReportFigure]
 
 
 def sections(quick: bool) -> list[Section]:
@@ -89,14 +89,14 @@ def sections(quick: bool) -> list[Section]:
     return [plant_section(), first, *control_gains.sections(quick), *others]
 
 
-def admissible_cases(starts: Sequence[Setting], evaluations: int) -> list[Case]:
+def admissible_cases(starts: Sequence[Setting], evaluations: int) -> list[AdmissibleCase]:
     """Return the cases: printed gains in both forms, and the minimum of (7.4) in both forms, from each start."""
     out = []
     for start in starts:
         for form in (INCREMENTAL, PI):
             setting = replace(start, form=form)
-            out.append(Case(setting, Gains(), "printed gains"))
-            out.append(Case(setting, best_gains(setting, evaluations), "our minimum of (7.4)"))
+            out.append(AdmissibleCase(setting, Gains(), "printed gains"))
+            out.append(AdmissibleCase(setting, best_gains(setting, evaluations), "our minimum of (7.4)"))
     return out
 
 
@@ -118,7 +118,7 @@ def best_gains(setting: Setting, evaluations: int) -> Gains:
     return Gains(*map(float, np.exp(found.x)))
 
 
-def _section(statement: Statement, cases: Sequence[Case]) -> Section:
+def _section(statement: Statement, cases: Sequence[AdmissibleCase]) -> Section:
     """One figure: where its statement holds on the rod, and the map of the settings with the arcs next to it."""
     rod = [(case, statement.judge(case)) for case in cases]
     arcs = [statement.judge(case.on_arcs()) for case in cases]
@@ -189,12 +189,12 @@ def plant_section() -> Section:
     )
 
 
-def _lost(*runs: ThesisRun) -> Judged | None:
+def _lost(*runs: ThesisRun) -> JudgedCase | None:
     """Return the verdict where a run has no equilibrium; None where all have one."""
-    return Judged(False, "no equilibrium at some iteration") if any(run.failed for run in runs) else None
+    return JudgedCase(False, "no equilibrium at some iteration") if any(run.failed for run in runs) else None
 
 
-def _judge_convergence(case: Case) -> Judged:
+def _judge_convergence(case: AdmissibleCase) -> JudgedCase:
     """7.9, 7.10: the step to 0.25 N."""
     run = hybrid(FORCE_N, ITERATIONS[case.setting.form], case.gains, case.setting)
     lost = _lost(run)
@@ -204,14 +204,14 @@ def _judge_convergence(case: Case) -> Judged:
     off_mm = abs(run.tip_m[-1, 0] - case.setting.tip_m[0]) * 1e3
     longer_mm = (run.joint[-1, 1] - run.joint[0, 1]) * 1e3
     holds = figures.steady_error_N < 0.05 * FORCE_N and figures.ringing_N < 0.05 * FORCE_N and off_mm < 0.5 and longer_mm > 0
-    return Judged(
+    return JudgedCase(
         bool(holds),
         f"error at the end {figures.steady_error_N * 1e3:.1f} mN, within 5 % after {figures.settling} iterations, "
         f"position {off_mm:.3f} mm off, {longer_mm:+.2f} mm of catheter more outside",
     )
 
 
-def _draw_convergence(case: Case) -> ReportFigure:
+def _draw_convergence(case: AdmissibleCase) -> ReportFigure:
     run = hybrid(FORCE_N, 60, case.gains, case.setting)
     catheter, shapes = load_catheter(CATHETER), []
     for label, index in (("start", 0), ("end", -1)):
@@ -236,7 +236,7 @@ def _draw_convergence(case: Case) -> ReportFigure:
     )
 
 
-def _judge_steps(case: Case) -> Judged:
+def _judge_steps(case: AdmissibleCase) -> JudgedCase:
     """7.13: the three steps of (7.4)."""
     runs = [hybrid(force, 40, case.gains, case.setting) for force in FORCES_N]
     lost = _lost(*runs)
@@ -249,14 +249,14 @@ def _judge_steps(case: Case) -> Judged:
         listed = "; " + ", ".join(
             f"{field.name} {getattr(case.gains, field.name):.3g}" for field in dataclasses.fields(Gains)
         )
-    return Judged(
+    return JudgedCase(
         little and all(step.settling < 40 for step in steps),
         f"J = {cost(case.gains, case.setting):.3f} N, within 5 % after {', '.join(f'{step.settling}' for step in steps)} "
         f"iterations, overshoot {', '.join(f'{step.overshoot_N * 1e3:.0f}' for step in steps)} mN{listed}",
     )
 
 
-def _draw_steps(case: Case) -> ReportFigure:
+def _draw_steps(case: AdmissibleCase) -> ReportFigure:
     t = np.arange(40)
     lines = [PlotLine(t, hybrid(force, 40, case.gains, case.setting).force_N, f"{force} N") for force in FORCES_N]
     return panels(
@@ -268,11 +268,11 @@ def _draw_steps(case: Case) -> ReportFigure:
     )
 
 
-def _growing(case: Case) -> ThesisRun:
+def _growing(case: AdmissibleCase) -> ThesisRun:
     return hybrid(0.2, 600, case.gains, case.setting, stiffness=lambda k: 1.0 + 0.1 * (k // 100))
 
 
-def _judge_stiffness(case: Case) -> Judged:
+def _judge_stiffness(case: AdmissibleCase) -> JudgedCase:
     """7.14: +10 % of bending stiffness each 100 iterations."""
     run = _growing(case)
     lost = _lost(run)
@@ -280,10 +280,10 @@ def _judge_stiffness(case: Case) -> Judged:
         return lost
     parts = [run.force_N[100 * block + 60 : 100 * block + 100] for block in range(6)]
     worst = [float(np.max(np.abs(part - 0.2))) * 1e3 for part in parts]
-    return Judged(max(worst) < 10.0, f"greatest error {', '.join(f'{value:.1f}' for value in worst)} mN")
+    return JudgedCase(max(worst) < 10.0, f"greatest error {', '.join(f'{value:.1f}' for value in worst)} mN")
 
 
-def _draw_stiffness(case: Case) -> ReportFigure:
+def _draw_stiffness(case: AdmissibleCase) -> ReportFigure:
     lines = [PlotLine(np.arange(600), np.minimum(_growing(case).force_N, 0.5), "force")]
     return panels(
         "Stiffness that grows",
@@ -303,7 +303,7 @@ class Beating(NamedTuple):
 HEART_ITERATIONS, HEART_FROM = 600, 100
 
 
-def _beating(case: Case, force_N: float) -> Beating:
+def _beating(case: AdmissibleCase, force_N: float) -> Beating:
     joint = hybrid(force_N, ITERATIONS[case.setting.form], case.gains, case.setting).joint[-1]
     controlled, left = (
         hybrid(force_N, HEART_ITERATIONS, case.gains, case.setting, heart, still=still, start_joint=joint)
@@ -312,7 +312,7 @@ def _beating(case: Case, force_N: float) -> Beating:
     return Beating(controlled, left)
 
 
-def _judge_tracking(case: Case) -> Judged:
+def _judge_tracking(case: AdmissibleCase) -> JudgedCase:
     """7.15: the tip stays on the moving tissue."""
     runs = [_beating(case, force).controlled for force in FORCES_N]
     lost = _lost(*runs)
@@ -322,10 +322,10 @@ def _judge_tracking(case: Case) -> Judged:
     follow_mm = float(np.std((run.tip_m[HEART_FROM:, 1] - run.wall_m[HEART_FROM:]) * 1e3))
     touched = min(float(one.force_N[HEART_FROM:].min()) for one in runs)
     kept = "contact kept" if touched > 0 else "contact lost"
-    return Judged(follow_mm < 0.2 and touched > 0, f"distance of tip and wall varies by {follow_mm:.4f} mm, {kept}")
+    return JudgedCase(follow_mm < 0.2 and touched > 0, f"distance of tip and wall varies by {follow_mm:.4f} mm, {kept}")
 
 
-def _draw_tracking(case: Case) -> ReportFigure:
+def _draw_tracking(case: AdmissibleCase) -> ReportFigure:
     run, shown = _beating(case, 0.2).controlled, slice(HEART_ITERATIONS - 160, HEART_ITERATIONS)
     lines = [
         PlotLine(run.time_s[shown], values[shown] * 1e3, label)
@@ -339,7 +339,7 @@ def _draw_tracking(case: Case) -> ReportFigure:
     )
 
 
-def _judge_beating(case: Case) -> Judged:
+def _judge_beating(case: AdmissibleCase) -> JudgedCase:
     """7.16: three forces, compared with a catheter that does not move."""
     runs = {force: _beating(case, force) for force in FORCES_N}
     lost = _lost(*(run for pair in runs.values() for run in pair))
@@ -350,10 +350,10 @@ def _judge_beating(case: Case) -> Judged:
         for force, pair in runs.items()
     }
     said = ", ".join(f"{force} N: {pair[0]:.1f} mN RMS, left alone {pair[1]:.1f}" for force, pair in rms.items())
-    return Judged(all(pair[0] < pair[1] for pair in rms.values()), said)
+    return JudgedCase(all(pair[0] < pair[1] for pair in rms.values()), said)
 
 
-def _draw_beating(case: Case) -> ReportFigure:
+def _draw_beating(case: AdmissibleCase) -> ReportFigure:
     shown, lines = slice(HEART_ITERATIONS - 160, HEART_ITERATIONS), []
     for force in FORCES_N:
         pair = _beating(case, force)
@@ -369,7 +369,7 @@ def _draw_beating(case: Case) -> ReportFigure:
     )
 
 
-def _amplitudes_N(case: Case, frequencies: np.ndarray) -> np.ndarray:
+def _amplitudes_N(case: AdmissibleCase, frequencies: np.ndarray) -> np.ndarray:
     """Amplitudes of the force (n,) N on a wall that moves by 1 mm as a sine of each frequency (Hz); NaN without contact."""
     joint, out = hybrid(0.2, ITERATIONS[case.setting.form], case.gains, case.setting).joint[-1], []
     for frequency in frequencies:
@@ -387,11 +387,11 @@ def _amplitudes_N(case: Case, frequencies: np.ndarray) -> np.ndarray:
 FACTORS = (0.25, 0.5, 1.0)
 
 
-def _judge_frequencies(case: Case) -> Judged:
+def _judge_frequencies(case: AdmissibleCase) -> JudgedCase:
     """7.17: K_pf × 1 compared with × 0.25, from 4 to 10 Hz and below 1 Hz."""
     step = step_figures(hybrid(0.2, ITERATIONS[case.setting.form], case.gains, case.setting), 0.2)
     if step.ringing_N > control_gains.AT_REST_N or step.steady_error_N > 0.05 * 0.2:
-        return Judged(False, "0.2 N is not held on a wall at rest")
+        return JudgedCase(False, "0.2 N is not held on a wall at rest")
 
     frequencies = np.array([0.2, 0.5, 4.1, 5.3, 6.7, 8.3, 9.7])
     low, high = (
@@ -400,13 +400,13 @@ def _judge_frequencies(case: Case) -> Judged:
     ratio = high / low
     slow, fast = float(np.mean(ratio[frequencies < 1.0])), float(np.mean(ratio[frequencies > 4.0]))
     if not math.isfinite(slow + fast):
-        return Judged(False, "contact lost at some frequency")
-    return Judged(
+        return JudgedCase(False, "contact lost at some frequency")
+    return JudgedCase(
         fast < 1.0, f"amplitude with K_pf × 1 {fast:.2f} of that with × 0.25 from 4 to 10 Hz, {slow:.2f} below 1 Hz"
     )
 
 
-def _draw_frequencies(case: Case) -> ReportFigure:
+def _draw_frequencies(case: AdmissibleCase) -> ReportFigure:
     frequencies = np.geomspace(0.1, 10.0, 16)
     lines = []
     for factor in FACTORS:

@@ -64,8 +64,8 @@ class Setting:
 
     And the form of the law. rod: the rod of chapter 3 is the plant, else the circular arcs.
 
-    With its steerocath_t a whole distal shaft (70 mm) outside cannot press 0.25 N across from a bend below 240 degrees, and
-    Algorithm 3.1 does not converge for it. So part of the shaft is in the sheath (section 3.2.3), and the length of the part
+    With the whole distal shaft (70 mm) of its steerocath_t outside, the printed gains lose contact before 0.25 N, and
+    Algorithm 3.1 does not converge there. So part of the shaft is in the sheath (section 3.2.3), and the length of the part
     outside at the start is the length in the inverse kinematics.
     """
 

@@ -51,7 +51,7 @@ class PlantModel(NamedTuple):
     tissue_N_per_m: float
 
 
-class Contact(NamedTuple):
+class RestingTip(NamedTuple):
     """Outcome at one instant: whether an equilibrium was found, the force across (N), the tip along and across (m)."""
 
     found: bool
@@ -60,7 +60,7 @@ class Contact(NamedTuple):
     y: float
 
 
-NOT_FOUND = Contact(False, math.inf, math.nan, math.nan)
+NOT_FOUND = RestingTip(False, math.inf, math.nan, math.nan)
 
 
 class Instant(NamedTuple):
@@ -82,7 +82,7 @@ def plant_model(catheter: str, is_rod: bool) -> PlantModel:
 
 
 @njit(cache=True, error_model="numpy")
-def rest(model: PlantModel, at: Instant, before: Instant, x: Array) -> Contact:
+def rest(model: PlantModel, at: Instant, before: Instant, x: Array) -> RestingTip:
     """Return where the tip rests, followed from `before` while that is stable, else from the unloaded shape.
 
     x (3,): force in the tip frame (N), zero without contact: at `before`, then at `at`.
@@ -100,7 +100,7 @@ def rest(model: PlantModel, at: Instant, before: Instant, x: Array) -> Contact:
     sweep(rod, x, NO_STATIONS, EXACT, POSE, out, work)
     along, across = -out[0, 2], out[0, 1]
     if across <= at.wall_m:
-        return Contact(True, 0.0, along, across)
+        return RestingTip(True, 0.0, along, across)
     found = _follow(model, Instant(at.curvature, at.insertion_m, across, at.stiffness), at, x, rod, out, work)
     if found.found and _stable(model, rod, x, out[0], work):
         return found
@@ -134,7 +134,7 @@ def _place(model: PlantModel, at: Instant, rod: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _follow(model: PlantModel, a: Instant, b: Instant, x: Array, rod: Array, out: Array, work: Array) -> Contact:
+def _follow(model: PlantModel, a: Instant, b: Instant, x: Array, rod: Array, out: Array, work: Array) -> RestingTip:
     """Return the contact at b, followed from the force x (3,) at a in steps that Newton's method can take; x is moved."""
     done, step, ahead = 0.0, 1.0, np.empty(3)
     while step >= SMALLEST_STEP:
@@ -159,7 +159,7 @@ def _follow(model: PlantModel, a: Instant, b: Instant, x: Array, rod: Array, out
 
 
 @njit(cache=True, error_model="numpy")
-def _press(rod: Array, wall_m: float, tissue_N_per_m: float, x: Array, out: Array, work: Array) -> Contact:
+def _press(rod: Array, wall_m: float, tissue_N_per_m: float, x: Array, out: Array, work: Array) -> RestingTip:
     """Newton's method on the force x (3,) in the tip frame, in place: (0, F, 0) in the base frame, y = wall + F / K_t."""
     J, Ji, miss, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
     limit = FIRST_N
@@ -170,7 +170,7 @@ def _press(rod: Array, wall_m: float, tissue_N_per_m: float, x: Array, out: Arra
         along, across, force = -row[2], row[1], row[4]
         miss[0], miss[1], miss[2] = -row[3], wall_m + force / tissue_N_per_m - across, -row[5]
         if abs(miss[1]) < TIP_m and abs(miss[0]) + abs(miss[2]) < LOAD_N:
-            return Contact(force > 0.0, force, along, across)
+            return RestingTip(force > 0.0, force, along, across)
         for j in range(3):
             J[0, j], J[2, j] = row[24 + j], row[32 + j]
             J[1, j] = row[16 + j] - row[28 + j] / tissue_N_per_m
@@ -187,7 +187,7 @@ def _press(rod: Array, wall_m: float, tissue_N_per_m: float, x: Array, out: Arra
 
 def contact_by_algorithm_3_1(
     model: PlantModel, at: Instant, elements: int = ELEMENTS, threshold: float = ORIENTATION_THRESHOLD
-) -> Contact:
+) -> RestingTip:
     """Return the contact as the thesis finds it: Newton-Raphson on the force, Algorithm 3.1 for each (Fig. 7.3).
 
     elements: of Euler's method along the rod; threshold: of the orientation (sum of quaternion components). The slope of
@@ -207,9 +207,9 @@ def contact_by_algorithm_3_1(
         near, _, y_near = tip(force + difference_N)
         depth_m = y - at.wall_m - force / model.tissue_N_per_m
         if force == 0.0 and depth_m <= 0.0:
-            return Contact(there, 0.0, x, y)
+            return RestingTip(there, 0.0, x, y)
         if abs(depth_m) < 1e-9:
-            return Contact(there, force, x, y)
+            return RestingTip(there, force, x, y)
         if not (there and near):
             break
         step_N = depth_m / (1.0 / model.tissue_N_per_m - (y_near - y) / difference_N)
@@ -236,14 +236,14 @@ def _arcs_shape(
 
 
 @njit(cache=True)
-def _arcs_contact(model: PlantModel, at: Instant, guess_N: float, carried: Array) -> Contact:
+def _arcs_contact(model: PlantModel, at: Instant, guess_N: float, carried: Array) -> RestingTip:
     """Contact of the arcs by regula falsi; carried (3,): set to the force. A shape that folds counts as too much force."""
     n = model.EI.size
     length, kappa0, kappa, work = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((pcar_kernels.ROWS, n))
     carried[:] = 0.0
     _, x, y = _arcs_shape(model, at, 0.0, length, kappa0, kappa, work)
     if y <= at.wall_m:
-        return Contact(True, 0.0, x, y)
+        return RestingTip(True, 0.0, x, y)
     low, high, low_gap, high_gap, status = 0.0, max(0.02, 1.5 * guess_N), y - at.wall_m, 0.0, 0
     for _ in range(30):
         status, x, y = _arcs_shape(model, at, high, length, kappa0, kappa, work)
@@ -264,4 +264,4 @@ def _arcs_contact(model: PlantModel, at: Instant, guess_N: float, carried: Array
         if high - low < 1e-7 or (status_here == 0 and abs(gap) < 1e-9):
             break
     carried[1] = middle
-    return Contact(True, middle, x, y)
+    return RestingTip(True, middle, x, y)
