@@ -55,7 +55,8 @@ def _print_table(report: DeviceReport) -> None:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
     for name, value in report.figures.items():
         table.add_row(name, f"{value:.6g}" if isinstance(value, float) else str(value))
-    console.print(table)
+    if report.figures:
+        console.print(table)
     for problem in report.problems:
         print(f"seldinger: {report.device}: {problem}", file=sys.stderr)
     print(f"{report.device}: {'good' if report.good else 'not fit for an experiment'}", file=sys.stderr)

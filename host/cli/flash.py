@@ -31,6 +31,8 @@ def flash(
     """Build the firmware and write it to the board. The board resets: make sure that the stages may stop."""
     from host.commissioning.firmware_flash import avrdude_command, built, check_avrdude, check_port, pins_of, write_firmware
 
+    if not port.strip():
+        raise InputError("--port", port, "the serial port of the board, such as /dev/ttyACM0")
     pins = pins_of(load_rig(rig), mcu)
     if not dry_run:
         check_avrdude()

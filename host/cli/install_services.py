@@ -56,6 +56,8 @@ def install_services(
         raise InputError.from_sentence(str(error)) from None
     except FileExistsError as error:
         raise InputError("--root", str(error), "a folder without files of that name") from None
+    except (NotADirectoryError, PermissionError) as error:
+        raise InputError("--root", str(root), f"a folder that can be written ({error.strerror})") from None
     for path in written:
         print(f"seldinger: wrote {path}", file=sys.stderr)
     if system and _MANAGER.is_dir():

@@ -68,6 +68,8 @@ def _not_opened(path: str, error: serial.SerialException) -> str:
         )
     # pyserial's sentence repeats the path and the number of the error.
     said = os.strerror(error.errno) if error.errno else str(error)
+    if "Inappropriate ioctl" in said:
+        said = "it is not a serial port"
     return f"serial port: found {path} that does not open ({said}), wanted a free device"
 
 

@@ -211,3 +211,5 @@ def test_a_port_of_the_simulated_rig_is_named_as_such() -> None:
     assert len(report.problems) == 1 and "pty: stands for a port of the simulated rig" in report.problems[0]
     absent = device_check.check_board(load_rig(RIG_FILE), "/dev/ttyACM99", 0.1)
     assert "found /dev/ttyACM99 that does not open (No such file or directory), wanted a free device" in absent.problems[0]
+    file = device_check.check_board(load_rig(RIG_FILE), str(RIG_FILE), 0.1)
+    assert file.problems[0].endswith("that does not open (it is not a serial port), wanted a free device")
