@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.actuation_errors import INSERTION, ROLL, ActuationKnowledge
 from host.estimation.adapted_rig import AdaptedRigEstimator
 from host.estimation.interface import Actuation, Estimator, PoseReading, Reporting, TipForce
+from host.estimation.lasting_errors import ALL_JOINTS, INSERTION, NOWHERE, ROLL, ActuationKnowledge, Prior
 from host.estimation.sensor_noise import PoseSensor, chi_square_limit
 from host.estimation.several_contacts import ActuationPrior, ContactsEstimate, search_contacts
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
 from host.mechanics.rod import rod_record
 from protocol.catheter import Catheter
 from protocol.enums import Phase
@@ -154,10 +154,6 @@ class ContactWatch:
             np.array([0.0, free - curvature, 0.0]), np.diag(np.square([start[INSERTION], curvature_sd, start[ROLL]]))
         )
         k = len(mean.offsets)
-        information, expected = np.zeros((6, 6)), np.zeros(6)
-        information[:3, :3] = np.eye(3) / FORCE_SD_N**2
-        information[3:, 3:] = np.linalg.inv(prior.covariance)
-        expected[3:] = prior.mean
         frame = TrackedFrame(
             rod_record(self._catheter, insertion, curvature)[:6].copy(),
             self._catheter.distal_length_m,
@@ -166,9 +162,7 @@ class ContactWatch:
             mean.poses,
             self._position_std_m,
             self._angle_std_rad,
-            expected,
-            information,
-            np.zeros((0, 3)),
+            *known_rows(Prior(NOWHERE, ALL_JOINTS, prior.mean, prior.covariance), FORCE_SD_N),
         )
         found = FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((k, 6)))
         found.x[3:] = prior.mean

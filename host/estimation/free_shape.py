@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.actuation_errors import INSERTION, ROLL, ActuationKnowledge
 from host.estimation.interface import Actuation, PoseReading
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit
+from host.estimation.lasting_errors import ALL_JOINTS, INSERTION, NOWHERE, ROLL, ActuationKnowledge, Prior
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
 from host.mechanics.rod import rod_record
 from protocol.catheter import Catheter, CosseratParameters
 from protocol.errors import InputError
@@ -53,11 +53,8 @@ class FreeShapeFit:
     ) -> None:
         self._catheter, self._shaft_offset_m = _with_rod(catheter), shaft_offset_m
         self._noise = np.array([position_std_m] * 3 + [angle_std_rad] * 3)
-        self._information = np.zeros((6, 6))
-        for unknown, std in enumerate(
-            (NO_FORCE_N, NO_FORCE_N, NO_FORCE_N, knowledge.start[INSERTION], OPEN_CURVATURE_per_m, knowledge.start[ROLL])
-        ):
-            self._information[unknown, unknown] = 1.0 / std**2
+        joints = [knowledge.start[INSERTION], OPEN_CURVATURE_per_m, knowledge.start[ROLL]]
+        self._known = Prior(NOWHERE, ALL_JOINTS, np.zeros(3), np.diag(np.square(joints)))
 
     @classmethod
     def from_rig(cls, rig: Rig, catheter: Catheter) -> FreeShapeFit:
@@ -89,9 +86,7 @@ class FreeShapeFit:
             poses,
             float(self._noise[0]),
             float(self._noise[3]),
-            np.zeros(6),
-            self._information,
-            np.zeros((0, 3)),
+            *known_rows(self._known, NO_FORCE_N),
         )
         k = len(seen)
         found = FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((k, 6)))

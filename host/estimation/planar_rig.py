@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.actuation_errors import CURVATURE, INSERTION, ROLL, ActuationErrors, ActuationKnowledge
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
+from host.estimation.lasting_errors import CURVATURE, INSERTION, NOWHERE, ROLL, ActuationKnowledge, LastingErrors, Prior
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
 from host.estimation.reach import check_reach
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
@@ -25,11 +25,13 @@ from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 
+_FOLLOWED = (INSERTION, CURVATURE)
 STEPS = 12
 LONGEST_ARC_m = 0.0056  # the 11 mm arcs of the catheter file, halved: 0.1 % of the force
 END_N = 1e-6
 LARGEST_FORCE_STEP_N = 0.1
 FORCE_LIMIT_N = 2.0
+LEAST_IN_PLANE = 0.1  # of the commanded direction: with less of it in the plane nothing is known of the force there
 CHI_SQUARE_PER_FREEDOM = 12.0  # about 3.5 standard deviations throughout: beyond it no force explains the poses
 
 
@@ -37,6 +39,7 @@ CHI_SQUARE_PER_FREEDOM = 12.0  # about 3.5 standard deviations throughout: beyon
 class _Prior:
     mean: Array  # (4,) as the parameters of a fit
     information: Array  # (4, 4)
+    of_lasting: Array  # (4, 4) the part of it on the actuation's errors and the force along the wall
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class PlanarRigEstimator:
         self._weight = np.linalg.inv(tip_covariance(position_std_m, angle_std_rad))
         self._contact = contact or ContactKnowledge()
         self._roll_sd_rad = knowledge.start[ROLL]
-        self.errors = ActuationErrors(knowledge)
+        self.errors = LastingErrors(knowledge, self._contact.tangential_sd_N)
         self._branch = np.zeros(2)
 
     @classmethod
@@ -115,17 +118,20 @@ class PlanarRigEstimator:
             poses[self._shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
         self.errors.move_to(actuation)
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
-        prior = self._prior(actuation, axes)
+        known = self.errors.prior(self._along_wall(actuation, axes), _FOLLOWED)
+        prior = self._prior(actuation, axes, known)
         fit = self._fit(poses, actuation, prior, self._branch)
         if not fit.ended and self._branch.any():
             fit = self._fit(poses, actuation, prior, np.zeros(2))
         converged = fit.ended and fit.chi_square <= CHI_SQUARE_PER_FREEDOM * 3 * len(poses)
         self._branch = fit.parameters[:2] if converged else np.zeros(2)
         if converged:
-            self.errors.learn_part([INSERTION, CURVATURE], fit.parameters[2:], fit.covariance[2:, 2:])
+            shown = _shown(known, axes)
+            self.errors.learn(known, shown @ fit.parameters, shown @ fit.covariance @ shown.T)
         force_N = -axes @ fit.parameters[:2]
         covariance = axes @ fit.covariance[:2, :2] @ axes.T
-        by_noise = axes @ np.linalg.inv(fit.information[:2, :2]) @ axes.T
+        lasting_too = prior.of_lasting[:2, :2] - axes.T @ self.errors.new_information(known.across) @ axes
+        by_noise = axes @ np.linalg.inv(fit.information[:2, :2] - lasting_too) @ axes.T
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
         lasting = covariance - by_noise + self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
         unseen = self._contact.out_of_plane_sd_N**2 * np.outer(normal, normal)
@@ -139,17 +145,24 @@ class PlanarRigEstimator:
             0.5 * (lasting + lasting.T) + unseen,
         )
 
-    def _prior(self, actuation: Actuation, axes: Array) -> _Prior:
-        """What is known before the poses are seen: of the force (x, y in the plane) and of the actuation's errors."""
-        information = np.zeros((4, 4))
-        information[:2, :2] = np.eye(2) / self._contact.force_sd(actuation) ** 2
-        if actuation.force_direction is not None:
-            along = axes.T @ np.asarray(actuation.force_direction, dtype=float)
-            across = np.array([-along[1], along[0]])
-            information[:2, :2] += np.outer(across, across) / self._contact.tangential_sd_N**2
-        two = [INSERTION, CURVATURE]
-        information[2:, 2:] = np.linalg.inv(self.errors.covariance[np.ix_(two, two)])
-        return _Prior(np.array([0.0, 0.0, *self.errors.mean[two]]), information)
+    @staticmethod
+    def _along_wall(actuation: Actuation, axes: Array) -> Array:
+        """Unit vector (1, 3) in the plane across the force that is commanded, base frame; (0, 3) if none is in it."""
+        if actuation.force_direction is None:
+            return NOWHERE
+        along = axes.T @ np.asarray(actuation.force_direction, dtype=float)
+        length = float(np.linalg.norm(along))
+        return (axes @ np.array([-along[1], along[0]]) / length)[None, :] if length > LEAST_IN_PLANE else NOWHERE
+
+    def _prior(self, actuation: Actuation, axes: Array, known: Prior) -> _Prior:
+        """What is known before the poses are seen: of the force (x, y in the plane) and of what lasts."""
+        shown = _shown(known, axes)
+        held = shown.T @ np.linalg.inv(known.covariance)
+        of_lasting = held @ shown
+        information = of_lasting.copy()
+        information[:2, :2] += np.eye(2) / self._contact.force_sd(actuation) ** 2
+        mean: Array = np.linalg.solve(information, held @ known.mean).astype(np.float64)
+        return _Prior(mean, information, of_lasting)
 
     def _roll(self, tip: PoseReading, actuation: Actuation) -> float:
         """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
@@ -215,6 +228,14 @@ class PlanarRigEstimator:
         by = pose_sensitivity(arcs, found, force, back_m)
         jacobian = np.column_stack([by.by_force, by.by_insertion, by.by_curvature])
         return pose - np.array([*position, angle]), jacobian
+
+
+def _shown(known: Prior, axes: Array) -> Array:
+    """Matrix (m + 2, 4) that makes the force along the wall and both joints' errors of the parameters of a fit."""
+    m = len(known.across)
+    shown = np.zeros((m + 2, 4))
+    shown[:m, :2], shown[m:, 2:] = known.across @ axes, np.eye(2)
+    return shown
 
 
 def _capped(information: Array) -> Array:

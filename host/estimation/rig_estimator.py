@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from host.estimation.actuation_errors import ActuationKnowledge
 from host.estimation.adapted_rig import AdaptedRigEstimator
 from host.estimation.contact_watch import ContactWatch, WatchedEstimator, curvature_as_configured
 from host.estimation.interface import Estimator
+from host.estimation.lasting_errors import ActuationKnowledge
 from protocol.catheter import load_catheter
 from protocol.rig_file import Rig
 

@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
+from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors, Prior
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import chi_square_limit
 from host.estimation.spatial import start_grid
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
 from host.mechanics.rod import finite, rod_record
 from protocol.catheter import Catheter, load_catheter
 from protocol.rig_file import Rig
@@ -48,7 +48,7 @@ class SpatialRigEstimator:
         self._catheter, self._shaft_offset_m = catheter, shaft_offset_m
         self._position_std_m, self._angle_std_rad = position_std_m, angle_std_rad
         self._contact = contact or ContactKnowledge()
-        self.errors = ActuationErrors(knowledge)
+        self.errors = LastingErrors(knowledge, self._contact.tangential_sd_N)
         self._force = np.zeros(3)
         self._unexplained = 0
 
@@ -84,10 +84,7 @@ class SpatialRigEstimator:
             offsets.append(self._shaft_offset_m)
             poses.append([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz])
         self.errors.move_to(actuation)
-        prior, information = np.zeros(6), np.zeros((6, 6))
-        prior[3:] = self.errors.mean
-        information[:3, :3] = np.eye(3) / self._contact.force_sd(actuation) ** 2
-        information[3:, 3:] = np.linalg.inv(self.errors.covariance)
+        known = self.errors.prior(along_wall(actuation), ALL_JOINTS)
         joints = np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad])
         frame = TrackedFrame(
             rod[:6].copy(),
@@ -97,23 +94,13 @@ class SpatialRigEstimator:
             np.array(poses),
             self._position_std_m,
             self._angle_std_rad,
-            prior,
-            information,
-            self._tangential_rows(actuation),
+            *known_rows(known, self._contact.force_sd(actuation)),
         )
-        settled, cost, found = self._search(frame)
+        settled, cost, found = self._search(frame, known)
         converged = settled and cost <= chi_square_limit(6 * len(offsets), ODD_DEVIATIONS)
-        return self._answer(frame, found, converged, pose_tip.stamp_ns)
+        return self._answer(frame, known, found, converged, pose_tip.stamp_ns)
 
-    def _tangential_rows(self, actuation: Actuation) -> Array:
-        """Directions (2, 3) across the force that is commanded, over the standard deviation there; (0, 3) without one."""
-        if actuation.force_direction is None:
-            return np.zeros((0, 3))
-        along = np.asarray(actuation.force_direction, dtype=float)
-        across = np.linalg.svd(along[None, :])[2][1:]
-        return np.ascontiguousarray(across / self._contact.tangential_sd_N)
-
-    def _search(self, frame: TrackedFrame) -> tuple[bool, float, FrameFit]:
+    def _search(self, frame: TrackedFrame, known: Prior) -> tuple[bool, float, FrameFit]:
         """From the last force; where that explains nothing, from none, then from a grid of forces."""
         limit = chi_square_limit(6 * len(frame.offsets), ODD_DEVIATIONS)
         best: tuple[bool, float, FrameFit] | None = None
@@ -124,7 +111,7 @@ class SpatialRigEstimator:
             starts += list(start_grid(0.5)[RESTARTS])
         for start in starts:
             found = _new_fit(len(frame.offsets))
-            found.x[:3], found.x[3:] = start, frame.prior[3:]
+            found.x[:3], found.x[3:] = start, known.mean[len(known.across) :]
             settled, cost = fit(frame, LARGEST_FORCE_N, found)
             if best is None or (settled, -cost) > (best[0], -best[1]):
                 best = (settled, cost, found)
@@ -133,12 +120,11 @@ class SpatialRigEstimator:
         assert best is not None
         return best
 
-    def _answer(self, frame: TrackedFrame, found: FrameFit, converged: bool, stamp_ns: int) -> TipForce:
+    def _answer(self, frame: TrackedFrame, known: Prior, found: FrameFit, converged: bool, stamp_ns: int) -> TipForce:
         covariance: Array = np.linalg.inv(found.information).astype(np.float64)
         force_N = -found.force_N
         total = found.by_x @ covariance @ found.by_x.T
-        # With the actuation's errors held at their estimates, the rest is the tracker's noise of this pose.
-        by_noise = found.by_x[:, :3] @ np.linalg.inv(found.information[:3, :3]) @ found.by_x[:, :3].T
+        by_noise = self._by_noise(frame, known, found)
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
         stiffness = self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
         lasting = total - by_noise + stiffness
@@ -147,7 +133,8 @@ class SpatialRigEstimator:
         residual = _residual(frame, found)
         if converged:
             self._force, self._unexplained = found.x[:3].copy(), 0
-            self.errors.learn(found.x[3:], covariance[3:, 3:])
+            shown = np.vstack([known.across @ found.by_x, np.eye(3, 6, 3)])
+            self.errors.learn(known, np.array([*known.across @ found.force_N, *found.x[3:]]), shown @ covariance @ shown.T)
         else:
             self._force = np.zeros(3)
             self._unexplained += 1
@@ -155,6 +142,21 @@ class SpatialRigEstimator:
                 self.errors.forget()
                 self._unexplained = 0
         return TipForce(force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T))
+
+    def _by_noise(self, frame: TrackedFrame, known: Prior, found: FrameFit) -> Array:
+        """Covariance (3, 3) of the force if what lasts is held at its estimate: the tracker's noise of this pose."""
+        by_force = found.by_x[:, :3]
+        lasting = (frame.known[3:, :3] @ found.by_x + frame.known[3:, 3:])[:, :3]
+        new = by_force.T @ self.errors.new_information(known.across) @ by_force
+        information = found.information[:3, :3] - lasting.T @ lasting + new
+        return np.asarray(by_force @ np.linalg.inv(information) @ by_force.T)
+
+
+def along_wall(actuation: Actuation) -> Array:
+    """Return unit vectors (2, 3) across the force that is commanded, base frame; (0, 3) without one."""
+    if actuation.force_direction is None:
+        return NOWHERE
+    return np.linalg.svd(np.asarray(actuation.force_direction, dtype=float)[None, :])[2][1:]
 
 
 def _new_fit(sensors: int) -> FrameFit:

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from host.estimation.lasting_errors import Prior
 from host.estimation.spatial_kernels import QUICK
 from host.estimation.spatial_residuals import quaternion_error, section
 from host.mechanics.cosserat_kernels import ALL_TANGENTS, BODY_1, K0, ROW, SHAFT_1, WORK, sweep
@@ -39,9 +40,21 @@ class TrackedFrame(NamedTuple):
     poses: Array  # (k, 7) positions (m) and quaternions, base frame
     position_std_m: float
     angle_std_rad: float
-    prior: Array  # (6,) expected x
-    information: Array  # (6, 6) how surely, inverse covariance
-    tangential: Array  # (2, 3) directions along the wall, base frame, over the force's standard deviation there, or (0, 3)
+    known: Array  # (m, 9) what is known before, whitened: rows by the force in the base frame (3) and by x (6)
+    expected: Array  # (m,) values of these rows
+
+
+def known_rows(prior: Prior, force_sd_N: float) -> tuple[Array, Array]:
+    """Return `known` and `expected` of a frame: force and errors, scaled to independent errors of standard deviation 1.
+
+    prior: of the force along the wall and all three joints. force_sd_N: standard deviation of each part of the force.
+    """
+    m = len(prior.across)
+    rows = np.zeros((m + 3, 9))
+    rows[:m, :3], rows[m:, 6:] = prior.across, np.eye(3)
+    root = np.linalg.cholesky(prior.covariance)
+    force = np.eye(3, 9, 3) / force_sd_N
+    return np.vstack([force, np.linalg.solve(root, rows)]), np.concatenate([np.zeros(3), np.linalg.solve(root, prior.mean)])
 
 
 class FrameFit(NamedTuple):
@@ -152,19 +165,17 @@ def _pose_tangents(
 def _normal_equations(f: TrackedFrame, found: FrameFit, x: Array, A: Array, H: Array, g: Array) -> float:
     """Set H (6, 6) = information and g (6,) = slope of the weighted cost, prior included; returns the cost."""
     cost = 0.0
-    for i in range(UNKNOWNS):
-        g[i] = 0.0
+    g[:], H[:] = 0.0, 0.0
+    slope = np.empty(UNKNOWNS)
+    for t in range(f.known.shape[0]):
+        z = f.expected[t]
         for j in range(UNKNOWNS):
-            H[i, j] = f.information[i, j]
-            g[i] += f.information[i, j] * (f.prior[j] - x[j])
-        cost += (f.prior[i] - x[i]) * g[i]
-    for t in range(f.tangential.shape[0]):
-        z = 0.0
-        slope = np.zeros(UNKNOWNS)
+            slope[j] = f.known[t, 3 + j]
+            z -= f.known[t, 3 + j] * x[j]
         for i in range(3):
-            z -= f.tangential[t, i] * found.force_N[i]
+            z -= f.known[t, i] * found.force_N[i]
             for j in range(UNKNOWNS):
-                slope[j] += f.tangential[t, i] * found.by_x[i, j]
+                slope[j] += f.known[t, i] * found.by_x[i, j]
         cost += z * z
         for i in range(UNKNOWNS):
             g[i] += slope[i] * z

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from host.estimation import planar
-from host.estimation.actuation_errors import ActuationKnowledge
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading
+from host.estimation.lasting_errors import ActuationKnowledge
 from host.estimation.planar_rig import PlanarRigEstimator, bending_plane
 from host.mechanics import pcar
 from protocol.catheter import load_catheter

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.estimation.actuation_errors import ActuationErrors, ActuationKnowledge
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.force import estimate_force
 from host.estimation.interface import Actuation, PoseReading
+from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors
 from host.estimation.planar_rig import PlanarRigEstimator
 from host.estimation.rig_estimator import make_estimator
 from host.estimation.spatial_rig import SpatialRigEstimator, _new_fit
@@ -70,9 +70,8 @@ def test_tangents_are_those_of_difference_quotients(insertion_m: float) -> None:
         np.array([[*pose.position_m, *pose.quaternion_wxyz] for pose in (tip, shaft)]),
         POSITION_STD_m,
         ANGLE_STD_rad,
-        np.zeros(6),
-        np.eye(6),
-        np.zeros((0, 3)),
+        np.zeros((0, 9)),
+        np.zeros(0),
     )
     rows, work, A, unused = np.zeros((3, ROW)), np.zeros(WORK), np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
     x = np.array([0.015, -0.03, -0.08, 0.4e-3, 0.6, 0.02])
@@ -119,6 +118,37 @@ def test_errors_of_the_actuation_are_followed_and_stated() -> None:
     assert one.errors.covariance[0, 0] < 0.1 * 0.8e-3**2
     noise = found.covariance_N2 - found.lasting_covariance_N2
     assert np.linalg.eigvalsh(noise).min() > -1e-12 and np.linalg.eigvalsh(found.lasting_covariance_N2).min() > -1e-12
+
+
+def test_a_lasting_force_along_the_wall_is_not_taken_for_an_error_of_the_joints() -> None:
+    """The wall is tilted: its force along the wall is the same in each pose, 1.5 of its standard deviations."""
+    on_tip, normal = np.array([0.0, 0.03, -0.12]), np.array([0.0, 0.0, 1.0])
+    unsure = ActuationKnowledge((0.3e-3, 0.5, 0.02), (2e-3, 0.1, 0.02), (1e-4, 0.1, 0.005))
+    rng, one, normalized = np.random.default_rng(9), estimator(unsure, tangential_sd_N=0.02), []
+    for k in range(240):
+        tip, shaft = poses(on_tip, -0.07, 18.0, 0.3, rng)
+        found = one.estimate(tip, shaft, Actuation(-0.07, 0.3, 18.0, k * 25_000_000, normal, "contact"))
+        error = found.force_N + on_tip
+        normalized.append(float(error @ np.linalg.solve(found.covariance_N2, error)))
+    assert found.converged
+    assert np.mean(normalized[-80:]) < 12.0  # 49 if the force is taken for new in each pose, 3 is true
+
+
+def test_a_force_along_the_wall_is_forgotten_without_contact() -> None:
+    normal, across = np.array([0.0, 0.0, 1.0]), np.eye(3)[:2]
+    errors = LastingErrors(UNSURE, 0.02)
+    errors.move_to(Actuation(-0.07, 0.0, 18.0, 0, normal, "contact"))
+    known = errors.prior(across, ALL_JOINTS)
+    assert np.sqrt(known.covariance[0, 0]) == pytest.approx(0.02)
+    errors.learn(known, np.array([0.01, 0.0, 0.0, 0.0, 0.0]), known.covariance * 0.3)
+    errors.move_to(Actuation(-0.07, 0.0, 18.0, 25_000_000, normal, "contact"))
+    assert errors.prior(across, ALL_JOINTS).mean[0] == pytest.approx(
+        0.0025, rel=0.01
+    )  # three quarters of the variance are new
+    errors.move_to(Actuation(-0.07, 0.0, 18.0, 50_000_000, normal, "approach"))
+    after = errors.prior(across, ALL_JOINTS)
+    assert not after.mean[:2].any() and np.sqrt(after.covariance[0, 0]) == pytest.approx(0.02)
+    assert np.linalg.eigvalsh(errors.prior(across, ALL_JOINTS).covariance).min() > 0.0
 
 
 def test_a_backlash_wider_than_assumed_is_learned_from_its_flanks() -> None:
@@ -188,9 +218,10 @@ def test_the_rig_file_chooses_the_model() -> None:
 
 
 def test_uncertainty_grows_with_travel_and_is_bounded_by_the_start() -> None:
-    errors = ActuationErrors(UNSURE)
+    errors = LastingErrors(UNSURE, 0.02)
     errors.move_to(Actuation(-0.07, 0.0, 18.0, 0))
-    errors.learn(np.array([1e-4, 0.1, 0.0]), np.diag([1e-10, 1e-4, 1e-8]))
+    known = errors.prior(NOWHERE, ALL_JOINTS)
+    errors.learn(known, np.array([1e-4, 0.1, 0.0]), np.diag([1e-10, 1e-4, 1e-8]))
     errors.move_to(Actuation(-0.06, 0.0, 18.0, 25_000_000))
     assert errors.covariance[0, 0] == pytest.approx(1e-10 + 5e-3**2 * 0.01 + 1e-4**2 * 0.025)
     assert errors.mean[0] == 1e-4

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from host.estimation.actuation_errors import ActuationKnowledge
 from host.estimation.contact_watch import ContactWatch
 from host.estimation.interface import Actuation, PoseReading
+from host.estimation.lasting_errors import ActuationKnowledge
 from host.mechanics.rotations import quaternion_of_vector, quaternion_product
 from host.navigation.request import joints_at
 from protocol.catheter import load_catheter

@@ -1,4 +1,4 @@
-"""Errors of the actuation that last from pose to pose: of insertion, curvature and roll, followed by a Kalman filter.
+"""Errors that last from pose to pose: of insertion, curvature and roll, and the force along the wall; a Kalman filter.
 
 The controller's joints are those of a transmission with backlash and windup. Their errors are unknown at the start and
 change when the joints move. Each pose contains information on them and on the force. The filter keeps what the poses have
@@ -7,24 +7,38 @@ told: mean and covariance of the three errors, and lets their uncertainty grow w
 A backlash that is wider than assumed makes one part of the insertion's error alternate: it is -p while the body is pushed
 and +p while it is pulled, with p half of the missing width, and changes over while the body moves by 2 p after a reversal.
 This is a fourth state, p, which poses of several reversals determine; the other three would follow it only with a delay.
+
+A wall that is not perpendicular to the commanded force makes a force along it that lasts as long as the contact. Three more
+states hold this force. Were it taken for new in each pose, its mean would count as an error of insertion and curvature, and
+the filter would be surer of the wrong one with every pose.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from host.estimation.interface import Actuation
+from protocol.enums import Phase
 from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 
 INSERTION, CURVATURE, ROLL, FLANK = 0, 1, 2, 3
+ALL_JOINTS = (INSERTION, CURVATURE, ROLL)
+NOWHERE: Array = np.zeros((0, 3))  # no direction along a wall
 GAP_NS = 1_000_000_000  # after so long without a pose nothing is remembered
 _FLANK_MEMORY_S = 60.0  # with a force sensor the controller corrects its width in contact
 _SHORTEST_CROSSING_m = 1e-4  # of the body, between the flanks: the side is seen at the tracker's rate
+_JOINTS, _ALONG_WALL = slice(0, 4), slice(4, 7)
+# Of the force along the wall: its memory, and the share of its variance that is new in each pose. A smaller share follows a
+# tilted wall better, and takes more of the joints' errors for force if the loop runs on estimates (docs/mechanics.md).
+_WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.75
+# Nothing is commanded to press on the wall in these, or the tip is still on its way to it.
+_APART = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.JOG))
 
 
 @dataclass(frozen=True)
@@ -64,42 +78,80 @@ class ActuationKnowledge:
         )
 
 
-class ActuationErrors:
-    """Errors of the joints, true joint minus the controller's: `mean` (3,) and `covariance` (3, 3) at the present pose."""
+class Prior(NamedTuple):
+    """What is expected of the force along the wall (m) and of k joints' errors, in this order.
 
-    def __init__(self, knowledge: ActuationKnowledge) -> None:
+    across: (m, 3) unit vectors along the wall, base frame. which: the k joints. mean: (m + k,). covariance: (m + k, m + k).
+    """
+
+    across: Array
+    which: tuple[int, ...]
+    mean: Array
+    covariance: Array
+
+
+class LastingErrors:
+    """True joints minus the controller's, and the force on the tip along the wall, at the present pose."""
+
+    def __init__(self, knowledge: ActuationKnowledge, tangential_sd_N: float) -> None:
+        """tangential_sd_N: standard deviation of the force along the wall, in each direction, before a pose is seen."""
         self._known = knowledge
+        self._new_N2 = _NEW_SHARE * tangential_sd_N**2
+        self._wall_N2 = (1.0 - _NEW_SHARE) * tangential_sd_N**2
         self.forget()
 
     def forget(self) -> None:
         """Return to the state at the start."""
         known = self._known
-        self._mean = np.array([0.0, 0.0, 0.0, known.flank_mean_m])
-        self._covariance = np.diag(np.square([*known.start, known.flank_m]))
+        self._mean = np.array([0.0, 0.0, 0.0, known.flank_mean_m, 0.0, 0.0, 0.0])
+        self._covariance = np.diag([*np.square([*known.start, known.flank_m]), *3 * [self._wall_N2]])
         self._last: Actuation | None = None
         self._side = 0.0
 
     @property
     def mean(self) -> Array:
         """Expected errors (3,) of insertion, curvature and roll."""
-        return self._now() @ self._mean
+        return self.prior(NOWHERE, ALL_JOINTS).mean
 
     @property
     def covariance(self) -> Array:
         """Covariance (3, 3) of these errors."""
-        now = self._now()
-        return np.asarray(now @ self._covariance @ now.T)
+        return self.prior(NOWHERE, ALL_JOINTS).covariance
 
     @property
     def missing_backlash(self) -> tuple[float, float]:
         """Return the excess (m) of the backlash over the controller's, and its standard deviation."""
         return 2.0 * float(self._mean[FLANK]), 2.0 * float(np.sqrt(self._covariance[FLANK, FLANK]))
 
-    def _now(self) -> Array:
-        """Matrix (3, 4) that makes the joints' errors of the four states."""
-        now = np.eye(3, 4)
-        now[INSERTION, FLANK] = -self._side
-        return now
+    def prior(self, across: Array, which: tuple[int, ...]) -> Prior:
+        """Return what is expected before the pose is seen. across: (m, 3) unit vectors along the wall. which: joints."""
+        now = self._now(across, which)
+        new = np.diag([*len(across) * [self._new_N2], *len(which) * [0.0]])
+        return Prior(across, which, now @ self._mean, np.asarray(now @ self._covariance @ now.T) + new)
+
+    def learn(self, prior: Prior, mean: Array, covariance: Array) -> None:
+        """Take over what a pose made of `prior`: mean (m + k,) and covariance (m + k, m + k) after it.
+
+        The states follow by their covariance with these quantities (Kalman filter, with the measurement already combined
+        with its prior).
+        """
+        cross = self._covariance @ self._now(prior.across, prior.which).T
+        gain = np.linalg.solve(prior.covariance, cross.T).T
+        self._mean = self._mean + gain @ (np.asarray(mean) - prior.mean)
+        after = self._covariance - gain @ (prior.covariance - covariance) @ gain.T
+        self._covariance = 0.5 * (after + after.T)
+
+    def new_information(self, across: Array) -> Array:
+        """Return the information (3, 3) on the force, base frame, of which the force along the wall is new in each pose."""
+        return np.asarray(across.T @ across) / self._new_N2
+
+    def _now(self, across: Array, which: tuple[int, ...]) -> Array:
+        """Matrix (m + k, 7) that makes the force along the wall and the joints' errors of the states."""
+        joints = np.eye(3, 7)
+        joints[INSERTION, FLANK] = -self._side
+        wall = np.zeros((len(across), 7))
+        wall[:, _ALONG_WALL] = across
+        return np.vstack([wall, joints[list(which)]])
 
     def move_to(self, actuation: Actuation) -> None:
         """Let the uncertainty grow by the travel and the time since the last call; never above that at the start."""
@@ -118,31 +170,19 @@ class ActuationErrors:
         self._change_side(moved[INSERTION])
         seconds = (actuation.stamp_ns - last.stamp_ns) * 1e-9
         growth = np.square(self._known.by_travel) * np.abs(moved) + np.square(self._known.by_time) * seconds
-        grown = self._covariance.copy()
-        grown += np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
+        grown = self._covariance[_JOINTS, _JOINTS] + np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
         start = np.array([*self._known.start, self._known.flank_m])
         shrink = np.minimum(1.0, start / np.maximum(np.sqrt(np.diag(grown)), 1e-12))
-        self._covariance = grown * np.outer(shrink, shrink)
+        pressed = actuation.force_direction is not None and actuation.mode not in _APART
+        kept = np.exp(-seconds / _WALL_MEMORY_S) if pressed else 0.0
+        self._covariance[_JOINTS, _JOINTS] = grown * np.outer(shrink, shrink)
+        self._covariance[_JOINTS, _ALONG_WALL] *= kept * shrink[:, None]
+        self._covariance[_ALONG_WALL, _JOINTS] = self._covariance[_JOINTS, _ALONG_WALL].T
+        self._covariance[_ALONG_WALL, _ALONG_WALL] *= kept**2
+        self._covariance[_ALONG_WALL, _ALONG_WALL] += (1.0 - kept**2) * self._wall_N2 * np.eye(3)
+        self._mean[_ALONG_WALL] *= kept
 
     def _change_side(self, moved_m: float) -> None:
         """Follow the flank of the backlash: +1 pushed, -1 pulled, between them in proportion to the body's motion."""
         crossing_m = max(2.0 * abs(self._mean[FLANK]), _SHORTEST_CROSSING_m)
         self._side = min(max(self._side + 2.0 * moved_m / crossing_m, -1.0), 1.0)
-
-    def learn(self, mean: Array, covariance: Array) -> None:
-        """Take over the result of a pose: mean (3,) and covariance (3, 3) after it."""
-        self.learn_part([INSERTION, CURVATURE, ROLL], mean, covariance)
-
-    def learn_part(self, which: list[int], mean: Array, covariance: Array) -> None:
-        """Take over the result of a pose for some of the errors, `which` (k): mean (k,), covariance (k, k).
-
-        The pose's answer replaces what was expected of these errors; the four states follow by their covariance with
-        them (Kalman filter, with the measurement already combined with its prior).
-        """
-        now = self._now()[which]
-        cross = self._covariance @ now.T
-        before = now @ cross
-        gain = np.linalg.solve(before, cross.T).T
-        self._mean = self._mean + gain @ (np.asarray(mean) - now @ self._mean)
-        after = self._covariance - gain @ (before - covariance) @ gain.T
-        self._covariance = 0.5 * (after + after.T)
