@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from protocol.catheter import Catheter, load_catheter
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 from protocol.requests import Request, unknown_key, validate
 from protocol.text_files import read_json
 
@@ -63,6 +63,8 @@ def read_request(source: str, planar: type[Planar], spatial: type[Spatial]) -> P
     """
     data = read_json(source)
     model: Any = data.get("model") if isinstance(data, dict) else None
+    if isinstance(data, dict) and data and not data.keys() & planar.model_fields.keys():
+        raise InputError(source, Description(f"the keys {', '.join(list(data)[:4])}"), "a request with the key model")
     if isinstance(data, dict) and model not in ("pcar", "cosserat"):
         raise InputError("model", "nothing" if model is None else model, "pcar or cosserat")
     wanted = planar if model == "pcar" else spatial
