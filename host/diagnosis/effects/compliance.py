@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, is_force
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Return the compliance: deflection per load."""
+    """Return the compliance: deflection per load; none where the output is a force, which a spring does not deflect."""
+    if is_force(s.unit):
+        return ()
     return (Parameter("compliance", f"{s.unit}/{s.source_unit}", (s.need / s.source_rms,), linear=True),)
 
 

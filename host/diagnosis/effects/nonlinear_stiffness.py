@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, is_force
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Return the parameters `compliance` and `cubic`."""
+    """Return the parameters `compliance` and `cubic`; none where the output is a force, which no spring deflects."""
+    if is_force(s.unit):
+        return ()
     unit = f"{s.unit}/{s.source_unit}"
     return (
         Parameter("compliance", unit, (s.need / s.source_rms,), linear=True),

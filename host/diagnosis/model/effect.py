@@ -12,6 +12,8 @@ import numpy.typing as npt
 from host.diagnosis.model.operators import direction
 
 Array = npt.NDArray[np.float64]
+# Units of forces and moments, each with the same unit without its scale.
+FORCES = {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}
 
 
 @dataclass(frozen=True)
@@ -213,3 +215,8 @@ def cornered(candidate: Candidate, values: Array) -> Candidate:
 def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     """`count` values from `low` to `high` in equal ratios."""
     return tuple(float(value) for value in np.geomspace(low, high, count))
+
+
+def is_force(unit: str) -> bool:
+    """Return whether `unit` is one of force or moment."""
+    return unit in FORCES

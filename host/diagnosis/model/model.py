@@ -10,12 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, rate_key
+from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, is_force, rate_key
 from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
-# Units of a load, each with the same unit without its scale.
-FORCES = {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}
 Mask = npt.NDArray[np.bool_]
 ActiveEffect = tuple[Candidate, Array]
 
@@ -73,7 +71,7 @@ class Segment:
 
 def forces_among(channels: tuple[str, ...], units: dict[str, str]) -> tuple[str, ...]:
     """Those `channels` that are measured in units of force: where a nominal model names no load, they may be one."""
-    return tuple(name for name in channels if units.get(name) in FORCES)
+    return tuple(name for name in channels if is_force(units.get(name, "")))
 
 
 class Model(ABC):

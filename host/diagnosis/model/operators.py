@@ -10,6 +10,7 @@ from numba import njit
 
 Array = npt.NDArray[np.float64]
 FIRST_SAMPLES = 10  # that show the speed with which a recording begins
+STEADY_SHARE = 0.9  # of all changes of a reading that repeat the one before, from which on the motion has equal steps
 LEAST_INERTIA = 1e-9  # in sample periods: below this a lag is of first order, or none
 
 
@@ -397,7 +398,8 @@ def white_level(x: Array) -> float:
 def quantum(values: Array) -> float:
     """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized.
 
-    Steps of a twentieth of the range and more are a signal that switches between levels, no resolution.
+    Steps of a twentieth of the range and more are a signal that switches between levels, no resolution. So are the steps of
+    a motion of constant speed, such as a triangle wave: each is as long as the one before.
     """
     good = values[np.isfinite(values)]
     levels = np.unique(good)
@@ -406,4 +408,15 @@ def quantum(values: Array) -> float:
     steps = np.diff(levels)
     dust = 1e-9 * (levels[-1] - levels[0])
     smallest = float(np.min(steps[steps > dust], initial=np.inf))
-    return smallest if smallest < 0.05 * (levels[-1] - levels[0]) else 0.0
+    return smallest if smallest < 0.05 * (levels[-1] - levels[0]) and not constant_speed(values, smallest) else 0.0
+
+
+def constant_speed(values: Array, step: float) -> bool:
+    """Whether nearly every change of `values` (n,) repeats the one before to 1/1000 of `step`.
+
+    The reading of a coarse sensor does so only if the motion advances by a whole number of steps in every sample.
+    """
+    steps = np.diff(values)
+    moving = np.abs(steps[:-1]) > 0.5 * step
+    alike = np.abs(np.diff(steps)) < 1e-3 * step
+    return int(np.count_nonzero(moving & alike)) > STEADY_SHARE * max(int(np.count_nonzero(moving)), 1)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.operators import fill, quantum
+from host.diagnosis.model.operators import constant_speed, fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -129,7 +129,7 @@ def resolution(values: Array, switched: bool) -> float:
     steps = np.diff(levels)
     smallest = float(np.min(steps))
     even = np.abs(steps / smallest - np.round(steps / smallest)) < 1e-3
-    return smallest if bool(even.all()) else 0.0
+    return smallest if bool(even.all()) and not constant_speed(values, smallest) else 0.0
 
 
 def coarse(

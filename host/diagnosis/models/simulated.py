@@ -22,9 +22,8 @@ from scipy.signal import fftconvolve
 from host.diagnosis.effects import library
 from host.diagnosis.effects.gravity_load import payload
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale, spread
+from host.diagnosis.model.effect import FORCES, Candidate, Context, Effect, Parameter, Port, Scale, spread
 from host.diagnosis.model.model import (
-    FORCES,
     ActiveEffect,
     Begin,
     Model,
