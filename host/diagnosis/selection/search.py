@@ -37,6 +37,7 @@ from host.diagnosis.selection.trial import (
     only_sampling,
     rank,
     related,
+    vanished,
     weighty,
     wider,
 )
@@ -551,7 +552,8 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
             few = gain.log_likelihood < problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * len(
                 term.parameters
             )
-            if few or gain.share < least or held.log_likelihood < 0.0:
+            gone = vanished(best, term, problem.rules)
+            if gone or few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break

@@ -62,16 +62,19 @@ def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
     return term.candidate.effect.dissipates and len(parts) > 1 and min(parts) < 0.0 < max(parts)
 
 
-def vanished(fit: Fit, rules: SelectionRules) -> bool:
-    """Whether the amounts of the last effect, which cannot be negative, went to zero: only its initial state remains.
+def vanished(fit: Fit, term: Term, rules: SelectionRules) -> bool:
+    """Whether the amounts of `term`, which cannot be negative, went to zero: only its initial state remains.
 
     A mode that takes part with no share of the motion can still ring down from the first sample on. What it then explains
-    is an initial state that the nominal model lacks.
+    is an initial state that the nominal model lacks. The same holds of a memory without linear parameters (a delay, a gap)
+    if all of its parameters that may be zero are.
     """
-    term = fit.terms[-1]
-    own = zip(term.parameters, fit.values_of(term), strict=True)
-    amounts = [(p, float(value)) for p, value in own if p.linear and p.low == 0.0]
-    alone = len(amounts) == sum(p.linear for p in term.parameters)
+    linear = any(p.linear for p in term.parameters)
+    if not linear and not term.candidate.effect.remembers:
+        return False
+    own = [(p, float(value)) for p, value in zip(term.parameters, fit.values_of(term), strict=True) if p.linear == linear]
+    amounts = [(p, value) for p, value in own if p.low == 0.0]
+    alone = len(amounts) == len(own) or not linear
     return bool(amounts) and alone and all(abs(v) < rules.least_amount * min(map(abs, p.grid)) for p, v in amounts)
 
 
@@ -161,7 +164,7 @@ def good_enough(trial: Trial, base: Fit) -> bool:
     Held-out samples alone are enough; where they show it dimly, because their excitation hardly calls for it, all
     samples together have to be surer by far. Blocks held out between the fitted ones have the same excitation: no excuse.
     """
-    gone = vanished(trial.fit, trial.rules)
+    gone = vanished(trial.fit, trial.fit.terms[-1], trial.rules)
     return not gone and not at_bound(trial.fit) and not of_sampling(trial) and called_for(trial, base)
 
 
