@@ -5,6 +5,10 @@ not predict) then holds the noise of a moment before, and an effect that makes t
 neighbouring samples, can take a part of the noise away without any physics in it. Forssell and Ljung, "Closed-loop
 identification revisited" (Automatica, 1999): a consistent comparison needs the noise that is fed back in the noise model.
 Here the part of the residual that later input predicts is taken off before two models are compared.
+
+A controller that computes the input of a row from the reading of the same row sends its noise into that row. A direct path
+through the plant would look alike, but such a path passes all of the input alike, and noise is in its new part alone:
+the residual then follows the new part and not the rest. Noise of the input's own reading has the same signature.
 """
 
 from __future__ import annotations
@@ -23,18 +27,26 @@ LAGS = 30  # later samples of the inputs together; the first later one is left o
 SAMPLES_PER_LAG = 40  # recorded, at least
 MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
 LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
+COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
+OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the rest of it
 OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
 
 
 def innovations(x: Array) -> Array:
     """Return what `x` (n,) does beyond its best linear prediction from the last ORDER samples, zero at its begin."""
+    new = unpredicted(x)
+    return new / (np.std(new[ORDER:]) + 1e-300)
+
+
+def unpredicted(x: Array) -> Array:
+    """As `innovations`, in the unit of `x` (n,)."""
     past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
     new = x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=None)[0]
-    return np.concatenate((np.zeros(ORDER), new / (np.std(new) + 1e-300)))
+    return np.concatenate((np.zeros(ORDER), new))
 
 
 def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> None:
-    """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs`.
+    """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs` or at once.
 
     residuals: (outputs, n) of each segment. `fed_back[row]` is an orthonormal basis (n, lags), or None.
     """
@@ -47,6 +59,41 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         if later < LEAST_SHARE or later < OVER_PAST * earlier:
             for segment in segments:
                 segment.fed_back[row] = None
+        at_once = [part for name in inputs for part in _at_once(segments, residuals, row, name, earlier)]
+        for index, column in at_once:
+            segments[index].fed_back[row] = _with(segments[index].fed_back[row], column)
+
+
+def _at_once(
+    segments: list[Segment], residuals: list[Array], row: int, name: str, earlier: float
+) -> list[tuple[int, Array]]:
+    """New part of input `name` of each segment, by its index, if noise of this output is in it; else none."""
+    parts = []
+    for index, (segment, residual) in enumerate(zip(segments, residuals, strict=True)):
+        x = segment.inputs.get(name)
+        if x is None or not ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES or np.ptp(x) == 0.0:
+            continue
+        new = unpredicted(fill(x))
+        spread = 1.4826 * float(np.median(np.abs(new[ORDER:])))
+        new = np.where(np.abs(new) <= COMMON * spread, new, 0.0)
+        rest = fill(x) - new
+        parts.append((index, new, rest - np.mean(rest), np.nan_to_num(residual[row])))
+    if not parts:
+        return []
+    new, rest, r = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
+    power, size = float(r @ r), float(new @ new)
+    if power == 0.0 or size == 0.0:
+        return []
+    by_new, by_rest = np.linalg.lstsq(np.column_stack((new, rest)), r, rcond=1e-12)[0]
+    share = by_new**2 * size / power
+    if share < LEAST_SHARE or share < OVER_PAST * earlier or abs(by_new) < OVER_REST * abs(by_rest):
+        return []
+    return [(index, part) for index, part, _, _ in parts if np.any(part)]
+
+
+def _with(basis: Array | None, column: Array) -> Array:
+    """`basis` (n, k) extended by `column` (n,), orthonormal."""
+    return np.linalg.qr(column[:, None] if basis is None else np.column_stack((basis, column)))[0]
 
 
 def freed(segment: Segment, row: int, residual: Array) -> Array:

@@ -19,6 +19,7 @@ SAME = 2e-3  # deviation of two inputs over their own, below which the one repea
 ALIKE = 0.8  # correlation of a channel with itself, from which a period is looked for
 FEWEST_REPEATED = 200  # samples
 REPEATS = "differences between repeats"
+HELD = 0.05  # share of third differences that are zero, from which on readings repeat and their median says nothing
 QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
 
@@ -193,10 +194,12 @@ def autoregression(lags: Array) -> Array:
 
 
 def _high_frequency(outputs: list[Array]) -> float:
-    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum.
+    """Standard deviation of white noise as strong as the quietest twentieth of the spectrum, or as the middling third
+    difference, whichever is less.
 
     A mean of few periodograms scatters, and its quietest twentieth lies below the noise even if that is white: it is
-    put where a twentieth of chi-squared is (Welch 1967).
+    put where a twentieth of chi-squared is (Welch 1967). Jumps, such as those of dry friction, raise the whole spectrum;
+    they leave the median of the differences as it is.
     """
     from scipy.signal import welch
     from scipy.stats import chi2
@@ -209,7 +212,11 @@ def _high_frequency(outputs: list[Array]) -> float:
             freedom = 2.0 * (1 + (line.size - size) // (size - size // 2))
             _, power = welch(line, fs=1.0, nperseg=size, window="blackman")
             low = chi2.ppf(QUIETEST, freedom) / freedom
-            spread.append(np.sqrt(0.5 * np.quantile(power[1:-1], QUIETEST) / low))
+            level = float(np.sqrt(0.5 * np.quantile(power[1:-1], QUIETEST) / low))
+            steps = np.diff(line, 3)
+            if np.mean(steps == 0.0) < HELD:
+                level = min(level, 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(20.0))
+            spread.append(level)
         elif np.count_nonzero(np.isfinite(values)) > 8:  # too short for a spectrum: third differences of what is smooth
             steps = np.diff(fill(values), 3)
             spread.append(1.4826 * np.median(np.abs(steps)) / np.sqrt(20.0))
