@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
+from host.diagnosis.effects import library
 from host.diagnosis.estimation.evidence import Gain
+from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.noise import estimate
 from host.diagnosis.estimation.rules import RULES
-from host.diagnosis.model.operators import lag, shift
+from host.diagnosis.model.effect import Candidate, Port, Scale
+from host.diagnosis.model.operators import lag, quantum, shift
 from host.diagnosis.selection.posterior import posterior
+from host.diagnosis.selection.trial import vanished
 
 Array = np.ndarray
 GEAR = {
@@ -149,3 +154,87 @@ def test_probabilities_add_up_and_follow_the_evidence() -> None:
     assert weak.effect < RULES.confident < sure.effect
     stand_in = posterior(gain(200.0), gain(100.0), 2, [], 0.6, RULES)
     assert stand_in.none > 0.9
+
+
+def looped(number: int) -> dict[str, Array]:
+    """A first-order motor under a PI controller that reads the noisy speed of the same row; steps of the set-point."""
+    rng, period_s, n = np.random.default_rng([88, number]), 0.01, 1500
+    keep, speed, integral = float(np.exp(-period_s / 0.15)), 0.0, 0.0
+    wanted = np.repeat(rng.uniform(-1.0, 1.0, n // 50), 50)
+    u, y = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = speed + 0.02 * rng.standard_normal()
+        error = wanted[k] - y[k]
+        integral += 4.0 * error * period_s
+        u[k] = 1.2 * error + integral
+        speed = keep * speed + (1.0 - keep) * 2.0 * u[k]
+    return {"t": period_s * np.arange(n), "u": u, "y": y}
+
+
+def test_noise_that_a_controller_answers_in_the_same_row_is_no_coupling() -> None:
+    nominal = {
+        "name": "motor",
+        "kind": "linear",
+        "data": {"time": "t"},
+        "channels": {"drive": {"column": "u", "unit": "V"}, "speed": {"column": "y", "unit": "rad/s"}},
+        "linear": {
+            "inputs": ["drive"],
+            "outputs": ["speed"],
+            "subsystem": "motor",
+            "numerator": ["gain"],
+            "denominator": ["tau", 1.0],
+            "hold": "zero",
+        },
+        "parameters": {"gain": 1.5, "tau": 0.2},
+    }
+    content = diagnose([looped(k) for k in (1, 2)], nominal).as_dict()
+    assert content["verdict"] == "nothing_missing" and content["effects"] == []
+
+
+def test_a_triangle_wave_in_equal_steps_is_no_coarse_sensor() -> None:
+    rng, k = np.random.default_rng(8), np.arange(2000)
+    x = 1e-3 * np.abs((k + 300) % 600 - 300)
+    coarse = 1e-3 * np.round(0.2 * np.sin(0.01 * k) / 1e-3)
+    assert quantum(x) == 0.0 and quantum(coarse) == pytest.approx(1e-3)
+    runs = [{"t": 0.01 * k, "m": x, "y": 1.2 * x + 5e-4 * rng.normal(size=k.size)} for _ in range(2)]
+    assert ids(diagnose(runs, GEAR).as_dict()) == set()
+
+
+def test_an_encoder_disk_off_its_centre_turns_unevenly() -> None:
+    """The mismatch, 14 mrad, is a small part of a turn; the first amplitudes that were tried are ten times larger."""
+    rng, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.02)
+    runs = []
+    for phase in (0.3, 1.9):
+        angle = 7.0 * np.sin(0.4 * t + phase) + 2.0 * np.sin(0.9 * t)
+        seen = np.unwrap(np.arctan2(np.sin(angle) - 0.007, np.cos(angle) - 0.012))
+        seen += 2.0 * np.pi * np.round((angle[0] - seen[0]) / (2.0 * np.pi))
+        runs.append({"t": t, "m": angle, "y": seen + 2e-3 * rng.normal(size=t.size)})
+    (found,) = diagnose(runs, GEAR).effects
+    assert found["id"] == "whip" and found["parameters"]["amplitude_rad"]["value"] == pytest.approx(0.0139, rel=0.05)
+
+
+def test_a_force_is_not_deflected_by_another_force() -> None:
+    """Cross-talk of a force sensor is a coupling: a compliance is a motion under a load."""
+    force, motion = (scale(unit) for unit in ("N", "m"))
+    for effect in library():
+        if effect.id in ("compliance", "nonlinear_stiffness") and effect.source == "load":
+            assert effect.parameters(force, effect.forms[0]) == () and effect.parameters(motion, effect.forms[0])
+
+
+def scale(unit: str) -> Scale:
+    return Scale(unit, 1.0, 0.0, 1.0, 1.0, 1e-3, 0.1, 0.01, 10.0, True, source_unit="N m")
+
+
+def test_a_delay_of_nothing_is_the_state_that_a_recording_begins_from() -> None:
+    late = next(effect for effect in library() if effect.id == "latency" and effect.port == "motion")
+    port = Port("oven", "motion", "oven", ("temperature",))
+    term = Term(Candidate(late, port), late.parameters(scale("m"), ""))
+    assert [vanished(Fit((term,), np.array([delay_s])), term, RULES) for delay_s in (1e-6, 5e-3)] == [True, False]
+
+
+def test_jumps_of_dry_friction_do_not_count_as_noise() -> None:
+    """Stretches at rest are missing, so the noise has to be read from the spectrum: jumps fill all of it."""
+    rng, t = np.random.default_rng(10), np.arange(0.0, 20.0, 0.01)
+    speed = np.cos(2.0 * np.pi * 0.4 * t) + np.cos(2.0 * np.pi * 1.1 * t + 1.0)
+    force = speed + 2.2 * np.sign(speed) + 0.05 * rng.standard_normal(t.size)
+    assert estimate([force], [np.zeros(t.size, dtype=bool)]).sigma == pytest.approx(0.05, rel=0.15)
