@@ -7,7 +7,8 @@ import numpy as np
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
-HALF_TURN = np.pi  # pitch of an angle beyond which it is once a turn: that is whip
+# Pitch of an angle beyond which it is once a turn, which is whip: midway to twice a turn, as of a universal joint.
+LONGEST_ANGLE = float(np.sqrt(2.0) * np.pi)
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -16,7 +17,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     if form == "place":
         longest = PERIODS * s.motion_span
         if (s.motion_unit or s.unit) == "rad":
-            longest = min(longest, HALF_TURN)
+            longest = min(longest, LONGEST_ANGLE)
         return (
             *pair,
             Parameter(

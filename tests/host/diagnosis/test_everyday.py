@@ -213,6 +213,20 @@ def test_an_encoder_disk_off_its_centre_turns_unevenly() -> None:
     assert found["id"] == "whip" and found["parameters"]["amplitude_rad"]["value"] == pytest.approx(0.0139, rel=0.05)
 
 
+def test_a_universal_joint_turns_unevenly_twice_a_turn() -> None:
+    rng, t = np.random.default_rng(12), np.arange(0.0, 20.0, 0.02)
+    runs = []
+    for phase in (0.2, 1.4):
+        angle = 7.0 * np.sin(0.4 * t + phase) + 2.0 * np.sin(0.9 * t)
+        bent = np.arctan2(np.sin(angle) * np.cos(0.2), np.cos(angle))
+        turned = angle + np.angle(np.exp(1j * (bent - angle)))
+        runs.append({"t": t, "m": angle, "y": turned + 2e-3 * rng.normal(size=t.size)})
+    (found,) = diagnose(runs, GEAR).effects
+    assert found["id"] == "periodic_disturbance" and found["parameters"]["pitch_rad"]["value"] == pytest.approx(
+        np.pi, rel=0.01
+    )
+
+
 def test_a_force_is_not_deflected_by_another_force() -> None:
     """Cross-talk of a force sensor is a coupling: a compliance is a motion under a load."""
     force, motion = (scale(unit) for unit in ("N", "m"))
