@@ -2,6 +2,7 @@
 
     python -m host.studies.control.pose_only_study --seeds 7701 7702 7703 7704 7705 7706 7707 7708 7709 7710
     python -m host.studies.control.pose_only_study --tilts-deg 30 60 --beats regular --seeds 7701 7702 7703
+    python -m host.studies.control.pose_only_study --unknown-deg 6 --beats regular --seeds 7701 7702 7703
 
 The estimate closes the loop on the simulated wall. Virtual time; the force is the simulator's, along the wall's normal, from
 5 s after contact on. "Of still" divides the RMS error by that of a catheter that the force sensor brought to the same wall
@@ -30,20 +31,24 @@ HEAD = (
 BEATS = {"regular": REGULAR, "irregular": IRREGULAR}
 
 
-def tilted_wall(tilt_deg: float) -> tuple[ContactJob, TissueConfig]:
+def tilted_wall(tilt_deg: float, unknown_deg: float = 0.0) -> tuple[ContactJob, TissueConfig]:
     """Return the job and the wall whose normal is turned by `tilt_deg` out of the bending plane, about e2.
 
-    The wall still goes through the target: the simulated catheter bends in the plane of e2 and e3, at e1 = 0.
+    The wall alone is turned by `unknown_deg` about e1 before: the job does not know it. The wall still goes through the
+    target: the simulated catheter bends in the plane of e2 and e3, at e1 = 0.
     """
     tilt = math.radians(tilt_deg)
     into = (-math.sin(tilt), 0.0, math.cos(tilt))
-    wall = replace(PlantConfig().tissue, normal=(math.sin(tilt), 0.0, -math.cos(tilt)))
+    unknown = math.radians(unknown_deg)
+    across = math.cos(unknown)
+    normal = (across * math.sin(tilt), math.sin(unknown), -across * math.cos(tilt))
+    wall = replace(PlantConfig().tissue, normal=normal)
     return replace(JOB, into=into), wall
 
 
-def run(rig: Rig, seed: int, model: str, beat: str, tilt_deg: float, seconds: float) -> Held:
+def run(rig: Rig, seed: int, model: str, beat: str, walls: tuple[ContactJob, TissueConfig], seconds: float) -> Held:
     """Hold WANTED_N by pose alone, with the estimator `model`."""
-    job, wall = tilted_wall(tilt_deg)
+    job, wall = walls
     changed = with_control(rig, "estimation", model=model)
     return hold(changed, seed, BEATS[beat], seconds, "estimate", job, tissue=wall)
 
@@ -78,6 +83,9 @@ def main() -> None:
     parser.add_argument(
         "--tilts-deg", type=float, nargs="+", default=[0.0], help="of the wall's normal out of the bending plane"
     )
+    parser.add_argument(
+        "--unknown-deg", type=float, default=0.0, help="tilt in the bending plane that the job does not know"
+    )
     parser.add_argument("--seconds", type=float, default=20.0, help="after contact")
     parser.add_argument("--each", action="store_true", help="print each run as well")
     options = parser.parse_args()
@@ -85,7 +93,7 @@ def main() -> None:
     print(HEAD)
     print("|---|---|---|---|---|---|---|---|---|---|")
     for tilt_deg in options.tilts_deg:
-        job, wall = tilted_wall(tilt_deg)
+        job, wall = tilted_wall(tilt_deg, options.unknown_deg)
         for beat in options.beats:
             where = f"{tilt_deg:g} degrees, {beat}"
             reference = [still(rig, seed, options.seconds - 5.0, BEATS[beat], job, tissue=wall) for seed in options.seeds]
@@ -96,7 +104,7 @@ def main() -> None:
             for model in options.models:
                 runs = []
                 for seed, reference_N in zip(options.seeds, reference, strict=True):
-                    runs.append(run(rig, seed, model, beat, tilt_deg, options.seconds))
+                    runs.append(run(rig, seed, model, beat, (job, wall), options.seconds))
                     if options.each:
                         print(f"| seed {seed} | {model} | {row(runs[-1:], [reference_N])}", flush=True)
                 print(f"| {where} | {model} | {row(runs, reference)}", flush=True)
