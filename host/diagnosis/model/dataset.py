@@ -43,6 +43,7 @@ class Recording:
     units: dict[str, str] = field(default_factory=dict)
     begin_s: float = 0.0
     jitter: float = 0.0  # largest deviation of a period from the median one, over it, as recorded
+    infinite: tuple[str, ...] = ()  # channels with infinite values as recorded, missing in `channels`
 
     @property
     def n(self) -> int:
@@ -165,6 +166,7 @@ def _one(
         raise InputError(f"channels.{short[0]}", f"{channels[short[0]].size} rows in {name}", f"{n} rows")
     if n < FEWEST_ROWS:
         raise InputError("recording", f"{n} rows in {name}", f"at least {FEWEST_ROWS} rows")
+    infinite = tuple(key for key, values in channels.items() if np.isinf(values).any())
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
     time_s, timed = _time_line(spec, name, columns, n)
     dt_s = float(np.median(np.diff(time_s)))
@@ -175,7 +177,7 @@ def _one(
         time_s, channels = _even(time_s, dt_s, channels)
     nothing = np.zeros(time_s.size, dtype=bool)
     units = {key: channel.unit for key, channel in needed.items()}
-    return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter)
+    return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter, infinite=infinite)
 
 
 def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:

@@ -142,6 +142,8 @@ def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str],
         elif float(np.mean(~np.isfinite(together))) > MISSING_SHARE:
             share = float(np.mean(~np.isfinite(together)))
             findings.append(Finding("missing", column, f"{share:.0%} of the samples of column {column} are missing."))
+        if any(name in recording.infinite for recording in recordings):
+            findings.append(Finding("missing", column, f"Column {column} holds infinite values. They count as missing."))
         if good.size and float(np.ptp(good)) <= DEAD * max(float(np.max(np.abs(good))), 1e-300):
             says = f"Column {column} has the same value, {good[0]:.4g}, in every sample."
             if name in vital:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_validator
+from pydantic import AfterValidator, AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
 from protocol.errors import InputError
 from protocol.requests import Request, validate
 from protocol.text_files import read_toml
+
+Term = TypeVar("Term", bound=str)
+
+
+def _each_once(terms: list[Term]) -> list[Term]:
+    if not terms or len(set(terms)) < len(terms):
+        raise ValueError("at least one term, and each once")
+    return terms
+
+
+Terms = Annotated[list[Term], AfterValidator(_each_once)]
 
 
 class ChannelSpec(Request):
@@ -146,7 +157,7 @@ class AxisSpec(Request):
     subsystem: str = "axis"
     input: str
     output: str
-    terms: list[Literal["mass", "damping", "stiffness", "offset"]] = ["mass", "damping", "offset"]
+    terms: Terms[Literal["mass", "damping", "stiffness", "offset"]] = ["mass", "damping", "offset"]
     reads: Literal["position", "velocity", "acceleration"] = "position"
     hold: Literal["zero", "linear", "band_limited"] | None = None
     controller: ControllerSpec | None = None
@@ -160,7 +171,7 @@ class ImpedanceSpec(Request):
     output: str
     load: list[str] = []
     others: list[str] = []
-    terms: list[Literal["mass", "damping", "stiffness", "load", "offset"]] = ["stiffness", "offset"]
+    terms: Terms[Literal["mass", "damping", "stiffness", "load", "offset"]] = ["stiffness", "offset"]
 
 
 class CallableSpec(SimulatorSpec):

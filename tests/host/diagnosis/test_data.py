@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from host.diagnosis.model.dataset import Recording, find_files, load, read_tables, thin
+from host.diagnosis.model.findings import _dead
 from host.diagnosis.model.nominal import NominalSpec, read_nominal
+from host.diagnosis.model.readings import Finding
 from host.diagnosis.model.tables import read_table
 from host.diagnosis.models import channels_of
 from protocol.errors import InputError
@@ -67,6 +69,25 @@ def test_empty_fields_are_missing(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("a,b\n1,2\n,3\nnan,4\n")
     columns = read_table(tmp_path / "x.csv")
     assert np.isnan(columns["a"][1:]).all() and columns["b"].tolist() == [2, 3, 4]
+
+
+def test_infinite_values_are_missing_and_said(tmp_path: Path) -> None:
+    path = table(tmp_path / "x.csv")
+    lines = path.read_text().splitlines()
+    lines[2] = "0.01,inf,1"
+    path.write_text("\n".join(lines) + "\n")
+    (one,) = read(tmp_path, [path])
+    assert np.isnan(one.channels["motor"][1]) and one.infinite == ("motor",)
+    findings: list[Finding] = []
+    _dead([one], {"motor"}, {"motor": "a"}, findings)
+    assert [finding.says for finding in findings] == ["Column a holds infinite values. They count as missing."]
+
+
+@pytest.mark.parametrize("terms", ["[]", '["mass", "mass"]'])
+def test_a_law_has_each_term_once(tmp_path: Path, terms: str) -> None:
+    law = f'[axis]\ninput = "motor"\noutput = "jaw"\nterms = {terms}\n'
+    with pytest.raises(InputError, match=r"axis\.terms: .*wanted at least one term, and each once"):
+        spec(tmp_path, TOML.split("[[link]]")[0].replace("transmission", "axis") + law)
 
 
 def test_scale_and_sign_are_applied(tmp_path: Path) -> None:
