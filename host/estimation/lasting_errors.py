@@ -36,7 +36,7 @@ _SHORTEST_CROSSING_m = 1e-4  # of the body, between the flanks: the side is seen
 _JOINTS, _ALONG_WALL = slice(0, 4), slice(4, 7)
 # Of the force along the wall: its memory, and the share of its variance that is new in each pose. A smaller share follows a
 # tilted wall better, and takes more of the joints' errors for force if the loop runs on estimates (docs/mechanics.md).
-_WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.75
+_WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.95
 # Nothing is commanded to press on the wall in these, or the tip is still on its way to it.
 _APART = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.JOG))
 
