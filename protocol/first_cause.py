@@ -1,8 +1,8 @@
 """Which cause came first: orders what went wrong by time and by what explains what, and says what to do about it.
 
 A starved computer shows as four faults: the loop is late, so set-points stop, so the board's dead man acts, and poses are
-stale when the loop is back. Only the first has a remedy; the others are listed after it. Page, log, report and terminal
-use this one function.
+stale when the loop is back. Only the first has a remedy; the others are listed after it. The realtime process publishes
+the result (`realtime/core/cause_watch.py`); page, report and terminal show it.
 """
 
 from __future__ import annotations

@@ -342,6 +342,16 @@ class BoardCounters(Message, frozen=True, kw_only=True):
     deadman_age_ms: Annotated[Duration_ms, doc("time since the newest valid set-point")]
 
 
+class RigCause(Message, frozen=True, kw_only=True):
+    """First cause of what went wrong since the rig was armed, with its remedy; empty where nothing did."""
+
+    name: Annotated[Text, doc("name of the first cause; empty if there is none")] = ""
+    since_ns: Annotated[Stamp_ns, doc("time at which it was noticed")] = 0
+    says: Annotated[Text, doc("the first cause in words")] = ""
+    remedy: Annotated[Text, doc("what to do about it")] = ""
+    followed: Annotated[Text, doc("all other causes, one in a line, with the time since the first")] = ""
+
+
 class LoopTiming(Message, frozen=True, kw_only=True):
     """The control loop's timing since its start: exact percentiles, and histograms over HISTOGRAM_EDGES_US."""
 
@@ -542,6 +552,7 @@ _TABLE = (
     Topic("stiffness", Stiffness, 4, "state", "host -> tools", "adapted stiffness of the catheter"),
     Topic("contact", BodyContact, 4, "state", "host -> tools", "contact away from the tip: place and force"),
     Topic("state", RigState, 100, "state", "realtime -> host, tools", "mode, safety action and cause, target"),
+    Topic("cause", RigCause, 2, "state", "realtime -> host, tools", "first cause of a stop or hold, with its remedy"),
     Topic("board", BoardCounters, 20, "state", "realtime -> host, tools", "counters of the stepper board"),
     Topic("loop", LoopTiming, 2, "state", "realtime -> host, tools", "timing of the control loop"),
     Topic("log", Log, 0, "event", "all -> host, tools", "log lines"),

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from host.recordings.cause_watch import CauseWatch
 from protocol.enums import BoardState
-from protocol.first_cause import describe
 
 # Samples of a trace that wait for the next frame: a third of a second of live ones, or what fills a trace after a jump.
 WAITING = 512
@@ -42,7 +40,6 @@ class Picture:
         self._estimate_rows: deque[list[float | None]] = deque(maxlen=WAITING)
         self._kept: dict[str, deque[list[float | None]]] = {name: deque(maxlen=KEPT) for name in ("rows", "estimates")}
         self._received = 0
-        self._causes = CauseWatch()
         self._plan: dict[str, Any] | None = None
         self._log: deque[dict[str, Any]] = deque(maxlen=LOG_LINES)
         self._log_new = False
@@ -52,7 +49,6 @@ class Picture:
         """Forget all messages, for a jump in time."""
         self._newest.clear()
         self._plan = None
-        self._causes = CauseWatch()
         self._log.clear()
         for rows in (self._force_rows, self._estimate_rows, *self._kept.values()):
             rows.clear()
@@ -63,7 +59,6 @@ class Picture:
         if topic.startswith("pose/") and body.get("position_m") is None:
             return  # not seen this time: the one before stands until it is old
         self._newest[topic] = body
-        self._causes.take(topic, body)
         if topic == "state":
             self.now_ns = body["stamp_ns"]
             # Before the first pose the loop's prediction is where it was switched on: nothing that is known.
@@ -193,11 +188,10 @@ class Picture:
 
     def _first(self, state: Body) -> dict[str, Any] | None:
         """The first cause of what stands, its remedy, and what followed; None while nothing holds the rig back."""
-        first = self._causes.first()
-        if first is None or state.get("safety_action", "none") in ("none", "warn"):
+        first = self._newest.get("cause", {})
+        if not first.get("name") or state.get("safety_action", "none") in ("none", "warn"):
             return None
-        followed = [describe(item) for item in first.followed]
-        return {"says": first.says, "remedy": first.remedy, "followed": followed}
+        return {"says": first["says"], "remedy": first["remedy"], "followed": first["followed"].splitlines()}
 
     def _drawn(self) -> dict[str, Any]:
         """The scene with numbers short enough to be sent thirty times a second: 10 um, 0.1 mN."""

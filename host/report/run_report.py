@@ -11,7 +11,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from host.recordings.recording import RecordingFile
 from host.report.run_figures import RunFigures
 from host.report.run_summary import SETTLE_S, RunSummary, summarize
-from protocol.first_cause import describe
 
 # Keeps a number and its unit on one line.
 NBSP = "\u00a0"
@@ -114,11 +113,9 @@ def verdict_of(summary: RunSummary) -> RunVerdict:
 def _with_first_cause(verdict: RunVerdict, summary: RunSummary) -> RunVerdict:
     """Return a failed run's verdict with its first cause, remedy and what followed."""
     first = summary.first
-    if verdict.level != "bad" or first is None or first.cause == "operator_stop":
+    if verdict.level != "bad" or first is None or first.name == "operator_stop":
         return verdict
-    followed = tuple(
-        f"{(item.at_ns - first.at_ns) * 1e-6:+.0f} ms: {describe(item)}".replace("-", "\u2212") for item in first.followed
-    )
+    followed = tuple(line.replace("-", "\u2212", 1) for line in first.followed.splitlines())
     return verdict._replace(sentence=f"{verdict.sentence} {first.says}", remedy=first.remedy, followed=followed)
 
 

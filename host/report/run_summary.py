@@ -6,11 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from host.recordings.cause_watch import CauseWatch
 from host.recordings.recording import RecordingFile
 from protocol.enums import SafetyAction
-from protocol.first_cause import FirstCause
-from protocol.topics import HISTOGRAM_BUCKETS
+from protocol.topics import HISTOGRAM_BUCKETS, RigCause
 
 Array = np.ndarray
 # A measured force above this is contact; below it is the sensor's noise.
@@ -100,7 +98,7 @@ class RunSummary:
     lost: dict[str, int]
     truncated: bool
     virtual: bool
-    first: FirstCause | None = None
+    first: RigCause | None = None
 
     @property
     def worst_action(self) -> str:
@@ -181,14 +179,12 @@ def summarize(recording: RecordingFile) -> RunSummary:
     )
 
 
-def _first_cause(recording: RecordingFile) -> FirstCause | None:
-    """Return the first cause since the rig was last armed, from the messages in the order of their time."""
-    watch = CauseWatch()
-    bodies = {topic: list(recording.messages(topic)) for topic in ("loop", "board", "state")}
-    merged = sorted(((body["stamp_ns"], topic, index) for topic, some in bodies.items() for index, body in enumerate(some)))
-    for _, topic, index in merged:
-        watch.take(topic, {name: value for name, value in bodies[topic][index].items() if value is not None})
-    return watch.first()
+def _first_cause(recording: RecordingFile) -> RigCause | None:
+    """Return the first cause since the rig was last armed, None where there is none."""
+    found = [body for body in recording.messages("cause") if body["name"]]
+    if not found:
+        return None
+    return RigCause(**{name: found[-1][name] for name in ("stamp_ns", "name", "since_ns", "says", "remedy", "followed")})
 
 
 def _direction(state: dict[str, Array], otherwise: Array) -> Array:

@@ -7,13 +7,11 @@ from typing import Any
 
 import msgspec
 
-from host.recordings.cause_watch import CauseWatch
 from protocol.enums import BoardState
-from protocol.first_cause import describe
-from protocol.topics import Message
+from protocol.topics import Message, RigCause
 from protocol.zenoh_session import Session
 
-TOPICS = ("state", "board", "loop", "commander", "force/sensor", "pose/tip", "force/estimate", "log")
+TOPICS = ("state", "cause", "board", "loop", "commander", "force/sensor", "pose/tip", "force/estimate", "log")
 _LOOK_S = 0.02
 
 
@@ -100,7 +98,6 @@ def read_status(session: Session, rig: str, listen_s: float = 1.2, wait_s: float
     """
     readers = {topic: session.latest(topic) for topic in TOPICS}
     newest: dict[str, Message] = {}
-    watch = CauseWatch()
     end_s = time.monotonic() + wait_s
     while time.monotonic() < end_s:
         for topic, reader in readers.items():
@@ -110,11 +107,10 @@ def read_status(session: Session, rig: str, listen_s: float = 1.2, wait_s: float
             if topic == "state" and topic not in newest:
                 end_s = time.monotonic() + listen_s
             newest[topic] = message
-            watch.take(topic, msgspec.to_builtins(message))
         time.sleep(_LOOK_S)
-    first = watch.first()
+    first = newest.get("cause")
     action = getattr(newest.get("state"), "safety_action", "none")
-    if first is None or action in ("none", "warn"):
+    if not isinstance(first, RigCause) or not first.name or action in ("none", "warn"):
         return RigStatus(rig=rig, newest=newest)
-    followed = tuple(describe(item) for item in first.followed)
+    followed = tuple(first.followed.splitlines())
     return RigStatus(rig=rig, newest=newest, cause=first.says, remedy=first.remedy, followed=followed)

@@ -23,6 +23,7 @@ from realtime.control import safety
 from realtime.control.configure import tick_parameters
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
+from realtime.core.cause_watch import CauseWatch
 from realtime.core.command_gate import CommandGate, without_secrets
 from realtime.core.force_zero import ForceZero
 from realtime.core.intake import Intake
@@ -151,6 +152,7 @@ class RigCore:
         self._first = True
         self._tick_ns = 0
         self._cause_seen_ns: dict[int, int] = {}
+        self._causes = CauseWatch()
 
     def step(self, now_ns: int, arrived: Arrived) -> Leaving:
         """Process the data that has arrived by `now_ns` (the rig's clock, ns) and return the data to be sent.
@@ -223,13 +225,19 @@ class RigCore:
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
         self._log_new_causes(outputs, tick_ns)
+        armed = self.phase not in (Phase.DISARMED, Phase.HOMING)
+        self._causes.take_tick(tick_ns, armed, self.action, int(outputs.cause))
         if number % telemetry.STAGE_EVERY == 0:
             self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs, self._located))
         if number % telemetry.STATE_EVERY == 0:
             state = telemetry.state_message(self._records["command"], outputs, self._located, self._homes)
             self._publish("state", state)
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
-            self._publish("board", board_message(self.link, tick_ns))
+            counters = board_message(self.link, tick_ns)
+            self._causes.take_board(counters)
+            self._publish("board", counters)
+        if self._causes.changed or number % telemetry.LOOP_EVERY == 0:
+            self._publish("cause", self._causes.message(tick_ns))
         if number % telemetry.LOOP_EVERY == 0:
             self._publish("loop", self._timing(tick_ns))
             self._publish("commander", self.gate.state())
@@ -242,6 +250,10 @@ class RigCore:
                 f"wanted {self.params[0].period_s * 1e3:g} ms"
             )
             self._leaving.log(tick_ns, "warning", "realtime", text)
+            timing = self._timing(tick_ns)
+            # Only the longest gap's place is kept, and it includes how late the second tick was.
+            where = timing.longest_gap_where if abs(timing.longest_gap_ns - gap_ns) < LONGEST_GAP_NS else ""
+            self._causes.take_gap(tick_ns, gap_ns, where)
         self._tick_ns = tick_ns
 
     def _log_new_causes(self, outputs: np.record, tick_ns: int) -> None:

@@ -26,6 +26,7 @@ from host.report.demo_summary import demo_result, print_summary
 from host.report.run_report import lateness_of, render, verdict_of, write_report
 from host.report.run_summary import spans, summarize
 from host.report.style import thinned
+from protocol.enums import SafetyAction
 from protocol.requests import plain
 from protocol.topics import (
     HISTOGRAM_BUCKETS,
@@ -37,10 +38,12 @@ from protocol.topics import (
     LoopTiming,
     Pose,
     Reply,
+    RigCause,
     RigState,
     Stage,
 )
 from realtime.control import safety
+from realtime.core.cause_watch import CauseWatch
 
 MS = 1_000_000
 CONFIGURATION = {
@@ -64,7 +67,7 @@ class Story:
     crc_errors: int = 0
     estimate_off_N: float = 0.02
     log: str = "hello"
-    gap_ns: int = 0
+    first: RigCause | None = None
     fault_from_ms: int = 0
     contact: bool = True
     fields: dict[str, Any] = field(default_factory=dict)
@@ -151,7 +154,6 @@ class Story:
                 loop_hz=1000.0,
                 ticks=20000,
                 missed_ticks=0,
-                longest_gap_ns=self.gap_ns if time_ns >= 10_000 * MS else 0,
                 tick_p50_us=20.0,
                 tick_p99_us=30.0,
                 tick_p999_us=40.0,
@@ -180,6 +182,8 @@ class Story:
             ),
         )
         writer.write("log", Log(stamp_ns=time_ns, level="info", source="test", text=self.log))
+        if self.first is not None and time_ns >= self.first.stamp_ns:
+            writer.write("cause", self.first)
         if time_ns == 2000 * MS:
             writer.write(
                 "command",
@@ -249,9 +253,13 @@ def test_verdict_says_what_is_wrong(story: Story, level: str, says: str, tmp_pat
 
 def starved(tmp_path: Path) -> RecordingFile:
     """A run that a busy computer ended: the loop was late, the dead man acted, poses were stale when it was back."""
-    causes = {name: sentence for name, _, _, sentence in safety.CAUSES}
-    words = "; ".join(causes[name] for name in ("board_fault", "pose_lost", "pose_stale"))
-    return Story(action="stop", cause=words, fault=1, fault_from_ms=10_000, gap_ns=180 * MS).write(tmp_path / "starved.mcap")
+    bits = safety.BOARD_FAULT | safety.POSE_LOST | safety.POSE_STALE
+    watch = CauseWatch()
+    watch.take_tick(9_820 * MS, True, SafetyAction.NONE, 0)
+    watch.take_gap(10_000 * MS, 180 * MS, "")
+    watch.take_tick(10_000 * MS, True, SafetyAction.STOP, bits)
+    story = Story(action="stop", cause="; ".join(safety.messages(bits)), fault=1, fault_from_ms=10_000)
+    return replace(story, first=watch.message(10_000 * MS)).write(tmp_path / "starved.mcap")
 
 
 @pytest.mark.slow
@@ -260,7 +268,7 @@ def test_a_starved_computer_is_the_headline_and_its_symptoms_are_folded(tmp_path
     verdict = verdict_of(summarize(recording))
     assert "The control loop was late" in verdict.sentence and "no set-point for 180 ms" in verdict.sentence
     assert "real-time priority" in verdict.remedy and "tracker" not in verdict.sentence + verdict.remedy
-    assert any("dead man" in line for line in verdict.followed) and any("pose" in line for line in verdict.followed)
+    assert any("latched a fault" in line for line in verdict.followed) and any("pose" in line for line in verdict.followed)
     page = render(recording)
     assert page.index("real-time priority") < page.index("<details")
     assert page.index('<details class="rest"') < page.index("<figure>")
@@ -268,7 +276,11 @@ def test_a_starved_computer_is_the_headline_and_its_symptoms_are_folded(tmp_path
 
 def test_the_page_tells_the_same_first_cause(tmp_path: Path) -> None:
     recording, picture = starved(tmp_path), Picture(CONFIGURATION, {})
-    came = [(body["stamp_ns"], topic, body) for topic in ("loop", "board", "state") for body in recording.messages(topic)]
+    came = [
+        (body["stamp_ns"], topic, body)
+        for topic in ("cause", "loop", "board", "state")
+        for body in recording.messages(topic)
+    ]
     for stamp_ns, topic, body in sorted(came, key=lambda item: item[:2]):
         if stamp_ns < 10_500 * MS:
             picture.take(topic, {name: value for name, value in body.items() if value is not None})

@@ -10,7 +10,7 @@ import pytest
 
 from protocol.enums import BoardState, CommandKind, Phase, SafetyAction
 from protocol.rig_file import Rig
-from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply, encode
+from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply, RigCause, encode
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, new
 from realtime.core.rig_core import CAUSE_QUIET_NS, Arrived, CommandRequest, Leaving, RigCore, Tick
@@ -285,3 +285,39 @@ def test_telemetry_does_not_depend_on_how_ticks_are_grouped(rig: Rig) -> None:
 def _without_counts(messages: Iterable[tuple[str, Message]]) -> Iterable[tuple[str, Message]]:
     for topic, message in messages:
         yield topic, msgspec.structs.replace(message, stamp_ns=0) if topic == "commander" else message
+
+
+def causes(bench: Bench) -> list[RigCause]:
+    return [message for _, message in bench.messages if isinstance(message, RigCause)]
+
+
+def test_every_stall_is_the_first_cause_of_its_stop_not_the_longest_alone(core: Bench) -> None:
+    core.armed().run(600)
+    for stall_ms in (120, 100):
+        core.now_ns += stall_ms * MS
+        core.run(20, safety.BOARD_SILENT, SafetyAction.STOP)
+        newest = causes(core)[-1]
+        assert newest.name == "loop_late" and f"{stall_ms + 1} ms" in newest.says and "real-time" in newest.remedy
+        assert newest.followed == "+0 ms: The stepper board sent no status."
+        core.phase = Phase.DISARMED
+        core.run(6_000)
+        core.phase = Phase.HOLD
+        core.run(600)
+        assert not causes(core)[-1].name, "armed again: what was before is over"
+
+
+def test_a_program_that_listens_late_receives_the_first_cause_and_its_time(core: Bench) -> None:
+    core.armed().run(600)
+    core.now_ns += 100 * MS
+    core.run(10, safety.BOARD_SILENT, SafetyAction.STOP)
+    stopped_ns = core.now_ns
+    core.run(7_000, safety.BOARD_SILENT, SafetyAction.STOP)
+    newest = causes(core)[-1]
+    assert newest.name == "loop_late" and newest.since_ns <= stopped_ns < newest.stamp_ns - 6_500 * MS
+
+
+def test_what_was_over_long_before_a_stop_is_not_its_cause(core: Bench) -> None:
+    core.armed().run(50, safety.POSE_REJECTED, SafetyAction.WARN)
+    core.run(6_000)
+    core.run(20, safety.BOARD_SILENT, SafetyAction.STOP)
+    assert causes(core)[-1].name == "board_silent"
