@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
+from host.diagnosis.model import units
 from protocol.errors import InputError
 from protocol.requests import Request, validate
 from protocol.text_files import read_toml
@@ -21,6 +22,8 @@ def _each_once(terms: list[Term]) -> list[Term]:
     return terms
 
 
+# A unit as a user writes it, in the one spelling of `host.diagnosis.model.units`.
+Unit = Annotated[str, AfterValidator(units.unit)]
 Terms = Annotated[list[Term], AfterValidator(_each_once)]
 
 
@@ -29,10 +32,17 @@ class ChannelSpec(Request):
 
     column: str
     scale: float = 1.0
-    unit: str = ""
+    unit: Unit = ""
     sign: Literal[-1, 1] = 1
     offset: float = 0.0
     session_offset: bool = False  # an offset of its own in every recording, estimated (kinds that run a simulator)
+
+    @model_validator(mode="after")
+    def _unit_of_the_value(self) -> ChannelSpec:
+        # scale = 0.001 with unit = "mm" names the unit of the column: the value itself is then in m.
+        if self.unit and self.scale != 1.0 and math.isclose(abs(self.scale), units.size(self.unit), rel_tol=1e-4):
+            self.unit = units.coherent(self.unit)
+        return self
 
 
 class SegmentSpec(Request):
@@ -62,7 +72,7 @@ class ParameterSpec(Request):
     free: bool = True
     low: float | None = None
     high: float | None = None
-    unit: str = ""
+    unit: Unit = ""
 
     @model_validator(mode="after")
     def _inside(self) -> ParameterSpec:
@@ -86,7 +96,7 @@ class OfferSpec(Request):
     low: float = 0.0
     high: float
     tried: list[float] = []  # values that screening tries; left out, five between the bounds
-    unit: str = ""
+    unit: Unit = ""
 
     @model_validator(mode="after")
     def _inside(self) -> OfferSpec:

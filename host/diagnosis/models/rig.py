@@ -25,7 +25,7 @@ from host.diagnosis.models.rig_kernel import (
     rotation_logs,
     shapes,
 )
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 
 Array = npt.NDArray[np.float64]
 HANDLES = {
@@ -68,7 +68,11 @@ def rig_channels(spec: NominalSpec) -> tuple[dict[str, ChannelSpec], set[str]]:
     for name, channel in spec.channels.items():
         if name not in needed:
             raise InputError(f"channels.{name}", name, "one of " + ", ".join(needed))
-        needed[name] = channel
+        wanted = needed[name].unit
+        if channel.unit not in ("", wanted):
+            known = f"{wanted}, the unit of the value after scale, sign and offset" if wanted else "no unit"
+            raise InputError(f"channels.{name}.unit", channel.unit, Description(known))
+        needed[name] = channel.model_copy(update={"unit": wanted})
     return needed, {*SHAFT, *FORCE}
 
 
