@@ -12,6 +12,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Json
 from protocol.catheter import load_catheter, unusual_parameters
+from protocol.errors import InputError
 from protocol.rig_file import Rig, catheter_problems, parse_rig, problems_of, read_rig_data, unusual_values
 from protocol.usual_values import UnusualValue
 
@@ -55,7 +56,7 @@ def _refuse_mistakes(file: Path, data: dict[str, Any]) -> None:
     problems = problems_of(data)
     if not problems:
         read = parse_rig(data, str(file))
-        problems = catheter_problems(read)
+        problems = [*catheter_problems(read), *_device_problems(read)]
         if read.network.listen:
             from host.security.keys_check import keys_problems
 
@@ -64,6 +65,17 @@ def _refuse_mistakes(file: Path, data: dict[str, Any]) -> None:
         print(f"seldinger: {file}: {problem}", file=sys.stderr)
     if problems:
         raise typer.Exit(2)
+
+
+def _device_problems(read: Rig) -> list[str]:
+    """The line with which the realtime process would refuse the kinds of the rig's devices, if it would."""
+    from realtime.core.device_sources import check_kinds
+
+    try:
+        check_kinds(read)
+    except InputError as error:
+        return [str(error)]
+    return []
 
 
 def _rows(section: dict[str, Any], given: Any, prefix: str = "") -> list[tuple[str, str, str]]:

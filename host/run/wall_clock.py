@@ -24,6 +24,7 @@ from protocol.rig_file import load_rig
 from protocol.text_files import read_text
 from protocol.topics import LoopTiming, RigState
 from protocol.zenoh_session import Session
+from realtime.core.device_sources import check_kinds
 from sim.scenario import TARGET_M, ContactJob, Outcome
 
 _BEFORE_S = 6.0  # to come before the tissue
@@ -63,6 +64,7 @@ class Fleet:
         self.close()
 
     def _start(self) -> None:
+        check_kinds(load_rig(self._settings.rig_file))
         text = read_text(self._settings.rig_file)
         self.rig_file.write_text(with_folder(text, self._sockets.folder), encoding="utf-8")
         rig = str(self.rig_file)

@@ -7,6 +7,7 @@ come with the package, or by an entry point that another package declares in the
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import time
 from collections.abc import Callable
@@ -30,6 +31,8 @@ _OWN = {
 }
 # Kinds whose drivers the loop serves as bytes, in virtual time too.
 AURORA, NET_FT = "aurora", "net_ft"
+_SERVED = {TRACKERS: AURORA, FORCE_SENSORS: NET_FT}
+_KEYS = {TRACKERS: "tracker.kind", FORCE_SENSORS: "force_sensor.kind"}
 # A source from which nothing comes for so long is lost; it is closed and opened again.
 SILENT_S = 1.0
 
@@ -51,6 +54,18 @@ OpenTracker = Callable[[Tracker], DeviceSource[PoseSample]]
 OpenForceSensor = Callable[[ForceSensorSection], DeviceSource[ForceSample]]
 
 
+def _offered(group: str) -> dict[str, str]:
+    """Kind -> module:function of all sources in a group, those of other packages included."""
+    return {point.name: point.value for point in metadata.entry_points(group=group)} | _OWN[group]
+
+
+def check_kinds(rig: Rig) -> None:
+    """Check that the rig's tracker and force sensor have drivers, and that these can be imported. Raises InputError."""
+    for group, kind in ((TRACKERS, rig.tracker.kind), (FORCE_SENSORS, rig.force_sensor.kind)):
+        if kind != _SERVED[group]:
+            source_of(group, kind)
+
+
 def source_of(group: str, kind: str) -> Callable[[Any], DeviceSource[Any]]:
     """Return the function that opens a source, called with the section of the rig file.
 
@@ -61,11 +76,13 @@ def source_of(group: str, kind: str) -> Callable[[Any], DeviceSource[Any]]:
     Raises:
         InputError: no package offers that kind, or what it offers cannot be imported.
     """
-    found = {point.name: point.value for point in metadata.entry_points(group=group)} | _OWN[group]
-    key = "tracker.kind" if group == TRACKERS else "force_sensor.kind"
+    found = _offered(group)
+    key = _KEYS[group]
     if kind not in found:
-        usual = AURORA if group == TRACKERS else NET_FT
-        raise InputError(key, kind, f"one of {', '.join(sorted({usual, *found}))}; a package adds one in group {group}")
+        known = sorted({_SERVED[group], *found})
+        near = difflib.get_close_matches(kind, known, 1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise InputError(key, kind, f"one of {', '.join(known)}; a package adds one in group {group}{meant}")
     module, _, name = found[kind].partition(":")
     try:
         return cast(Callable[[Any], DeviceSource[Any]], getattr(importlib.import_module(module), name))

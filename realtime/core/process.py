@@ -8,7 +8,7 @@ from typing import Any
 
 from protocol.reply_seal import ReplySeal
 from protocol.rig_file import Rig
-from protocol.topics import CommandCounts, Log, LoopTiming, Reply
+from protocol.topics import TOPICS, CommandCounts, Log, LoopTiming, Reply
 from protocol.zenoh_session import Session
 from realtime.control.records import INPUTS, OUTPUTS, STATE, new
 from realtime.control.tick import tick
@@ -26,7 +26,7 @@ from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 from realtime.loop.scheduling import RealtimeSettings
 
 logger = logging.getLogger("seldinger.realtime")
-_TOPICS = "stage pose/tip pose/shaft force/sensor state board loop log command reply commander".split()
+PUBLISHED = tuple(topic.name for topic in TOPICS.values() if topic.direction.startswith(("realtime ->", "all ->")))
 
 
 class RealtimeProcess:
@@ -62,7 +62,7 @@ class RealtimeProcess:
         self._port = BoardPort(board_port or rig.board.port, rig.board.baud, open_timeout_s, logger.warning)
         self._session = Session.of_rig(rig)
         self._seal = ReplySeal(paths.reply_key)
-        publishers = {name: self._session.publisher(name) for name in _TOPICS}
+        publishers = {name: self._session.publisher(name) for name in PUBLISHED}
         self._estimates = self._session.latest("force/estimate")
         self.loop = NativeLoop(
             tick,

@@ -23,6 +23,20 @@ def test_the_shipped_file_is_good_and_shown_whole() -> None:
     assert "stages.insertion.steps_per_unit" in told.stdout and "default" not in told.stdout
 
 
+@pytest.mark.parametrize(
+    ("kind", "typed", "says"),
+    [
+        ("aurora", "auroa", "tracker.kind: found 'auroa', wanted one of aurora, openigtlink; a package adds one"),
+        ("net_ft", "netft", "did you mean net_ft?"),
+    ],
+)
+def test_a_kind_without_a_driver_is_refused_as_at_the_start(kind: str, typed: str, says: str, tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text(RIG_FILE.read_text().replace(f'kind = "{kind}"', f'kind = "{typed}"', 1))
+    told = checked(file, "--quiet")
+    assert told.exit_code == 2 and says.replace("'", '"') in told.stderr and len(told.stderr.splitlines()) == 1
+
+
 def test_json_gives_the_effective_configuration() -> None:
     told = json.loads(checked(RIG_FILE, "--json").stdout)
     assert told["good"] and told["configuration"] == load_rig(RIG_FILE).effective()

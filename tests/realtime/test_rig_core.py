@@ -13,6 +13,7 @@ from protocol.rig_file import Rig
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply, RigCause, encode
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, new
+from realtime.core.process import PUBLISHED
 from realtime.core.rig_core import CAUSE_QUIET_NS, Arrived, CommandRequest, Leaving, RigCore, Tick
 from realtime.core.telemetry import loop_message
 from realtime.drivers.aurora import PoseSample
@@ -289,6 +290,14 @@ def _without_counts(messages: Iterable[tuple[str, Message]]) -> Iterable[tuple[s
 
 def causes(bench: Bench) -> list[RigCause]:
     return [message for _, message in bench.messages if isinstance(message, RigCause)]
+
+
+def test_the_process_publishes_every_topic_of_the_core(core: Bench) -> None:
+    core.armed().run(600)
+    core.ask("stop")
+    core.run(20)
+    sent = {topic for topic, _ in core.messages}
+    assert {"stage", "state", "cause", "board", "loop", "command", "reply", "commander", "log"} <= sent <= set(PUBLISHED)
 
 
 def test_every_stall_is_the_first_cause_of_its_stop_not_the_longest_alone(core: Bench) -> None:
