@@ -24,7 +24,7 @@ from host.estimation.interface import Actuation, Estimator, PoseReading, Reporti
 from host.estimation.lasting_errors import ALL_JOINTS, INSERTION, NOWHERE, ROLL, ActuationKnowledge, Prior
 from host.estimation.sensor_noise import PoseSensor, chi_square_limit
 from host.estimation.several_contacts import ActuationPrior, ContactsEstimate, search_contacts
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
+from host.estimation.spatial_rig_kernels import TrackedFrame, fit, known_rows, new_fit
 from host.mechanics.rod import rod_record
 from protocol.catheter import Catheter
 from protocol.enums import Phase
@@ -164,7 +164,7 @@ class ContactWatch:
             self._angle_std_rad,
             *known_rows(Prior(NOWHERE, ALL_JOINTS, prior.mean, prior.covariance), FORCE_SD_N),
         )
-        found = FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((k, 6)))
+        found = new_fit(k)
         found.x[3:] = prior.mean
         settled, cost = fit(frame, LARGEST_FORCE_N, found)
         excess = cost / chi_square_limit(6 * k - 3, ODD_DEVIATIONS)

@@ -24,6 +24,9 @@ from protocol.errors import InputError, one_of
 
 Array = NDArray[np.float64]
 
+FOR_ONE_SAMPLE = "the default: it is for one sample"
+NOT_FOR_PCAR = "the default: the planar model reads the tip's pose alone, in the bending plane, and needs no start"
+
 
 @overload
 def estimate_force(
@@ -118,37 +121,67 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
     checked_catheter(catheter)
     _check_settings(sensors, prior, thorough, ordered)
     workers = checked_workers(workers)
-    if model == "cosserat":
-        if case is None:
-            raise InputError("case", "nothing", "1 to 6")
-        if not _many(sensors):
-            number("insertion_m", insertion_m, "one finite length in m: the sensors have one sample")
-            _check_sensors(catheter.distal_length_m, insertion_m, sensors[: checked_case(case)])
-            return estimate_cosserat(
-                catheter,
-                insertion_m,
-                curvature_per_m,
-                case,
-                sensors,
-                previous_force_N=previous_force_N,
-                prior=prior,
-                roll_rad=roll_rad,
-                thorough=thorough,
-            )
-        _only_one(previous_force_N=previous_force_N, prior=prior, roll_rad=roll_rad or None, thorough=thorough or None)
-        used = sensors[: checked_case(case)]
-        poses = Poses(
-            [number(f"sensors.{i}.offset_m", sensor[0], "an arc length in m") for i, sensor in enumerate(used)],
-            _stacked("position_m", [sensor[1] for sensor in used], 3),
-            _stacked("quaternion_wxyz", [sensor[2] for sensor in used], 4),
+    alone = OneSample(previous_force_N, prior, roll_rad, thorough)
+    if model == "pcar":
+        if case is not None:
+            raise InputError("case", str(case), NOT_FOR_PCAR)
+        alone.refuse(("previous_force_N", "roll_rad"), NOT_FOR_PCAR)
+        return _planar(catheter, insertion_m, curvature_per_m, sensors, alone, workers)
+    if case is None:
+        raise InputError("case", "nothing", "1 to 6")
+    used = sensors[: checked_case(case)]
+    if _many(sensors):
+        alone.refuse(OneSample._fields, FOR_ONE_SAMPLE)
+        return _many_spatial(catheter, insertion_m, curvature_per_m, case, Poses.of(used), ordered, workers)
+    number("insertion_m", insertion_m, "one finite length in m: the sensors have one sample")
+    _check_sensors(catheter.distal_length_m, insertion_m, used)
+    return estimate_cosserat(catheter, insertion_m, curvature_per_m, case, sensors, **alone._asdict())
+
+
+class OneSample(NamedTuple):
+    """The settings of `estimate_force` that one sample alone takes."""
+
+    previous_force_N: ArrayLike | None
+    prior: SurfacePrior | None
+    roll_rad: float
+    thorough: bool
+
+    def refuse(self, keys: Sequence[str], wanted: str) -> None:
+        """Raise InputError where one of the settings `keys` is not the default."""
+        number("roll_rad", self.roll_rad, "a finite angle in rad")
+        for key in keys:
+            value = getattr(self, key)
+            if value is not None and not (key in ("roll_rad", "thorough") and value == 0):
+                raise InputError(key, str(value), wanted)
+
+
+class Poses(NamedTuple):
+    """Arc lengths back from the tip (k), positions (n, k, 3) and quaternions (n, k, 4) of n samples."""
+
+    offsets_m: list[float]
+    positions_m: Array
+    quaternions_wxyz: Array
+
+    @classmethod
+    def of(cls, sensors: Sequence[Any]) -> Poses:
+        """Return the poses of k sensors, each with a row for each sample. Raises InputError."""
+        return cls(
+            [number(f"sensors.{i}.offset_m", sensor[0], "an arc length in m") for i, sensor in enumerate(sensors)],
+            _stacked("position_m", [sensor[1] for sensor in sensors], 3),
+            _stacked("quaternion_wxyz", [sensor[2] for sensor in sensors], 4),
         )
-        insertion_m = column("insertion_m", insertion_m, len(poses.positions_m), "a finite length in m")
-        _check_rows(poses.positions_m, poses.offsets_m, catheter.distal_length_m + insertion_m)
-        found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
-        if not ordered and case in ONE_TO_ONE:
-            _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
-        return found
-    return _planar(catheter, insertion_m, curvature_per_m, sensors, prior, thorough, workers)
+
+
+def _many_spatial(
+    catheter: Catheter, insertion_m: Any, curvature_per_m: Any, case: int, poses: Poses, ordered: bool, workers: int | None
+) -> BatchEstimate:
+    """Estimate n samples with the rod; those more exact than the sensors' noise are searched a second time, one by one."""
+    insertion_m = column("insertion_m", insertion_m, len(poses.positions_m), "a finite length in m")
+    _check_rows(poses.positions_m, poses.offsets_m, catheter.distal_length_m + insertion_m)
+    found = estimate_batch(catheter, insertion_m, curvature_per_m, case, *poses, ordered=ordered, workers=workers)
+    if not ordered and case in ONE_TO_ONE:
+        _search_again(found, catheter, insertion_m, curvature_per_m, case, poses)
+    return found
 
 
 def _check_settings(sensors: object, prior: object, thorough: object, ordered: object) -> None:
@@ -188,14 +221,6 @@ def _check_rows(positions_m: Array, offsets_m: Sequence[float], exposed_m: Array
         check_apart(f"sensors.{{}}.position_m.{row}", offsets_m, list(positions_m[row]))
 
 
-class Poses(NamedTuple):
-    """Arc lengths back from the tip (k), positions (n, k, 3) and quaternions (n, k, 4) of n samples."""
-
-    offsets_m: list[float]
-    positions_m: Array
-    quaternions_wxyz: Array
-
-
 def _search_again(
     found: BatchEstimate, catheter: Catheter, insertion_m: ArrayLike, curvature_per_m: ArrayLike, case: int, poses: Poses
 ) -> None:
@@ -219,12 +244,6 @@ def _many(sensors: Sequence[Any]) -> bool:
     return isinstance(position, list | tuple) and len(position) > 0 and hasattr(position[0], "__len__")
 
 
-def _only_one(**given: object) -> None:
-    for key, value in given.items():
-        if value is not None:
-            raise InputError(key, str(value), "the default: it is for one sample")
-
-
 def _stacked(key: str, parts: list[Any], width: int) -> Array:
     """Arrays (n, width) of k sensors as one (n, k, width). Raises InputError."""
     arrays = [
@@ -242,10 +261,10 @@ def _planar(
     insertion_m: Any,
     curvature_per_m: Any,
     sensors: Sequence[Any],
-    prior: SurfacePrior | None,
-    thorough: bool,
+    alone: OneSample,
     workers: int | None,
 ) -> PlanarEstimate | RecordingEstimate:
+    """Estimate one sample or many with circular arcs, from the pose of the tip in the bending plane."""
     if len(sensors) != 1 or len(sensors[0]) != 3 or number("sensors.0.offset_m", sensors[0][0], "0.0: the tip") != 0.0:
         raise InputError("sensors", str(sensors), "one (0.0, position_m, angle_rad): the planar model reads the tip's pose")
     _, position, angle = sensors[0]
@@ -254,8 +273,8 @@ def _planar(
         _check_sensors(catheter.distal_length_m, insertion_m, sensors)
         x, y = finite("sensors.0.position_m", position, (2,), "two finite numbers in m")
         pose = (x, y, number("sensors.0.angle_rad", angle, "a finite angle in rad"))
-        return planar.estimate(arcs, pose, prior=prior, thorough=thorough)
-    _only_one(prior=prior, thorough=thorough or None)
+        return planar.estimate(arcs, pose, prior=alone.prior, thorough=alone.thorough)
+    alone.refuse(("prior", "thorough"), FOR_ONE_SAMPLE)
     places = real("sensors.0.position_m", position, "numbers (n, 2), in m")
     angles = real("sensors.0.angle_rad", angle, "numbers (n,), in rad")
     if places.ndim != 2 or places.shape[1] != 2 or angles.shape != places.shape[:1]:

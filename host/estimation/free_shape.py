@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from host.estimation.interface import Actuation, PoseReading
 from host.estimation.lasting_errors import ALL_JOINTS, INSERTION, NOWHERE, ROLL, ActuationKnowledge, Prior
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
+from host.estimation.sensor_noise import TrackedSensors
+from host.estimation.spatial_rig_kernels import TrackedFrame, fit, known_rows, new_fit
 from host.mechanics.rod import rod_record
 from protocol.catheter import Catheter, CosseratParameters
 from protocol.errors import InputError
@@ -43,30 +44,15 @@ class FreeShape(NamedTuple):
 class FreeShapeFit:
     """Fits the unloaded shape to the poses of tip and shaft."""
 
-    def __init__(
-        self,
-        catheter: Catheter,
-        shaft_offset_m: float,
-        position_std_m: float,
-        angle_std_rad: float,
-        knowledge: ActuationKnowledge,
-    ) -> None:
-        self._catheter, self._shaft_offset_m = _with_rod(catheter), shaft_offset_m
-        self._noise = np.array([position_std_m] * 3 + [angle_std_rad] * 3)
+    def __init__(self, catheter: Catheter, sensors: TrackedSensors, knowledge: ActuationKnowledge) -> None:
+        self._catheter, self._sensors = _with_rod(catheter), sensors
         joints = [knowledge.start[INSERTION], OPEN_CURVATURE_per_m, knowledge.start[ROLL]]
         self._known = Prior(NOWHERE, ALL_JOINTS, np.zeros(3), np.diag(np.square(joints)))
 
     @classmethod
     def from_rig(cls, rig: Rig, catheter: Catheter) -> FreeShapeFit:
         """For the catheter and the tracker of a rig file."""
-        tracker = rig.tracker
-        return cls(
-            catheter,
-            tracker.shaft_sensor_offset_m,
-            tracker.position_noise_m,
-            tracker.orientation_noise_rad,
-            ActuationKnowledge.from_rig(rig),
-        )
+        return cls(catheter, TrackedSensors.from_rig(rig), ActuationKnowledge.from_rig(rig))
 
     def __call__(self, tip: PoseReading, shaft: PoseReading | None, actuation: Actuation) -> FreeShape | None:
         """The unloaded shape nearest to the poses, `shaft` None where it was not seen; None where there is none.
@@ -74,7 +60,7 @@ class FreeShapeFit:
         Raises: InputError where the actuation is out of range.
         """
         rod = rod_record(self._catheter, actuation.insertion_m, actuation.curvature_per_m)
-        seen = [(0.0, tip)] + ([] if shaft is None else [(self._shaft_offset_m, shaft)])
+        seen = [(0.0, tip)] + ([] if shaft is None else [(self._sensors.shaft_offset_m, shaft)])
         poses = np.array([[*pose.position_m, *pose.quaternion_wxyz] for _, pose in seen])
         if not np.isfinite(poses).all():
             return None
@@ -84,17 +70,17 @@ class FreeShapeFit:
             np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad]),
             np.array([offset for offset, _ in seen]),
             poses,
-            float(self._noise[0]),
-            float(self._noise[3]),
+            self._sensors.position_std_m,
+            self._sensors.angle_std_rad,
             *known_rows(self._known, NO_FORCE_N),
         )
         k = len(seen)
-        found = FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((k, 6)))
+        found = new_fit(k)
         settled, cost = fit(frame, LARGEST_FORCE_N, found)
         if not settled or not np.isfinite(found.x).all():
             return None
         covariance = np.linalg.inv(found.information[3:, 3:])  # force held
-        whitened = found.residual / self._noise
+        whitened = found.residual / np.repeat([self._sensors.position_std_m, self._sensors.angle_std_rad], 3)
         # One unknown is free of assumptions; those of insertion and roll come with a measurement each, their assumption.
         return FreeShape(
             actuation.curvature_per_m + float(found.x[4]), float(np.sqrt(covariance[1, 1])), whitened, cost, 6 * k - 1

@@ -18,6 +18,7 @@ from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.lasting_errors import CURVATURE, INSERTION, NOWHERE, ROLL, ActuationKnowledge, LastingErrors, Prior
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
 from host.estimation.reach import check_reach
+from host.estimation.sensor_noise import TrackedSensors
 from host.mechanics.pcar import Arcs, Equilibrium, arcs_of, point_at, pose_sensitivity, solve
 from host.mechanics.rod import finite
 from protocol.catheter import Catheter, load_catheter
@@ -70,16 +71,12 @@ class PlanarRigEstimator:
     def __init__(
         self,
         catheter: Catheter,
-        shaft_offset_m: float,
-        position_std_m: float,
-        angle_std_rad: float,
+        sensors: TrackedSensors,
         knowledge: ActuationKnowledge,
         contact: ContactKnowledge | None = None,
     ) -> None:
-        self._catheter = catheter
-        self._shaft_offset_m = shaft_offset_m
-        self._position_std_m = position_std_m
-        self._weight = np.linalg.inv(tip_covariance(position_std_m, angle_std_rad))
+        self._catheter, self._sensors = catheter, sensors
+        self._weight = np.linalg.inv(tip_covariance(sensors.position_std_m, sensors.angle_std_rad))
         self._contact = contact or ContactKnowledge()
         self._roll_sd_rad = knowledge.start[ROLL]
         self.errors = LastingErrors(knowledge, self._contact.tangential_sd_N)
@@ -88,12 +85,9 @@ class PlanarRigEstimator:
     @classmethod
     def from_rig(cls, rig: Rig) -> PlanarRigEstimator:
         """For the catheter and the tracker of a rig file. Raises InputError where the catheter is not known."""
-        tracker = rig.tracker
         return cls(
             load_catheter(rig.catheter.name),
-            tracker.shaft_sensor_offset_m,
-            tracker.position_noise_m,
-            tracker.orientation_noise_rad,
+            TrackedSensors.from_rig(rig),
             ActuationKnowledge.from_rig(rig),
             ContactKnowledge.from_rig(rig),
         )
@@ -113,9 +107,9 @@ class PlanarRigEstimator:
         y_axis, normal = bending_plane(self._roll(pose_tip, actuation))
         poses = {0.0: self._planar(pose_tip, y_axis, actuation)}
         seen = pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all()
-        if pose_shaft is not None and seen and self._shaft_offset_m < outside - 1e-3:
+        if pose_shaft is not None and seen and self._sensors.shaft_offset_m < outside - 1e-3:
             check_reach("pose_shaft.position_m", pose_shaft.position_m, outside)
-            poses[self._shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
+            poses[self._sensors.shaft_offset_m] = self._planar(pose_shaft, y_axis, actuation)
         self.errors.move_to(actuation)
         axes = np.column_stack([np.array([0.0, 0.0, 1.0]), y_axis])
         known = self.errors.prior(self._along_wall(actuation, axes), _FOLLOWED)
@@ -168,7 +162,7 @@ class PlanarRigEstimator:
         """Roll of the bending plane: the transmission's, corrected towards the plane that the tip lies in."""
         y_axis, normal = bending_plane(actuation.roll_rad)
         lateral, across = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
-        seen = lateral * lateral / self._position_std_m**2
+        seen = lateral * lateral / self._sensors.position_std_m**2
         held = 1.0 / self._roll_sd_rad**2
         return actuation.roll_rad - math.atan2(across * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
 

@@ -15,6 +15,7 @@ from host.estimation.spatial_kernels import UNIT_TOLERANCE
 from host.mechanics.rod import finite
 from host.mechanics.rotations import conjugate, quaternion_product, rotation_matrix
 from protocol.errors import InputError
+from protocol.rig_file import Rig
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,20 @@ class PoseSensor(NamedTuple):
     quaternion_wxyz: ArrayLike  # (4,) sensor frame -> base frame
     position_covariance_m2: ArrayLike | None = None  # (3, 3) base frame
     orientation_covariance_rad2: ArrayLike | None = None  # (3, 3) sensor frame
+
+
+class TrackedSensors(NamedTuple):
+    """The sensors of a rig, one at the tip and one on the shaft, and the tracker's noise."""
+
+    shaft_offset_m: float  # arc length from the tip back to the second sensor
+    position_std_m: float  # per axis
+    angle_std_rad: float  # per axis
+
+    @classmethod
+    def from_rig(cls, rig: Rig) -> TrackedSensors:
+        """Return the sensors and the noise of the rig file's tracker."""
+        tracker = rig.tracker
+        return cls(tracker.shaft_sensor_offset_m, tracker.position_noise_m, tracker.orientation_noise_rad)
 
 
 @dataclass(frozen=True)

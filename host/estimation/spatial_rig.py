@@ -17,9 +17,9 @@ from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
 from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors, Prior
 from host.estimation.reach import check_reach
-from host.estimation.sensor_noise import chi_square_limit
+from host.estimation.sensor_noise import TrackedSensors, chi_square_limit
 from host.estimation.spatial import start_grid
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows, new_fit
 from host.mechanics.rod import finite, rod_record
 from protocol.catheter import Catheter, load_catheter
 from protocol.rig_file import Rig
@@ -39,14 +39,11 @@ class SpatialRigEstimator:
     def __init__(
         self,
         catheter: Catheter,
-        shaft_offset_m: float,
-        position_std_m: float,
-        angle_std_rad: float,
+        sensors: TrackedSensors,
         knowledge: ActuationKnowledge,
         contact: ContactKnowledge | None = None,
     ) -> None:
-        self._catheter, self._shaft_offset_m = catheter, shaft_offset_m
-        self._position_std_m, self._angle_std_rad = position_std_m, angle_std_rad
+        self._catheter, self._sensors = catheter, sensors
         self._contact = contact or ContactKnowledge()
         self.errors = LastingErrors(knowledge, self._contact.tangential_sd_N)
         self._force = np.zeros(3)
@@ -57,15 +54,7 @@ class SpatialRigEstimator:
         """For the catheter and the tracker of a rig file. Raises InputError where the rod's stiffness is not known."""
         catheter = load_catheter(rig.catheter.name)
         rod_record(catheter, 0.0, 0.0)
-        tracker = rig.tracker
-        return cls(
-            catheter,
-            tracker.shaft_sensor_offset_m,
-            tracker.position_noise_m,
-            tracker.orientation_noise_rad,
-            ActuationKnowledge.from_rig(rig),
-            ContactKnowledge.from_rig(rig),
-        )
+        return cls(catheter, TrackedSensors.from_rig(rig), ActuationKnowledge.from_rig(rig), ContactKnowledge.from_rig(rig))
 
     def use_stiffness(self, catheter: Catheter, relative_sd: float) -> None:
         """Use the stiffness of `catheter` from now on, known to `relative_sd`."""
@@ -81,7 +70,7 @@ class SpatialRigEstimator:
         offsets, poses = [0.0], [[*pose_tip.position_m, *pose_tip.quaternion_wxyz]]
         if pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all():
             check_reach("pose_shaft.position_m", pose_shaft.position_m, exposed_m)
-            offsets.append(self._shaft_offset_m)
+            offsets.append(self._sensors.shaft_offset_m)
             poses.append([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz])
         self.errors.move_to(actuation)
         known = self.errors.prior(along_wall(actuation), ALL_JOINTS)
@@ -92,8 +81,8 @@ class SpatialRigEstimator:
             joints,
             np.array(offsets),
             np.array(poses),
-            self._position_std_m,
-            self._angle_std_rad,
+            self._sensors.position_std_m,
+            self._sensors.angle_std_rad,
             *known_rows(known, self._contact.force_sd(actuation)),
         )
         settled, cost, found = self._search(frame, known)
@@ -110,7 +99,7 @@ class SpatialRigEstimator:
         if self._unexplained <= 1:  # a pose that stays odd is not searched for again at every frame
             starts += list(start_grid(0.5)[RESTARTS])
         for start in starts:
-            found = _new_fit(len(frame.offsets))
+            found = new_fit(len(frame.offsets))
             found.x[:3], found.x[3:] = start, known.mean[len(known.across) :]
             settled, cost = fit(frame, LARGEST_FORCE_N, found)
             if best is None or (settled, -cost) > (best[0], -best[1]):
@@ -157,10 +146,6 @@ def along_wall(actuation: Actuation) -> Array:
     if actuation.force_direction is None:
         return NOWHERE
     return np.linalg.svd(np.asarray(actuation.force_direction, dtype=float)[None, :])[2][1:]
-
-
-def _new_fit(sensors: int) -> FrameFit:
-    return FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((sensors, 6)))
 
 
 def _residual(frame: TrackedFrame, found: FrameFit) -> float:

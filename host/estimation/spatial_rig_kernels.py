@@ -67,6 +67,11 @@ class FrameFit(NamedTuple):
     residual: Array  # (k, 6) measured minus modelled: position (m), turn (rad)
 
 
+def new_fit(sensors: int) -> FrameFit:
+    """Return an empty result for the poses of so many sensors, to be filled by `fit`."""
+    return FrameFit(np.zeros(6), np.zeros((6, 6)), np.zeros(3), np.zeros((3, 6)), np.zeros((sensors, 6)))
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _base_curvatures(rod: Array, base: Array, inside: bool, u: Array) -> None:
     """Set u (3,) = curvatures of the rod at the sheath, where `inside` says whether that is the distal shaft."""

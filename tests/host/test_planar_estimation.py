@@ -17,6 +17,7 @@ from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading
 from host.estimation.lasting_errors import ActuationKnowledge
 from host.estimation.planar_rig import PlanarRigEstimator, bending_plane
+from host.estimation.sensor_noise import TrackedSensors
 from host.mechanics import pcar
 from protocol.catheter import load_catheter
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -220,7 +221,9 @@ def reading(arcs: pcar.Arcs, force: NDArray, back_m: float, roll_rad: float, noi
 
 
 def test_rig_estimator_gives_the_force_on_the_tissue_in_the_base_frame() -> None:
-    estimator = PlanarRigEstimator(BLAZER, 0.02, 0.29e-3, 0.0035, SURE, ContactKnowledge(10.0, 10.0, 10.0, 0.05))
+    estimator = PlanarRigEstimator(
+        BLAZER, TrackedSensors(0.02, 0.29e-3, 0.0035), SURE, ContactKnowledge(10.0, 10.0, 10.0, 0.05)
+    )
     for roll in (0.0, 1.2, -2.5):
         arcs, force = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056), np.array([-0.15, -0.02])
         tip, shaft = (reading(arcs, force, back, roll, np.zeros(3)) for back in (0.0, 0.02))

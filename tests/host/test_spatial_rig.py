@@ -15,8 +15,9 @@ from host.estimation.interface import Actuation, PoseReading
 from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors
 from host.estimation.planar_rig import PlanarRigEstimator
 from host.estimation.rig_estimator import make_estimator
-from host.estimation.spatial_rig import SpatialRigEstimator, _new_fit
-from host.estimation.spatial_rig_kernels import TrackedFrame, model
+from host.estimation.sensor_noise import TrackedSensors
+from host.estimation.spatial_rig import SpatialRigEstimator
+from host.estimation.spatial_rig_kernels import TrackedFrame, model, new_fit
 from host.mechanics.cosserat import solve_cosserat
 from host.mechanics.cosserat_kernels import ROW, WORK
 from host.mechanics.rod import rod_record
@@ -56,7 +57,8 @@ def poses(
 
 
 def estimator(knowledge: ActuationKnowledge, **contact: float) -> SpatialRigEstimator:
-    return SpatialRigEstimator(BLAZER, OFFSET_m, POSITION_STD_m, ANGLE_STD_rad, knowledge, ContactKnowledge(**contact))
+    sensors = TrackedSensors(OFFSET_m, POSITION_STD_m, ANGLE_STD_rad)
+    return SpatialRigEstimator(BLAZER, sensors, knowledge, ContactKnowledge(**contact))
 
 
 @pytest.mark.parametrize("insertion_m", [-0.07, 0.01])
@@ -76,10 +78,10 @@ def test_tangents_are_those_of_difference_quotients(insertion_m: float) -> None:
     )
     rows, work, A, unused = np.zeros((3, ROW)), np.zeros(WORK), np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
     x = np.array([0.015, -0.03, -0.08, 0.4e-3, 0.6, 0.02])
-    here, steps = _new_fit(2), (1e-6, 1e-6, 1e-6, 1e-7, 1e-4, 1e-6)
+    here, steps = new_fit(2), (1e-6, 1e-6, 1e-6, 1e-7, 1e-4, 1e-6)
     model(frame, x, rows, work, here, A)
     for c, step in enumerate(steps):
-        ahead, behind = _new_fit(2), _new_fit(2)
+        ahead, behind = new_fit(2), new_fit(2)
         model(frame, x + step * np.eye(6)[c], rows, work, ahead, unused)
         model(frame, x - step * np.eye(6)[c], rows, work, behind, unused)
         slope = -(ahead.residual - behind.residual) / (2.0 * step)

@@ -187,7 +187,11 @@ def test_bad_input_to_solve_is_named(change: dict, key: str) -> None:
         ({"sensors": [(0.0, [0.0, 0.08], [1.0, 0, 0, 0]), (0.03, [0.0] * 3, [1.0, 0, 0, 0])]}, "sensors.0.position_m"),
         ({"sensors": [(0.0, [0.0] * 3, [1.0, 1.0, 0, 0]), (0.03, [0.0] * 3, [1.0, 0, 0, 0])]}, "sensors.0.quaternion_wxyz"),
         ({"model": "beam"}, "model"),
-        ({"model": "pcar"}, "sensors"),
+        ({"model": "pcar"}, "case"),
+        ({"model": "pcar", "case": None}, "sensors"),
+        ({"model": "pcar", "case": None, "roll_rad": 0.1}, "roll_rad"),
+        ({"model": "pcar", "case": None, "previous_force_N": [0.0, 0.0]}, "previous_force_N"),
+        ({"roll_rad": [0.1, 0.2]}, "roll_rad"),
     ],
 )
 def test_bad_input_to_estimate_force_is_named(change: dict, key: str) -> None:
