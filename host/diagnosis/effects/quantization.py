@@ -9,6 +9,9 @@ import numpy as np
 from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale
 
 SAMPLES = 150  # of each output and recording, to look for steps in
+# Steps that the range holds at the most, for the search: a reading of 12 bits. Without it, the search of recordings without
+# noise would try as many steps as the range holds of their rounding errors.
+MOST_STEPS = 4000
 HARMONICS = 4  # of the saw tooth: a smooth approximation, so that a fit can follow it
 
 
@@ -39,7 +42,7 @@ def from_saw_tooth(evidence: Evidence, parameters: tuple[Parameter, ...], unit: 
     span = float(np.max(np.abs(place))) if place.size else 0.0
     if not span > high:
         return tuple(replace(p, grid=()) for p in parameters)
-    turns = np.arange(1.0 / high, 1.0 / low, 0.2 / span)
+    turns = np.arange(1.0 / high, min(1.0 / low, MOST_STEPS / span), 0.2 / span)
     follows = np.array([float(rest @ np.sin(2.0 * np.pi * k * place)) / k for k in turns])
     best = turns[np.argsort(follows)[:3]]
     grid = tuple(float(1.0 / k) for k in best)

@@ -38,7 +38,7 @@ def rig_of(files: list[Path]) -> Rig:
 
 
 def rig_rows(path: Path) -> dict[str, Array]:
-    """Columns of kind rig (docs/diagnosis.md), a row for each frame of the tracker.
+    """Columns of kind rig (docs/nominal-models.md), a row for each frame of the tracker.
 
     handle_insertion_m is behind the backlash of the rig's configuration, handle_knob_rad behind its knob curve (curvature
     over `knob_gain`): what is known of the transmission is taken off before anything is compared. Raises InputError.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from host.diagnosis.effects import library
-from host.diagnosis.effects.quantization import stepped
+from host.diagnosis.effects.quantization import MOST_STEPS, from_saw_tooth, stepped
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES
-from host.diagnosis.model.effect import Candidate, Parameter, Port
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
@@ -106,3 +106,15 @@ def test_a_calibrated_probability_takes_its_share_from_all_others() -> None:
     for each in (asis, lower):
         assert each.effect + each.rivals[0][1] + each.nothing + each.none == pytest.approx(1.0)
     assert calibrated(0.8, 0.5, -0.3) == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * np.log(4.0) - 0.3))))
+
+
+@pytest.mark.parametrize(("step_m", "found"), [(5e-4, True), (1e-16, False)])
+def test_steps_of_recordings_without_noise_are_searched_in_bounded_time(step_m: float, found: bool) -> None:
+    """Where only rounding is left, the range holds 1e14 steps: the search ends, and proposes none."""
+    place = 0.02 * np.sin(0.01 * np.arange(1000))
+    residual = step_m * np.round(place / step_m) - place if found else 1e-16 * np.sin(np.arange(1000.0))
+    reading = Reading("m", place, residual, float(np.std(residual)))
+    (step,) = from_saw_tooth(Evidence((), (), (reading,), True), (Parameter("step", "m", (1.0,), 0.0, 1.0),), "m")
+    assert bool(step.grid) is found and all(size > place.max() / MOST_STEPS for size in step.grid)
+    if found:
+        assert min(abs(size / step_m - 1.0) for size in step.grid) < 0.02
