@@ -314,8 +314,8 @@ class RigState(Message, frozen=True, kw_only=True):
         ]
         | None
     ) = None
-    target_force_N: Annotated[Force_N | None, doc("requested force along that direction")] = None
-    force_N: Annotated[Force_N | None, doc("force along that direction, as the control loop uses it")] = None
+    target_force_N: Annotated[Force_N | None, doc("requested force along `force_direction`")] = None
+    force_N: Annotated[Force_N | None, doc("force along `force_direction`, as the control loop uses it")] = None
     pose_age_ns: Annotated[Stamp_ns, doc("age of the newest accepted pose")] = 0
     poses_rejected: Annotated[Count, doc("poses refused since the start")] = 0
     forces_rejected: Annotated[Count, doc("force readings refused since the start")] = 0

@@ -1,16 +1,19 @@
 """How a record of the tick is declared: each field once, with its type, unit and one line of meaning.
 
-A declared class is three things: the type that compiled kernels are checked against, the numpy dtype (`dtype_of`), and
-the rows of the table in docs/records.md (`as_markdown`).
+A declared class is four things: the type that compiled kernels are checked against, the numpy dtype (`dtype_of`), the
+rows of the table in docs/records.md (`as_markdown`), and the part of a message that it carries (`carried`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from operator import itemgetter
 from typing import Any, NamedTuple, Protocol, overload
 
 import numpy as np
+
+from protocol.messages import Message, specs
 
 
 class Floats(Protocol):
@@ -64,12 +67,16 @@ Point = tuple[float, float, float]  # m
 
 
 class RecordField(NamedTuple):
-    """One field: "f8", "i8" or the class of a nested record; unit; meaning; shape, () for a scalar."""
+    """One field: "f8", "i8" or the class of a nested record; unit; meaning; shape, () for a scalar.
+
+    message: class and field of the message that carries the value; None if none does.
+    """
 
     kind: Any
     unit: str
     doc: str
     shape: tuple[int, ...] = ()
+    message: tuple[type[Message], str] | None = None
 
 
 def real(unit: str, doc: str, *shape: int) -> Any:
@@ -82,6 +89,13 @@ def whole(unit: str, doc: str, *shape: int) -> Any:
     return RecordField("i8", unit, doc, shape)
 
 
+def carried_by(message: type[Message], name: str) -> Any:
+    """Declare a field whose value a message carries in its field `name`: kind, size, unit and meaning are declared there."""
+    spec = specs(message)[name]
+    shape = (len(spec.columns),) if spec.columns else ()
+    return RecordField({"float": "f8", "integer": "i8"}[spec.kind], spec.unit, spec.doc, shape, (message, name))
+
+
 def part(record: type, doc: str) -> Any:
     """Declare a field that is a record of its own."""
     return RecordField(record, "", doc)
@@ -90,6 +104,24 @@ def part(record: type, doc: str) -> Any:
 def fields_of(record: type) -> dict[str, RecordField]:
     """Return the fields of a declared class by name, in the order of declaration."""
     return {name: field for name, field in vars(record).items() if isinstance(field, RecordField)}
+
+
+@cache
+def _carried_fields(record: type, message: type[Message]) -> tuple[tuple[str, str], ...]:
+    return tuple(
+        (name, field.message[1])
+        for name, field in fields_of(record).items()
+        if field.message is not None and field.message[0] is message
+    )
+
+
+def carried(message: type[Message], record: type, values: np.record) -> dict[str, Any]:
+    """Return the fields of `message` that a declared class carries, as plain Python values.
+
+    Arguments: record, the declared class; values, one record of it.
+    """
+    plain = ((name, values[field].tolist()) for field, name in _carried_fields(record, message))
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in plain}
 
 
 class Record(np.record):  # type: ignore[misc]

@@ -1,10 +1,14 @@
-"""The records that cross the tick: parameters, state, inputs, outputs. Every field is declared here and nowhere else."""
+"""The records that cross the tick: parameters, state, inputs, outputs.
+
+Every field is declared once: here, or in the message that carries its value (`carried_by`, `protocol.topics`).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from realtime.control.declare import Floats, Ints, Matrix, Tensor, as_markdown, dtype_of, part, real, whole
+from protocol.topics import ForceSensor, Pose, RigState
+from realtime.control.declare import Floats, Ints, Matrix, Tensor, as_markdown, carried_by, dtype_of, part, real, whole
 
 N_AXES = 3
 CURVE_POINTS = 129
@@ -31,9 +35,9 @@ class PoseRecord:
 
     count: int = whole("", "count of poses")
     stamp_ns: int = whole("ns", "time of measurement")
-    arrival_ns: int = whole("ns", "time of arrival")
-    position_m: Floats = real("m", "position of the sensor", 3)
-    quaternion_wxyz: Floats = real("", "rotation sensor to base, unit, scalar first", 4)
+    arrival_ns: int = carried_by(Pose, "arrival_ns")
+    position_m: Floats = carried_by(Pose, "position_m")
+    quaternion_wxyz: Floats = carried_by(Pose, "quaternion_wxyz")
 
 
 class Force:
@@ -42,7 +46,7 @@ class Force:
     count: int = whole("", "count of readings")
     stamp_ns: int = whole("ns", "time of measurement; for an estimate, that of its pose")
     arrival_ns: int = whole("ns", "time of arrival")
-    force_N: Floats = real("N", "force on the tissue", 3)
+    force_N: Floats = carried_by(ForceSensor, "force_N")
     covariance_N2: Matrix = real("N^2", "covariance of an estimate; zero for the sensor", 3, 3)
     lasting_covariance_N2: Matrix = real("N^2", "its part that estimates shortly after each other share", 3, 3)
     nominal_N: Floats = real("N", "an estimate's force without adaptation of the stiffness; zero for the sensor", 3)
@@ -536,18 +540,18 @@ class Outputs:
     position_steps: Ints = whole("steps", "the set-point, by axis", N_AXES)
     stage_unit: Floats = real("m, rad, rad", "set-point in units of the axes", N_AXES)
     joint: Floats = real("m, rad, rad", "predicted joints, the insertion corrected by the poses", N_AXES)
-    tip_m: Floats = real("m", "predicted tip", 3)
-    tip_velocity_m_per_s: Floats = real("m/s", "velocity of the tip", 3)
+    tip_m: Floats = carried_by(RigState, "tip_m")
+    tip_velocity_m_per_s: Floats = carried_by(RigState, "tip_velocity_m_per_s")
     goal_m: Floats = real("m", "moving goal of the tip", 3)
     force_N: Floats = real("N", "force of the source, base frame", 3)
-    normal_force_N: float = real("N", "compression that the loop works with")
+    normal_force_N: float = carried_by(RigState, "force_N")
     wanted_force_N: float = real("N", "requested compression")
     phase: int = whole("", "a Phase")
     action: int = whole("", "a SafetyAction")
     cause: int = whole("", "causes that stand or are latched, a bit set of `safety.CAUSES`")
-    poses_rejected: int = whole("", "poses rejected so far")
-    forces_rejected: int = whole("", "force readings rejected so far")
-    pose_age_ns: int = whole("ns", "age of the newest accepted pose")
+    poses_rejected: int = carried_by(RigState, "poses_rejected")
+    forces_rejected: int = carried_by(RigState, "forces_rejected")
+    pose_age_ns: int = carried_by(RigState, "pose_age_ns")
     force_source: int = whole("", "a ForceSource")
     wall_m: float = real("m", "predicted wall along the inward normal")
     wall_sd_m: float = real("m", "its standard deviation")

@@ -16,7 +16,9 @@ from protocol.topics import (
     histogram_bucket,
 )
 from realtime.control import safety
+from realtime.control.declare import carried
 from realtime.control.inverse_kinematics import curvature_of_knob
+from realtime.control.records import Force, Outputs, PoseRecord
 from realtime.loop.latency import bin_edges_ns, percentiles_us
 from realtime.loop.loop_thread import NativeLoop
 from realtime.loop.native_loop import GAP_PLACES, LATENESS_BIN_NS, WORK_BIN_NS
@@ -51,12 +53,10 @@ def pose_message(record: np.record, frame: int = 0, quality_m: float | None = No
     """Return the message of a POSE record (base frame)."""
     return Pose(
         stamp_ns=int(record.stamp_ns),
-        arrival_ns=int(record.arrival_ns),
         frame=frame,
         missing=False,
-        position_m=tuple(map(float, record.position_m)),
-        quaternion_wxyz=tuple(map(float, record.quaternion_wxyz)),
         quality_m=quality_m,
+        **carried(Pose, PoseRecord, record),
     )
 
 
@@ -65,8 +65,8 @@ def force_message(record: np.record, status: int = 0) -> ForceSensor:
     return ForceSensor(
         stamp_ns=int(record.stamp_ns),
         arrival_ns=int(record.arrival_ns),
-        force_N=tuple(map(float, record.force_N)),
         status=status,
+        **carried(ForceSensor, Force, record),
     )
 
 
@@ -78,21 +78,19 @@ def state_message(command: np.record, outputs: np.record, located: bool, homing:
     pressing = float(command.force_N) if outputs.phase == Phase.CONTACT else None
     # The wall of a contact stays where it is while the rig holds or retracts; a new position leaves it.
     at_wall = command.kind in (CommandKind.CONTACT, CommandKind.HOLD, CommandKind.RETRACT) and bool(np.any(command.normal))
-    tip_m, velocity_m_per_s = outputs.tip_m, outputs.tip_velocity_m_per_s
+    loop = carried(RigState, Outputs, outputs)
+    loop["pose_age_ns"] = max(loop["pose_age_ns"], 0)
+    if not located:
+        loop["tip_m"] = loop["tip_velocity_m_per_s"] = None
     return RigState(
         stamp_ns=int(outputs.now_ns),
         mode=(Phase.HOMING if homing else Phase(int(outputs.phase))).label,
         safety_action=SafetyAction(int(outputs.action)).label,
         cause="; ".join(safety.messages(int(outputs.cause)))[:500],
         target_m=tuple(map(float, command.target_m)) if command.kind != CommandKind.NONE else None,
-        tip_m=tuple(map(float, tip_m)) if located else None,
-        tip_velocity_m_per_s=tuple(map(float, velocity_m_per_s)) if located else None,
         force_direction=tuple(-float(x) for x in command.normal) if at_wall else None,
         target_force_N=pressing,
-        force_N=float(outputs.normal_force_N),
-        pose_age_ns=max(int(outputs.pose_age_ns), 0),
-        poses_rejected=int(outputs.poses_rejected),
-        forces_rejected=int(outputs.forces_rejected),
+        **loop,
     )
 
 
