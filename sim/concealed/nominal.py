@@ -1,7 +1,7 @@
 """The nominal model of the catheter rig in the proof's generator: the one that a rig engineer would calibrate.
 
-Written from the published description of kind `rig` (docs/diagnosis.md), apart from host's twin, so that sizes of planted
-effects can be stated relative to it and a crudely calibrated nominal file can be written next to the recordings.
+Written from the published description of kind `rig` (docs/nominal-models.md), apart from host's twin, so that sizes of
+planted effects can be stated relative to it and a crudely calibrated nominal file can be written next to the recordings.
 """
 
 from __future__ import annotations

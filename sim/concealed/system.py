@@ -248,7 +248,7 @@ terms = ["mass", "damping", "stiffness", "offset"]
 
 
 def nominal_toml(system: System, calibrated: Array, heldout: str) -> str:
-    """The nominal model of a case as docs/diagnosis.md describes it, with parameters as calibrated."""
+    """The nominal model of a case as docs/nominal-models.md describes it, with parameters as calibrated."""
     head = f'name = "concealed case"\nkind = "{system.kind}"\n\n[data]\ntime = "time_s"\nheldout = ["{heldout}"]\n\n'
     if system.kind == "rig":
         values: dict[str, Any] = dict(zip(concealed_nominal.PARAMETERS, calibrated, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 from host.studies.faults.campaign import DELAYS_S, HOLD_AFTER_S, OVER_FORCE_SHARE, SECOND_WITHIN_S, RunResult, summary_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -32,15 +33,24 @@ unless the catheter differs from its file, or the true force was above {over_sha
 Runs that broke a rule: **{bad}**. Largest true force: {peak_N:.3f} N (limit {limit_N} N). Unhandled exceptions:
 {unhandled}. Recordings that could not be read: {unreadable}. Motion without a command after a stop: {rearmed}.
 
-| fault | drawn | runs | must be detected, missed | detected after, ms (median, 99 %) | first detected by \
-| strongest action | peak, N | motion into the tissue after, mm | poses lost |
-|---|---|---|---|---|---|---|---|---|---|
-{rows}
+**What was injected:**
+
+{injected}
+
+**How it was detected:**
+
+{detected}
 
 - *must be detected*: runs in which the fault was large or long enough to have an effect (`sim/fault_table.py`); the others
   may or may not be detected. A jam or slip must be detected if more than {steps_to_find} steps were lost for {lost_s:g} s
   or longer; its time of detection counts from the begin of that loss.
 - *first detected by*: a cause of the failsafe, a line in the log, or a count of a driver or the board.
+
+**What followed:**
+
+{followed}
+
+- *strongest action*: number of runs in which it was the strongest.
 - *motion into the tissue after*: motion of the insertion stage after the fault was detected, if the action was hold,
   retract or stop.
 - After a lost link, reset or power cycle all stages must be at rest within {rest_ms:.0f} ms: longest {longest_ms:.0f} ms.
@@ -77,11 +87,7 @@ def page_section(results: list[RunResult], seed: int, board: str) -> str:
         unhandled=sum(bool(result.unhandled) for result in results),
         unreadable=sum(not result.recording_readable for result in results),
         rearmed=sum(bool(result.outcome.get("rearmed")) for result in results),
-        rows="\n".join(
-            _row(fault, [r for r in results if r.plan.fault == fault.name])
-            for fault in FAULTS
-            if any(r.plan.fault == fault.name for r in results)
-        ),
+        **_tables(results),
         rest_ms=1e3 * LINK_REST_S,
         longest_ms=_longest_rest_ms(results),
         violations="\n".join(_violations(bad)),
@@ -91,27 +97,49 @@ def page_section(results: list[RunResult], seed: int, board: str) -> str:
     )
 
 
-def _row(fault: FaultKind, results: list[RunResult]) -> str:
-    s = summary_of(results)
+def _tables(results: list[RunResult]) -> dict[str, str]:
+    """The three tables of the section: what was injected, how it was detected, what followed; a row for each fault."""
+    shown = [(fault, [r for r in results if r.plan.fault == fault.name]) for fault in FAULTS]
+    shown = [(fault, runs) for fault, runs in shown if runs]
+    return {
+        "injected": _table("fault | what it does | size and duration", [_injected(fault) for fault, _ in shown]),
+        "detected": _table(
+            "fault | runs | must be detected, missed | detected after, ms (median, 99 %) | first detected by",
+            [(fault.name, *_detected(runs)) for fault, runs in shown],
+        ),
+        "followed": _table(
+            "fault | strongest action | peak, N | motion into the tissue after, mm | poses lost",
+            [(fault.name, *_followed(runs)) for fault, runs in shown],
+        ),
+    }
+
+
+def _table(head: str, rows: Sequence[Sequence[object]]) -> str:
+    lines = [f"| {head} |", "|" + "---|" * (head.count("|") + 1)]
+    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+
+
+def _injected(fault: FaultKind) -> tuple[str, str, str]:
+    """Name, meaning, and the ranges from which size and duration are drawn."""
     drawn = [f"{fault.size[0]:g} to {fault.size[1]:g} {fault.unit}"] if fault.unit else []
     if fault.seconds[0] != fault.seconds[1]:
         drawn.append(f"{fault.seconds[0]:g} to {fault.seconds[1]:g} s")
+    return fault.name, fault.says, ", ".join(drawn)
+
+
+def _detected(results: list[RunResult]) -> tuple[object, ...]:
+    """Runs, those in which the fault must be detected, times of detection, and what detected it most often."""
+    s = summary_of(results)
     times = "" if s["detection_ms_p50"] is None else f"{s['detection_ms_p50']:.0f}, {s['detection_ms_p99']:.0f}"
     found = Counter(_what(result.outcome["detected_by"]) for result in results if result.outcome.get("detected_by"))
+    return s["runs"], f"{s['must_detect']}, {s['missed']}", times, found.most_common(1)[0][0] if found else ""
+
+
+def _followed(results: list[RunResult]) -> tuple[object, ...]:
+    """Actions with their counts, largest force, largest motion into the tissue, and lost poses."""
+    s = summary_of(results)
     actions = ", ".join(f"{name} {count}" for name, count in sorted(s["actions"].items(), key=lambda item: -item[1]))
-    cells = (
-        f"{fault.name}: {fault.says}",
-        ", ".join(drawn),
-        s["runs"],
-        f"{s['must_detect']}, {s['missed']}",
-        times,
-        found.most_common(1)[0][0] if found else "",
-        actions,
-        f"{s['peak_force_N']:.3f}",
-        f"{1e3 * s['moved_after_m']:.2f}",
-        s["poses_lost"],
-    )
-    return "| " + " | ".join(map(str, cells)) + " |"
+    return actions, f"{s['peak_force_N']:.3f}", f"{1e3 * s['moved_after_m']:.2f}", s["poses_lost"]
 
 
 def _what(found: str) -> str:
