@@ -1,7 +1,9 @@
-"""Prints every function that the compiled loop with the real tick calls; a script, as only fresh code can be looked at."""
+"""Prints every function that the compiled loop with the real tick calls, the tick and its blocks included.
+
+A script: a process of its own has compiled, or loaded from the cache, nothing but this loop.
+"""
 
 import re
-import sys
 from typing import Any
 
 from realtime.control import records
@@ -12,10 +14,15 @@ from realtime.loop.loop_thread import NativeLoop, input_mailboxes
 
 
 def called_by(dispatcher: Any) -> set[str]:
-    """Names called from the machine code of `dispatcher`, its wrappers for the interpreter left out."""
+    """Names called from the machine code of `dispatcher`, its wrappers for the interpreter left out.
+
+    Its library holds the code of every function that it calls, also of one that was loaded from the cache: there,
+    `inspect_llvm` has no text, but the module to link with is complete.
+    """
     names: set[str] = set()
-    for signature in dispatcher.signatures:
-        text = dispatcher.inspect_llvm(signature)
+    for overload in dispatcher.overloads.values():
+        text = str(overload.library._get_module_for_linking())
+        assert "define " in text
         for body in re.finditer(r'^define [^@]*@"?([^"(]+)"?\(.*?^}', text, re.S | re.M):
             if "cpython" not in body.group(1) and "cfunc" not in body.group(1):
                 names.update(re.findall(r'(?:call|invoke)\b[^@\n]*@"?([\w.$]+)', body.group(0)))
@@ -36,11 +43,6 @@ def main() -> None:
     )
     loop.prepare()
     found = called_by(loop._run)
-    for name, module in sorted(sys.modules.items()):
-        if name.startswith(("realtime.", "protocol.")):
-            for item in vars(module).values():
-                if hasattr(item, "inspect_llvm"):
-                    found |= called_by(item)
     print("\n".join(sorted(name for name in found if not name.startswith(("_ZN", "llvm.")))))
 
 
