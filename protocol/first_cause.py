@@ -7,11 +7,17 @@ the result (`realtime/core/cause_watch.py`); page, report and terminal show it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
 # An explanation came at most so long before what it explains: a rig that was late a minute ago is not late now.
 EXPLAINS_FOR_NS = 5_000_000_000
+# Devices that share nothing but the computer do not fall silent within this time by chance; a silence is noticed after 50 to
+# 150 ms, depending on the device.
+TOGETHER_NS = 300_000_000
+# The model process is none of them: without poses it has nothing to answer.
+_SILENCES = (("board_silent",), ("pose_stale", "pose_lost"), ("force_stale", "force_lost"))
 # ... or was noticed after at most this time: lateness and the board's counters are reported twice a second.
 NOTICED_WITHIN_NS = 600_000_000
 
@@ -29,23 +35,32 @@ RULES: dict[str, Rule] = {
     "operator_stop": Rule("The operator stopped the rig.", "Disarm and arm again when ready."),
     "loop_late": Rule(
         "The control loop was late: the computer was too busy.",
-        "Close other programs, and give the loop real-time priority; `seldinger latency-check` measures its lateness.",
+        "Close other programs, and give the loop real-time priority; `seldinger latency-check` measures its lateness. "
+        "Then clear and arm again.",
+    ),
+    "devices_silent": Rule(
+        "Several devices fell silent at the same time.",
+        "Check the load of the computer (`seldinger latency-check`), then what the devices share: USB hub, network, power. "
+        "Then clear and arm again.",
+        ("loop_late", "operator_stop"),
     ),
     "board_reset": Rule(
         "The stepper board was reset.", "Check the board's supply and its USB cable, then home the axes.", ("operator_stop",)
     ),
     "board_silent": Rule(
-        "The stepper board sent no status.", "Check cable and power of the board, then clear.", ("loop_late", "board_reset")
+        "The stepper board sent no status.",
+        "Check cable and power of the board, then clear.",
+        ("loop_late", "devices_silent", "board_reset"),
     ),
     "underrun": Rule(
         "The board ran out of set-points while moving.",
         "Raise [board] setpoint_lead_s, or make the computer less busy.",
-        ("loop_late", "board_silent", "board_reset"),
+        ("loop_late", "devices_silent", "board_silent", "board_reset"),
     ),
     "deadman": Rule(
         "The board received no set-points, so its dead man stopped the axes.",
         "Check the cable of the board and the load of the computer, then clear.",
-        ("loop_late", "underrun", "board_silent", "board_reset"),
+        ("loop_late", "devices_silent", "underrun", "board_silent", "board_reset"),
     ),
     "estop": Rule("The emergency stop opened.", "Release the emergency stop when it is safe, then clear."),
     "limit": Rule("A limit switch opened.", "Move the stage off the switch by hand, clear, and home the axis."),
@@ -70,12 +85,12 @@ RULES: dict[str, Rule] = {
     "pose_stale": Rule(
         "The tracker sent no recent pose.",
         "Check the tracker's cable, and that the tip is in its measurement volume.",
-        ("loop_late", "poses_wild"),
+        ("loop_late", "devices_silent", "poses_wild"),
     ),
     "pose_lost": Rule(
         "The tracker sent no pose for longer than the limit.",
         "Check the tracker's cable, and that the tip is in its measurement volume, then clear.",
-        ("loop_late", "poses_wild", "pose_stale"),
+        ("loop_late", "devices_silent", "poses_wild", "pose_stale"),
     ),
     "force_rejected": Rule(
         "A force reading was not finite or out of the sensor's range.", "Check the force sensor's cable.", ("loop_late",)
@@ -83,12 +98,12 @@ RULES: dict[str, Rule] = {
     "force_stale": Rule(
         "The force source sent no recent value in contact.",
         "Check the force sensor and its network.",
-        ("loop_late", "force_rejected"),
+        ("loop_late", "devices_silent", "force_rejected"),
     ),
     "force_lost": Rule(
         "The force source sent no value for longer than the limit in contact.",
         "Check the force sensor and its network, then clear.",
-        ("loop_late", "force_rejected", "force_stale"),
+        ("loop_late", "devices_silent", "force_rejected", "force_stale"),
     ),
     "force_handover": Rule(
         "The force sensor sends no data or repeats one value. The loop uses the estimate.",
@@ -108,7 +123,10 @@ RULES: dict[str, Rule] = {
     "host_silent": Rule(
         "The model process does not answer.",
         "Check whether it runs (`systemctl status seldinger-host`), or start it again.",
-        ("loop_late",),
+        (
+            "loop_late",
+            "devices_silent",
+        ),
     ),
     "host_lost": Rule(
         "The model process did not answer for longer than the limit.",
@@ -127,6 +145,11 @@ RULES: dict[str, Rule] = {
         "A force remains on the tip after the retraction.",
         "Pull the catheter back by hand until the force is gone.",
         ("over_force", "force_disagrees", "board_silent", "board_fault", "operator_stop"),
+    ),
+    "device_returned": Rule(
+        "A device was lost and is back, so the rig was disarmed.",
+        "Check the cable of the device, then arm again.",
+        ("loop_late", "board_reset", "board_silent", "pose_lost", "force_lost"),
     ),
     "over_force": Rule(
         "The contact force went above the limit.",
@@ -170,6 +193,9 @@ def first_cause(observed: Iterable[Observation]) -> FirstCause | None:
     for item in observed:
         if item.cause not in earliest or item.at_ns < earliest[item.cause].at_ns:
             earliest[item.cause] = item
+    together_ns = _together_ns(earliest)
+    if together_ns is not None:
+        earliest.setdefault("devices_silent", Observation("devices_silent", together_ns))
     ordered = sorted(earliest.values(), key=lambda item: (item.at_ns, _RANK.get(item.cause, len(_RANK))))
     if not ordered:
         return None
@@ -179,7 +205,18 @@ def first_cause(observed: Iterable[Observation]) -> FirstCause | None:
     says = rule.says or first.text
     if rule.says and first.text and first.text != rule.says:
         says = f"{rule.says.removesuffix('.')} ({first.text})."
-    return FirstCause(first.cause, first.at_ns, says, rule.remedy, tuple(item for item in ordered if item != first))
+    # That several fell silent is a conclusion, not an observation: it is a headline or nothing.
+    followed = tuple(item for item in ordered if item not in (first, earliest.get("devices_silent")))
+    return FirstCause(first.cause, first.at_ns, says, rule.remedy, followed)
+
+
+def _together_ns(earliest: dict[str, Observation]) -> int | None:
+    """When the first of several devices fell silent that did so at the same time; None where at most one did."""
+    times = sorted(
+        min(earliest[name].at_ns for name in names if name in earliest) for names in _SILENCES if earliest.keys() & {*names}
+    )
+    pairs = itertools.pairwise(times)
+    return next((before for before, after in pairs if after - before <= TOGETHER_NS), None)
 
 
 def _explanations(item: Observation, earliest: dict[str, Observation]) -> list[str]:

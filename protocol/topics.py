@@ -343,7 +343,7 @@ class BoardCounters(Message, frozen=True, kw_only=True):
 
 
 class RigCause(Message, frozen=True, kw_only=True):
-    """First cause of what went wrong since the rig was armed, with its remedy; empty where nothing did."""
+    """First cause of what holds the rig back, with its remedy; empty if nothing does."""
 
     name: Annotated[Text, doc("name of the first cause; empty if there is none")] = ""
     since_ns: Annotated[Stamp_ns, doc("time at which it was noticed")] = 0

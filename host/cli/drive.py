@@ -79,10 +79,12 @@ class Driver:
     def why(self) -> str:
         """Return the end of a sentence with the first cause of what holds the rig back; empty if nothing does."""
         state = self.state
-        if state is None or state.safety_action in ("none", "warn"):
+        if state is None:
             return ""
         cause = self.rig.first_cause()
-        return f"; first cause: {cause}" if cause else f"; safety: {state.cause}"
+        if cause:
+            return f"; first cause: {cause}"
+        return "" if state.safety_action in ("none", "warn") else f"; safety: {state.cause}"
 
     def finish(self) -> None:
         """Print the result as one JSON object on standard output, if `--json` is given."""

@@ -167,7 +167,7 @@ class Picture:
             "mode": state.get("mode", ""),
             "action": state.get("safety_action", ""),
             "causes": causes_of(state.get("cause", "")),
-            "first": self._first(state),
+            "first": self._first(),
             "force_N": _rounded(state.get("force_N"), 4),
             "target_force_N": state.get("target_force_N"),
             "pose_age_ms": _rounded(_ms(state.get("pose_age_ns")), 1),
@@ -186,10 +186,10 @@ class Picture:
             frame["log"], self._log_new = list(self._log), False
         return frame
 
-    def _first(self, state: Body) -> dict[str, Any] | None:
+    def _first(self) -> dict[str, Any] | None:
         """The first cause of what stands, its remedy, and what followed; None while nothing holds the rig back."""
         first = self._newest.get("cause", {})
-        if not first.get("name") or state.get("safety_action", "none") in ("none", "warn"):
+        if not first.get("name"):
             return None
         return {"says": first["says"], "remedy": first["remedy"], "followed": first["followed"].splitlines()}
 

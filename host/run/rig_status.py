@@ -109,8 +109,7 @@ def read_status(session: Session, rig: str, listen_s: float = 1.2, wait_s: float
             newest[topic] = message
         time.sleep(_LOOK_S)
     first = newest.get("cause")
-    action = getattr(newest.get("state"), "safety_action", "none")
-    if not isinstance(first, RigCause) or not first.name or action in ("none", "warn"):
+    if not isinstance(first, RigCause) or not first.name:
         return RigStatus(rig=rig, newest=newest)
     followed = tuple(first.followed.splitlines())
     return RigStatus(rig=rig, newest=newest, cause=first.says, remedy=first.remedy, followed=followed)

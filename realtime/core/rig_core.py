@@ -225,8 +225,7 @@ class RigCore:
         tick_ns = int(outputs.now_ns)
         self._watch_gap(tick_ns)
         self._log_new_causes(outputs, tick_ns)
-        armed = self.phase not in (Phase.DISARMED, Phase.HOMING)
-        self._causes.take_tick(tick_ns, armed, self.action, int(outputs.cause))
+        self._causes.take_tick(tick_ns, self.action, int(outputs.cause))
         if number % telemetry.STAGE_EVERY == 0:
             self._publish("stage", telemetry.stage_message(self.params[0], self._records["board"], outputs, self._located))
         if number % telemetry.STATE_EVERY == 0:
@@ -234,7 +233,8 @@ class RigCore:
             self._publish("state", state)
         if number % telemetry.BOARD_EVERY == 0 and self.link.status is not None:
             counters = board_message(self.link, tick_ns)
-            self._causes.take_board(counters)
+            if not self._homes:  # a homing moves onto the switch: that fault is what it looks for
+                self._causes.take_board(counters)
             self._publish("board", counters)
         if self._causes.changed or number % telemetry.LOOP_EVERY == 0:
             self._publish("cause", self._causes.message(tick_ns))
@@ -332,6 +332,7 @@ class RigCore:
         text = self.commands.device_returned(device, self.force_source, self.phase)
         if text:
             self._command_changed()
+            self._causes.take_return(self.now_ns, device)
             self._log("warning", device, text)
 
     def _standing(self) -> RigPosition:
@@ -410,6 +411,8 @@ class RigCore:
         if command.action == "mark" and reply.result == "accepted":
             self._log("info", "mark", command.note)
         elif reply.result == "accepted":
+            if command.action in ("arm", "disarm", "clear_fault"):
+                self._causes.restart()
             if command.action in ("arm", "clear_fault"):
                 self.supervision.restart()
                 self._hand_over_causes()

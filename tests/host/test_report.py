@@ -255,9 +255,9 @@ def starved(tmp_path: Path) -> RecordingFile:
     """A run that a busy computer ended: the loop was late, the dead man acted, poses were stale when it was back."""
     bits = safety.BOARD_FAULT | safety.POSE_LOST | safety.POSE_STALE
     watch = CauseWatch()
-    watch.take_tick(9_820 * MS, True, SafetyAction.NONE, 0)
+    watch.take_tick(9_820 * MS, SafetyAction.NONE, 0)
     watch.take_gap(10_000 * MS, 180 * MS, "")
-    watch.take_tick(10_000 * MS, True, SafetyAction.STOP, bits)
+    watch.take_tick(10_000 * MS, SafetyAction.STOP, bits)
     story = Story(action="stop", cause="; ".join(safety.messages(bits)), fault=1, fault_from_ms=10_000)
     return replace(story, first=watch.message(10_000 * MS)).write(tmp_path / "starved.mcap")
 

@@ -10,6 +10,7 @@ import pytest
 
 from protocol.enums import BoardState, CommandKind, Phase, SafetyAction
 from protocol.rig_file import Rig
+from protocol.serial_frames import Fault
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply, RigCause, encode
 from realtime.control import safety
 from realtime.control.records import INPUTS, OUTPUTS, new
@@ -36,6 +37,7 @@ class Bench:
         self.rig, self.peer, self.now_ns, self.sensors = rig, Peer(), 20_000 * MS, True
         self.messages: list[tuple[str, Message]] = []
         self.state, self.steps, self.counts = BoardState.DISARMED, np.zeros(3, int), np.zeros(3, int)
+        self.fault = Fault.NONE
         self.phase, self._ticks, self._commands, self._answers = Phase.DISARMED, 0, 0, b""
 
     @staticmethod
@@ -57,6 +59,7 @@ class Bench:
     def status(self) -> bytes:
         return self.peer.status(
             state=self.state,
+            fault=self.fault,
             position_steps=tuple(self.steps),
             encoder_counts=tuple(self.counts),
             mcu_time_us=self.now_ns // 1000 & 0xFFFFFFFF,
@@ -308,9 +311,13 @@ def test_every_stall_is_the_first_cause_of_its_stop_not_the_longest_alone(core: 
         newest = causes(core)[-1]
         assert newest.name == "loop_late" and f"{stall_ms + 1} ms" in newest.says and "real-time" in newest.remedy
         assert newest.followed == "+0 ms: The stepper board sent no status."
-        core.phase = Phase.DISARMED
+        assert core.ask("clear_fault").result == "accepted"
+        core.phase, core.state = Phase.DISARMED, BoardState.DISARMED
         core.run(6_000)
-        core.phase = Phase.HOLD
+        core.ask("take", lease="")
+        reply = core.ask("arm")
+        assert reply.result == "accepted", reply.text
+        core.phase, core.state = Phase.HOLD, BoardState.RUNNING
         core.run(600)
         assert not causes(core)[-1].name, "armed again: what was before is over"
 
@@ -323,6 +330,29 @@ def test_a_program_that_listens_late_receives_the_first_cause_and_its_time(core:
     core.run(7_000, safety.BOARD_SILENT, SafetyAction.STOP)
     newest = causes(core)[-1]
     assert newest.name == "loop_late" and newest.since_ns <= stopped_ns < newest.stamp_ns - 6_500 * MS
+
+
+def test_a_fault_of_the_board_while_the_rig_is_armed_has_a_cause_although_the_loop_has_none(core: Bench) -> None:
+    core.armed()
+    core.now_ns += 100 * MS
+    core.phase, core.state, core.fault = Phase.DISARMED, BoardState.FAULT, Fault.DEADMAN
+    core.run(100)
+    newest = causes(core)[-1]
+    assert newest.name == "loop_late" and newest.followed.endswith("so its dead man stopped the axes.")
+    core.state, core.fault = BoardState.DISARMED, Fault.NONE
+    core.run(100)
+    assert not causes(core)[-1].name
+
+
+def test_a_device_that_is_back_is_why_the_rig_is_disarmed(core: Bench) -> None:
+    core.armed().run(600)
+    core.core.step(core.now_ns, Arrived(device_events=[DeviceEvent(core.now_ns, "net_ft", DeviceEventKind.RECONNECTED, "")]))
+    core.run(50)
+    newest = causes(core)[-1]
+    assert newest.name == "device_returned" and "(net_ft)" in newest.says and "arm again" in newest.remedy
+    assert core.ask("arm").result == "accepted"
+    core.run(20)
+    assert not causes(core)[-1].name
 
 
 def test_what_was_over_long_before_a_stop_is_not_its_cause(core: Bench) -> None:
