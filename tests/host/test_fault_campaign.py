@@ -1,4 +1,4 @@
-"""The fault campaign: its plan, its rules, and a hundred runs that break none."""
+"""The fault campaign: its plan, its rules, and runs of every fault that break none."""
 
 import dataclasses
 import json
@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from host.cli.faults import faults as command
-from host.studies.faults.campaign import RunPlan, RunResult, by_fault, judged, plan_runs, run_campaign, violations
+from host.studies.faults.campaign import RunPlan, RunResult, by_fault, judged, plan_runs, run_campaign, run_plans, violations
 from host.studies.faults.finished import FinishedRuns
 from host.studies.reliability_page import fuzz_section, write_section
 from protocol.errors import InputError
@@ -221,9 +221,21 @@ def test_the_command_gives_json_a_page_and_the_same_figures_twice(tmp_path: Path
     assert "mcu_reset" in (tmp_path / "r.md").read_text(encoding="utf-8")
 
 
+def broken(results: Sequence[RunResult]) -> list[object]:
+    return [(dataclasses.astuple(one.plan), one.violations) for one in results if one.violations]
+
+
 @pytest.mark.slow
+def test_each_fault_breaks_no_rule() -> None:
+    """Every fault once, a third of them in each phase; `make long` has more of them, the campaign all in all phases."""
+    turns = {fault.name: PHASES[number % len(PHASES)] for number, fault in enumerate(FAULTS)}
+    plans = [plan for plan in plan_runs(len(FAULTS) * len(PHASES), 2026) if turns[plan.fault] == plan.phase]
+    assert [plan.fault for plan in plans].count("none") == 1 and {plan.fault for plan in plans} == set(BY_NAME)
+    results = list(run_plans(plans, 2026, jobs=2))
+    assert len(results) == len(FAULTS) and not broken(results)
+
+
+@pytest.mark.long
 def test_a_hundred_random_faults_break_no_rule() -> None:
     results = run_campaign(100, 2026, jobs=2)
-    assert len(results) == 100
-    broken = [(dataclasses.astuple(one.plan), one.violations) for one in results if one.violations]
-    assert not broken
+    assert len(results) == 100 and not broken(results)

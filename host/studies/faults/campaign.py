@@ -188,14 +188,18 @@ def run_campaign(
     results = list(finished)
     there = {result.plan.index for result in results}
     plans = [plan for plan in plan_runs(runs, seed, faults) if plan.index not in there]
-    of_rig = [[plan for plan in plans if plan.rig == rig] for rig in sorted({plan.rig for plan in plans})]
-    for result in _runs_of(of_rig, seed, jobs, board):
+    for result in run_plans(plans, seed, jobs, board):
         results.append(result)
         progress(result, len(results))
     return sorted(results, key=lambda result: result.plan.index)
 
 
-def _runs_of(of_rig: list[list[RunPlan]], seed: int, jobs: int, board: str) -> Iterator[RunResult]:
+def run_plans(plans: Sequence[RunPlan], seed: int, jobs: int = 1, board: str = "native") -> Iterator[RunResult]:
+    """Make the runs of `plans`, those of one rig together; each result as soon as it is there.
+
+    seed: that of the campaign, from which the rigs are drawn. Raises BoardUnavailable where the board cannot be built.
+    """
+    of_rig = [[plan for plan in plans if plan.rig == rig] for rig in sorted({plan.rig for plan in plans})]
     if jobs <= 1:
         for group in of_rig:
             yield from run_on_rig(group, seed, board)
