@@ -322,9 +322,8 @@ def test_records_that_do_not_fit_are_refused() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(bool(config.DISABLE_JIT), reason="nothing is compiled with NUMBA_DISABLE_JIT=1")
 def test_the_compiled_loop_calls_neither_the_interpreter_nor_an_allocator() -> None:
-    script = Path(__file__).with_name("list_compiled_calls.py")
     listed = subprocess.run(
-        [sys.executable, str(script)],
+        [sys.executable, "-m", "tests.realtime.list_compiled_calls"],
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
