@@ -27,7 +27,8 @@ from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
 if TYPE_CHECKING:
     from host.run.protocol_file import DryRun, ScriptedProtocol
-    from host.run.protocol_run import Job, ProtocolResult
+    from host.run.protocol_result import ProtocolResult
+    from host.run.protocol_run import Job
 
 
 def run(
@@ -58,11 +59,11 @@ def run(
         writable_folder("--out", directory)
     # Loaded after the checks: models take seconds.
     from host.report.protocol_report import write_protocol_report
-    from host.run import protocol_file, protocol_run
+    from host.run import protocol_file, protocol_result, protocol_run
 
     steps = protocol_file.read_protocol(protocol, loaded)
     checked = protocol_file.dry_run(steps, loaded)
-    earlier = () if resume is None else protocol_run.read_result(resume, steps)
+    earlier = () if resume is None else protocol_result.read_result(resume, steps)
     if resume is not None and not dry_run:
         writable_file("--resume", resume)
     _show(steps, checked, loaded)
@@ -71,7 +72,7 @@ def run(
             planned = {"actions": len(steps.actions), "seconds": checked.seconds}
             write_json({"protocol": steps.file.name, "good": True, **planned})
         return
-    target = resume or protocol_run.new_result_path(directory)
+    target = resume or protocol_result.new_result_path(directory)
     job = protocol_run.Job(steps, loaded, target, earlier)
     try:
         result = _carry_out(job, simulated, yes, directory, board, seed, effects)
@@ -89,7 +90,7 @@ def run(
 def _carry_out(
     job: Job, simulated: bool, yes: bool, directory: Path, board: str, seed: int, effects: tuple[str, ...]
 ) -> ProtocolResult:
-    from host.run import protocol_run
+    from host.run import protocol_rigs
 
     with Progress() as bar:
         if simulated:
@@ -97,10 +98,10 @@ def _carry_out(
             from host.run.demo import DemoSettings
 
             estimator = EstimationService(load_estimator(DemoSettings().estimator, job.rig))
-            return protocol_run.run_simulated(job, directory, board, seed, effects, estimator, bar)
+            return protocol_rigs.run_simulated(job, directory, board, seed, effects, estimator, bar)
         if not yes:
             typer.confirm("The catheter will move. Is a hand at the emergency stop?", abort=True, err=True)
-        return protocol_run.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Continue?", err=True), bar)
+        return protocol_rigs.run_live(job, lambda message: yes or typer.confirm(f"\n{message} Continue?", err=True), bar)
 
 
 def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:

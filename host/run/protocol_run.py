@@ -1,48 +1,28 @@
-"""Runs a protocol on a rig, simulated or real: step by step, judged against its tolerances, resumable after a stop."""
+"""Carries out a protocol on a rig that is armed: step by step, judged against its tolerances, resumable after a stop."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
-import zenoh
 
 from host.navigation.request import PlanAnswer
-from host.recordings.header import header_of
-from host.recordings.writer import RecordingWriter, new_recording_path
-from host.run.commander import Commander
-from host.run.connection import may_run
 from host.run.protocol_file import Action, ProtocolFile, ScriptedProtocol, before
+from host.run.protocol_result import FAILED, OK, OUT_OF_TOLERANCE, ActionResult, ProtocolResult, TouchResult, write_result
 from protocol.commander import Acknowledgement
-from protocol.errors import Description, InputError
-from protocol.messages import MessageType
-from protocol.requests import plain
 from protocol.rig_file import Rig
-from protocol.text_files import json_of, read_text
-from protocol.topics import Message, PlannedStep, Pose, RigState, decode, key
-from protocol.zenoh_session import Session
-from sim.board import SimulatedBoard
-from sim.effects import parse
-from sim.scenario import Estimator, Scenario
-from sim.world import World, simulated_plant
+from protocol.topics import PlannedStep, Pose, RigState
 
-ARM_WITHIN_S = 10.0
-# A rig that runs publishes its state 100 times a second; one of this computer without a socket does not run.
-STATES_WITHIN_S, NOT_RUNNING_S = 3.0, 0.2
 THERE_S = 0.3
 # Commands of a plan a second: half of what the rig lets through.
 PLAN_HZ = 20.0
 # Samples of the force a second in a result's trace.
 TRACE_HZ = 20.0
 GRAM_N = 9.80665e-3
-OK, OUT_OF_TOLERANCE, FAILED = "ok", "out_of_tolerance", "failed"
 ENDED = ("stopped", "disarmed", "retract")
 Progress = Callable[[str, float], None]
 
@@ -73,84 +53,6 @@ class DrivenRig(Protocol):
     def publish_step(self, step: PlannedStep) -> None:
         """Publish a step of a plan, for pages and recording."""
         ...
-
-
-class TouchResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one touch. Mean, RMS error and tip error are those after `settle_s`; the others of the whole touch.
-
-    force_time_integral: of the measured force over the time of the touch. contact_loss: force below the rig's threshold
-    of contact. tip_error_m: of the tracker's mean position of the tip from the wanted point, across the normal; None
-    without poses. It is not taken from the loop's predicted tip, which the loop itself brings to the point.
-    """
-
-    force_N: float
-    mean_force_N: float
-    rms_error_N: float
-    peak_force_N: float
-    seconds: float
-    force_time_integral_Ns: float
-    force_time_integral_gs: float
-    contact_loss_s: float
-    contact_loss_share: float
-    longest_loss_s: float
-    tip_error_m: float | None
-    contact_after_s: float
-    trace_time_s: tuple[float, ...] = ()
-    trace_force_N: tuple[float, ...] = ()
-
-
-class ActionResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of one action: verdict (ok, out_of_tolerance, failed), reason in words, and its figures."""
-
-    id: str
-    kind: str
-    verdict: str
-    says: str
-    started_s: float
-    seconds: float
-    point_m: tuple[float, float, float] | None = None
-    error_m: float | None = None
-    touch: TouchResult | None = None
-
-
-class ProtocolResult(msgspec.Struct, frozen=True, kw_only=True):
-    """A run of a protocol. done: every action has a result and none failed. recording: its file, empty on a real rig."""
-
-    protocol: str
-    sha256: str
-    rig: str
-    simulated: bool
-    actions_planned: int
-    results: tuple[ActionResult, ...] = ()
-    ended: str = ""
-    recording: str = ""
-
-    @property
-    def done(self) -> bool:
-        """Whether every action was carried out."""
-        return len(self.results) == self.actions_planned and all(item.verdict != FAILED for item in self.results)
-
-    @property
-    def good(self) -> bool:
-        """Whether every action was carried out within its tolerances."""
-        return self.done and all(item.verdict == OK for item in self.results)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as one JSON object."""
-        touches = [item.touch for item in self.results if item.touch is not None]
-        counts = {
-            verdict: sum(item.verdict == verdict for item in self.results) for verdict in (OK, OUT_OF_TOLERANCE, FAILED)
-        }
-        summary: dict[str, Any] = {"done": self.done, **counts, "touches": len(touches)}
-        errors_m = [touch.tip_error_m for touch in touches if touch.tip_error_m is not None]
-        if touches:
-            summary |= {
-                "mean_force_N": float(np.mean([touch.mean_force_N for touch in touches])),
-                "force_time_integral_Ns": float(np.sum([touch.force_time_integral_Ns for touch in touches])),
-                "contact_loss_share": float(np.mean([touch.contact_loss_share for touch in touches])),
-                "tip_error_m": float(np.mean(errors_m)) if errors_m else None,
-            }
-        return {**msgspec.to_builtins(self), "summary": summary}
 
 
 class StepFailed(RuntimeError):
@@ -469,32 +371,6 @@ def carry_out(job: Job, driven: DrivenRig, blank: ProtocolResult, progress: Prog
     return result
 
 
-def new_result_path(directory: Path) -> Path:
-    """Return a file name for a result in `directory` that is not taken."""
-    return new_recording_path(directory, "protocol-result").with_suffix(".json")
-
-
-def write_result(result: ProtocolResult, target: Path) -> None:
-    """Write the result as JSON, so that a crash leaves the one before it."""
-    part = target.with_suffix(".part")
-    part.write_text(json.dumps(plain(result.as_json()), allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, target)
-
-
-def read_result(path: Path, protocol: ScriptedProtocol) -> tuple[ActionResult, ...]:
-    """Return the results of an earlier run of the same protocol. Raises InputError where it is none, or of another."""
-    wanted = "the JSON file of an earlier run of this protocol"
-    data = json_of(read_text(path, "--resume", wanted), path, "--resume", wanted)
-    try:
-        data.pop("summary", None)
-        result = msgspec.convert(data, ProtocolResult)
-    except (ValueError, TypeError):
-        raise InputError("--resume", str(path), wanted) from None
-    if result.sha256 != protocol.sha256:
-        raise InputError("--resume", Description(f"{path}, of another protocol or another version of it"), wanted)
-    return result.results
-
-
 def blank_result(job: Job, simulated: bool, recording: str = "") -> ProtocolResult:
     """Return the result before the first action."""
     return ProtocolResult(
@@ -505,173 +381,3 @@ def blank_result(job: Job, simulated: bool, recording: str = "") -> ProtocolResu
         actions_planned=len(job.protocol.actions),
         recording=recording,
     )
-
-
-# --- the two kinds of rig ---
-
-
-class SimulatedDrive:
-    """A simulated rig in lock step (`sim.scenario.Scenario`). The operator of a simulation always confirms."""
-
-    def __init__(self, scenario: Scenario, publish: Callable[[str, Message], None]) -> None:
-        self._scenario, self._publish = scenario, publish
-        self._states: list[RigState] = []
-        self._poses: list[Pose] = []
-
-    def take(self, message: Message) -> None:
-        """Keep a state, or a pose of the tip, that the loop published."""
-        if isinstance(message, RigState):
-            self._states.append(message)
-        elif isinstance(message, Pose):
-            self._poses.append(message)
-
-    def poses(self) -> list[Pose]:
-        """Return the tracker's poses of the tip since the last call; see DrivenRig.poses."""
-        taken, self._poses = self._poses, []
-        return taken
-
-    def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """Give one command; see DrivenRig.give."""
-        return self._scenario.command(action, target, **fields)
-
-    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let virtual time pass, with a check at each new state; see DrivenRig.wait."""
-        return self._scenario.run(seconds, lambda: bool(self._states) and until())
-
-    def states(self) -> list[RigState]:
-        """Return the loop's states since the last call; see DrivenRig.states."""
-        taken, self._states = self._states, []
-        return taken
-
-    def operator(self, message: str) -> bool:
-        """Confirm at once; see DrivenRig.operator."""
-        self._scenario.commander.mark(f"operator: {message}"[:500])
-        return True
-
-    def publish_step(self, step: PlannedStep) -> None:
-        """Publish a step of a plan; see DrivenRig.publish_step."""
-        self._publish("plan", step)
-
-
-def run_simulated(
-    job: Job,
-    directory: Path,
-    board: str,
-    seed: int,
-    effects: tuple[str, ...] = (),
-    estimator: Estimator | None = None,
-    progress: Progress = lambda step, share: None,
-) -> ProtocolResult:
-    """Run the protocol on the simulated rig in virtual time, recorded into `directory`. Raises InputError, RuntimeError."""
-    try:
-        plant = simulated_plant(job.rig, seed, effects=tuple(map(parse, effects)))
-    except ValueError as error:
-        raise InputError.from_sentence(f"--effect: {str(error).partition(': ')[2]}") from None
-    path = new_recording_path(directory, "protocol")
-    header = header_of(job.rig, "virtual", seed, {"job": job.protocol.file.name})
-    with SimulatedBoard(board) as made, RecordingWriter(path, header) as recording:
-        world = World(job.rig, plant, made, seed)
-        listeners: list[Callable[[Message], None]] = []
-
-        def publish(topic: str, message: Message) -> None:
-            recording.write(topic, message, world.now_ns)
-            if topic in ("state", "pose/tip"):
-                for listener in listeners:
-                    listener(message)
-
-        scenario = Scenario(job.rig, world, publish, estimator=estimator)
-        driven = SimulatedDrive(scenario, publish)
-        listeners.append(driven.take)
-        if not scenario.arm():
-            raise RuntimeError("devices not ready")
-        result = carry_out(job, driven, blank_result(job, True, str(path)), progress)
-        scenario.command("disarm")
-        scenario.run(0.1)
-    return result
-
-
-class LiveDrive:
-    """The running rig over zenoh. ask_operator: shows a message and returns whether to continue."""
-
-    def __init__(self, session: Session, commander: Commander, ask_operator: Callable[[str], bool]) -> None:
-        self._commander, self._ask = commander, ask_operator
-        self._steps = session.publisher("plan")
-        self._subscriber = session.zenoh.declare_subscriber(key(session.rig, "state"), zenoh.handlers.RingChannel(1024))
-        self._pose_subscriber = session.zenoh.declare_subscriber(
-            key(session.rig, "pose/tip"), zenoh.handlers.RingChannel(512)
-        )
-
-    def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
-        """Give one command over zenoh; see DrivenRig.give."""
-        return self._commander.give(action, target, **fields)
-
-    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Wait, with a check every 10 ms; see DrivenRig.wait. Raises StepFailed if the lease was lost."""
-        end_s = time.monotonic() + seconds
-        while True:
-            if until():
-                return True
-            if time.monotonic() >= end_s:
-                return False
-            if self._commander.lost:
-                raise StepFailed(f"lease lost: {self._commander.lost}")
-            time.sleep(0.01)
-
-    def states(self) -> list[RigState]:
-        """Return the loop's states since the last call; see DrivenRig.states. Malformed ones are omitted."""
-        return _taken(self._subscriber, RigState)
-
-    def poses(self) -> list[Pose]:
-        """Return the tracker's poses since the last call; see DrivenRig.poses. Malformed ones are omitted."""
-        return _taken(self._pose_subscriber, Pose)
-
-    def operator(self, message: str) -> bool:
-        """Ask the operator; see DrivenRig.operator."""
-        return self._ask(message)
-
-    def publish_step(self, step: PlannedStep) -> None:
-        """Publish a step of a plan; see DrivenRig.publish_step."""
-        self._steps.put(step)
-
-
-def _taken(subscriber: Any, kind: type[MessageType]) -> list[MessageType]:
-    taken: list[MessageType] = []
-    while (sample := subscriber.try_recv()) is not None:
-        try:
-            taken.append(decode(kind, bytes(sample.payload)))
-        except ValueError:
-            continue
-    return taken
-
-
-def run_live(job: Job, ask_operator: Callable[[str], bool], progress: Progress = lambda step, share: None) -> ProtocolResult:
-    """Run the protocol on the running rig of the rig file; its services record. Raises RuntimeError.
-
-    The rig is armed where it is disarmed. At the end, and on Ctrl-C, it holds and is left armed.
-    """
-    with Session.of_rig(job.rig) as session, Commander(session, "protocol") as commander:
-        driven = LiveDrive(session, commander, ask_operator)
-        newest: list[RigState] = []
-
-        def came() -> bool:
-            newest.extend(driven.states())
-            return bool(newest)
-
-        patience_s = STATES_WITHIN_S if may_run(job.rig) else NOT_RUNNING_S
-        if not driven.wait(patience_s, came):
-            raise RuntimeError(f"no message of the topic state from the rig within {patience_s:g} s; check that it runs")
-        taken = commander.take()
-        if not taken.accepted:
-            raise RuntimeError(f"lease: {taken.reason}")
-        if newest[-1].mode == "disarmed":
-            armed = commander.arm()
-            if not armed.accepted or not driven.wait(ARM_WITHIN_S, lambda: came() and newest[-1].mode == "hold"):
-                raise RuntimeError(f"not armed: {armed.reason or 'the loop does not hold'}")
-        try:
-            return carry_out(job, driven, blank_result(job, False), progress)
-        except BaseException:
-            commander.hold()
-            raise
-
-
-__all__ = ["Job", "ProtocolResult", "carry_out", "read_result", "run_live", "run_simulated", "write_result"]

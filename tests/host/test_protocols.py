@@ -13,9 +13,10 @@ import pytest
 
 from host.recordings.rig_picture import Picture
 from host.report.protocol_report import write_protocol_report
-from host.run import protocol_run
 from host.run.protocol_file import ScriptedProtocol, dry_run, read_protocol
-from host.run.protocol_run import Job, ProtocolResult, blank_result, carry_out, read_result, run_simulated
+from host.run.protocol_result import ProtocolResult, read_result
+from host.run.protocol_rigs import run_simulated
+from host.run.protocol_run import Job, blank_result, carry_out
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
@@ -349,4 +350,4 @@ def test_six_points_of_a_line_on_the_beating_wall(tmp_path: Path) -> None:
     assert len(touches) == 6
     assert all(abs(touch.mean_force_N - 0.2) < 0.05 and touch.peak_force_N < 0.4 for touch in touches)
     assert all(touch.contact_loss_share < 0.05 and touch.force_time_integral_Ns > 0.4 for touch in touches)
-    assert protocol_run.read_result(tmp_path / "result.json", steps) == result.results
+    assert read_result(tmp_path / "result.json", steps) == result.results
