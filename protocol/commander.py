@@ -209,6 +209,10 @@ def _plain(value: Any) -> Any:
 
 def _said(reply: Reply | None) -> Acknowledgement:
     if reply is None:
-        return Acknowledgement(False, "no answer: the rig may or may not have received the command", "unanswered")
+        return Acknowledgement(
+            False,
+            "no answer: the rig may or may not have received the command; look at its state, then repeat",
+            "unanswered",
+        )
     accepted = reply.result == "accepted"
     return Acknowledgement(accepted, "" if accepted else f"{reply.result}: {reply.text}", reply.result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ipaddress
 import json
 import logging
@@ -241,6 +242,10 @@ def _open(config: zenoh.Config, listen: list[str]) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         found = str(error).split(" at /")[0]
+        if "Unable to acquire lock" in found:
+            raise OSError(
+                f"zenoh: found another process that listens on {', '.join(listen)}, wanted one; end it first"
+            ) from None
         wanted = f"to listen on {', '.join(listen)}" if listen else "a rig that listens there and takes this certificate"
         raise OSError(f"zenoh: found {found}, wanted {wanted}") from None
 
@@ -268,6 +273,8 @@ class Session:
         self.zenoh = _open(
             configuration(listen, connect, network), listen + list(network.listen if network is not None else ())
         )
+        # A session that is open at the interpreter's end aborts it, with the message of a thread that is still in zenoh.
+        atexit.register(self.close)
 
     @classmethod
     def of_rig(cls, rig: Rig) -> Session:
@@ -296,6 +303,7 @@ class Session:
         session = cls.__new__(cls)
         session.rig, session.local, session._servers = rig, None, []
         session.zenoh = _open(zenoh.Config.from_json5(json.dumps(client_settings(endpoint, keys))), [])
+        atexit.register(session.close)
         return session
 
     def publisher(self, topic: str) -> Publisher:
@@ -356,7 +364,12 @@ class Session:
         return reply if reply.id == command.id or reply.result == "malformed" else None
 
     def close(self) -> None:
-        """Undeclare everything, close the links and end the threads that answer."""
+        """Undeclare everything, close the links and end the threads that answer.
+
+        The session that listens is closed last: one that is closed in the moment in which its link is lost can end with a
+        panic of zenoh's router, which prints a Rust traceback.
+        """
+        atexit.unregister(self.close)
         self.zenoh.close()
         for server in self._servers:
             server.join()

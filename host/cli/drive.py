@@ -6,7 +6,7 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,7 @@ import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile
-from host.cli.quantities import direction, point, positive, quantity
+from host.cli.quantities import direction, meant, point, positive, quantity
 from protocol.enums import JogAxis
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG
@@ -36,6 +36,7 @@ TIP_DIRECTIONS = {
 # Beyond these a number is a slip; what the rig accepts is narrower, and its answer says so.
 FASTEST_PER_S, WIDEST_M, LONGEST_S, MOST_N = 10.0, 0.1, 3600.0, 1.0
 LOOK_S = 0.02
+SETTLE_S = 1.5  # of a touch, as in a protocol
 # A goal is reached when the tip has been near it for so long.
 THERE_S = 0.3
 ANSWERS_WITHIN_S = 3.0
@@ -193,7 +194,8 @@ def jog(
     unit, most = unit_of(what), LONGEST_JOG[what]
     way = quantity("travel", travel, unit)
     if not 0.0 < abs(way) <= most:
-        raise InputError("travel", travel, f"other than 0, at most {most:g} {unit} either way")
+        hint = meant(travel, unit, lambda number: 0.0 < abs(number) <= most)
+        raise InputError("travel", travel, f"other than 0, at most {most:g} {unit} either way{hint}")
     pace = None if speed is None else positive("--speed", speed, unit, FASTEST_PER_S, "per second")
     with driving("jog", rig, json, name, endpoint, keys) as driver:
         driver.rig.jog(what.label, way, pace, along)
@@ -272,25 +274,39 @@ def touch(
         if hold_s is None:
             driver.say("the force is held until hold, retract or stop")
             return
-        forces = _pressed(driver, hold_s)
-        driver.result |= {"mean_force_N": sum(forces) / max(len(forces), 1), "seconds": hold_s}
+        mean_N, settle_s = settled_mean(_pressed(driver, hold_s))
+        driver.result |= {"mean_force_N": mean_N, "settle_s": settle_s, "seconds": hold_s}
         if driver.state.mode in ("stopped", "disarmed", "retract"):
             raise driver.failed(f"the touch ended early, phase {driver.state.mode}")
         driver.rig.retract()
         driver.wait(5.0, lambda state: state.mode == "stopped")  # type: ignore[attr-defined]
-        driver.say(f"mean force {driver.result['mean_force_N']:.3f} N; retracted")
+        driver.say(f"mean force {mean_N:.3f} N of {force_N:g} N, without the first {settle_s:.1f} s; retracted")
 
 
-def _pressed(driver: Driver, seconds: float) -> list[float]:
-    """Return the forces (N) of the states in so many seconds of a touch, or until it ends."""
-    forces: list[float] = []
+def settled_mean(forces: Sequence[tuple[int, float]]) -> tuple[float, float]:
+    """Return the mean force (N) of a touch after its begin, and how much of it (s) was left out, as in a protocol.
+
+    forces: time (ns) and force (N) of each state. The force rises slowly, so the first 1.5 s (of a short touch the first
+    half) do not show what is held.
+    """
+    if not forces:
+        return math.nan, 0.0
+    first_ns, last_ns = forces[0][0], forces[-1][0]
+    settle_ns = min(round(SETTLE_S * 1e9), (last_ns - first_ns) // 2)
+    kept = [force_N for stamp_ns, force_N in forces if stamp_ns - first_ns >= settle_ns]
+    return sum(kept) / len(kept), settle_ns * 1e-9
+
+
+def _pressed(driver: Driver, seconds: float) -> list[tuple[int, float]]:
+    """Return time (ns) and force (N) of the states in so many seconds of a touch, or until it ends."""
+    forces: list[tuple[int, float]] = []
     seen = -1
 
     def ended(state: Any) -> bool:
         nonlocal seen
         if state.stamp_ns != seen and state.force_N is not None:
             seen = state.stamp_ns
-            forces.append(state.force_N)
+            forces.append((seen, state.force_N))
         return state.mode in ("stopped", "disarmed", "retract")
 
     driver.wait(seconds, ended)

@@ -331,11 +331,13 @@ def main() -> None:
     """Run the command line.
 
     Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else, one line on standard error, and the
-    traceback of an unexpected error in a log file. SIGTERM ends a command as Ctrl-C does: what it has started is stopped in
-    order.
+    traceback of an unexpected error in a log file. SIGTERM, and the end of its terminal, end a command as Ctrl-C does: what
+    it has started is stopped in order.
     """
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # a closed terminal; `nohup` ignores it
+        signal.signal(signal.SIGHUP, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
     argv = sys.argv[1:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 
 import numpy as np
 
@@ -52,8 +53,18 @@ def positive(key: str, text: str, unit: str, most: float, what: str = "") -> flo
     """
     value = quantity(key, text, unit)
     if not 0.0 < value <= most:
-        raise InputError(key, text, f"more than 0, at most {most:.4g} {unit}{f' ({what})' if what else ''}")
+        wanted = f"more than 0, at most {most:.4g} {unit}{f' ({what})' if what else ''}"
+        raise InputError(key, text, wanted + meant(text, unit, lambda number: 0.0 < number <= most))
     return value
+
+
+def meant(text: str, unit: str, fits: Callable[[float], bool]) -> str:
+    """Return "; did you mean 5deg?" for a number without a unit that would fit in a smaller one, nothing for any other."""
+    match = _NUMBER.fullmatch(text)
+    if match is None or match[2]:
+        return ""
+    smaller = [name for name, (si, size) in UNITS.items() if si == unit and size < 1.0 and fits(float(match[1]) * size)]
+    return f"; did you mean {match[1]}{smaller[0]}?" if smaller else ""
 
 
 def point(key: str, text: str) -> tuple[float, float, float]:

@@ -128,6 +128,9 @@ class Fleet:
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
+            # Ctrl-C ends this process alone, which then ends the others one after another: sessions that close at once, the
+            # one that listens among them, can end with a panic of zenoh's router.
+            process_group=0,
         )
         self.processes[name] = process
         assert process.stdout is not None

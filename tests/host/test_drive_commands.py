@@ -240,6 +240,28 @@ def test_a_motion_that_fails_states_the_first_cause_alone(capsys: pytest.Capture
     assert unknown.why().startswith("; safety: no status from the stepper board")
 
 
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("jog", "knob", "5"), "either way; did you mean 5deg?"),
+        (("jog", "e3", "--", "-2"), "either way; did you mean -2mm?"),
+        (("jog", "e3", "50mm"), "either way"),
+        (("touch", "0,-10.7mm,25mm", "--force", "200"), "did you mean 200mN?"),
+    ],
+)
+def test_a_number_in_a_smaller_unit_is_recognized(words: tuple[str, ...], hint: str) -> None:
+    with pytest.raises(InputError) as caught:
+        CliRunner().invoke(build(list(words)), list(words), catch_exceptions=False)
+    assert str(caught.value).endswith(hint)
+
+
+def test_the_rising_of_the_force_is_no_part_of_its_mean() -> None:
+    rising = [(20_000_000 * i, min(0.2, 0.2 * i / 50)) for i in range(400)]
+    mean_N, settle_s = drive.settled_mean(rising)
+    assert abs(mean_N - 0.2) < 1e-9 and settle_s == 1.5
+    assert drive.settled_mean(rising[:100])[1] < 1.0 and math.isnan(drive.settled_mean([])[0])
+
+
 def test_the_status_puts_the_first_cause_first() -> None:
     state = stopped_state()
     status = RigStatus(

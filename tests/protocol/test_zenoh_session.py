@@ -253,3 +253,19 @@ def test_a_session_opens_no_other_socket_than_it_was_told(endpoint: str) -> None
         opened = listening_sockets() - before
         assert len(opened) == (1 if endpoint.startswith("tcp") else 0)
         assert all(address.startswith("tcp 0100007F:") for address in opened)
+
+
+LEFT_OPEN = """
+import sys
+from protocol.zenoh_session import Session
+session = Session("rig", [sys.argv[1]], [])
+session.serve_requests(lambda name, payload: None)
+reader = session.latest("log")
+"""
+
+
+def test_a_session_that_nobody_closes_does_not_abort_the_interpreter(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", LEFT_OPEN, f"unixsock-stream/{tmp_path}/a.sock"], capture_output=True, text=True
+    )
+    assert ended.returncode == 0 and ended.stderr == ""
