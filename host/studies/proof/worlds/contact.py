@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from host.studies.proof.worlds import ode, rod, signals
+from host.studies.proof.worlds import ode, rod, signals, windows
 from host.studies.proof.worlds import operators as op
 from host.studies.proof.worlds.case import (
     Columns,
@@ -43,7 +43,7 @@ def _sized(make: Make, reach: float) -> Make:
 def _handle_effects() -> tuple[Plantable, ...]:
     found = []
     for place, reach in zip(AXES, REACH, strict=True):
-        for effect in ode._motion_effects(place, others=True, loads=False):
+        for effect in ode.motion_effects(place, others=True, loads=False):
             if effect.id in _CHOSEN and not (place == "knob" and effect.id == "dead_zone"):
                 same = (*effect.same, "whip") if effect.id == "periodic_disturbance" else effect.same
                 found.append(replace(effect, make=_sized(effect.make, reach), same=same))
@@ -103,8 +103,8 @@ class Pressed(SeparateRecordings):
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         stamps, style = setup.stamps[i], setup.style
-        grid, h = ode.fine_grid(setup, i)
-        commands = [r * ode.command(setup, i, k)(grid) for k, r in enumerate(REACH)]
+        grid, h = windows.fine_grid(setup, i)
+        commands = [r * windows.command(setup, i, k)(grid) for k, r in enumerate(REACH)]
         commands[2] = commands[2] + style["knob_rad"]
         wanted = np.column_stack([np.interp(stamps, grid, x) for x in commands])
         handle, shift = wanted, np.zeros(stamps.size)
@@ -208,7 +208,7 @@ class Pressed(SeparateRecordings):
         return {
             "name": "catheter in contact",
             "kind": "callable",
-            "channels": ode.channels(*inputs, *self.outputs),
+            "channels": windows.channels(*inputs, *self.outputs),
             "callable": {
                 "function": "host.studies.proof.worlds.nominal_rod:tips",
                 "inputs": inputs,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from host.studies.proof.worlds import ode, signals
+from host.studies.proof.worlds import ode, signals, windows
 from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, SeparateRecordings, Setup, Trace
 from host.studies.proof.worlds.nominal_arm import torques
 
@@ -123,8 +123,8 @@ class Gear(ode.Link):
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), gain = setup.scales, _clock(setup, i), setup.parameters["gain"]
-        wanted = c.motion * ode.command(setup, i, 0)(time_s)
-        other, load = ode.command(setup, i, 1)(time_s), c.force * ode.command(setup, i, 2)(time_s)
+        wanted = c.motion * windows.command(setup, i, 0)(time_s)
+        other, load = windows.command(setup, i, 1)(time_s), c.force * windows.command(setup, i, 2)(time_s)
         xml = self._xml(setup, planted)
         noise = np.repeat(setup.noise(i, "load_rad"), setup.style["every"])
         slow = [0.0]
@@ -211,8 +211,8 @@ class Gear(ode.Link):
         x = [t.channels["motor_rad"] for t in traces]
         columns = np.column_stack([np.concatenate(x), np.ones(sum(a.size for a in x))])
         turned = np.concatenate([t.channels["load_rad"] for t in traces])
-        rest = ode.without(columns, turned, sum(a.size for a in x[:-1]))
-        return [{"load_rad": part} for part in ode.split(rest, x)]
+        rest = windows.without(columns, turned, sum(a.size for a in x[:-1]))
+        return [{"load_rad": part} for part in windows.split(rest, x)]
 
     def nominal(self, setup: Setup) -> dict[str, Any]:
         """Return the nominal file's content."""
@@ -220,7 +220,7 @@ class Gear(ode.Link):
         return {
             "name": "servo joint",
             "kind": "transmission",
-            "channels": ode.channels("motor_rad", "other_rad", "torque_Nm", "load_rad"),
+            "channels": windows.channels("motor_rad", "other_rad", "torque_Nm", "load_rad"),
             "link": [{"subsystem": _GEAR, **names}],
         }
 
@@ -277,9 +277,9 @@ class Slider(ode.Axis):
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int, p: Array | None = None) -> Trace:
         c, (time_s, lead), own, every = setup.scales, _clock(setup, i), setup.parameters, setup.style["every"]
-        wanted = ode.command(setup, i, 0)(time_s) * (c.motion if setup.closed_loop else c.force)
+        wanted = windows.command(setup, i, 0)(time_s) * (c.motion if setup.closed_loop else c.force)
         noise = setup.noise(i, "position_m")
-        gains, lead_n = ode._loop(setup), lead // every
+        gains, lead_n = ode.axis_loop(setup), lead // every
         late = round(_only(planted, "latency").get("delay_s", 0.0) / STEP_S)
         commands, read, total, before = np.zeros(time_s.size), [], 0.0, 0.0
 
@@ -401,7 +401,7 @@ class Pad(ode.Press):
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), p, every = setup.scales, _clock(setup, i), setup.parameters, setup.style["every"]
-        wanted = c.motion * ode.command(setup, i, 0)(time_s)
+        wanted = c.motion * windows.command(setup, i, 0)(time_s)
         noise = np.repeat(setup.noise(i, "force_N"), every)
         w = 10.0 / c.slow_s
         kp, kd, slow = p["mass"] * w * w, 2.0 * p["mass"] * w, [0.0]
@@ -474,8 +474,8 @@ frictionloss="{loss.get("force_N", 0.0)}"/>
             for t in traces
         ]
         force = np.concatenate([t.channels["force_N"] for t in traces])
-        rest = ode.without(np.vstack(rows), force, sum(len(r) for r in rows[:-1]))
-        return [{"force_N": part} for part in ode.split(rest, [r[:, 0] for r in rows])]
+        rest = windows.without(np.vstack(rows), force, sum(len(r) for r in rows[:-1]))
+        return [{"force_N": part} for part in windows.split(rest, [r[:, 0] for r in rows])]
 
     def nominal(self, setup: Setup) -> dict[str, Any]:
         """Return the nominal file's content."""
@@ -483,7 +483,7 @@ frictionloss="{loss.get("force_N", 0.0)}"/>
         return {
             "name": "pad",
             "kind": "impedance",
-            "channels": ode.channels("motion_m", "force_N"),
+            "channels": windows.channels("motion_m", "force_N"),
             "impedance": {"subsystem": _PAD, "input": "motion_m", "output": "force_N", "terms": terms},
         }
 
@@ -533,7 +533,7 @@ class Arm(SeparateRecordings):
 
     def _one(self, setup: Setup, planted: Sequence[Planted], i: int) -> Trace:
         c, (time_s, lead), every = setup.scales, _clock(setup, i), setup.style["every"]
-        wanted = np.column_stack([c.motion * ode.command(setup, i, k)(time_s) for k in (0, 1)])
+        wanted = np.column_stack([c.motion * windows.command(setup, i, k)(time_s) for k in (0, 1)])
         late, drift, limit = (_only(planted, n) for n in ("latency", "sensor_drift", "saturation"))
         grip = _only(planted, "joint friction goes with the other joint's torque").get("size", 0.0)
 
@@ -599,7 +599,7 @@ class Arm(SeparateRecordings):
         return {
             "name": "two-link arm",
             "kind": "callable",
-            "channels": ode.channels("shoulder_rad", "elbow_rad", *self.outputs),
+            "channels": windows.channels("shoulder_rad", "elbow_rad", *self.outputs),
             "callable": {
                 "function": "host.studies.proof.worlds.nominal_arm:torques",
                 "inputs": ["shoulder_rad", "elbow_rad"],

@@ -1,7 +1,6 @@
 """World `ode`: driven axes, motion links and pressed materials by differential equations and hysteresis operators.
 
-Windows of 1 to 60 s are cut from motion, at 25 to 2000 Hz, with jitter and drop-outs; controllers act on noisy readings with
-milliseconds of delay.
+Controllers act on noisy readings with milliseconds of delay. How recordings are sampled and cut: `windows`.
 """
 
 from __future__ import annotations
@@ -11,57 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from host.studies.proof.worlds import drive, signals
+from host.studies.proof.worlds import drive
 from host.studies.proof.worlds import operators as op
 from host.studies.proof.worlds.case import Columns, Mechanism, Plantable, Planted, Scales, SeparateRecordings, Setup, Trace
+from host.studies.proof.worlds.windows import channels, command, fine_grid, sampling, split, times, without
 
 Array = np.ndarray
-LEAD_S = 3.0  # longest part of the motion that is cut off before a window, in units of the slowest period
-_FINE = 400_000  # most points of a fine grid
 
 
-def sampling(rng: np.random.Generator, jitter_allowed: bool = True) -> tuple[Scales, tuple[Array, ...], float]:
-    """Return (scales with motion and force 1, stamps of two or three recordings, fastest excitation in Hz)."""
-    rate = float(np.exp(rng.uniform(np.log(25.0), np.log(2000.0))))
-    duration = float(np.exp(rng.uniform(np.log(max(1.0, 500.0 / rate)), np.log(min(60.0, 12000.0 / rate)))))
-    fastest = min(rate / 20.0, float(rng.uniform(8.0, 25.0)) / duration, 12.0)
-    jitter = float(rng.uniform(0.05, 0.3)) if jitter_allowed and rng.random() < 0.3 else 0.0
-    count = 2 if rng.random() < 0.4 else 3
-    stamps = tuple(signals.stamps(rng, rate, duration * rng.uniform(0.8, 1.0), jitter) for _ in range(count))
-    slow = 1.0 / (2.0 * np.pi * fastest)
-    return Scales(1.0, 1.0, 1.0 / slow, slow, duration, 1.0 / rate), stamps, fastest
-
-
-def command(setup: Setup, recording: int, number: int) -> signals.Command:
-    """Return the command of one channel in one recording."""
-    rng = setup.stream(recording, number, 3)
-    kind = signals.KINDS[int(rng.choice(3, p=[0.5, 0.3, 0.2]))]
-    duration, fastest = setup.scales.duration_s, setup.style["fastest_Hz"]
-    slowest = min(1.5 / duration, 0.5 * fastest)
-    return signals.command(rng, kind, slowest, fastest, (-LEAD_S / slowest, duration + 1.0))
-
-
-def fine_grid(setup: Setup, recording: int) -> tuple[Array, float]:
-    """Return an even grid (n,) s that begins before the window, and its step."""
-    last = float(setup.stamps[recording][-1])
-    lead = min(6.0 * setup.scales.duration_s, max(0.5 * setup.scales.duration_s, 30.0 * setup.scales.slow_s))
-    h = max(min(setup.scales.period_s / 4.0, setup.scales.slow_s / 40.0, 1e-3), (last + lead) / _FINE)
-    return np.arange(-lead, last + 2.0 * h, h), h
-
-
-def without(columns: Array, values: Array, fitted: int) -> Array:
-    """Return what least squares on `columns` (n, k) leaves of values (n,), fitted to the first `fitted` rows."""
-    size = np.linalg.norm(columns[:fitted], axis=0) + 1e-300
-    found = np.linalg.lstsq(columns[:fitted] / size, values[:fitted], rcond=1e-12)[0]
-    return np.asarray(values - columns / size @ found)
-
-
-def split(values: Array, parts: Sequence[Array]) -> list[Array]:
-    """Return values (n,) cut into the lengths of `parts`."""
-    return np.split(values, np.cumsum([part.size for part in parts])[:-1])
-
-
-def _motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, ...]:
+def motion_effects(place: str, others: bool, loads: bool) -> tuple[Plantable, ...]:
     """Return effects on a motion between an input and an output."""
     found = [
         Plantable("backlash", place, lambda s, c: {"width": 0.06 * c.motion * s}, compared=("width",)),
@@ -182,14 +139,14 @@ class Link(SeparateRecordings):
 
     name: str = "link"
     outputs: tuple[str, ...] = ("output_m",)
-    effects: tuple[Plantable, ...] = _motion_effects("link", others=True, loads=True)
+    effects: tuple[Plantable, ...] = motion_effects("link", others=True, loads=True)
     outside: tuple[Plantable, ...] = _unlisted("link")
 
     def draw(self, rng: np.random.Generator, closed_loop: bool) -> Setup:
         """Draw gain, offset, sampling and noise."""
         scales, stamps, fastest = sampling(rng)
         motion = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.3))))
-        scales = Scales(motion, float(rng.uniform(1.0, 30.0)), motion / scales.slow_s, *_times(scales))
+        scales = Scales(motion, float(rng.uniform(1.0, 30.0)), motion / scales.slow_s, *times(scales))
         gain = float(rng.uniform(0.3, 3.0)) * (1 if rng.random() < 0.7 else -1)
         sigma = {"output_m": abs(gain) * motion * float(np.exp(rng.uniform(np.log(1e-3), np.log(1e-2))))}
         parameters = {"gain": gain, "offset": 0.1 * motion * float(rng.standard_normal())}
@@ -253,15 +210,6 @@ def looped(wanted: Array, forward: Any, setup: Setup, i: int, grid: Array, h: fl
     raise ValueError("loop: found no stable correction, wanted one that settles")
 
 
-def _times(c: Scales) -> tuple[float, float, float]:
-    return c.slow_s, c.duration_s, c.period_s
-
-
-def channels(*names: str) -> dict[str, dict[str, str]]:
-    """Return [channels] whose units are the names' endings."""
-    return {name: {"column": name, "unit": name.rpartition("_")[2].replace("Nm", "N m")} for name in names}
-
-
 _PRESS_PLACE = "material"
 _PRESS_EFFECTS = (
     Plantable("coulomb_friction", _PRESS_PLACE, lambda s, c: {"force_N": 0.05 * c.force * s}, compared=("force_N",)),
@@ -321,7 +269,7 @@ class Press(SeparateRecordings):
         """Draw stiffness, damping, sampling and noise."""
         scales, stamps, fastest = sampling(rng)
         motion, force = (float(np.exp(rng.uniform(np.log(a), np.log(b)))) for a, b in ((5e-4, 0.05), (0.1, 100.0)))
-        scales = Scales(motion, force, motion / scales.slow_s, *_times(scales))
+        scales = Scales(motion, force, motion / scales.slow_s, *times(scales))
         sigma = {"force_N": force * float(np.exp(rng.uniform(np.log(1.5e-3), np.log(1e-2)))), "motion_m": 1e-5 * motion}
         parameters = {
             "stiffness": force / motion,
@@ -503,7 +451,7 @@ class Axis(SeparateRecordings):
         stiffness = mass * own**2 if self.sprung else 0.0
         damping = 2.0 * float(rng.uniform(0.15, 0.7)) * mass * own * (1.0 if self.sprung else 0.3)
         force = 0.5 * motion * mass * (own**2 + (0.0 if self.sprung else w**2))
-        scales = Scales(motion, force, motion * w, *_times(scales))
+        scales = Scales(motion, force, motion * w, *times(scales))
         sigma = {"position_m": motion * float(np.exp(rng.uniform(np.log(1e-3), np.log(6e-3))))}
         if not self.sprung:
             sigma = {"position_m": 2e-6 * motion, "drive_N": force * float(np.exp(rng.uniform(np.log(2e-3), np.log(1e-2))))}
@@ -527,7 +475,7 @@ class Axis(SeparateRecordings):
         channel = "position_m"
         noise = np.concatenate([np.zeros(lead), setup.noise(i, channel)])
         actuator, effects = _planted_forces(planted, setup)
-        out, used = drive.run(law, time_s, wanted, setup.style["held"], actuator, effects, _loop(setup), noise)
+        out, used = drive.run(law, time_s, wanted, setup.style["held"], actuator, effects, axis_loop(setup), noise)
         if not np.all(np.isfinite(out)) or np.max(np.abs(out[:, 0])) > 20.0 * c.motion:
             raise ValueError("axis: found a motion that runs away, wanted one that stays")
         cut = out[lead:]
@@ -581,7 +529,7 @@ class Axis(SeparateRecordings):
         }
 
 
-def _loop(setup: Setup) -> drive.Loop:
+def axis_loop(setup: Setup) -> drive.Loop:
     """Return the controller's gains: bandwidth about the fastest excitation, less where the delay would make it unstable."""
     if not setup.closed_loop:
         return drive.Loop()
