@@ -36,6 +36,7 @@ TIP_DIRECTIONS = {
 # Beyond these a number is a slip; what the rig accepts is narrower, and its answer says so.
 FASTEST_PER_S, WIDEST_M, LONGEST_S, MOST_N = 10.0, 0.1, 3600.0, 1.0
 LOOK_S = 0.02
+RETRACTED = "retracted and stopped; disarm and arm to move again"
 SETTLE_S = 1.5  # of a touch, as in a protocol
 # A goal is reached when the tip has been near it for so long.
 THERE_S = 0.3
@@ -266,10 +267,12 @@ def touch(
     patience_s = positive("--within", within, "s", LONGEST_S)
     with driving("touch", rig, json, name, endpoint, keys) as driver:
         driver.rig.touch(goal_m, into, force_N)
+        began_s = time.monotonic()
         ended = ("contact", "stopped", "retract", "disarmed")
         if not driver.wait(patience_s, lambda state: state.mode in ended) or driver.state.mode != "contact":  # type: ignore[attr-defined]
             driver.rig.hold()
-            raise driver.failed(f"no contact within {patience_s:g} s; the rig holds")
+            took_s = time.monotonic() - began_s
+            raise driver.failed(f"no contact after {took_s:.1f} s, phase {driver.state.mode}; the rig holds")
         driver.say(f"in contact, {force_N:g} N wanted")
         if hold_s is None:
             driver.say("the force is held until hold, retract or stop")
@@ -280,7 +283,7 @@ def touch(
             raise driver.failed(f"the touch ended early, phase {driver.state.mode}")
         driver.rig.retract()
         driver.wait(5.0, lambda state: state.mode == "stopped")  # type: ignore[attr-defined]
-        driver.say(f"mean force {mean_N:.3f} N of {force_N:g} N, without the first {settle_s:.1f} s; retracted")
+        driver.say(f"mean force {mean_N:.3f} N of {force_N:g} N, without the first {settle_s:.1f} s; {RETRACTED}")
 
 
 def settled_mean(forces: Sequence[tuple[int, float]]) -> tuple[float, float]:

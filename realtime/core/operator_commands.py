@@ -23,6 +23,8 @@ from realtime.core.reach import TargetReach
 from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 
 _KINDS = {kind.label: kind for kind in CommandKind}
+# The loop leaves a stop, and the stop that ends a retraction, by disarming only (`realtime/control/tick.py`).
+_STOPPED = "found the loop stopped, wanted it to hold or to move; disarm and arm again"
 _JOG_PHASES = (Phase.HOLD, Phase.POSITION, Phase.JOG)
 # A tick this long after a clear has acted on it.
 CLEARED_WITHIN_NS = 20_000_000
@@ -208,6 +210,8 @@ class OperatorCommands:
     def _target(self, command: Command) -> str:
         if not self._record.armed:
             return "target: found the rig disarmed, wanted armed"
+        if self._standing().phase is Phase.STOPPED:
+            return f"target: {_STOPPED}"
         problem = self._too_much(command) or ("" if command.target_m is None else self._reach.problem(command.target_m))
         if problem:
             return problem
@@ -226,8 +230,10 @@ class OperatorCommands:
             return "jog: found the rig disarmed, wanted armed"
         axis, travel, speed = JogAxis[command.axis.upper()], command.travel_unit or 0.0, command.speed_unit_per_s or 0.0
         here = self._standing()
+        if here.phase is Phase.STOPPED:
+            return f"jog: {_STOPPED}"
         if here.phase not in _JOG_PHASES:
-            return f"jog: found the loop in phase {here.phase.label}, wanted hold, position or jog; hold or retract first"
+            return f"jog: found the loop in phase {here.phase.label}, wanted hold, position or jog; hold first"
         direction = np.array(command.direction if command.direction is not None else (0.0, 0.0, 0.0))
         problem = (
             self._too_far(axis, travel, speed)

@@ -360,3 +360,17 @@ def test_what_was_over_long_before_a_stop_is_not_its_cause(core: Bench) -> None:
     core.run(6_000)
     core.run(20, safety.BOARD_SILENT, SafetyAction.STOP)
     assert causes(core)[-1].name == "board_silent"
+
+
+def test_a_stopped_rig_refuses_a_motion_that_it_would_not_carry_out_and_says_how_to_go_on(core: Bench) -> None:
+    core.armed()
+    core.phase = Phase.STOPPED
+    core.run(5)
+    for action, fields in (
+        ("target", {"target": "position", "target_m": (0.0, -0.0107, 0.02)}),
+        ("target", {"target": "retract"}),
+        ("jog", {"axis": "insertion", "travel_unit": 1e-3, "speed_unit_per_s": 1e-3}),
+    ):
+        reply = core.ask(action, **fields)
+        assert reply.result == "refused" and reply.text.endswith("disarm and arm again"), reply.text
+    assert core.ask("hold").result == "accepted"

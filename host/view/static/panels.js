@@ -5,6 +5,7 @@ const MODES = {disarmed: "Disarmed", hold: "Holding", position: "Moving", approa
   retract: "Retract", stopped: "Stopped", jog: "Jog", homing: "Homing"};
 const IDLE = {disarmed: "The stages do not move until the rig is armed.",
   hold: "Armed and holding.",
+  stopped: "Stopped. Disarm and arm to move again.",
   homing: "An axis moves to its home switch. Stop, Hold and Disarm end it."};
 
 const element = id => document.getElementById(id);
