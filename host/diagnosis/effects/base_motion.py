@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines
 
 
 def drift(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -16,8 +16,8 @@ def beat(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine along the base axes, and frequency."""
     pairs = tuple(Parameter(f"{part}_{a}", "m", (1e-3,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
     top = min(0.2 / s.dt_s, 4.0)
-    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.5 / s.duration_s))
-    return (*pairs, Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    grid = lines(s, 2.0 / s.duration_s, top, 0.5)
+    return (*pairs, Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
 
 
 def rock(s: Scale, form: str) -> tuple[Parameter, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -12,8 +12,8 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     parts = tuple(
         Parameter(f"{part}_{a}", "N/m", (0.05,), linear=True) for a in "xy" for part in ("steady", "sine", "cosine")
     )
-    lines = tuple(np.arange(0.3, min(3.0, 0.4 / s.dt_s), 0.5 / s.duration_s))
-    return (*parts, Parameter("frequency", "Hz", lines, 0.1, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+    grid = lines(s, 0.3, min(3.0, 0.4 / s.dt_s), 0.5)
+    return (*parts, Parameter("frequency", "Hz", grid, 0.1, 0.45 / s.dt_s, step=0.1 / s.duration_s))
 
 
 def apply(state: dict, c: Context, p: Array, form: str) -> dict:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines, spread
 
 PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
 # Pitch of an angle beyond which it is once a turn, which is whip: midway to twice a turn, as of a universal joint.
@@ -31,10 +31,10 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
             ),
         )
     top = min(0.2 / s.dt_s, 8.0)
-    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         *pair,
-        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
     )
 
 
@@ -55,11 +55,11 @@ SAYS = "A periodic disturbance is added to the signal."
 def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Motion of the wall along its normal."""
     top = min(0.2 / s.dt_s, 5.0)
-    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         Parameter("sine", "m", (3e-4,), linear=True),
         Parameter("cosine", "m", (3e-4,), linear=True),
-        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
     )
 
 
@@ -73,10 +73,10 @@ def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine along the base axes, and frequency."""
     pairs = tuple(Parameter(f"{part}_{a}", s.unit, (s.need,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
     top = min(0.2 / s.dt_s, 5.0)
-    lines = tuple(np.arange(2.0 / s.duration_s, top, 0.4 / s.duration_s))
+    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         *pairs,
-        Parameter("frequency", "Hz", lines, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
     )
 
 

@@ -23,6 +23,8 @@ Mask = npt.NDArray[np.bool_]
 BLOCKS_OF_A_LONE_RECORDING = 10
 FEWEST_ROWS = 50  # of a recording
 GAP_SAMPLES = 10  # missing in a row in every channel, beyond which an input cannot be bridged by a line
+# Of an even grid: points for each row, and points in all, above which its gaps are cut short.
+MOST_EMPTY, LARGEST_GRID = 10, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -193,9 +195,22 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
     return np.arange(n, dtype=np.float64), False
 
 
+def _grid(time_s: Array, dt_s: float) -> Array:
+    """Even grid over the stamps. Where gaps are most of it, as between two days in one file, they are cut short."""
+    if (time_s[-1] - time_s[0]) / dt_s <= max(MOST_EMPTY * time_s.size, LARGEST_GRID):
+        return np.asarray(np.arange(time_s[0], time_s[-1] + 0.5 * dt_s, dt_s))
+    empty = dt_s * np.arange(-GAP_SAMPLES - 1, 0)  # enough for the recording to be divided there
+    ends = np.flatnonzero(np.diff(time_s) > 2.0 * (GAP_SAMPLES + 2) * dt_s)
+    parts = []
+    for first, last in zip([0, *(ends + 1)], [*ends, time_s.size - 1], strict=True):
+        parts += [time_s[first] + empty] if first else []
+        parts.append(np.arange(time_s[first], time_s[last] + 0.5 * dt_s, dt_s))
+    return np.concatenate(parts)
+
+
 def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
     """Even grid; a grid point further than one and a half periods from any sample stays missing."""
-    grid = np.arange(time_s[0], time_s[-1] + 0.5 * dt_s, dt_s)
+    grid = _grid(time_s, dt_s)
     after = np.clip(np.searchsorted(time_s, grid), 1, time_s.size - 1)
     hole = (time_s[after] - time_s[after - 1]) > 3.0 * dt_s
     even = {}

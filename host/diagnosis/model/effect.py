@@ -14,6 +14,7 @@ from host.diagnosis.model.operators import direction
 Array = npt.NDArray[np.float64]
 # Units of forces and moments, each with the same unit without its scale.
 FORCES = {"N": "N", "mN": "N", "kN": "N", "N m": "N m", "Nm": "N m", "N*m": "N m", "mN m": "N m"}
+MOST_LINES = 200_000  # of a search by frequency: 8 Hz over three hours
 
 
 @dataclass(frozen=True)
@@ -215,6 +216,14 @@ def cornered(candidate: Candidate, values: Array) -> Candidate:
 def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     """`count` values from `low` to `high` in equal ratios."""
     return tuple(float(value) for value in np.geomspace(low, high, count))
+
+
+def lines(s: Scale, low_Hz: float, top_Hz: float, spacing: float) -> tuple[float, ...]:
+    """Frequencies (Hz) to search, so far apart that the phase differs by `spacing` turns over the recordings.
+
+    At most MOST_LINES: two recordings of one clock may lie days apart.
+    """
+    return tuple(np.arange(low_Hz, top_Hz, max(spacing / s.duration_s, top_Hz / MOST_LINES)))
 
 
 def is_force(unit: str) -> bool:

@@ -75,3 +75,14 @@ def test_a_part_of_few_samples_is_left_out() -> None:
     columns = without(without(recorded(), 8.5, 10.0, False), 10.2, 11.0, False)
     _, problem, _ = prepare(nominal_of(AXIS), [Table("r.csv", columns)])
     assert [float(s.recording.time_s[0]) for s in problem.segments] == pytest.approx([0.0, 11.0], abs=2.0 * DT)
+
+
+def test_a_gap_of_days_needs_no_memory() -> None:
+    columns = recorded()
+    later = {**columns, "t": np.where(T < 10.0, T, T + 1e9)}
+    _, problem, _ = prepare(nominal_of(AXIS), [Table("r.csv", later)])
+    first, second = (segment.recording for segment in problem.segments)
+    assert (first.n, second.n) == pytest.approx((1000, 1000), abs=2)
+    assert second.time_s[0] == pytest.approx(10.0 + 1e9, abs=2 * DT)
+    at = np.searchsorted(T + 1e9, second.time_s[1:] + first.begin_s)
+    assert np.allclose(second.channels["position"][1:], columns["x"][np.minimum(at, 1999)], atol=2e-3 * np.ptp(columns["x"]))
