@@ -340,7 +340,7 @@ COLLISIONS = """() => {
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_each_state_is_named_readable_and_fits_the_screen(shown: tuple[Fake, OpenPage], name: str, tmp_path: Path) -> None:
+def test_each_state_is_named_readable_and_fits_the_screen(shown: tuple[Fake, OpenPage], name: str) -> None:
     fake, open_page = shown
     fake.state, page = STATES[name], open_page.page
     safety, phase, cause = fake.state.says
@@ -351,9 +351,6 @@ def test_each_state_is_named_readable_and_fits_the_screen(shown: tuple[Fake, Ope
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.evaluate(COLLISIONS) == []
         assert contrast(page) >= 4.5, (width, scheme)
-        if (width, scheme) in ((1280, "light"), (1280, "dark"), (360, "dark")):
-            page.wait_for_timeout(100)  # a frame in the new size
-            page.screenshot(path=str(tmp_path / f"{name.replace(' ', '-')}-{width}-{scheme}.png"), full_page=width == 1280)
     model = open_page.page.text_content("#model") or ""
     assert ("31 ± 4 mm behind the tip" in model) == (name == "body contact")
     disabled = page.locator('[data-home="insertion"]').is_disabled()
@@ -373,7 +370,7 @@ def planned(step: int) -> dict[str, Any]:
     return {"id": "2", "step": step, "shapes": shapes, "loads": [0.0] * 5 + [0.02, 0.05, 0.08], "pressed": pressed}
 
 
-def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake, OpenPage], tmp_path: Path) -> None:
+def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake, OpenPage]) -> None:
     fake, open_page = rig
     page = open_page.page
     fake.state = replace(STATES["hold"], mode="position", says=("No fault", "Moving", ""))
@@ -388,7 +385,6 @@ def test_a_plan_is_drawn_step_by_step_and_the_step_now_is_marked(rig: tuple[Fake
         open_page.wait(lambda: page.evaluate("seldinger.scene.plan.children.length") == 16)
         page.wait_for_timeout(100)
         pictures.append(open_page.picture_of("#scene-card"))
-        page.screenshot(path=str(tmp_path / f"plan-{step}.png"))
     assert page.locator("#legend-plan").is_visible()
     assert near(pictures[0], "#0b7285") > free + 300, "the plan's steps"
     assert int((abs(pictures[1] - pictures[0]).max(axis=-1) > 20).sum()) > 300, "another step is marked"
