@@ -62,7 +62,10 @@ def run(
     from host.run import protocol_file, protocol_result, protocol_run
 
     steps = protocol_file.read_protocol(protocol, loaded)
-    checked = protocol_file.dry_run(steps, loaded)
+    try:
+        checked = protocol_file.dry_run(steps, loaded)
+    except InputError as error:
+        raise error.in_file(protocol) from None
     earlier = () if resume is None else protocol_result.read_result(resume, steps)
     if resume is not None and not dry_run:
         writable_file("--resume", resume)

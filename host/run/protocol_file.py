@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -167,7 +168,9 @@ def read_protocol(path: Path, rig: Rig) -> ScriptedProtocol:
     try:
         file = validate(ProtocolFile, _with_floats(content))
     except InputError as error:
-        raise error.in_file(path) from None
+        # Lists count from 0, steps in results and reports from 1.
+        numbered = re.sub(r"^steps\.(\d+)", lambda step: f"steps.{int(step[1]) + 1}", str(error))
+        raise InputError.from_sentence(numbered).in_file(path) from None
     actions = list(
         itertools.chain.from_iterable(
             _actions_of(str(number), step, file, rig, path.parent) for number, step in enumerate(file.steps, 1)
@@ -270,7 +273,7 @@ def dry_run(protocol: ScriptedProtocol, rig: Rig) -> DryRun:
         for place in way:
             problem = reach.problem(place)
             if problem:
-                raise InputError.from_sentence(f"{key}.{problem}")
+                raise InputError.from_sentence(f"{key}.{problem.replace('target_m', 'point_m', 1)}")
         if action.kind == "touch":
             forces.append(action.force_N)
             if not LEAST_FORCE_N <= action.force_N <= most_N:

@@ -6,6 +6,7 @@ import numpy as np
 
 from protocol.messages import Vector
 from protocol.rig_file import Rig
+from protocol.unit_slips import hint
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
 
@@ -24,7 +25,8 @@ class TargetReach:
         low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
         for axis, value, least, most in zip("xyz", target_m, low, high, strict=True):
             if not least <= value <= most:
-                return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace)"
+                slip = hint(("target_m",), value, lambda number, low_m=least, high_m=most: low_m <= number <= high_m)  # type: ignore[misc]
+                return f"target_m: found {axis} = {value}, wanted {least} to {most} (safety.workspace){slip}"
         insertion, transmission = self._rig.stages.insertion, self._rig.transmission
         # Half the backlash on either side: the body may stand anywhere in it.
         half_m = 0.5 * transmission.insertion_backlash_m

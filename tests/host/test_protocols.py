@@ -59,12 +59,12 @@ def test_a_round_ends_where_it_began(tmp_path: Path) -> None:
         ("", "name"),
         (HEAD, "steps"),
         (HEAD + "steps = []\n", "steps"),
-        (HEAD + '[[steps]]\ndo = "fly"\n', "steps.0"),
-        (HEAD + '[[steps]]\ndo = "goto"\npoint_m = [0.0, 1.0]\n', "steps.0.goto.point_m"),
-        (HEAD + GOTO + "pont_m = 3\n", "steps.0.goto.pont_m"),
-        (HEAD + TOUCH.replace("hold_s = 2", "hold_s = -2"), "steps.0.touch.hold_s"),
-        (HEAD + TOUCH.replace("hold_s = 2", "hold_s = nan"), "steps.0.touch.hold_s"),
-        (HEAD + TOUCH + "force_N = 2.0\n", "steps.0.touch.force_N"),
+        (HEAD + '[[steps]]\ndo = "fly"\n', "steps.1"),
+        (HEAD + '[[steps]]\ndo = "goto"\npoint_m = [0.0, 1.0]\n', "steps.1.goto.point_m"),
+        (HEAD + GOTO + "pont_m = 3\n", "steps.1.goto.pont_m"),
+        (HEAD + TOUCH.replace("hold_s = 2", "hold_s = -2"), "steps.1.touch.hold_s"),
+        (HEAD + TOUCH.replace("hold_s = 2", "hold_s = nan"), "steps.1.touch.hold_s"),
+        (HEAD + TOUCH + "force_N = 2.0\n", "steps.1.touch.force_N"),
         (HEAD + TOUCH + "normal = [0.0, 0.0, 2.0]\n", "steps.1.normal"),
         (HEAD + "[stop]\nafter = 'later'\n" + GOTO, "stop.after"),
         (HEAD + "[tolerance]\ntip_mm = 2\n" + GOTO, "tolerance.tip_mm"),
@@ -81,8 +81,8 @@ def test_what_is_no_protocol_is_refused_and_the_key_is_named(tmp_path: Path, tex
 @pytest.mark.parametrize(
     ("text", "key"),
     [
-        (HEAD + GOTO.replace("0.020", "0.5"), "steps.1.target_m"),
-        (HEAD + GOTO.replace("-0.0107, 0.020", "-0.1, 0.0"), "steps.1.target_m"),
+        (HEAD + GOTO.replace("0.020", "0.5"), "steps.1.point_m"),
+        (HEAD + GOTO.replace("-0.0107, 0.020", "-0.1, 0.0"), "steps.1.point_m"),
         (HEAD + TOUCH + "force_N = 0.45\n", "steps.1.force_N"),
         (HEAD + TOUCH + "force_N = 0.001\n", "steps.1.force_N"),
         (HEAD + "[stop]\npeak_force_N = 0.9\n" + TOUCH, "stop.peak_force_N"),
@@ -92,6 +92,12 @@ def test_what_the_rig_cannot_do_is_refused_by_the_dry_run(tmp_path: Path, text: 
     with pytest.raises(InputError) as refused:
         dry_run(written(tmp_path, text), RIG)
     assert str(refused.value).startswith(key)
+
+
+def test_a_point_in_mm_is_recognized(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as refused:
+        dry_run(written(tmp_path, HEAD + GOTO.replace("-0.0107", "-10.7")), RIG)
+    assert str(refused.value).endswith("; in m: -10.7 mm is -0.0107")
 
 
 class ScriptedRig:
