@@ -7,6 +7,7 @@ a program that can enter it may read and command, all others of the computer may
 from __future__ import annotations
 
 import os
+import socket
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,3 +77,15 @@ def local_paths(rig_name: str, folder: str = "") -> LocalPaths:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     own = Path(runtime) / "seldinger" if runtime else Path(f"/tmp/seldinger-{os.geteuid()}")
     return LocalPaths(own / rig_name)
+
+
+def listens(path: Path) -> bool:
+    """Return whether a process listens at the unix socket `path`; one that a killed process left does not count."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except PermissionError:  # of another user's rig: it is there
+            return True
+        except OSError:
+            return False
+        return True

@@ -16,6 +16,7 @@ from host.run.commander import Acknowledgement, Commander
 from protocol.enums import JogAxis
 from protocol.errors import InputError
 from protocol.jog_limits import fastest_jog
+from protocol.local_paths import listens
 from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
 from protocol.topics import TOPICS, Log, Message, decode, key
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE
@@ -288,8 +289,11 @@ def connect(
 
 
 def may_run(rig: Rig) -> bool:
-    """Return whether a rig may run on this computer: one of its sockets exists, or its rig file connects elsewhere."""
-    return bool(rig.zenoh.connect) or rig.local.zenoh_socket.exists() or rig.local.stop_socket.exists()
+    """Return whether a rig may run on this computer: a process listens at a socket of it, or its file connects elsewhere.
+
+    The sockets that a killed process leaves do not count.
+    """
+    return bool(rig.zenoh.connect) or listens(rig.local.stop_socket) or listens(rig.local.zenoh_socket)
 
 
 def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[str] | None = None) -> Session:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,7 @@ import numpy as np
 from host.recordings.writer import new_recording_path
 from host.run.commander import Commander
 from host.run.demo import DemoRun, DemoSettings, Progress
-from protocol.local_paths import LocalPaths
+from protocol.local_paths import LocalPaths, listens
 from protocol.rig_file import load_rig
 from protocol.text_files import read_text
 from protocol.topics import LoopTiming, RigState
@@ -316,12 +315,7 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
 
 def _in_use(paths: LocalPaths) -> bool:
     """Return whether a realtime process listens in this folder; the socket of a killed process does not count."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        try:
-            probe.connect(str(paths.stop_socket))
-        except OSError:
-            return False
-        return True
+    return listens(paths.stop_socket)
 
 
 def with_folder(text: str, folder: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -173,8 +174,11 @@ def test_a_rig_that_does_not_run_is_not_waited_for(words: tuple[str, ...], says:
     result = called(*words, "--rig", str(file))
     assert result.exit_code == 1 and says in result.stderr and str(tmp_path) in result.stderr
     assert "3 s" not in result.stderr
-    (tmp_path / "zenoh.sock").touch()
-    assert connection.may_run(load_rig(file)), "a rig that may run is given its time"
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(tmp_path / "zenoh.sock"))
+        listening.listen()
+        assert connection.may_run(load_rig(file)), "a rig that may run is given its time"
+    assert (tmp_path / "zenoh.sock").exists() and not connection.may_run(load_rig(file)), "left by a killed process"
 
 
 def said(*words: str) -> dict[str, Any]:
