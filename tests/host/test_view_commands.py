@@ -32,7 +32,7 @@ def seldinger(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def serves(*arguments: str, port: int) -> tuple[int, str]:
+def serves(*arguments: str, port: int, ends_by: signal.Signals = signal.SIGINT) -> tuple[int, str]:
     """Exit status and standard error of a command that is served from until it is interrupted."""
     child = subprocess.Popen(
         [sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)], stderr=subprocess.PIPE, text=True, cwd=ROOT
@@ -47,15 +47,16 @@ def serves(*arguments: str, port: int) -> tuple[int, str]:
         return True
 
     until(answers, "the page")
-    child.send_signal(signal.SIGINT)
+    child.send_signal(ends_by)
     _, words = child.communicate(timeout=PATIENCE_S)
     return child.returncode, words
 
 
-def test_play_serves_a_recording_until_it_is_interrupted(recording: Path) -> None:  # noqa: F811
+@pytest.mark.parametrize("ends_by", [signal.SIGINT, signal.SIGHUP], ids=["Ctrl-C", "closed terminal"])
+def test_play_serves_a_recording_until_it_is_interrupted(recording: Path, ends_by: signal.Signals) -> None:  # noqa: F811
     port = free_port()
-    status, words = serves("play", str(recording), port=port)
-    assert status in (0, 130) and f"http://{ADDRESS}:{port}/" in words and "Traceback" not in words
+    status, words = serves("play", str(recording), port=port, ends_by=ends_by)
+    assert status in (0, 130, 143) and f"http://{ADDRESS}:{port}/" in words and "Traceback" not in words
 
 
 def children_of(parent: int) -> list[int]:
