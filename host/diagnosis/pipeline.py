@@ -22,6 +22,7 @@ from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
+from host.diagnosis.model.effect import Port
 from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import NominalSpec
@@ -193,7 +194,7 @@ def _diagnosed(
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
         overall.part(0.02, 0.03)(cost, 0.0)
-    candidate_effects = candidates(model.ports, problem.segments[0].recording.timed, model.taken | left_out)
+    candidate_effects = candidates(candidate_ports(problem), problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])
@@ -221,6 +222,13 @@ def _diagnosed(
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
     return result
+
+
+def candidate_ports(problem: Problem) -> tuple[Port, ...]:
+    """Ports of the model, each with those at which a linear time-invariant effect does the same."""
+    first = next(segment for segment in problem.segments if segment.fit.any())
+    path = problem.model.linear_path(first, problem.model.guess(problem.segments))
+    return tuple(replace(port, path=path) if port.name in path else port for port in problem.model.ports)
 
 
 def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:

@@ -18,7 +18,7 @@ from host.diagnosis.design.excitation import Excitation, Span, family
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, jacobian, minimize, size_of
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.model.effect import Candidate, alike_everywhere
 from host.diagnosis.selection.equivalence import Standing
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found
@@ -61,7 +61,7 @@ def design(problem: Problem, found: Found, standing: list[Standing], progress: C
     """
     out = []
     for stands in standing if all(term.candidate.effect.listed for term in found.best.terms) else ():
-        for other in (other for other in stands.alike if other.effect.listed):
+        for other in (o for o in stands.alike if o.effect.listed and not alike_everywhere(stands.candidate, o)):
             progress(f"motion that separates {stands.candidate.key} and {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)

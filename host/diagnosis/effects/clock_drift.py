@@ -31,7 +31,9 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 SAYS = "One clock runs faster: the delay grows by {rate}."
 EFFECTS = tuple(
-    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate")
+    Effect(
+        "clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate", invariant=True
+    )
     for port in ("motion", "timing")
 ) + (
     Effect(

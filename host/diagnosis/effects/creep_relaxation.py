@@ -115,6 +115,7 @@ EFFECTS = (
         apply_motion,
         timed=True,
         remembers=True,
+        invariant=True,
         contains=("rate_lag",),
         several=True,
     ),

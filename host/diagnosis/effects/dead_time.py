@@ -83,6 +83,7 @@ EFFECTS = tuple(
         remembers=True,
         begins_with_speed=True,
         shifts="time",
+        invariant=True,
     )
     for port in ("motion", "timing")
 )

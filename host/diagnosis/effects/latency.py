@@ -40,7 +40,19 @@ def rows(values: Array, c: Context, late: Array) -> Array:
 
 SAYS = "The channel is delayed by {delay} at every frequency."
 EFFECTS = tuple(
-    Effect("latency", port, 61, parameters, SAYS, "y(t) = x(t - delay)", apply, timed=True, remembers=True, shifts="time")
+    Effect(
+        "latency",
+        port,
+        61,
+        parameters,
+        SAYS,
+        "y(t) = x(t - delay)",
+        apply,
+        timed=True,
+        remembers=True,
+        shifts="time",
+        invariant=True,
+    )
     for port in ("motion", "timing")
 ) + (
     Effect(

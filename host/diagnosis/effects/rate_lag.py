@@ -46,6 +46,7 @@ EFFECTS = tuple(
         timed=True,
         remembers=True,
         shifts="time",
+        invariant=True,
     )
     for port in ("motion", "timing")
 ) + (

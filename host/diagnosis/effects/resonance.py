@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import FORCES, Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.model.operators import second_order
+
+DRIVES = (*FORCES, "V", "A", "mA")  # units of what drives a mass
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Frequency and damping ratio; form `share`: of a mode that takes part in only a share of the motion."""
-    share = (Parameter("mode_share", "", (0.2,), 0.0, 1.0, linear=True),) if form == "share" else ()
+    """Frequency and damping ratio; form `share`: of a mode that takes part in only a share of the motion; form `drive`:
+    of a load behind a compliant shaft, read at the drive that a force or torque moves.
+    """
+    if form == "drive" and s.unit not in DRIVES:
+        return ()  # a motion that is imposed does not feel the load
+    share = {
+        "share": (Parameter("mode_share", "", (0.2,), 0.0, 1.0, linear=True),),
+        "drive": (Parameter("load_ratio", "", (0.5,), 0.0, np.inf, linear=True),),
+    }.get(form, ())
     return (
         *share,
         Parameter(
@@ -44,7 +53,11 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Second-order low pass with a peak, of all of the motion or of a share."""
+    """Second-order low pass with a peak, of all of the motion or of a share; or the reaction of a load on its drive."""
+    if form == "drive":
+        moved = of_mode(signal, c, p[1], p[2], *(-s / p[0] if abs(p[0]) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
+        turned = moved + p[2] / (np.pi * p[1]) * np.gradient(moved, c.dt_s)  # the damper turns the load as well
+        return np.asarray(signal + p[0] * (signal - turned))
     if form == "share":
         moved = of_mode(signal, c, p[1], p[2], *(s / p[0] if abs(p[0]) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
         return np.asarray(signal + p[0] * (moved - signal))
@@ -62,7 +75,12 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"second_mass": p[0], "second_omega": 2.0 * np.pi * p[1], "second_damping": p[2]}
 
 
-EQUATION = "m'' + 2 z w m' + w^2 m = w^2 x,  y = m; of a share: y = x + share*(m - x)"
+# Two masses on a spring k and damper d: the drive follows its force as the rigid pair does, times
+# 1 + ratio s^2 / (s^2 + 2 z w s + w^2), ratio = load / drive mass, w^2 = k (1/m1 + 1/m2) (Ellis, Control System Design
+# Guide, 2012, chapter 16).
+EQUATION = (
+    "m'' + 2 z w m' + w^2 m = w^2 x,  y = m; share: y = x + share*(m - x); drive: y = x + load_ratio*(x - m - 2 z/w m')"
+)
 EFFECTS = (
     Effect(
         "resonance",
@@ -73,10 +91,11 @@ EFFECTS = (
         EQUATION,
         apply,
         timed=True,
-        forms=("", "share"),
+        forms=("", "share", "drive"),
         contains=("rate_lag",),
         remembers=True,
         begins_with_speed=True,
+        invariant=True,
     ),
     Effect(
         "resonance",
@@ -87,10 +106,11 @@ EFFECTS = (
         EQUATION,
         apply,
         timed=True,
-        forms=("", "share"),
+        forms=("", "share", "drive"),
         contains=("rate_lag",),
         remembers=True,
         begins_with_speed=True,
+        invariant=True,
     ),
     Effect(
         "resonance",

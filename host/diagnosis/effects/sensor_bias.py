@@ -17,6 +17,16 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
     return tuple(Parameter(f"offset_{a}", "N", (0.02,), linear=True) for a in "xyz")
 
 
+def scalar(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Offset of one reading."""
+    return (Parameter("offset", s.unit, (s.need,), linear=True),)
+
+
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Shift the reading (n,) by p[0]."""
+    return np.asarray(signal + p[0])
+
+
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
     """Both positions shifted; the tip sensor alone in form `tip`."""
     shift = p[:, None]
@@ -47,5 +57,16 @@ EFFECTS = (
         "The force sensor reads ({offset_x}, {offset_y}, {offset_z}) too much.",
         "y = x + offset",
         apply_force,
+    ),
+    Effect(
+        "sensor_bias",
+        "drift",
+        78,
+        scalar,
+        "The reading has a constant offset of {offset}.",
+        "y = x + offset",
+        apply,
+        at_rest=True,
+        invariant=True,
     ),
 )

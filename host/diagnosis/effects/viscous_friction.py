@@ -41,6 +41,7 @@ EFFECTS = (
         apply,
         timed=True,
         dissipates=True,
+        invariant=True,
     ),
     Effect(
         "viscous_friction",

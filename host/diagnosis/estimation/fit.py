@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
+MODE_LINES = 3  # highest lines of the residual at which a mode is tried, before its grid
 
 
 @dataclass(frozen=True)
@@ -300,19 +301,34 @@ def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
         segment.start.update(start)
 
 
+def get_begins(problem: Problem) -> list[Array]:
+    """States that recordings begin from; empty of one whose model has none."""
+    return [np.zeros(0) if segment.begin is None else segment.begin.values.copy() for segment in problem.segments]
+
+
+def set_begins(problem: Problem, given: list[Array]) -> None:
+    """Set the states that recordings begin from again."""
+    for segment, values in zip(problem.segments, given, strict=True):
+        if segment.begin is not None:
+            segment.begin.values = values
+
+
 def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, float]) -> Array:
     """Start values of a term: grid values for nonlinear parameters, projected amplitudes for linear ones."""
     return np.array([linear_value.get(p.name, nonlinear.get(p.name, p.grid[0] if p.grid else 0.0)) for p in term.parameters])
 
 
 def tuned(term: Term, lines: Array) -> tuple[Parameter, ...]:
-    """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual."""
-    return tuple(
-        replace(p, grid=tuple(float(f) for f in lines if p.low < f < p.high) or p.grid[:3])
-        if p.spectral and any(q.linear for q in term.parameters)
-        else p
-        for p in term.parameters
-    )
+    """Parameters of a term to scan over; a frequency is tried at the `lines` (Hz) that stand out in the residual.
+
+    A disturbance is at one of them. A mode may lie between them, where nothing excites it: it keeps its grid as well.
+    """
+    found = []
+    for p in term.parameters:
+        near = tuple(float(f) for f in lines if p.low < f < p.high) if p.spectral else ()
+        grid = (*near[:MODE_LINES], *p.grid) if p.log else near or p.grid[:3]
+        found.append(replace(p, grid=grid) if p.spectral else p)
+    return tuple(found)
 
 
 def lines_of(residuals: list[Array], dt_s: float, count: int = 5) -> Array:

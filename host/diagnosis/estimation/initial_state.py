@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from host.diagnosis.estimation.evidence import correlation_time
+from host.diagnosis.estimation.fit import Fit, Problem, Term, free, jacobian, moved, robust, size_of
+from host.diagnosis.model.effect import rate_key
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 FARTHEST = 4.0  # standard deviations of the measured state within which the estimated one stays
 
 
-def estimate_state(model: Model, segment: Segment, theta: Array, active: list[ActiveEffect]) -> None:
+def estimate_state(model: Model, segment: Segment, theta: Array, active: list[ActiveEffect], unseen: int = 0) -> None:
     """Estimate `segment.begin` by one Gauss-Newton step from the measured state.
 
     Measured state and outputs are weighed by their variances; that of an output's mean counts correlated samples once.
     Nothing happens where the model knows its state.
+
+    unseen: first samples that a dead time makes of what was before the recording. No state explains them.
     """
     begin = segment.begin
     if begin is None or not begin.estimated:
@@ -27,6 +35,7 @@ def estimate_state(model: Model, segment: Segment, theta: Array, active: list[Ac
     begin.values = begin.measured.copy()
     base = model.simulate(segment, theta, active)
     r = segment.y - base
+    r[:, :unseen] = np.nan
     changes = []
     for k in moving:
         begin.values = begin.measured + np.eye(begin.spread.size)[k] * begin.spread[k]
@@ -37,6 +46,139 @@ def estimate_state(model: Model, segment: Segment, theta: Array, active: list[Ac
     by = np.linalg.solve(A.T @ A + np.eye(moving.size), A.T @ (r / scale)[used])
     begin.values = begin.measured.copy()
     begin.values[moving] += np.clip(by, -FARTHEST, FARTHEST) * begin.spread[moving]
+
+
+@dataclass(frozen=True)
+class _State:
+    """One number that a recording begins with: of its model (`index`), or the memory of an effect (`key`).
+
+    mean, spread: what is known of it before the fit. A memory begins within its port's motion of the input.
+    """
+
+    segment: Segment
+    mean: float
+    spread: float
+    index: int = -1
+    key: str = ""
+
+    @property
+    def value(self) -> float:
+        if self.key:
+            return self.segment.start.get(self.key, 0.0)
+        assert self.segment.begin is not None
+        return float(self.segment.begin.values[self.index])
+
+    def put(self, value: float) -> None:
+        """Let the recording begin with `value`, within four standard deviations."""
+        reach = FARTHEST * self.spread
+        value = min(max(value, self.mean - reach), self.mean + reach)
+        if self.key:
+            self.segment.start[self.key] = value
+        elif self.segment.begin is not None:
+            self.segment.begin.values = self.segment.begin.values.copy()
+            self.segment.begin.values[self.index] = value
+
+
+def _states(problem: Problem, segment: Segment, terms: tuple[Term, ...]) -> list[_State]:
+    """Every number that `segment` begins with, where it is not known."""
+    found, begin = [], segment.begin
+    if begin is not None and begin.estimated:
+        for k in np.flatnonzero(begin.spread > 0.0):
+            found.append(_State(segment, float(begin.measured[k]), float(begin.spread[k]), int(k)))
+    for term in terms:
+        candidate = term.candidate
+        if candidate.effect.remembers and candidate.effect.invariant:
+            port, dt_s = candidate.port.name, segment.recording.dt_s
+            motion = problem.model.motion(segment, candidate.port)
+            found.append(_State(segment, 0.0, float(np.ptp(motion)) or 1.0, key=port))
+            if candidate.effect.begins_with_speed:
+                found.append(_State(segment, 0.0, float(np.ptp(np.gradient(motion, dt_s))) or 1.0, key=rate_key(port)))
+    return found
+
+
+def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask) -> tuple[Array, Array, list[_State]]:
+    """Weighted residual (samples,) of a recording and its change (samples, k) per standard deviation of each state."""
+
+    def left() -> Array:
+        r = problem.left(segment, fit.terms, values)[:, mask] / problem.scale[:, None]
+        return np.nan_to_num(r, nan=0.0, posinf=0.0, neginf=0.0).ravel()
+
+    states = _states(problem, segment, fit.terms)
+    r, columns = left(), []
+    for state in states:
+        now = state.value
+        state.put(now + state.spread)
+        by = (state.value - now) / state.spread
+        if by < 0.5:  # at its upper end
+            state.put(now - state.spread)
+            by = (state.value - now) / state.spread
+        columns.append((r - left()) / by)
+        state.put(now)
+    return r, np.array(columns).reshape(-1, r.size).T, states
+
+
+def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
+    """`fit` after Gauss-Newton steps of all its parameters and the states of the recordings to fit, together.
+
+    In turn they converge slowly where a state can take the place of an effect for as long as the plant remembers: an
+    offset of a tank's reading, for one. A step that does not lower the cost is undone and is the last. Then the states of
+    all recordings are estimated with these parameters, those of recordings that are held out too.
+    """
+    parameters = problem.parameters(fit.terms)
+    used = [segment for segment in problem.segments if segment.fit.any()]
+    values, r = fit.values, problem.stacked(fit.terms, fit.values)
+    cost, _ = robust(r)
+    for _ in range(steps):
+        J = jacobian(problem, fit.terms, values, r, [size_of(p, v) for p, v in zip(parameters, values, strict=True)])
+        answers = [_answers(problem, segment, fit, values, segment.fit) for segment in used]
+        states = [state for _, _, own in answers for state in own]
+        if not states:
+            return fit
+        weights = np.repeat([_heaviest(problem, own) for own, _, _ in answers], [len(own) for _, _, own in answers])
+        A = np.vstack(
+            [
+                np.hstack([J, block_diag(*(columns for _, columns, _ in answers))]),
+                np.hstack([np.zeros((len(states), J.shape[1])), np.diag(weights)]),
+            ]
+        )
+        by = _least_squares(A, np.concatenate([r, weights * _pull(states)]))
+        trial, before = values.copy(), [state.value for state in states]
+        for index, step in zip(free(parameters), by, strict=False):
+            trial[index] = moved(parameters[index], values[index], float(step))
+        _move(states, by[J.shape[1] :])
+        r_new = problem.stacked(fit.terms, trial)
+        cost_new, _ = robust(r_new)
+        if not cost_new < cost:
+            for state, old in zip(states, before, strict=True):
+                state.put(old)
+            break
+        values, r, cost = trial, r_new, cost_new
+    for segment in problem.segments:
+        own, columns, states = _answers(problem, segment, fit, values, np.ones(segment.n, dtype=bool))
+        if states:
+            weight = _heaviest(problem, own)
+            A = np.vstack([columns, weight * np.eye(len(states))])
+            _move(states, _least_squares(A, np.concatenate([own, weight * _pull(states)])))
+    return Fit(fit.terms, values, cost=cost)
+
+
+def _least_squares(A: Array, b: Array) -> Array:
+    size = np.sqrt(np.sum(A * A, axis=0)) + 1e-300
+    return np.asarray(np.linalg.lstsq(A / size, b, rcond=1e-10)[0] / size)
+
+
+def _pull(states: list[_State]) -> Array:
+    return np.array([(state.mean - state.value) / state.spread for state in states])
+
+
+def _move(states: list[_State], by: Array) -> None:
+    for state, step in zip(states, by, strict=True):
+        state.put(state.value + float(step) * state.spread)
+
+
+def _heaviest(problem: Problem, r: Array) -> float:
+    """Weight of what is known of a state beforehand, in units of the weighted residual r (outputs * n,) of its recording."""
+    return max(_weighing(row) for row in r.reshape(len(problem.noise), -1))
 
 
 def _weighing(row: Array) -> float:

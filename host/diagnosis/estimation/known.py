@@ -88,6 +88,11 @@ class Known(Model):
         """Call the model without the known effects."""
         return self._inner.announce(segments, theta[: self.own])
 
+    def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
+        """Call the model without the known effects; a known effect that is not linear and time-invariant ends the path."""
+        linear = all(candidate.effect.invariant for candidate, _ in self.active)
+        return self._inner.linear_path(segment, theta[: self.own]) if linear else ()
+
     def settle(self, segment: Segment, theta: Array) -> None:
         """Call the model without the known effects."""
         self._inner.settle(segment, theta[: self.own])

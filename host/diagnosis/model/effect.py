@@ -161,6 +161,7 @@ class Effect:
     several: bool = False  # more than one may act at a port
     hides: bool = False  # the nominal parameters cannot be fitted without it
     shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
+    invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,7 @@ class Port:
     drags: tuple[str, ...] = ()
     offers: tuple[Effect, ...] = ()  # parameters of a simulator that compete as effects, of this port alone
     held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
+    path: tuple[str, ...] = ()  # this port and those to which a linear time-invariant model alone leads
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,19 @@ class Candidate:
     def name(self) -> str:
         """Effect and subsystem: what a verdict names."""
         return f"{self.effect.id}@{self.port.subsystem}"
+
+
+def same_place(a: Candidate, b: Candidate) -> bool:
+    """Whether no data can tell the place of `a` from that of `b`: one port, or linear time-invariant effects on one path.
+
+    Linear time-invariant operators commute: a delay of the input of a linear plant is a delay of its output.
+    """
+    return a.port.name == b.port.name or (b.port.name in a.port.path and a.effect.invariant and b.effect.invariant)
+
+
+def alike_everywhere(a: Candidate, b: Candidate) -> bool:
+    """Whether `a` and `b` are one effect at two places that no motion separates."""
+    return a.effect.id == b.effect.id and a.port.name != b.port.name and same_place(a, b)
 
 
 def rate_key(port: str) -> str:

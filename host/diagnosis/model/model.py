@@ -135,6 +135,10 @@ class Model(ABC):
         """Let the input run between its samples as `hold` (of `holds`) says."""
         raise NotImplementedError(f"{self.kind}: no choice of hold")
 
+    def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
+        """Names of ports that linear time-invariant parts of the model alone join; empty where none are."""
+        return ()
+
     def restarts(self, segments: list[Segment]) -> list[Array]:
         """Further start values of the nominal parameters, for effects that hide them."""
         return []

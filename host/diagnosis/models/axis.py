@@ -145,6 +145,11 @@ class AxisModel(Model):
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
         return segment
 
+    def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
+        """Drive and reading: the mass on its spring and damper between them is linear."""
+        name = self.spec.subsystem
+        return (f"{name}_drive", f"{name}_reading") if self.spec.controller is None else ()
+
     def hold_as(self, segments: list[Segment], hold: str) -> None:
         """Let the input run between its samples as `hold` says, in all that is derived from it."""
         self.hold = hold

@@ -52,6 +52,7 @@ CHAIN = "payload"  # port of what hangs on an arm
 MOST_LINKS = 4
 MOST_FORCED = 4  # pairs of a force and a motion up to which each force may act along each motion
 MOST_DYNAMIC = 4096  # samples of a step response that are used
+LINEAR = 1e-3  # deviation from superposition, relative, below which a simulator counts as linear
 
 
 @dataclass(frozen=True)
@@ -382,6 +383,25 @@ class SimulatedModel(Model):
             f"one simulation takes {each * 1e3:.3g} ms; a round of screening takes about {screening} of them "
             f"({screening * each:.0f} s), the fits of a round up to {fits} ({fits * each:.0f} s)"
         )
+
+    def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
+        """Input and reading of a simulator with one of each that is linear and time-invariant, by four simulations.
+
+        Superposition is tested with the recorded input and a late copy of it, both begun at the first sample's value.
+        """
+        if len(self.section.inputs) != 1 or len(self.section.outputs) != 1:
+            return ()
+        name, output = self.section.inputs[0], self.section.outputs[0]
+        late = max(1, segment.n // 7)
+        moved = segment.inputs[name] - segment.inputs[name][0]
+        copy = np.concatenate([np.zeros(late), moved[:-late]])
+        inputs = (0.0 * moved, moved, copy, 0.3 * copy - 0.6 * moved)
+        rest, whole, copied, mixed = (self._moved(segment, theta, [], name, by - moved)[0] for by in inputs)
+        whole, copied, mixed = whole - rest, copied - rest, mixed - rest
+        errors = (mixed - 0.3 * copied + 0.6 * whole, copied[late:] - whole[:-late])
+        size = float(np.std(whole))
+        linear = all(np.isfinite(e).all() and float(np.sqrt(np.mean(e**2))) <= LINEAR * size for e in errors)
+        return (name, f"{output}_reading") if linear and size > 0.0 else ()
 
     def slopes(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> dict[str, StepResponse]:
         """Step response of the outputs for each input that answers linearly enough, by two simulations.

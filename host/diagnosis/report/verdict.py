@@ -10,7 +10,7 @@ import numpy as np
 
 from host.diagnosis.design.experiment import lines as experiment_lines
 from host.diagnosis.estimation.rules import RULES
-from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 from host.diagnosis.selection.equivalence import Standing
@@ -91,6 +91,8 @@ def next_step(result: Diagnosis) -> str:
         return f"Record the proposed motion and diagnose again with it: {result.designs[0].says}"
     if result.verdict == "mismatch_not_identified":
         return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
+    if unsure and (places := placeless(result)):
+        return f"Record a signal between {' and '.join(places)} as well: it alone can tell the place of the effect."
     if unsure:
         shown = words(unsure[0]["id"])
         return f"Record a further motion that shows {shown}, and diagnose again: the verdict is not confident yet."
@@ -98,6 +100,17 @@ def next_step(result: Diagnosis) -> str:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
     unseen = next((finding for finding in result.findings if finding.id == "excitation"), None)
     return unseen.says if unseen is not None else "Nothing: the nominal model explains these recordings."
+
+
+def placeless(result: Diagnosis) -> list[str]:
+    """Return the places of the first effect that would be confident if its place were known; empty if there is none."""
+    for standing in result.standings:
+        found = posterior_of(result, standing)
+        rivals = [(rival, p) for rival, p in found.rivals if alike_everywhere(standing.candidate, rival)]
+        together = found.effect + sum(p for _, p in rivals)
+        if found.effect < result.problem.rules.confident <= together:
+            return [words(port) for port in standing.candidate.port.path]
+    return []
 
 
 def words(effect_id: str) -> str:
@@ -235,6 +248,7 @@ def _effect(
         if p.high > p.low
     }
     says = sentence(candidate, parameters, values)
+    says += elsewhere(result, candidate)
     if standing.rests_on and len(result.problem.segments) > 1:
         says += f" The evidence rests on one recording, {standing.rests_on}."
     return {
@@ -252,6 +266,15 @@ def _effect(
         "indistinguishable_from": [other.name for other in standing.alike],
         "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
     }
+
+
+def elsewhere(result: Diagnosis, candidate: Candidate) -> str:
+    """Return a sentence that names the places at which the effect would act alike, if there are others; else empty."""
+    active = [term.candidate for term in result.found.best.terms]
+    places = [port.replace("_", " ") for port in candidate.port.path]
+    if not candidate.effect.invariant or len(places) < 2 or not all(other.effect.invariant for other in active):
+        return ""
+    return f" These data cannot tell whether it acts at {' or at '.join(places)}: the model between them is linear."
 
 
 def at_bound(p: Parameter, value: float) -> bool:

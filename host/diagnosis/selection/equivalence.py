@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_begins, get_starts, minimize, set_begins, set_starts
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.posterior import coarse
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found
+from host.diagnosis.selection.search import Found, begun_again
 from host.diagnosis.selection.trial import Trial, at_bound
 from host.diagnosis.selection.unlisted import Remainder, equations_for
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -114,9 +114,12 @@ def _equals(
             continue  # it stands for another active effect too: both together would say one thing twice
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
-        other = finish(
-            problem, minimize(problem, (*less.terms, term), np.concatenate((less.values, start)), rounds=10, tolerance=1e-4)
-        )
+        begin = np.concatenate((less.values, start))
+        before, begun = get_begins(problem), get_starts(problem)
+        other = minimize(problem, (*less.terms, term), begin, rounds=10, tolerance=1e-4)
+        other = finish(problem, begun_again(problem, other))
+        set_begins(problem, before)
+        set_starts(problem, begun)
         contained = candidate.effect.id in trial.candidate.effect.contains
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
             continue

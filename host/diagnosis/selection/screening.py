@@ -28,7 +28,7 @@ from host.diagnosis.estimation.fit import (
     tuned,
 )
 from host.diagnosis.model.dataset import one_clock
-from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Reading
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Reading, same_place
 from host.diagnosis.model.model import scale_of
 
 Array = npt.NDArray[np.float64]
@@ -76,7 +76,7 @@ def replaced_by(fit: Fit, candidate: Candidate) -> tuple[str, ...] | None:
     drop = []
     for term in fit.terms:
         other = term.candidate
-        if other.port.name != candidate.port.name:
+        if not same_place(other, candidate):
             continue
         if other.effect.spans and other.effect.spans == candidate.effect.spans:
             return None

@@ -16,13 +16,15 @@ from host.diagnosis.estimation.fit import (
     Term,
     finish,
     first_needs,
+    get_begins,
     get_starts,
     minimize,
     reweigh,
     robust,
+    set_begins,
     set_starts,
 )
-from host.diagnosis.estimation.initial_state import estimate_state
+from host.diagnosis.estimation.initial_state import estimate_state, fit_with_states
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
@@ -45,6 +47,7 @@ from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+STATE_STEPS = 3  # of parameters and initial states together
 
 
 @dataclass
@@ -79,11 +82,26 @@ def settle(problem: Problem, values: Array) -> None:
 def start_again(problem: Problem, fit: Fit) -> None:
     """Lets a model that runs freely from a measured state find that state again."""
     for segment in problem.segments:
-        estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values))
+        unseen = problem.unseen(segment, fit.terms, fit.values)
+        estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values), unseen)
+
+
+def begun_again(problem: Problem, fit: Fit) -> Fit:
+    """`fit` with the states that its effects want recordings to begin from, where they may act at several places.
+
+    A delay of the input begins with another state of a linear plant than a delay of its reading does. With the state of
+    one of them the other looks worse than it is.
+    """
+    if not any(term.candidate.effect.invariant and term.candidate.port.path for term in fit.terms):
+        return fit
+    fit = fit_with_states(problem, fit, STATE_STEPS)
+    return minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
 
 
 def refined(problem: Problem, fit: Fit) -> Fit:
     """`fit` brought to its end on all samples, together with the states that recordings begin from."""
+    if fit.terms:
+        fit = begun_again(problem, fit)
     for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
         start_again(problem, fit)
         fit = minimize(problem, fit.terms, fit.values)
@@ -119,13 +137,15 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     ]
     fit = min(fits, key=lambda f: f.cost)
     fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
+    before, begun = get_begins(problem), get_starts(problem)
+    fit = begun_again(problem, fit)
     if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
     fit = finish(problem, fit)
-    begun = get_starts(problem)
     fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
     set_starts(problem, begun)
+    set_begins(problem, before)
     heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
     trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
-from host.diagnosis.model.effect import Candidate, Parameter
+from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
 
 @dataclass
@@ -143,9 +143,7 @@ def only_sampling(trial: Trial, trials: list[Trial]) -> bool:
 def related(simple: Candidate, general: Candidate) -> bool:
     """Whether `general` is a finer shape of `simple`, at the same place."""
     a, b = simple.effect, general.effect
-    return simple.port.name == general.port.name and (
-        a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family)
-    )
+    return same_place(simple, general) and (a.id == b.id or a.id in b.contains or bool(a.family and a.family == b.family))
 
 
 def wider(general: Candidate, bounded: Candidate) -> bool:
