@@ -132,7 +132,7 @@ def test_a_delay_or_lag_is_named_once_with_its_whole_value(delay_s: float, lag_s
     assert found["probability"] > 0.8 and "cannot tell whether it acts at u or at y reading" in found["says"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_places_in_two_subsystems_share_the_probability() -> None:
     nominal = {**MOTOR, "linear": {**MOTOR["linear"], "ports": {"u": "amplifier", "y": "encoder"}}}
     verdict = sd.diagnose([motor(k, delay_s=0.08) for k in (1, 2, 3)], nominal)

@@ -98,8 +98,10 @@ def test_a_motion_that_is_imposed_feels_no_load() -> None:
     assert mode_of("motion").parameters(imposed, "drive") == () and mode_of("motion").parameters(SCALE, "drive") != ()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("side", "hertz"), [("motor", 7.3), ("load", 13.0)])
+@pytest.mark.parametrize(
+    ("side", "hertz"),
+    [pytest.param("motor", 7.3, marks=pytest.mark.slow), pytest.param("load", 13.0, marks=pytest.mark.long)],
+)
 def test_the_mode_of_a_compliant_shaft_is_named(side: str, hertz: float) -> None:
     verdict = sd.diagnose([drive(k, hertz, 0.004, side) for k in (1, 2)], RIGID)
     (found,) = verdict.effects
