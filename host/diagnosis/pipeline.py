@@ -194,7 +194,9 @@ def _diagnosed(
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
         overall.part(0.02, 0.03)(cost, 0.0)
-    candidate_effects = candidates(candidate_ports(problem), problem.segments[0].recording.timed, model.taken | left_out)
+    ports = candidate_ports(problem)
+    problem.joint_states = any(port.path for port in ports)
+    candidate_effects = candidates(ports, problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])

@@ -62,6 +62,7 @@ class Problem:
     columns: dict[str, str] = field(default_factory=dict)  # channel -> column, for equations
     rules: SelectionRules = RULES
     budget: Budget = field(default_factory=Budget)
+    joint_states: bool = False  # whether parameters and initial states are fitted together: the model is a linear path
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
 
     @property

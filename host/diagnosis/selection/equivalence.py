@@ -39,7 +39,12 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
     out = []
     for term in found.best.terms:
         terms, values = without(found.best, problem, (term.candidate.key,))
-        less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+        before, begun = get_begins(problem), get_starts(problem)
+        less = found.nominal
+        if terms:
+            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
+            set_begins(problem, before)
+            set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
         alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)

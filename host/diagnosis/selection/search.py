@@ -81,18 +81,21 @@ def settle(problem: Problem, values: Array) -> None:
 
 def start_again(problem: Problem, fit: Fit) -> None:
     """Lets a model that runs freely from a measured state find that state again."""
+    if problem.joint_states:
+        fit_with_states(problem, fit, 0)
+        return
     for segment in problem.segments:
         unseen = problem.unseen(segment, fit.terms, fit.values)
         estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values), unseen)
 
 
 def begun_again(problem: Problem, fit: Fit) -> Fit:
-    """`fit` with the states that its effects want recordings to begin from, where they may act at several places.
+    """`fit` with its own states at the first samples, where the model is a linear path.
 
     A delay of the input begins with another state of a linear plant than a delay of its reading does. With the state of
-    one of them the other looks worse than it is.
+    one of them the other looks worse than it is; with that of the nominal fit, every effect looks better than it is.
     """
-    if not any(term.candidate.effect.invariant and term.candidate.port.path for term in fit.terms):
+    if not problem.joint_states:
         return fit
     fit = fit_with_states(problem, fit, STATE_STEPS)
     return minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
@@ -100,8 +103,7 @@ def begun_again(problem: Problem, fit: Fit) -> Fit:
 
 def refined(problem: Problem, fit: Fit) -> Fit:
     """`fit` brought to its end on all samples, together with the states that recordings begin from."""
-    if fit.terms:
-        fit = begun_again(problem, fit)
+    fit = begun_again(problem, fit)
     for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
         start_again(problem, fit)
         fit = minimize(problem, fit.terms, fit.values)
@@ -120,7 +122,7 @@ def fit_nominal(problem: Problem) -> Fit:
         settle(problem, fit.values)
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values)
-    fit = settled(problem, fit)
+    fit = settled(problem, begun_again(problem, fit))
     find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
     return fit
 
@@ -565,7 +567,8 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
         dropped = False
         for term in best.terms:
             terms, values = without(best, problem, (term.candidate.key,))
-            less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4))
+            before, begun = get_begins(problem), get_starts(problem)
+            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
             gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd)
             held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd)
             least = 0.5 * max(problem.rules.least_error_reduction, problem.rules.least_excess_reduction * gain.excess)
@@ -577,4 +580,6 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break
+            set_begins(problem, before)
+            set_starts(problem, begun)
     return best
