@@ -272,7 +272,8 @@ def touch(
         if not driver.wait(patience_s, lambda state: state.mode in ended) or driver.state.mode != "contact":  # type: ignore[attr-defined]
             driver.rig.hold()
             took_s = time.monotonic() - began_s
-            raise driver.failed(f"no contact after {took_s:.1f} s, phase {driver.state.mode}; the rig holds")
+            held = "" if driver.state.mode in ("stopped", "disarmed") else "; the rig holds"
+            raise driver.failed(f"no contact after {took_s:.1f} s, phase {driver.state.mode}{held}")
         driver.say(f"in contact, {force_N:g} N wanted")
         if hold_s is None:
             driver.say("the force is held until hold, retract or stop")

@@ -29,6 +29,7 @@ DEPTHS = {
     "pose/shaft": 1,
     "force/sensor": 1,
     "board": 1,
+    "cause": 1,
     "loop": 1,
     "stiffness": 1,
     "contact": 1,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
+import re
 import socket
 import threading
 import time
@@ -418,3 +420,12 @@ def test_a_half_open_request_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
             except ConnectionResetError:
                 pass
             client.close()
+
+
+def test_a_page_receives_every_topic_that_it_draws() -> None:
+    """A topic that the picture reads and no source delivers leaves a part of the page empty without a word."""
+    from host.recordings import rig_picture
+    from host.view import live, replay
+
+    read = set(re.findall(r'(?:_newest\.get|_fresh)\(\s*f?"([a-z/]+)"', inspect.getsource(rig_picture)))
+    assert "cause" in read and read <= set(live.DEPTHS) and read <= {*replay.EVERY, *replay.NEWEST}

@@ -32,9 +32,10 @@ function set(id, text) {
 
 export function showSafety(frame, live) {
   const silent = live && (frame.silent_s === null || frame.silent_s > 1);
-  const action = silent ? "silent" : frame.action;
+  const action = silent ? "silent" : frame.action === "none" && frame.first ? "stop" : frame.action;
   if (element("safety").dataset.action !== action) element("safety").dataset.action = action;
-  set("action", silent ? (frame.silent_s === null ? "No data yet" : "No data") : ACTIONS[frame.action] || frame.action || "–");
+  const held = frame.action === "none" && frame.first;  // disarmed by a fault of the board, or by a device that is back
+  set("action", held && !silent ? "Fault" : silent ? (frame.silent_s === null ? "No data yet" : "No data") : ACTIONS[frame.action] || frame.action || "–");
   set("mode", silent ? "–" : MODES[frame.mode] || frame.mode || "–");
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;
   set("force", force);
