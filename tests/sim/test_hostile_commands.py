@@ -204,7 +204,8 @@ def test_a_stop_from_a_second_commander_stops_and_stays_stopped(board: LibraryBo
     assert run.run(0.2, lambda: run.phase == Phase.STOPPED)
     run.run(0.2)
     at_rest = moved(run)
-    assert run.command("hold").accepted and run.command("target", "position", target_m=ELSEWHERE).accepted
+    refused = run.command("target", "position", target_m=ELSEWHERE)
+    assert run.command("hold").accepted and not refused.accepted and "disarm and arm again" in refused.reason
     run.run(0.2)
     assert moved(run).steps == at_rest.steps and run.phase == Phase.STOPPED
 
