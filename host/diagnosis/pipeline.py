@@ -31,6 +31,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
+from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, search
@@ -189,6 +190,9 @@ def _diagnosed(
     overall.part(0.0, 0.02)("reading recordings", 0.0)
     data = inspected(spec, sources)
     model, problem, full = problems(spec, data.recordings, rules)
+    right, apart = readings_apart(problem, data.recordings)
+    if apart:
+        model, problem, full = problems(spec, right, rules)
     problem.budget = budget
     held = hold_between_samples(problem, [full] if full is not problem else [])
     cost = model.announce(problem.segments, model.guess(problem.segments))
@@ -208,7 +212,7 @@ def _diagnosed(
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.remainder = remainder
-    result.findings = [*data.findings, *held, *uncertain(problem, found.best, spans)]
+    result.findings = [*data.findings, *apart, *held, *uncertain(problem, found.best, spans)]
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
     piled = remainder.doubtful and len(found.best.terms) > problem.rules.partial_effects
@@ -270,8 +274,11 @@ def _figures(full: Problem, found: Found) -> Figures:
         for store, fit in ((before, nominal), (after, best)):
             store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.segments, strict=True)])
         for store, fit in ((white_b, nominal), (white_a, best)):
-            masks = [p.heldout for p in full.segments]
-            store[row] = whiteness([full.noise[row].whiten(r[row]) for r in fit.residuals], masks)
+            masks, noise = [p.heldout for p in full.segments], full.noise[row]
+            # The colour of the noise is an estimate: a residual that is white itself must not fail for a wrong one.
+            coloured = whiteness([noise.whiten(r[row]) for r in fit.residuals], masks)
+            white = whiteness([r[row] / noise.sigma for r in fit.residuals], masks) if noise.sigma > 0.0 else 0.0
+            store[row] = max(coloured, white)
     ratio = np.where(after > 0, before / np.maximum(after, 1e-300), 1.0)
     used = np.isfinite(before) & (before > 0)
     primary = int(np.argmax(np.where(used, ratio, 0.0)))

@@ -44,10 +44,15 @@ class Design:
     inputs: dict[str, Array]
 
     @property
+    def separates(self) -> bool:
+        """Whether a recording of the excitation separates the two."""
+        return self.separation > PLAIN
+
+    @property
     def says(self) -> str:
         """Describe the excitation and its predicted separation in one line."""
         held = "".join(f", {name.replace('_', ' ')} at {value:.3g}" for name, value in self.excitation.held)
-        doubt = "" if self.separation > PLAIN else " No motion of this family separates them."
+        doubt = "" if self.separates else " No motion of this family separates them."
         return (
             f"{self.excitation.channel.replace('_', ' ')}: {self.excitation.words}{held}. "
             f"Predicted separation of {self.candidate.name} and {self.other.name}: {self.separation:.3g} in units of "

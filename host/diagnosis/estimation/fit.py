@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, cornered
@@ -17,6 +18,7 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
+BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
 MODE_LINES = 3  # highest lines of the residual at which a mode is tried, before its grid
 
@@ -186,17 +188,77 @@ def robust(r: Array) -> tuple[float, Array]:
     return cost, np.sqrt(np.where(inside, 1.0, HUBER / np.maximum(size, 1e-300)))
 
 
-def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: int = 40, tolerance: float = 1e-7) -> Fit:
+@dataclass(frozen=True)
+class FreeStates:
+    """Rates (m, k) of the weighted residuals by all initial states that are fitted, and their estimate from residuals.
+
+    A state and a parameter can cause much the same (the first speed of a free mass, and its gain). Estimated in turn, each
+    takes over the error of the other and neither moves far. Residuals `freed` of what a change of the states explains are
+    those of the states that belong to the parameters tried (variable projection; Golub and Pereyra 2003). A state that is
+    measured is held by its variance, in the units of `estimate_state`.
+    """
+
+    rates: Array
+    gains: Array  # (k, m): estimate of the change of the states from residuals
+    pull: Array  # (k,): change towards the measured states without residuals
+    away: Array  # (k,): states less the measured ones, in standard deviations
+    weight: Array  # (k,): of a standard deviation, in the units of the residuals
+
+    def freed(self, r: Array) -> Array:
+        """Residuals (m + k,) without what a change of the initial states explains, and how far these are from measured."""
+        change = self.gains @ r + self.pull
+        return np.concatenate((r - self.rates @ change, self.weight * (self.away + change)))
+
+    def freed_rates(self, J: Array) -> Array:
+        """Rates (m + k, p) of freed residuals by the parameters."""
+        change = self.gains @ J
+        return np.vstack((J - self.rates @ change, self.weight[:, None] * change))
+
+
+def free_states(problem: Problem, terms: tuple[Term, ...], values: Array) -> FreeStates | None:
+    """Initial states that are estimated, linearized where they are now; None if no recording has any."""
+    base = problem.stacked(terms, values)
+    columns, away, levels, at, rows = [], [], [], 0, len(problem.model.outputs)
+    for segment in problem.segments:
+        part = slice(at, at + rows * int(segment.fit.sum()))
+        at, begin = part.stop, segment.begin
+        if part.start == part.stop or begin is None or not begin.estimated:
+            continue
+        left = base[part].reshape(rows, -1)
+        level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in left]))
+        now = begin.values
+        for k in np.flatnonzero(begin.spread > 0.0):
+            begin.values = now + np.eye(now.size)[k] * begin.spread[k]
+            columns.append(base - problem.stacked(terms, values))
+            away.append((now[k] - begin.measured[k]) / begin.spread[k])
+            levels.append(level)
+        begin.values = now
+    if not columns:
+        return None
+    S, prior = np.array(columns).T, np.array(levels)
+    inverse = np.linalg.pinv(S.T @ S + np.diag(prior), rcond=1e-13, hermitian=True)
+    return FreeStates(S, inverse @ S.T, -inverse @ (prior * np.array(away)), np.array(away), np.sqrt(prior))
+
+
+def minimize(
+    problem: Problem,
+    terms: tuple[Term, ...],
+    start: Array,
+    rounds: int = 40,
+    tolerance: float = 1e-7,
+    states: bool = False,
+) -> Fit:
     """Values that minimize the Huber cost of the weighted simulation error, from `start`.
 
     A dead time hides the first samples. How many is held while it is fitted: the cost would jump with each of them.
+    states: whether initial states follow the values tried; they are not changed, the caller estimates them again.
     """
     if problem.waits_s == 0.0 and any(p.dead_time for term in terms for p in term.parameters):
         for _ in range(3):
             late_s = problem.late_s(terms, start)
             waits_s = WAIT * late_s + 3.0 * problem.segments[0].recording.dt_s
             held = replace(problem, waits_s=waits_s)
-            fit = minimize(held, terms, start, rounds, tolerance)
+            fit = minimize(held, terms, start, rounds, tolerance, states)
             fit.cost /= max(held.seen_share(terms, start), 1e-3)  # that a longer dead time gains nothing by hiding samples
             start = fit.values
             if problem.late_s(terms, start) <= waits_s:
@@ -204,14 +266,17 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
         return fit
     parameters = problem.parameters(terms)
     values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])
-    r = problem.stacked(terms, values)
+    moving = free(parameters)
+    begins = free_states(problem, terms, values) if states and moving else None
+    raw = problem.stacked(terms, values)
+    r = raw if begins is None else begins.freed(raw)
     cost, w = robust(r)
     damping = 1e-3
     J = np.zeros((r.size, 0))
-    moving = free(parameters)
     for _ in range(rounds if moving else 0):
         sizes = [size_of(p, v) for p, v in zip(parameters, values, strict=True)]
-        J = jacobian(problem, terms, values, r, sizes)
+        J = jacobian(problem, terms, values, raw, sizes)
+        J = J if begins is None else begins.freed_rates(J)
         A, g = (J * w[:, None]).T @ (J * w[:, None]), J.T @ (w * w * r)
         diagonal = np.maximum(np.diag(A), 1e-12 * (np.max(np.diag(A)) + 1e-300))
         better = False
@@ -225,7 +290,8 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
                     if p.log
                     else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
                 )
-            r_new = problem.stacked(terms, trial)
+            raw_new = problem.stacked(terms, trial)
+            r_new = raw_new if begins is None else begins.freed(raw_new)
             cost_new, w_new = robust(r_new)
             if cost_new < cost:
                 better = True
@@ -234,7 +300,7 @@ def minimize(problem: Problem, terms: tuple[Term, ...], start: Array, rounds: in
         if not better:
             break
         gained = (cost - cost_new) / cost
-        values, r, cost, w = trial, r_new, cost_new, w_new
+        values, raw, r, cost, w = trial, raw_new, r_new, cost_new, w_new
         damping = max(damping / 8.0, 1e-9)
         if gained < tolerance:
             break
@@ -291,15 +357,21 @@ def first_needs(problem: Problem, fit: Fit) -> list[dict[str, float]]:
 
 
 def get_starts(problem: Problem) -> list[dict[str, float]]:
-    """Starts of memory of every recording."""
-    return [dict(segment.start) for segment in problem.segments]
+    """Starts of memory of every recording, and the states that it begins from."""
+    return [{**segment.start, **_begun(segment)} for segment in problem.segments]
+
+
+def _begun(segment: Segment) -> dict[str, float]:
+    return {} if segment.begin is None else {f"{BEGIN}{k}": float(v) for k, v in enumerate(segment.begin.values)}
 
 
 def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
-    """Set the stored initial states of all recordings again."""
+    """Set the stored initial states of all recordings again; the states that they begin from where `given` has them."""
     for segment, start in zip(problem.segments, given, strict=True):
         segment.start.clear()
-        segment.start.update(start)
+        segment.start.update({key: value for key, value in start.items() if not key.startswith(BEGIN)})
+        if segment.begin is not None and f"{BEGIN}0" in start:
+            segment.begin.values = np.array([start[f"{BEGIN}{k}"] for k in range(segment.begin.values.size)])
 
 
 def get_begins(problem: Problem) -> list[Array]:

@@ -29,6 +29,8 @@ BETTER = 0.1  # and largest ratio of what it leaves unexplained to what the labe
 WRONG_WAY = 3e-4  # share that the labelled order leaves at least: in a closed loop either order leaves only noise
 EXACT = 1e-7  # residual over span below which a channel is a copy of another
 NOISY = 1e-6  # noise over span, from which on two channels cannot be alike by chance
+CLEAN = 1.5  # times the noise of a force, up to which a law with a shift leaves nothing but noise
+LONGEST_FOR_CLOCK = 20000  # samples of a recording in which a shift is looked for
 LEADS = 2  # samples by which an output may not come before its input
 FACTORS = {1e3: "1000 (milli)", 1e-3: "1/1000 (milli)", 1e6: "10^6 (micro)", 1e-6: "10^-6 (micro)"}
 FACTORS |= {180.0 / np.pi: "57.3 (degrees and radians)", np.pi / 180.0: "1/57.3 (degrees and radians)"}
@@ -203,7 +205,7 @@ def _compared(
     if not path.related:
         return recordings
     if path.law:
-        return _by_law(recordings, path, columns, findings)
+        return _by_law(spec, recordings, path, columns, findings)
     return _by_gain(recordings, path, columns, findings)
 
 
@@ -301,7 +303,7 @@ def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], f
         findings.append(Finding("sign", output_column, says))
     if path.gain and abs(correlation) > 0.95:
         ratio = abs(gain / path.gain)
-        factor = _factor(ratio, NEAR_FACTOR if path.stated else SAME_FACTOR)
+        factor = factor_of(ratio, NEAR_FACTOR if path.stated else SAME_FACTOR)
         if factor:
             says = f"Column {output_column} is about {FACTORS[factor]} times what the nominal model says of {input_column}: "
             says += "the unit of one of them is probably another (channels.*.scale)."
@@ -317,7 +319,7 @@ def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], f
     return _causal(recordings, path, columns, findings)
 
 
-def _factor(ratio: float, near: float) -> float:
+def factor_of(ratio: float, near: float) -> float:
     """The factor of a slip of units that `ratio` (positive) is within `near` (logarithm) of; 0 if there is none."""
     away, best = min((abs(float(np.log(max(ratio, 1e-300) / factor))), factor) for factor in FACTORS)
     return best if away < near else 0.0
@@ -380,7 +382,9 @@ def regression(recording: Recording, path: Pair, exchanged: bool = False) -> tup
     return found[:-1], np.std(columns[:-1], axis=1) * np.abs(found[:-1]), explained
 
 
-def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
+def _by_law(
+    spec: NominalSpec, recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
     """A pair that an equation of motion connects."""
     used = [recording for recording in recordings if recording.timed and recording.n >= 100]
     if path.reads == "acceleration" or not used:
@@ -409,7 +413,69 @@ def _by_law(recordings: list[Recording], path: Pair, columns: dict[str, str], fi
         says += f"negative. The diagnosis continues with {force_column} reversed (channels.*.sign)."
         findings.append(Finding("sign", force_column, says))
         recordings = [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
+    leading = path.input if spec.impedance is not None else path.output
+    recordings = _causal_by_law(recordings, path, leading, columns, findings)
     return _in_units(recordings, path, straight, explained, columns, findings)
+
+
+def _causal_by_law(
+    recordings: list[Recording], path: Pair, leading: str, columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """A force that comes before the motion that causes it (or the reverse): their clocks disagree, so it is shifted back.
+
+    leading: the channel that cannot come first. A relaxing material advances its force too, by another amount at every
+    frequency. The shift therefore has to leave nothing but the noise of the force, and to be the same in every recording.
+    """
+    leads = [_lead_by_law(recording, path, leading) for recording in recordings if recording.timed and recording.n >= 100]
+    lead = round(float(np.median(leads))) if leads else 0
+    if not leads or min(leads) < LEADS or max(leads) - min(leads) > 1 + lead // 10:
+        return recordings
+    other = path.output if leading == path.input else path.input
+    early = f"{lead * recordings[0].dt_s:.3g} s"
+    says = f"Column {columns[leading]} comes {early} before column {columns[other]}, which drives it: with that shift the "
+    says += "nominal law leaves only noise. Their clocks disagree. "
+    says += f"The diagnosis continues with {columns[leading]} shifted back."
+    findings.append(Finding("clock", columns[leading], says))
+    moved = []
+    for recording in recordings:
+        late = np.concatenate((np.full(lead, np.nan), recording.channels[leading][:-lead]))
+        moved.append(_with(recording, leading, late))
+    return moved
+
+
+def _lead_by_law(recording: Recording, path: Pair, leading: str) -> int:
+    """Samples by which `leading` comes first, by what the law leaves at each shift of it; 0 if it does not."""
+    part = slice(0, LONGEST_FOR_CLOCK)
+    force, motion = fill(recording.channels[path.input])[part], fill(recording.channels[path.output])[part]
+    dt, noise = recording.dt_s, white_level(force)
+    most = min(force.size // 10, 200)
+    window = smoothing_window(motion, dt, white_level(motion), 7 * dt)
+    if most < LEADS + 1 or force.size < 4 * window + 4 * most:
+        return 0
+    x, v, a = smooth_derivatives(motion, dt, window)
+    if path.reads == "velocity":
+        x, v, a = np.cumsum(x) * dt, x, v
+    table = {"mass": a, "damping": v, "stiffness": x}
+    rows = np.array([*(table[term] for term in path.law), np.ones_like(force)])
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True) + 1e-300
+    edge = most + window
+    middle = rows[:, edge:-edge].T
+    gram = np.linalg.pinv(middle.T @ middle, rcond=1e-10, hermitian=True)
+
+    def left(shift: int, signal: Array = force) -> float:
+        """RMS that the law leaves of a force that comes `shift` samples later than its motion."""
+        f = signal[edge + shift : signal.size - edge + shift]
+        return float(np.sqrt(np.mean((f - middle @ (gram @ (middle.T @ f))) ** 2)))
+
+    now = left(0)
+    if now < 2.0 * CLEAN * noise:
+        return 0
+    side = -1 if leading == path.input else 1  # a force that comes first is found before its motion
+    after = min(left(-side * lag) for lag in range(0, most, 2))
+    # A damping takes over a part of a shift. Only a force that is smoothed as its motion is finds the whole of it.
+    smooth = smooth_derivatives(force, dt, window)[0]
+    best = int(np.argmin([left(side * lead, smooth) for lead in range(most)]))
+    return best if left(side * best) < min(CLEAN * noise, 0.5 * now, 0.5 * after) else 0
 
 
 def _in_units(
@@ -430,7 +496,7 @@ def _in_units(
     ratios = found[usable] / stated[usable]
     order = np.array([("stiffness", "damping", "mass").index(term) for term in path.law])[usable]
     force_column, motion_column = columns[path.input], columns[path.output]
-    factor = _factor(1.0 / float(np.exp(np.mean(np.log(ratios)))), NEAR_FACTOR)
+    factor = factor_of(1.0 / float(np.exp(np.mean(np.log(ratios)))), NEAR_FACTOR)
     if factor and np.ptp(np.log(ratios)) < 2.0 * NEAR_FACTOR:
         says = f"{motion_column} over {force_column} is about {FACTORS[factor]} times what the nominal parameters say: "
         says += (

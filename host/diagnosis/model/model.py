@@ -98,6 +98,7 @@ class Model(ABC):
     hold: str = ""  # the one that it takes,
     hold_stated: bool = False  # and whether its file states it
     either_sign: bool = False  # whether a force that is read may count against the motion as well as with it
+    simulates: bool = False  # whether it runs a simulator, whose law cannot be read: data are checked against its outputs
     pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined
 
     @abstractmethod

@@ -35,7 +35,9 @@ class ChannelSpec(Request):
     unit: Unit = ""
     sign: Literal[-1, 1] = 1
     offset: float = 0.0
-    session_offset: bool = False  # an offset of its own in every recording, estimated (kinds that run a simulator)
+    session_offset: bool = (
+        False  # an offset of its own in every recording, estimated (simulators, outputs of a transmission)
+    )
 
     @model_validator(mode="after")
     def _unit_of_the_value(self) -> ChannelSpec:
@@ -357,8 +359,13 @@ class NominalSpec(Request):
             if self.offer:
                 raise ValueError(f"[[offer]] with a kind that runs a simulator, not kind {self.kind}")
             sessions = [name for name, channel in self.channels.items() if channel.session_offset]
-            if sessions:
-                raise ValueError(f"session_offset ({sessions[0]}) with a kind that runs a simulator, not kind {self.kind}")
+            tared = {link.output for link in self.link}
+            alien = next((name for name in sessions if name not in tared), None)
+            if alien is not None:
+                raise ValueError(
+                    f"session_offset ({alien}) with an output of a transmission or a kind that runs a simulator, "
+                    f"not kind {self.kind}"
+                )
         return self
 
     @property

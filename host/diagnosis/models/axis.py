@@ -289,14 +289,25 @@ class AxisModel(Model):
         return segment.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else segment.x
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
-        """Force residual where a force is compared; else the motion residual times stiffness (a quasi-static guess of
-        size).
+        """Force residual where a force is compared; else the motion residual times what a unit of the reading takes.
+
+        That is the stiffness for a position (quasi-static), and at the typical rate of the motion the sum of damping and
+        inertia for a speed, and the mass for an acceleration.
         """
         if len(self.outputs) == 2 or not self.free_run:
             return np.asarray(residual[-1])
         if port.name.endswith("_reading"):
             return np.asarray(residual[0])
-        size = dict(zip(self.spec.terms, theta, strict=False)).get("stiffness", 1.0)
+        assert isinstance(segment, AxisSegment)
+        law = dict(zip(self.spec.terms, map(float, theta), strict=False))
+        if self.spec.reads == "position":
+            return np.asarray(residual[0] * law.get("stiffness", 1.0))
+        mass = law.get("mass", 1.0)
+        seen = np.isfinite(residual[0])
+        free_of_noise = segment.y[0][seen] - residual[0][seen]
+        moved = max(float(np.std(free_of_noise)), 1e-300)
+        rate = float(np.std(np.diff(free_of_noise))) / segment.recording.dt_s / moved
+        size = mass if self.spec.reads == "acceleration" else law.get("damping", 0.0) + mass * rate
         return np.asarray(residual[0] * size)
 
 

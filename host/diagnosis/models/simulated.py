@@ -110,6 +110,7 @@ class SimulatedModel(Model):
     """Base of the kinds `callable`, `linear`, `mujoco` and `fmu`."""
 
     scan_points = 24
+    simulates = True
     either_sign = True
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
 

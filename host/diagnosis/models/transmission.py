@@ -9,6 +9,7 @@ from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Parameter, Port
 from host.diagnosis.model.model import (
     ActiveEffect,
+    Begin,
     Model,
     Output,
     Segment,
@@ -37,6 +38,7 @@ class TransmissionModel(Model):
     def __init__(self, spec: NominalSpec) -> None:
         self.links: list[LinkSpec] = spec.link
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
+        self.tared = tuple(link.output for link in self.links if spec.channels[link.output].session_offset)
         names = [
             link.subsystem if len(spec.link) == 1 or _alone(link, spec) else f"{link.subsystem}_{link.output}"
             for link in spec.link
@@ -61,6 +63,7 @@ class TransmissionModel(Model):
             )
             for key, unit, default in (("gain", ratio, 1.0), ("offset", self.units[link.output], 0.0)):
                 value, free = spec.start(prefix + key, default)
+                free = free and not (key == "offset" and link.output in self.tared)  # each recording has its own
                 bound = np.inf if free else value
                 parameters.append(Parameter(prefix + key, unit, (value,), -bound if free else value, bound, linear=True))
             for order in range(link.lag_order):
@@ -92,6 +95,10 @@ class TransmissionModel(Model):
             units[name], units[f"output:{name}"] = self.units[link.input], self.units[link.output]
             units[f"{name}_reading"] = self.units[link.output]
         segment.units = units
+        if self.tared:
+            spans = [float(np.nanmax(recording.channels[name]) - np.nanmin(recording.channels[name])) for name in self.tared]
+            none = np.zeros(len(spans))
+            segment.begin = Begin(self.tared, none, np.array([span or 1.0 for span in spans]), none.copy())
         return segment
 
     def guess(self, segments: list[Segment]) -> Array:
@@ -127,13 +134,14 @@ class TransmissionModel(Model):
         """Every link's output, free run. Shape (outputs, n)."""
         out = np.empty_like(segment.y)
         at = 0
+        tares = dict(zip(self.tared, segment.begin.values, strict=True)) if segment.begin is not None else {}
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
             signal = apply_effects(segment.inputs[link.input], active, name, segment, "input")
             signal = theta[at] * signal + theta[at + 1]
             for constant in theta[at + 2 : at + 2 + link.lag_order]:
                 signal = lag(signal, segment.recording.dt_s, float(constant))
             at += 2 + link.lag_order
-            signal = apply_effects(signal, active, name, segment, "output")
+            signal = apply_effects(signal, active, name, segment, "output") + tares.get(link.output, 0.0)
             out[row] = apply_effects(signal, active, f"{name}_reading", segment, None)
         return out
 

@@ -83,12 +83,25 @@ def next_step(result: Diagnosis) -> str:
     named = effects(result)
     if result.stopped_early:
         return "Diagnose again with a longer time budget: the search was stopped before its end."
-    first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) != ("clock", "time")), None)
+    remarks = {("clock", "time"), ("unit", result.spec.data.time)}  # stamps: put right already, or only perhaps wrong
+    first = next((f for f in result.findings if f.id not in REMARKS and (f.id, f.channel) not in remarks), None)
     if first is not None:
         return f"Correct the data first ({first.id}: {first.channel}), then diagnose again."
     unsure = [entry for entry in named if entry["probability"] < result.problem.rules.confident]
+    useful = next((design for design in result.designs if design.separates), None)
+    if useful is not None:
+        return f"Record the proposed motion and diagnose again with it: {useful.says}"
     if result.designs:
-        return f"Record the proposed motion and diagnose again with it: {result.designs[0].says}"
+        one, other = result.designs[0].candidate, result.designs[0].other
+        return (
+            f"Measure a further signal at {one.port.subsystem}, or choose by what is known of the hardware: no motion that "
+            f"was tried separates {one.name} from {other.name}, so their predictions hardly differ."
+        )
+    if result.verdict == "mismatch_not_identified" and result.model.simulates:
+        return (
+            "Offer the simulator's parameters that are nominally off ([[offer]]), or record slower and faster motions with "
+            "rests, and diagnose again: no known effect at its inputs and outputs fits."
+        )
     if result.verdict == "mismatch_not_identified":
         return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
     if unsure and (places := placeless(result)):

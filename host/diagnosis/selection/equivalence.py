@@ -128,6 +128,8 @@ def _equals(
         contained = candidate.effect.id in trial.candidate.effect.contains
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
             continue
+        if at_bound(other) and len(other.values) > len(best.values):
+            continue  # its further parameter ended at a bound, so it says what the simpler one says
         ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)

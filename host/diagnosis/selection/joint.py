@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare
-from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, minimize, set_starts
+from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
 from host.diagnosis.selection.screening import above_noise
 from host.diagnosis.selection.trial import Trial, bound_by, related, sure_together
 
@@ -62,6 +62,45 @@ def best_pair(
                 _earned_over(problem, fit, _alone(problem, nominal, fit, which), noise_sd) for which in (0, 1)
             ):
                 found.append((*passed, fit, second.starts))
+    if not found:
+        return None
+    _, held, fit, starts = max(found, key=lambda item: item[0])
+    return fit, held, starts
+
+
+def pair_instead(
+    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array
+) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
+    """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
+
+    A loop with a dead band both rests after a reversal and is late. It outdoes play or a delay alone where both are there,
+    and hides them: past it, neither earns much. Pairs of an effect that it contains and any unlike one at its port have to
+    be likelier than it is. The arguments and what is returned are those of `best_pair`.
+    """
+    rules, term = problem.rules, one.terms[0]
+    here = [t for t in _singles(trials, len(trials)) if t.candidate.port.name == term.candidate.port.name]
+    parts = [t for t in here if t.candidate.effect.id in term.candidate.effect.contains]
+    if len(_unlike(parts)) < 2 or problem.budget.spent():
+        return None
+    tried = [
+        (a, b)
+        for a, b in itertools.combinations(here, 2)
+        if (a in parts or b in parts)
+        and not (related(a.candidate, b.candidate) or related(b.candidate, a.candidate))
+        and term.candidate.key not in (a.candidate.key, b.candidate.key)
+    ]
+    begun, found = get_starts(problem), []
+    for a, b in tried[: rules.split_fits]:
+        starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
+        set_starts(problem, starts)
+        fit = _fitted(problem, nominal, a, b)
+        passed = _passed(problem, nominal, fit, noise_sd)
+        ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd)
+        more = len(fit.values) - len(one.values)
+        likelier = ahead.log_likelihood > rules.heldout_log_likelihood + rules.parameter_penalty * max(more, 0)
+        if likelier and passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
+            found.append((*passed, fit, starts))
+    set_starts(problem, begun)
     if not found:
         return None
     _, held, fit, starts = max(found, key=lambda item: item[0])

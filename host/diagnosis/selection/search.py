@@ -28,7 +28,7 @@ from host.diagnosis.estimation.initial_state import estimate_state, fit_with_sta
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
-from host.diagnosis.selection.joint import best_pair
+from host.diagnosis.selection.joint import best_pair, pair_instead
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, without
 from host.diagnosis.selection.trial import (
@@ -106,7 +106,8 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     fit = begun_again(problem, fit)
     for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
         start_again(problem, fit)
-        fit = minimize(problem, fit.terms, fit.values)
+        fit = minimize(problem, fit.terms, fit.values, states=True)
+    start_again(problem, fit)
     return finish(problem, fit)
 
 
@@ -121,7 +122,7 @@ def fit_nominal(problem: Problem) -> Fit:
     for _ in range(3):
         settle(problem, fit.values)
         reweigh(problem, fit)
-        fit = minimize(problem, (), fit.values)
+        fit = minimize(problem, (), fit.values, states=True)
     fit = settled(problem, begun_again(problem, fit))
     find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
     return fit
@@ -138,11 +139,12 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4) for begin in begins
     ]
     fit = min(fits, key=lambda f: f.cost)
-    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
+    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4, states=True)
     before, begun = get_begins(problem), get_starts(problem)
     fit = begun_again(problem, fit)
     if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
+    start_again(problem, fit)  # also of held-out recordings: the state of the model so far is not that of this one
     fit = finish(problem, fit)
     fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
@@ -276,6 +278,10 @@ def _grow(
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
         best = _taken(problem, winner)
+        two = pair_instead(problem, found.nominal, best, trials, noise_sd) if len(best.terms) == 1 else None
+        if two is not None:
+            best, gain = _joined(problem, two), two[1]
+            steps += [Step("joint", term.candidate.key, gain, trials) for term in best.terms]
         if len(best.terms) > 1:
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
@@ -293,7 +299,7 @@ def _better_base(problem: Problem, base: Fit, trial: Trial) -> Fit | None:
     cost = robust(problem.stacked(base.terms, base.values))[0]
     if again.cost > (1.0 - problem.rules.least_excess_reduction) * cost:
         return None
-    again = minimize(problem, again.terms, again.values)
+    again = minimize(problem, again.terms, again.values, states=True)
     if base.terms:
         again = refined(problem, again)
         reweigh(problem, again)
@@ -386,14 +392,18 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
     if pair is None:
         set_starts(problem, begun)
         return
-    fit, gain, starts = pair
+    found.best = _joined(problem, pair)
+    found.steps += [Step("joint", term.candidate.key, pair[1], refused) for term in found.best.terms]
+    _grow(problem, found, candidate_effects, noise_sd, pair[1].log_likelihood, progress)
+
+
+def _joined(problem: Problem, pair: tuple[Fit, Gain, list[dict[str, float]]]) -> Fit:
+    """The fit of a pair brought to its end, memories started and outputs weighed as it has them."""
+    fit, _, starts = pair
     set_starts(problem, starts)
     fit = refined(problem, fit)
     reweigh(problem, fit)
-    found.best = fit
-    found.steps.append(Step("joint", fit.terms[0].candidate.key, gain, refused))
-    found.steps.append(Step("joint", fit.terms[1].candidate.key, gain, refused))
-    _grow(problem, found, candidate_effects, noise_sd, gain.log_likelihood, progress)
+    return fit
 
 
 def _taken(problem: Problem, trial: Trial) -> Fit:

@@ -1,0 +1,113 @@
+"""Readings of a simulator's outputs that another sign, unit or column explains: found before any physics is fitted.
+
+The other kinds of model are checked by their law (`model/findings.py`). A simulator has none that could be read, so its
+outputs are compared with what it simulates for its nominal parameters. The initial state of a recording is read off the
+same outputs; what it explains is taken off both, so that a reversed reading is not compared with its own reversed start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.estimation.fit import Problem
+from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.findings import FACTORS, NEAR_FACTOR, OPPOSITE, factor_of
+from host.diagnosis.model.model import Segment
+from host.diagnosis.model.readings import Finding
+
+Array = npt.NDArray[np.float64]
+ALIKE = 0.95  # correlation with what is simulated, from which on a factor between the two is one of units
+
+
+def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[list[Recording], list[Finding]]:
+    """The recordings with readings put right, and what was found. problem: of a simulator, before any fit."""
+    model = problem.model
+    if not model.simulates:
+        return list(recordings), []
+    theta = model.guess(problem.segments)
+    pairs = [_freed(problem, segment, theta) for segment in problem.segments]
+    names = [output.channel for output in model.outputs]
+    columns = [problem.columns.get(name, name) for name in names]
+    alike = np.array(
+        [[_likeness(pairs, measured, simulated)[0] for simulated in range(len(names))] for measured in range(len(names))]
+    )
+    findings: list[Finding] = []
+    change: dict[str, float] = {}
+    order = list(range(len(names)))
+    for a in range(len(names)):
+        for b in range(a + 1, len(names)):
+            crossed, straight = min(alike[a, b], alike[b, a]), max(alike[a, a], alike[b, b])
+            same = model.outputs[a].unit == model.outputs[b].unit
+            if same and crossed > ALIKE and straight < 0.5:
+                order[a], order[b] = b, a
+                says = f"Columns {columns[a]} and {columns[b]} are probably exchanged: each follows what the nominal model "
+                says += "says of the other. The diagnosis continues with them exchanged."
+                findings.append(Finding("swapped", columns[a], says))
+    for row, simulated in enumerate(order):
+        if simulated != row:
+            continue
+        correlation, gain = _likeness(pairs, row, row)
+        if correlation < OPPOSITE:
+            says = f"Column {columns[row]} moves against what the nominal model says (correlation {correlation:.2f}): "
+            says += "it, or an input, has the opposite sign (channels.*.sign). "
+            says += f"The diagnosis continues with {columns[row]} reversed."
+            findings.append(Finding("sign", columns[row], says))
+            change[names[row]] = -1.0
+        factor = factor_of(abs(gain), NEAR_FACTOR) if abs(correlation) > ALIKE else 0.0
+        if factor:
+            says = f"Column {columns[row]} is about {FACTORS[factor]} times what the nominal model says: the unit of it, or "
+            says += "of an input, is probably another (channels.*.scale). The diagnosis continues with "
+            says += f"{columns[row]} divided by that."
+            findings.append(Finding("unit", columns[row], says))
+            change[names[row]] = change.get(names[row], 1.0) / factor
+    if not findings:
+        return list(recordings), []
+    return [_put_right(recording, names, order, change) for recording in recordings], findings
+
+
+def _put_right(recording: Recording, names: list[str], order: list[int], change: dict[str, float]) -> Recording:
+    """A recording with its outputs in `order` and times `change`."""
+    given = {name: recording.channels[names[place]] for name, place in zip(names, order, strict=True)}
+    moved = {name: values * change.get(name, 1.0) for name, values in given.items()}
+    return replace(recording, channels={**recording.channels, **moved})
+
+
+def _freed(problem: Problem, segment: Segment, theta: Array) -> tuple[Array, Array]:
+    """Measured and simulated outputs (outputs, n) without what offsets and initial states explain; NaN where missing."""
+    simulated = np.asarray(problem.model.simulate(segment, theta, []))
+    states = []
+    begin = segment.begin
+    if begin is not None:
+        now = begin.values
+        for k in np.flatnonzero(begin.spread > 0.0):
+            begin.values = now + np.eye(now.size)[k] * begin.spread[k]
+            states.append(np.asarray(problem.model.simulate(segment, theta, [])) - simulated)
+        begin.values = now
+    measured, said = np.full_like(segment.y, np.nan), np.full_like(segment.y, np.nan)
+    for row in range(segment.y.shape[0]):
+        good = np.isfinite(segment.y[row]) & np.isfinite(simulated[row])
+        basis = np.column_stack([np.ones(int(good.sum())), *(state[row][good] for state in states)])
+        size = np.linalg.norm(basis, axis=0)
+        basis = basis[:, size > 0.0] / size[size > 0.0]
+        if not np.isfinite(basis).all() or good.sum() < 2 * basis.shape[1]:
+            continue
+        for store, values in ((measured, segment.y[row][good]), (said, simulated[row][good])):
+            store[row, good] = values - basis @ np.linalg.lstsq(basis, values, rcond=1e-9)[0]
+    return measured, said
+
+
+def _likeness(pairs: list[tuple[Array, Array]], measured: int, simulated: int) -> tuple[float, float]:
+    """Correlation of a measured with a simulated output over all recordings, and the gain between the two."""
+    across = own = other = 0.0
+    for y, out in pairs:
+        good = np.isfinite(y[measured]) & np.isfinite(out[simulated])
+        across += float(y[measured][good] @ out[simulated][good])
+        own += float(y[measured][good] @ y[measured][good])
+        other += float(out[simulated][good] @ out[simulated][good])
+    if own <= 0.0 or other <= 0.0:
+        return 0.0, 0.0
+    return across / float(np.sqrt(own * other)), across / other
