@@ -106,8 +106,9 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     fit = begun_again(problem, fit)
     for _ in range(2 if any(segment.begin is not None for segment in problem.segments) else 1):
         start_again(problem, fit)
-        fit = minimize(problem, fit.terms, fit.values, states=True)
-    start_again(problem, fit)
+        fit = minimize(problem, fit.terms, fit.values, states=not problem.joint_states)
+    if not problem.joint_states:
+        start_again(problem, fit)
     return finish(problem, fit)
 
 
@@ -139,12 +140,14 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         minimize(few, (*terms, item.term), begin, rounds=problem.rules.first_iterations, tolerance=1e-4) for begin in begins
     ]
     fit = min(fits, key=lambda f: f.cost)
-    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4, states=True)
+    alone = not problem.joint_states  # the other models are begun again together with their parameters
+    fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4, states=alone)
     before, begun = get_begins(problem), get_starts(problem)
     fit = begun_again(problem, fit)
     if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
-    start_again(problem, fit)  # also of held-out recordings: the state of the model so far is not that of this one
+    if alone:
+        start_again(problem, fit)  # also of held-out recordings: the state of the model so far is not this one's
     fit = finish(problem, fit)
     fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
