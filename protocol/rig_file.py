@@ -332,7 +332,7 @@ class EstimationSection(_Section):
     contact_force_sd_N: Annotated[float, Field(gt=0, le=10)] = 1.0
     tangential_force_sd_N: Annotated[float, Field(gt=0, le=1)] = 0.02
     insertion_walk_m: Annotated[float, Field(gt=0, le=0.01)] = 0.0001
-    curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.1
+    curvature_walk_per_m: Annotated[float, Field(gt=0, le=20)] = 0.03
     roll_walk_rad: Annotated[float, Field(gt=0, le=1)] = 0.1
     adaptation: bool = True
     adaptation_limit: Annotated[float, Field(gt=0, le=0.3)] = 0.3

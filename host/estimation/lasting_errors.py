@@ -8,6 +8,10 @@ A backlash that is wider than assumed makes one part of the insertion's error al
 and +p while it is pulled, with p half of the missing width, and changes over while the body moves by 2 p after a reversal.
 This is a fourth state, p, which poses of several reversals determine; the other three would follow it only with a delay.
 
+A knob that turns to and fro brings the curvature back to what it was, friction included: within the range that it visited
+lately its travel adds no uncertainty. Otherwise the knob's motion with each beat would make the filter forget in seconds
+what many poses had told of the curvature, which one pose can hardly tell from a force along the wall.
+
 A wall that is not perpendicular to the commanded force makes a force along it that lasts as long as the contact. Three more
 states hold this force. Were it taken for new in each pose, its mean would count as an error of insertion and curvature, and
 the filter would be surer of the wrong one with every pose.
@@ -15,6 +19,7 @@ the filter would be surer of the wrong one with every pose.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,11 +37,12 @@ ALL_JOINTS = (INSERTION, CURVATURE, ROLL)
 NOWHERE: Array = np.zeros((0, 3))  # no direction along a wall
 GAP_NS = 1_000_000_000  # after so long without a pose nothing is remembered
 _FLANK_MEMORY_S = 60.0  # with a force sensor the controller corrects its width in contact
+_VISIT_MEMORY_S = 30.0  # a knob that returns within it brings the curvature back, friction included
 _SHORTEST_CROSSING_m = 1e-4  # of the body, between the flanks: the side is seen at the tracker's rate
 _JOINTS, _ALONG_WALL = slice(0, 4), slice(4, 7)
-# Of the force along the wall: its memory, and the share of its variance that is new in each pose. A smaller share follows a
-# tilted wall better, and takes more of the joints' errors for force if the loop runs on estimates (docs/mechanics.md).
-_WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.95
+# Of the force along the wall: its memory, and the share of its variance that is new in each pose. A smaller share makes
+# the filter surer of a tilted wall than it is (docs/mechanics.md).
+_WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.1
 # Nothing is commanded to press on the wall in these, or the tip is still on its way to it.
 _APART = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.JOG))
 
@@ -46,7 +52,8 @@ class ActuationKnowledge:
     """Uncertainty of the joints: standard deviations at the start, and their growth.
 
     start (3,): insertion (m), curvature (1/m), roll (rad). by_travel (3,): of each joint's error after one unit of its
-    own travel (m, 1/m, rad), growing with the square root of the travel. by_time (3,): the same after one second.
+    own travel (m, 1/m, rad), growing with the square root of the travel; of the knob only travel beyond the range that it
+    visited lately counts. by_time (3,): the same after one second.
     flank_m: of half the backlash's width, which lasts; 0: known. flank_mean_m: by how much half the width that the
     controller assumes is expected to be too small.
     """
@@ -107,6 +114,7 @@ class LastingErrors:
         self._covariance = np.diag([*np.square([*known.start, known.flank_m]), *3 * [self._wall_N2]])
         self._last: Actuation | None = None
         self._side = 0.0
+        self._visited = (math.nan, math.nan)
 
     @property
     def mean(self) -> Array:
@@ -141,9 +149,9 @@ class LastingErrors:
         after = self._covariance - gain @ (prior.covariance - covariance) @ gain.T
         self._covariance = 0.5 * (after + after.T)
 
-    def new_information(self, across: Array) -> Array:
-        """Return the information (3, 3) on the force, base frame, of which the force along the wall is new in each pose."""
-        return np.asarray(across.T @ across) / self._new_N2
+    def information_of_one_pose(self, across: Array) -> Array:
+        """Return the information (3, 3) on the force, base frame, that its part along the wall has if no pose was seen."""
+        return np.asarray(across.T @ across) / (self._new_N2 + self._wall_N2)
 
     def _now(self, across: Array, which: tuple[int, ...]) -> Array:
         """Matrix (m + k, 7) that makes the force along the wall and the joints' errors of the states."""
@@ -169,6 +177,7 @@ class LastingErrors:
         )
         self._change_side(moved[INSERTION])
         seconds = (actuation.stamp_ns - last.stamp_ns) * 1e-9
+        moved[CURVATURE] = self._beyond(last.curvature_per_m, actuation.curvature_per_m, seconds)
         growth = np.square(self._known.by_travel) * np.abs(moved) + np.square(self._known.by_time) * seconds
         grown = self._covariance[_JOINTS, _JOINTS] + np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
         start = np.array([*self._known.start, self._known.flank_m])
@@ -182,7 +191,30 @@ class LastingErrors:
         self._covariance[_ALONG_WALL, _ALONG_WALL] += (1.0 - kept**2) * self._wall_N2 * np.eye(3)
         self._mean[_ALONG_WALL] *= kept
 
+    def _beyond(self, from_per_m: float, to_per_m: float, seconds: float) -> float:
+        """Return how far `to_per_m` is outside the curvatures visited lately, and take it among them."""
+        low, high = self._visited if math.isfinite(self._visited[0]) else (from_per_m, from_per_m)
+        kept = math.exp(-seconds / _VISIT_MEMORY_S)
+        low, high = to_per_m + kept * (low - to_per_m), to_per_m + kept * (high - to_per_m)
+        self._visited = min(low, to_per_m), max(high, to_per_m)
+        return max(low - to_per_m, to_per_m - high, 0.0)
+
     def _change_side(self, moved_m: float) -> None:
         """Follow the flank of the backlash: +1 pushed, -1 pulled, between them in proportion to the body's motion."""
         crossing_m = max(2.0 * abs(self._mean[FLANK]), _SHORTEST_CROSSING_m)
         self._side = min(max(self._side + 2.0 * moved_m / crossing_m, -1.0), 1.0)
+
+
+def lasting_part(total: Array, of_one_pose: Array) -> Array:
+    """Return the part (n, n) of the covariance `total` (n, n) that estimates shortly after each other share.
+
+    of_one_pose: (n, n), positive definite, covariance of the force from one pose alone, joints known. What the filter
+    remembers makes estimates scatter less and together: over some tenths of a second their mean is as uncertain as that of
+    estimates from single poses. Who averages estimates as if they were independent has to be told the scatter of single
+    ones. In directions in which this is more than `total`, nothing lasts. `total` minus the result is a covariance too.
+    """
+    root = np.linalg.cholesky(of_one_pose)
+    relative = np.linalg.solve(root, np.linalg.solve(root, total).T)
+    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    back = root @ vectors
+    return np.asarray((back * np.maximum(values - 1.0, 0.0)) @ back.T)

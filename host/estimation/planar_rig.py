@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
-from host.estimation.lasting_errors import CURVATURE, INSERTION, NOWHERE, ROLL, ActuationKnowledge, LastingErrors, Prior
+from host.estimation.lasting_errors import (
+    CURVATURE,
+    INSERTION,
+    NOWHERE,
+    ROLL,
+    ActuationKnowledge,
+    LastingErrors,
+    Prior,
+    lasting_part,
+)
 from host.estimation.planar import UNSEEN_STD_N, tip_covariance
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import TrackedSensors
@@ -123,20 +132,21 @@ class PlanarRigEstimator:
             shown = _shown(known, axes)
             self.errors.learn(known, shown @ fit.parameters, shown @ fit.covariance @ shown.T)
         force_N = -axes @ fit.parameters[:2]
-        covariance = axes @ fit.covariance[:2, :2] @ axes.T
-        lasting_too = prior.of_lasting[:2, :2] - axes.T @ self.errors.new_information(known.across) @ axes
-        by_noise = axes @ np.linalg.inv(fit.information[:2, :2] - lasting_too) @ axes.T
+        in_plane = fit.covariance[:2, :2]
+        lasting_too = prior.of_lasting[:2, :2] - axes.T @ self.errors.information_of_one_pose(known.across) @ axes
+        of_one_pose = np.linalg.inv(fit.information[:2, :2] - lasting_too)
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
-        lasting = covariance - by_noise + self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
+        stiffness = self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
         unseen = self._contact.out_of_plane_sd_N**2 * np.outer(normal, normal)
-        total = by_noise + lasting + unseen
+        lasting = axes @ lasting_part(in_plane, of_one_pose) @ axes.T + stiffness + unseen
+        total = axes @ in_plane @ axes.T + stiffness + unseen
         return TipForce(
             force_N,
             0.5 * (total + total.T),
             converged,
             fit.residual,
             pose_tip.stamp_ns,
-            0.5 * (lasting + lasting.T) + unseen,
+            0.5 * (lasting + lasting.T),
         )
 
     @staticmethod

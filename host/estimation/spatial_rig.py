@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from host.estimation.contact_knowledge import ContactKnowledge
 from host.estimation.interface import Actuation, PoseReading, TipForce
-from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors, Prior
+from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowledge, LastingErrors, Prior, lasting_part
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import TrackedSensors, chi_square_limit
 from host.estimation.spatial import start_grid
@@ -113,10 +113,10 @@ class SpatialRigEstimator:
         covariance: Array = np.linalg.inv(found.information).astype(np.float64)
         force_N = -found.force_N
         total = found.by_x @ covariance @ found.by_x.T
-        by_noise = self._by_noise(frame, known, found)
+        of_one_pose = self._of_one_pose(frame, known, found)
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
         stiffness = self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
-        lasting = total - by_noise + stiffness
+        lasting = lasting_part(total, of_one_pose) + stiffness
         total = total + stiffness
         total *= min(1.0, UNSEEN_STD_N**2 / max(float(np.diag(total).max()), 1e-300))
         residual = _residual(frame, found)
@@ -132,11 +132,11 @@ class SpatialRigEstimator:
                 self._unexplained = 0
         return TipForce(force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T))
 
-    def _by_noise(self, frame: TrackedFrame, known: Prior, found: FrameFit) -> Array:
-        """Covariance (3, 3) of the force if what lasts is held at its estimate: the tracker's noise of this pose."""
+    def _of_one_pose(self, frame: TrackedFrame, known: Prior, found: FrameFit) -> Array:
+        """Covariance (3, 3) of the force from this pose alone, with the joints' errors held at their estimate."""
         by_force = found.by_x[:, :3]
         lasting = (frame.known[3:, :3] @ found.by_x + frame.known[3:, 3:])[:, :3]
-        new = by_force.T @ self.errors.new_information(known.across) @ by_force
+        new = by_force.T @ self.errors.information_of_one_pose(known.across) @ by_force
         information = found.information[:3, :3] - lasting.T @ lasting + new
         return np.asarray(by_force @ np.linalg.inv(information) @ by_force.T)
 
