@@ -35,7 +35,12 @@ def seldinger(*arguments: str) -> subprocess.CompletedProcess[str]:
 def serves(*arguments: str, port: int, ends_by: signal.Signals = signal.SIGINT) -> tuple[int, str]:
     """Exit status and standard error of a command that is served from until it is interrupted."""
     child = subprocess.Popen(
-        [sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)], stderr=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-m", "host.cli.main", *arguments, "--port", str(port)],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        # Tests that run under nohup, or in the background of a shell, ignore these, and a child inherits it.
+        preexec_fn=lambda: [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)],
     )
 
     def answers() -> bool:
