@@ -79,7 +79,7 @@ RIG: dict[str, Range] = {
     "estimation.contact_force_sd_N": (0.05, 10),
     "estimation.tangential_force_sd_N": (0.001, 1),
     "estimation.insertion_walk_m": (3e-6, 0.003),
-    "estimation.curvature_walk_per_m": (0.003, 3),
+    "estimation.curvature_walk_per_m": (0.001, 1),
     "estimation.roll_walk_rad": (0.003, 1),
     "estimation.adaptation_limit": (0.01, 0.3),
     "estimation.adaptation_sd": (0.003, 0.5),
