@@ -51,9 +51,12 @@ def serves(*arguments: str, port: int, ends_by: signal.Signals = signal.SIGINT) 
             return False
         return True
 
-    until(answers, "the page")
-    child.send_signal(ends_by)
-    _, words = child.communicate(timeout=PATIENCE_S)
+    try:
+        until(answers, "the page")
+        child.send_signal(ends_by)
+        _, words = child.communicate(timeout=PATIENCE_S)
+    finally:
+        child.kill()
     return child.returncode, words
 
 
