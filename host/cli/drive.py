@@ -37,7 +37,6 @@ TIP_DIRECTIONS = {
 FASTEST_PER_S, WIDEST_M, LONGEST_S, MOST_N = 10.0, 0.1, 3600.0, 1.0
 LOOK_S = 0.02
 RETRACTED = "retracted and stopped; disarm and arm to move again"
-SETTLE_S = 1.5  # of a touch, as in a protocol
 # A goal is reached when the tip has been near it for so long.
 THERE_S = 0.3
 ANSWERS_WITHIN_S = 3.0
@@ -293,6 +292,8 @@ def settled_mean(forces: Sequence[tuple[int, float]]) -> tuple[float, float]:
     forces: time (ns) and force (N) of each state. The force rises slowly, so the first 1.5 s (of a short touch the first
     half) do not show what is held.
     """
+    from host.run.protocol_file import SETTLE_S
+
     if not forces:
         return math.nan, 0.0
     first_ns, last_ns = forces[0][0], forces[-1][0]

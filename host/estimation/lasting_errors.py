@@ -114,7 +114,7 @@ class LastingErrors:
         self._covariance = np.diag([*np.square([*known.start, known.flank_m]), *3 * [self._wall_N2]])
         self._last: Actuation | None = None
         self._side = 0.0
-        self._visited = (math.nan, math.nan)
+        self._visited = (0.0, 0.0)  # lowest and highest curvature (1/m), from the first actuation on
 
     @property
     def mean(self) -> Array:
@@ -167,6 +167,7 @@ class LastingErrors:
         if last is None or not 0 <= actuation.stamp_ns - last.stamp_ns <= GAP_NS:
             self.forget()
             self._last = actuation
+            self._visited = (actuation.curvature_per_m, actuation.curvature_per_m)
             return
         moved = np.array(
             [
@@ -177,7 +178,7 @@ class LastingErrors:
         )
         self._change_side(moved[INSERTION])
         seconds = (actuation.stamp_ns - last.stamp_ns) * 1e-9
-        moved[CURVATURE] = self._beyond(last.curvature_per_m, actuation.curvature_per_m, seconds)
+        moved[CURVATURE] = self._beyond(actuation.curvature_per_m, seconds)
         growth = np.square(self._known.by_travel) * np.abs(moved) + np.square(self._known.by_time) * seconds
         grown = self._covariance[_JOINTS, _JOINTS] + np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
         start = np.array([*self._known.start, self._known.flank_m])
@@ -191,13 +192,12 @@ class LastingErrors:
         self._covariance[_ALONG_WALL, _ALONG_WALL] += (1.0 - kept**2) * self._wall_N2 * np.eye(3)
         self._mean[_ALONG_WALL] *= kept
 
-    def _beyond(self, from_per_m: float, to_per_m: float, seconds: float) -> float:
-        """Return how far `to_per_m` is outside the curvatures visited lately, and take it among them."""
-        low, high = self._visited if math.isfinite(self._visited[0]) else (from_per_m, from_per_m)
+    def _beyond(self, curvature_per_m: float, seconds: float) -> float:
+        """Return how far the curvature is outside those visited lately, and take it among them."""
         kept = math.exp(-seconds / _VISIT_MEMORY_S)
-        low, high = to_per_m + kept * (low - to_per_m), to_per_m + kept * (high - to_per_m)
-        self._visited = min(low, to_per_m), max(high, to_per_m)
-        return max(low - to_per_m, to_per_m - high, 0.0)
+        low, high = (curvature_per_m + kept * (end - curvature_per_m) for end in self._visited)
+        self._visited = min(low, curvature_per_m), max(high, curvature_per_m)
+        return max(low - curvature_per_m, curvature_per_m - high, 0.0)
 
     def _change_side(self, moved_m: float) -> None:
         """Follow the flank of the backlash: +1 pushed, -1 pulled, between them in proportion to the body's motion."""

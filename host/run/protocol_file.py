@@ -29,6 +29,7 @@ Metres = Annotated[float, Field(gt=0.0, le=0.1)]
 Newton = Annotated[float, Field(gt=0.0, le=1.0)]
 Into = Annotated[Point, Field(description="unit vector into the tissue, base frame")]
 MOST_POINTS = 200
+SETTLE_S = 1.5  # of a touch, while the force rises
 
 
 class GotoStep(Request):
@@ -121,7 +122,7 @@ class ProtocolFile(Request):
     force_N: Newton = 0.2
     normal: Into = (0.0, 0.0, 1.0)
     clearance_m: Metres = 0.004
-    settle_s: Seconds = 1.5
+    settle_s: Seconds = SETTLE_S
     tolerance: Tolerance = Tolerance()
     stop: Stop = Stop()
     steps: Annotated[list[Step], Field(min_length=1, max_length=MOST_POINTS)]

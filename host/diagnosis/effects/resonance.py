@@ -54,14 +54,14 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Second-order low pass with a peak, of all of the motion or of a share; or the reaction of a load on its drive."""
+    if not form:
+        return of_mode(signal, c, p[0], p[1], c.start, c.start_rate)
+    part = -p[0] if form == "drive" else p[0]  # of the mode in the signal, from which its start is read
+    moved = of_mode(signal, c, p[1], p[2], *(s / part if abs(part) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
     if form == "drive":
-        moved = of_mode(signal, c, p[1], p[2], *(-s / p[0] if abs(p[0]) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
         turned = moved + p[2] / (np.pi * p[1]) * np.gradient(moved, c.dt_s)  # the damper turns the load as well
         return np.asarray(signal + p[0] * (signal - turned))
-    if form == "share":
-        moved = of_mode(signal, c, p[1], p[2], *(s / p[0] if abs(p[0]) > 1e-3 else 0.0 for s in (c.start, c.start_rate)))
-        return np.asarray(signal + p[0] * (moved - signal))
-    return of_mode(signal, c, p[0], p[1], c.start, c.start_rate)
+    return np.asarray(signal + p[0] * (moved - signal))
 
 
 def of_mode(signal: Array, c: Context, frequency_Hz: float, damping_ratio: float, start: float, rate: float) -> Array:

@@ -374,18 +374,6 @@ def set_starts(problem: Problem, given: list[dict[str, float]]) -> None:
             segment.begin.values = np.array([start[f"{BEGIN}{k}"] for k in range(segment.begin.values.size)])
 
 
-def get_begins(problem: Problem) -> list[Array]:
-    """States that recordings begin from; empty of one whose model has none."""
-    return [np.zeros(0) if segment.begin is None else segment.begin.values.copy() for segment in problem.segments]
-
-
-def set_begins(problem: Problem, given: list[Array]) -> None:
-    """Set the states that recordings begin from again."""
-    for segment, values in zip(problem.segments, given, strict=True):
-        if segment.begin is not None:
-            segment.begin.values = values
-
-
 def starts(term: Term, linear_value: dict[str, float], nonlinear: dict[str, float]) -> Array:
     """Start values of a term: grid values for nonlinear parameters, projected amplitudes for linear ones."""
     return np.array([linear_value.get(p.name, nonlinear.get(p.name, p.grid[0] if p.grid else 0.0)) for p in term.parameters])

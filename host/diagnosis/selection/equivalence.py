@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, finish, get_begins, get_starts, minimize, set_begins, set_starts
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.posterior import coarse
@@ -39,11 +39,10 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
     out = []
     for term in found.best.terms:
         terms, values = without(found.best, problem, (term.candidate.key,))
-        before, begun = get_begins(problem), get_starts(problem)
+        begun = get_starts(problem)
         less = found.nominal
         if terms:
             less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
-            set_begins(problem, before)
             set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
@@ -120,10 +119,9 @@ def _equals(
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         begin = np.concatenate((less.values, start))
-        before, begun = get_begins(problem), get_starts(problem)
+        begun = get_starts(problem)
         other = minimize(problem, (*less.terms, term), begin, rounds=10, tolerance=1e-4)
         other = finish(problem, begun_again(problem, other))
-        set_begins(problem, before)
         set_starts(problem, begun)
         contained = candidate.effect.id in trial.candidate.effect.contains
         if contained and (at_bound(other) or _collapsed(problem, best, other)):

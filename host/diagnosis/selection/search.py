@@ -16,12 +16,10 @@ from host.diagnosis.estimation.fit import (
     Term,
     finish,
     first_needs,
-    get_begins,
     get_starts,
     minimize,
     reweigh,
     robust,
-    set_begins,
     set_starts,
 )
 from host.diagnosis.estimation.initial_state import estimate_state, fit_with_states
@@ -142,7 +140,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     fit = min(fits, key=lambda f: f.cost)
     alone = not problem.joint_states  # the other models are begun again together with their parameters
     fit = minimize(few, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4, states=alone)
-    before, begun = get_begins(problem), get_starts(problem)
+    begun = get_starts(problem)
     fit = begun_again(problem, fit)
     if any(a is not b for a, b in zip(few.segments, problem.segments, strict=True)):
         fit = minimize(problem, fit.terms, fit.values, rounds=1)
@@ -152,7 +150,6 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
     set_starts(problem, begun)
-    set_begins(problem, before)
     heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
     trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)
@@ -580,7 +577,7 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
         dropped = False
         for term in best.terms:
             terms, values = without(best, problem, (term.candidate.key,))
-            before, begun = get_begins(problem), get_starts(problem)
+            begun = get_starts(problem)
             less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
             gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd)
             held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd)
@@ -593,6 +590,5 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break
-            set_begins(problem, before)
             set_starts(problem, begun)
     return best
