@@ -74,6 +74,11 @@ RULES: dict[str, Rule] = {
         "Check for a jam or a loose encoder plug, clear, and home the axes.",
         ("board_reset", "limit", "board_fault", "over_force"),
     ),
+    "tracker_moved": Rule(
+        "The tracker moved against the rig.",
+        "Fix the field generator and the rig's table, register the tracker again (base_from_tracker_*), then clear.",
+        ("loop_late",),
+    ),
     "pose_rejected": Rule(
         "A pose was not finite, out of the workspace or too fast.",
         "Check for metal or motors near the tracker's field generator.",
@@ -113,12 +118,12 @@ RULES: dict[str, Rule] = {
     "force_disagrees": Rule(
         "Force sensor and estimate disagree.",
         "Zero the force sensor in free space; if they still disagree, check its mounting and the catheter's stiffness.",
-        ("force_rejected", "force_stale", "steps_lost"),
+        ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
     ),
     "force_undecided": Rule(
         "Force sensor and estimate began to disagree.",
         "Wait; if they still disagree, the catheter retracts. Zero the force sensor in free space.",
-        ("force_rejected", "force_stale", "steps_lost"),
+        ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
     ),
     "host_silent": Rule(
         "The model process does not answer.",
@@ -154,7 +159,7 @@ RULES: dict[str, Rule] = {
     "over_force": Rule(
         "The contact force went above the limit.",
         "Take the catheter off the tissue, then clear.",
-        ("loop_late", "steps_lost", "force_disagrees", "force_handover"),
+        ("loop_late", "steps_lost", "tracker_moved", "force_disagrees", "force_handover"),
     ),
 }
 _UNKNOWN = Rule("", "Check the log lines before it.")

@@ -151,9 +151,20 @@ def _force_turned(run: FaultyScenario, size: float, seconds: float) -> None:
     run.world.plant.measured_wrench = turned  # type: ignore[method-assign]
 
 
-def _tracker_moved(run: FaultyScenario, size: float, seconds: float) -> None:
-    """Move the field generator along the catheter's axis: every pose is off by `size`."""
-    run.world._tracker_shift_m[2] += size
+def _tracker_moved(axis: int) -> Inject:
+    """Displace the field generator along an axis of the base frame within `seconds`: every pose is off by `size`."""
+
+    def inject(run: FaultyScenario, size: float, seconds: float) -> None:
+        tracker, plant = run.world._tracker_shift_m, run.world.plant
+        step, start_m, begin_s = plant.step, float(tracker[axis]), plant.time_s
+
+        def moving(dt_s: float, stage_position: np.ndarray) -> None:
+            tracker[axis] = start_m + size * min((plant.time_s - begin_s) / seconds, 1.0)
+            step(dt_s, stage_position)
+
+        plant.step = moving  # type: ignore[method-assign, assignment]
+
+    return inject
 
 
 def _wall_nearer(run: FaultyScenario, size: float, seconds: float) -> None:
@@ -198,6 +209,11 @@ def _long(least_s: float) -> Callable[[float, float], bool]:
 
 def _never(size: float, seconds: float) -> bool:
     return False
+
+
+def _displaced(size: float, seconds: float) -> bool:
+    """Whether the tracker was displaced by more than a catheter's usual motion in the time of a push."""
+    return abs(size) > 0.005
 
 
 _BIT = "share of bits"
@@ -399,12 +415,25 @@ FAULTS: tuple[FaultKind, ...] = (
     ),
     FaultKind(
         "tracker_moved",
-        "the field generator moved along the catheter: all poses are off by so much",
-        _tracker_moved,
+        "the field generator is displaced along the catheter: all poses are off by so much",
+        _tracker_moved(2),
         (-0.02, 0.02),
         "m",
-        seconds=(1.5, 1.5),
-        must_detect=_never,
+        seconds=(0.001, 0.3),
+        must_detect=_displaced,
+        within_s=0.6,
+        tail_s=1.5,
+    ),
+    FaultKind(
+        "tracker_moved_aside",
+        "the field generator is displaced across the catheter",
+        _tracker_moved(0),
+        (-0.02, 0.02),
+        "m",
+        seconds=(0.001, 0.3),
+        must_detect=_displaced,
+        within_s=0.6,
+        tail_s=1.5,
     ),
     FaultKind(
         "wall_nearer",

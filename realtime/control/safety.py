@@ -48,6 +48,12 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         False,
         "the catheter's body touches something: the estimated force is not that of the tip; see the topic contact for where",
     ),
+    (
+        "tracker_moved",
+        ACTION_RETRACT,
+        True,
+        "the tracker moved against the rig: retracting; fix the field generator, register it again, then clear",
+    ),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
 (
@@ -71,15 +77,16 @@ CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}
     FORCE_UNREACHED,
     STILL_PRESSED,
     BODY_CONTACT,
+    TRACKER_MOVED,
 ) = (1 << index for index in range(len(CAUSES)))
 LATCHING = sum(1 << index for index, cause in enumerate(CAUSES) if cause[2])
 
 _HOLD_BITS = POSE_STALE | POSES_WILD | FORCE_STALE | FORCE_UNDECIDED | HOST_SILENT
-_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST | HOST_LOST
+_RETRACT_BITS = OVER_FORCE | FORCE_LOST | FORCE_DISAGREES | STEPS_LOST | HOST_LOST | TRACKER_MOVED
 # With these the board does not move the stages, whatever is sent.
 BOARD_BITS = BOARD_SILENT | BOARD_FAULT
 # These may be followed by a force within milliseconds: the catheter is taken away at full speed.
-URGENT_BITS = OVER_FORCE | STEPS_LOST
+URGENT_BITS = OVER_FORCE | STEPS_LOST | TRACKER_MOVED
 _STOP_BITS = POSE_LOST | BOARD_SILENT | BOARD_FAULT | OPERATOR_STOP
 
 

@@ -142,8 +142,7 @@ class RigCore:
         self.gate = CommandGate(
             lambda: self.now_ns, self._execute, roles=rig.access.roles if rig.access else {}, new_lease=new_lease
         )
-        ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
-        self.supervision = Supervision((ratios[0], ratios[1], ratios[2]), round(rig.safety.host_lost_after_s * 1e9))
+        self.supervision = Supervision(rig)
         self._watched = 0
         self._records, self._timing, self._intake = records, timing, Intake(rig)
         self._force_zero = ForceZero(rig.force_sensor.noise_N, rig.force_sensor.range_N)
@@ -187,6 +186,11 @@ class RigCore:
     @property
     def _homes(self) -> bool:
         return self.commands.homing is not None
+
+    @property
+    def _moves(self) -> bool:
+        """Return whether the loop is armed: only then are the cross-checks of its motion made."""
+        return self.phase not in (Phase.DISARMED, Phase.HOMING)
 
     def _advance_homing(self) -> None:
         """Move the axis that is being homed a step further, and log how it ended."""
@@ -287,8 +291,8 @@ class RigCore:
                 self._leaving.changed.add("board")
                 if self.commands.take_board_status():
                     self._command_changed()
-                if self.phase not in (Phase.DISARMED, Phase.HOMING) and board.ready:
-                    self._report(self.supervision.status(board.position_steps, board.encoder_counts))
+                if self._moves and board.ready:
+                    self._report(self.supervision.status(board.position_steps, board.encoder_counts, self.now_ns))
                 continue
             # A homing moves onto the switch: that fault is what it looks for.
             is_error = event.kind in _BOARD_ERRORS and not (self._homes and event.kind is BoardEventKind.FAULT)
@@ -311,6 +315,8 @@ class RigCore:
             record = self._records[name]
             self._intake.pose(record, sample.stamp_ns, sample.arrival_ns, sample.position_m, sample.quaternion_wxyz)
             self._leaving.changed.add(name)
+            if self._moves:
+                self._report(self.supervision.pose(name == "tip", record))
             self._publish(f"pose/{name}", telemetry.pose_message(record, sample.frame, sample.quality_m))
 
     def _take_forces(self, samples: Sequence[ForceSample]) -> None:

@@ -1,4 +1,4 @@
-"""Cross-checks that are slower than the tick: lost steps, a model process that is late or silent."""
+"""Cross-checks that are slower than the tick: lost steps, a displaced tracker, a model process that is late or silent."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.rig_file import Rig
 from protocol.serial_frames import AXES
 from protocol.topics import ForceEstimate
 from realtime.control import safety
 from realtime.control.records import N_AXES
+from realtime.core.tracker_check import TrackerCheck
 
 Vector = NDArray[np.float64]
 
@@ -101,12 +103,18 @@ class HostCheck:
 class Supervision:
     """All checks together. `causes` is the bit set of failsafe causes that stand.
 
-    Lost steps stay until `restart`; causes of the model process stand while it does not answer, a contact of the body while
-    it reports one.
+    Lost steps and a displaced tracker stay until `restart`; causes of the model process stand while it does not answer, a
+    contact of the body while it reports one.
     """
 
-    def __init__(self, encoder_counts_per_step: tuple[float, float, float], host_lost_after_ns: int) -> None:
-        self.steps, self.host = StepCheck(encoder_counts_per_step), HostCheck(host_lost_after_ns)
+    def __init__(self, rig: Rig) -> None:
+        ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
+        self.steps = StepCheck((ratios[0], ratios[1], ratios[2]))
+        self.host = HostCheck(round(rig.safety.host_lost_after_s * 1e9))
+        self.tracker = TrackerCheck(rig.tracker.position_noise_m, rig.catheter.distal_length_m)
+        stage = rig.stages.insertion
+        self._m_per_step = rig.transmission.insertion_slope / stage.steps_per_unit
+        self._m_per_count = self._m_per_step / stage.encoder_counts_per_step
         self._lasting = self._body_causes = 0
 
     @property
@@ -118,16 +126,28 @@ class Supervision:
     def restart(self) -> None:
         """Delete all findings; for arming and clearing, when the operator has seen them."""
         self.steps.restart()
+        self.tracker.restart()
         self._lasting = 0
 
-    def status(self, position_steps: Vector, encoder_counts: Vector) -> SupervisionFinding | None:
-        """Check a board's status while armed; steps and counts (3,). Return a new finding."""
+    def status(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> SupervisionFinding | None:
+        """Check a board's status that arrived at `now_ns` while armed; steps and counts (3,). Return a new finding."""
+        by_steps_m, by_encoder_m = position_steps[0] * self._m_per_step, encoder_counts[0] * self._m_per_count
+        self.tracker.take_stage(now_ns, float(by_steps_m), float(by_encoder_m))
         if self._lasting & safety.STEPS_LOST:
             return None
         finding = self.steps.check(position_steps[:N_AXES], encoder_counts[:N_AXES])
         if finding is not None:
             self._lasting |= finding.cause
         return finding
+
+    def pose(self, is_tip: bool, pose: np.record) -> SupervisionFinding | None:
+        """Check a POSE record that was filled while armed, the shaft's of a frame before the tip's. Return a new finding."""
+        displaced_m = self.tracker.take_pose(is_tip, int(pose.stamp_ns), pose.position_m, pose.quaternion_wxyz)
+        if not displaced_m or self._lasting & safety.TRACKER_MOVED:
+            return None
+        self._lasting |= safety.TRACKER_MOVED
+        text = f"tip and shaft were displaced together by at least {displaced_m * 1e3:.1f} mm, and no stage moved them"
+        return SupervisionFinding(safety.TRACKER_MOVED, text)
 
     def host_answered(self, estimate: ForceEstimate, now_ns: int) -> SupervisionFinding | None:
         """Note an estimate that arrived at `now_ns`. Return a new finding."""

@@ -238,6 +238,14 @@ def test_each_fault_breaks_no_rule() -> None:
     assert len(results) == len(FAULTS) and not broken(results)
 
 
+@pytest.mark.slow
+def test_a_displaced_tracker_followed_by_a_dead_force_sensor_retracts_before_the_wall() -> None:
+    """Neither source of force sees the wall then: without the check of the tracker this rig pressed with 0.91 N."""
+    plan = RunPlan(0, 55, "tracker_moved", "approach", 0.00705, 0.001, 0.431, "force_scaled", -0.037, 1.5, 0.194)
+    (one,) = run_plans([plan], 604422)
+    assert not one.violations and "tracker_moved" in one.outcome["causes"] and one.outcome["action"] == "retract"
+
+
 @pytest.mark.long
 def test_a_hundred_random_faults_break_no_rule() -> None:
     results = run_campaign(100, 2026, jobs=2)

@@ -3,12 +3,13 @@
 import numpy as np
 
 from protocol.enums import SafetyAction
+from protocol.rig_file import SIMULATED_RIG, load_rig
 from protocol.topics import ForceEstimate
 from realtime.control import safety
 from realtime.core.supervision import HOST_SILENT_NS, STEPS_SWING, Supervision
 
 MS = 1_000_000
-LOST_NS = 2_000_000_000
+LOST_NS = 2_000_000_000  # host_lost_after_s of the rig file
 ZERO = np.zeros(3, int)
 
 
@@ -20,7 +21,10 @@ def answer(stamp_ns: int, body_contact: bool = False) -> ForceEstimate:
 
 
 def made() -> Supervision:
-    supervision = Supervision((1.0, 1.0, 2.0), LOST_NS)
+    """Checks of a rig with 1, 1 and 2 encoder counts per step."""
+    rig = load_rig(SIMULATED_RIG)
+    knob = rig.stages.knob.model_copy(update={"encoder_counts_per_step": 2.0})
+    supervision = Supervision(rig.model_copy(update={"stages": rig.stages.model_copy(update={"knob": knob})}))
     supervision.restart()
     return supervision
 
@@ -29,14 +33,14 @@ def test_an_offset_at_arming_and_the_lag_of_a_move_are_no_loss() -> None:
     supervision = made()
     for tick in range(200):
         steps = np.array([16 * tick, 0, 10 * tick])
-        assert supervision.status(steps, np.array([16 * tick + 5000 - 80, 7, 20 * tick])) is None
+        assert supervision.status(steps, np.array([16 * tick + 5000 - 80, 7, 20 * tick]), tick * MS) is None
     assert supervision.causes == 0
 
 
 def test_steps_that_stay_lost_are_told_once_and_stand_until_the_restart() -> None:
     supervision = made()
     lost = np.array([0, round(STEPS_SWING) + 1, 0])
-    told = [supervision.status(ZERO, -lost * (tick > 3)) for tick in range(40)]
+    told = [supervision.status(ZERO, -lost * (tick > 3), tick * MS) for tick in range(40)]
     words = [finding.text for finding in told if finding]
     assert len(words) == 1 and words[0].startswith("roll: encoder and steps differ by 41 steps")
     assert supervision.causes == safety.STEPS_LOST and safety.action_of(supervision.causes) == SafetyAction.RETRACT
@@ -47,14 +51,16 @@ def test_steps_that_stay_lost_are_told_once_and_stand_until_the_restart() -> Non
 def test_one_strange_status_is_no_loss() -> None:
     supervision = made()
     for tick in range(40):
-        supervision.status(ZERO, ZERO + 500 * (tick == 10))
+        supervision.status(ZERO, ZERO + 500 * (tick == 10), tick * MS)
     assert supervision.causes == 0
 
 
 def test_a_rotor_that_slips_at_full_speed_is_found_with_the_second_status() -> None:
     supervision = made()
-    supervision.status(ZERO, ZERO)
-    found = [supervision.status(ZERO, np.array([0, 0, -2 * 61 * (tick + 1)])) is not None for tick in range(3)]
+    supervision.status(ZERO, ZERO, 0)
+    found = [
+        supervision.status(ZERO, np.array([0, 0, -2 * 61 * (tick + 1)]), (tick + 1) * MS) is not None for tick in range(3)
+    ]
     assert found == [False, True, False]
 
 
