@@ -9,6 +9,7 @@ from numba import njit
 
 from realtime.control import (
     backlash,
+    causes,
     constraint_frame,
     force_predictor,
     force_source,
@@ -30,13 +31,11 @@ from realtime.control import (
 from realtime.control.codes import (
     ACTION_HOLD,
     ACTION_RETRACT,
-    BOARD_FAULT,
     COMMAND_CONTACT,
     COMMAND_HOLD,
     COMMAND_JOG,
     COMMAND_POSITION,
     COMMAND_RETRACT,
-    COMMAND_STOP,
     JOG_TIP,
     LAW_PREDICTIVE,
     PHASE_APPROACH,
@@ -66,14 +65,10 @@ _SLOW_FACTOR = 4.0
 _NORMAL_S = 2.0
 # How far beyond the given target the approach goes on looking for the wall.
 _SEARCH_m = 0.010
-# The requested force counts as not reached after the free tip has been as deep as it may be for this long.
-_SHORT_S = 1.0
 # A retraction ends when nothing has pressed for this long; if something still does, it goes on for this much further.
 _FREE_S, _RETRACT_MORE_m = 0.1, 0.030
 # An urgent retraction turns the knob by at most this, if that takes the tip away by more than this per radian.
 _BEND_rad, _BENDS_AWAY_m, _NUDGE_rad = 0.5, 0.003, 1e-3
-# This many poses rejected in a row make the loop hold.
-_WILD_POSES = 3
 
 
 @njit(cache=True)
@@ -145,84 +140,6 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
     )
     if result == target_predictor.ACCEPTED:
         wall_observer.correct_backlash(params.backlash, state.backlash, state.wall, dt_s)
-
-
-@njit(cache=True)
-def _flags(params: Params, state: State, inputs: Inputs, pose_result: int, forces_rejected: int) -> int:
-    """Return the bit set of all causes at this tick."""
-    armed = state.phase != PHASE_DISARMED
-    flags = 0
-    if pose_result == predictor.REJECTED:
-        flags |= safety.POSE_REJECTED
-    if forces_rejected != state.force_rejected:
-        flags |= safety.FORCE_REJECTED
-    if state.predictor.rejected_in_row >= _WILD_POSES:
-        flags |= safety.POSES_WILD
-    if armed:
-        flags |= _armed_flags(params, state, inputs) | _witness_flags(params, state, inputs)
-    return flags | _force_flags(params, state, inputs.now_ns, armed)
-
-
-@njit(cache=True)
-def _force_flags(params: Params, state: State, now_ns: int, armed: bool) -> int:
-    """Return the causes that concern the force that closes the loop."""
-    flags, limits = 0, params.safety
-    force_age_ns = now_ns - state.force.age_from_ns
-    force_timeout_ns = limits.force_timeout_ns
-    if state.force.source == SOURCE_ESTIMATE:
-        force_timeout_ns = limits.hold_after_ns
-        if params.force_source == SOURCE_SENSOR:
-            flags |= safety.FORCE_HANDOVER
-    if armed and force_age_ns <= force_timeout_ns:
-        force = state.force.force_N
-        if math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2) > limits.over_force_N:
-            flags |= safety.OVER_FORCE
-    if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
-        if force_age_ns > force_timeout_ns:
-            flags |= safety.FORCE_STALE
-        if force_age_ns > limits.stop_after_ns:
-            flags |= safety.FORCE_LOST
-    return flags
-
-
-@njit(cache=True)
-def _witness_flags(params: Params, state: State, inputs: Inputs) -> int:
-    """Return the causes from sensor, estimate and geometry of an armed loop, whichever of them closes the loop."""
-    flags, witness = 0, state.witness
-    if witnesses.over(params, witness, state.force, inputs):
-        flags |= safety.OVER_FORCE
-    differ = witnesses.disagree(witness, inputs, params.period_s)
-    if differ == 2:
-        flags |= safety.FORCE_DISAGREES
-    elif differ == 1:
-        flags |= safety.FORCE_UNDECIDED
-    if state.phase == PHASE_CONTACT and state.predictive.short_s > _SHORT_S:
-        flags |= safety.FORCE_UNREACHED
-    if state.phase == PHASE_STOPPED and witnesses.pressed(witness, inputs):
-        flags |= safety.STILL_PRESSED
-    return flags
-
-
-@njit(cache=True)
-def _armed_flags(params: Params, state: State, inputs: Inputs) -> int:
-    """Return the causes that concern poses, board and operator of an armed loop; and those that the supervision found."""
-    limits, now_ns = params.safety, inputs.now_ns
-    flags = inputs.command.watch
-    in_contact = state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT
-    if not (in_contact or witnesses.pressed(state.witness, inputs)):
-        flags &= ~safety.HOST_LOST
-    pose_age_ns = now_ns - state.predictor.accepted_ns
-    if pose_age_ns > limits.hold_after_ns:
-        flags |= safety.POSE_STALE
-    if pose_age_ns > limits.stop_after_ns:
-        flags |= safety.POSE_LOST
-    if inputs.command.kind == COMMAND_STOP:
-        flags |= safety.OPERATOR_STOP
-    if inputs.board.state == BOARD_FAULT:
-        flags |= safety.BOARD_FAULT
-    if now_ns - inputs.board.arrival_ns > limits.board_timeout_ns:
-        flags |= safety.BOARD_SILENT
-    return flags
 
 
 @njit(cache=True)
@@ -661,7 +578,7 @@ def tick(params: Any, state: Any, inputs: Any, outputs: Any) -> None:
     if not math.isfinite(force_N):
         force_N = 0.0
     # 3. What is wrong, and what is done about it.
-    flags = _flags(p, s, u, pose_result, rejected)
+    flags = causes.apply(p, s, u, pose_result, rejected)
     clear = u.command.clear != s.cleared
     s.cleared = u.command.clear
     if u.command.armed == 0:  # disarming ends a stop of the operator; other causes wait to be cleared
