@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 import sys
-import threading
 import warnings
 from pathlib import Path
-from types import FrameType
 
+from protocol.end_signals import EndSignals
 from protocol.errors import InputError
 from protocol.rig_file import load_rig
 from realtime.core.process import RealtimeProcess
@@ -27,36 +25,35 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--force-source", choices=("sensor", "estimate"), default="sensor")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, handlers=[log_handler()])
-    stop, manager = threading.Event(), ServiceNotifier()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGTERM, on_signal)
-    signal.signal(signal.SIGINT, on_signal)
+    ends, manager = EndSignals(), ServiceNotifier()
+    process: RealtimeProcess | None = None
     try:
         with warnings.catch_warnings(record=True) as unusual:
             rig = load_rig(options.rig)
         for warning in unusual:
             logging.getLogger("rig").warning(str(warning.message))
-        process = RealtimeProcess(
-            rig,
-            board_port=options.board_port,
-            tracker_port=options.tracker_port,
-            force_port=options.force_port,
-            force_source=options.force_source,
-        )
+        with ends.interrupting():
+            process = RealtimeProcess(
+                rig,
+                board_port=options.board_port,
+                tracker_port=options.tracker_port,
+                force_port=options.force_port,
+                force_source=options.force_source,
+            )
+            process.start()
     except InputError as error:
         print(f"seldinger: {error}", file=sys.stderr)
         return 2
     except (OSError, ValueError) as error:
         print(f"seldinger: {error}", file=sys.stderr)
         return 1
-    process.start()
-    manager.ready("disarmed: waits for an operator")
-    while not stop.wait(0.1) and process.alive:
+    if process is None:  # ended before its ports were open
+        return 0
+    if not ends.asked.is_set():
+        manager.ready("disarmed: waits for an operator")
+    while not ends.asked.wait(0.1) and process.alive:
         manager.beat(process.loop.heartbeat)
-    failed = not process.alive
+    failed = not ends.asked.is_set() and not process.alive
     manager.stopping()
     process.stop()
     if failed:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import re
-import signal
 import sys
-import threading
-from types import FrameType
 from typing import Annotated
 
 import typer
 
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile
+from protocol.end_signals import EndSignals
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 
@@ -52,7 +50,7 @@ def igtl(
             if json:
                 write_json({"address": address, "port": port})
                 sys.stdout.flush()
-            served.serve(_until_signal(), _say)
+            served.serve(EndSignals().asked, _say)
 
 
 @bridge.command()
@@ -80,7 +78,7 @@ def ros2(
             if json:
                 write_json({"topics": names, "commands": commands})
                 sys.stdout.flush()
-            served.serve(_until_signal(), _say)
+            served.serve(EndSignals().asked, _say)
 
 
 def _say(text: str) -> None:
@@ -93,15 +91,3 @@ def _note_missing_rig(rig: Rig) -> None:
 
     if not may_run(rig):
         _say(f"no rig {rig.name} runs at {rig.local.folder} yet; its messages are served once it does")
-
-
-def _until_signal() -> threading.Event:
-    """An event that Ctrl-C and SIGTERM set."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    return stop

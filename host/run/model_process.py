@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import threading
 import time
 import warnings
 from pathlib import Path
-from types import FrameType
 
 from host.estimation.interface import Estimator
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter
+from protocol.end_signals import EndSignals
 from protocol.rig_file import load_rig
 from protocol.topics import Log
 from protocol.usual_values import UnusualValue
@@ -99,17 +98,6 @@ class EstimatorProcess:
         self.step()
 
 
-def _stop_on_signals() -> threading.Event:
-    stop = threading.Event()
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGTERM, on_signal)
-    signal.signal(signal.SIGINT, on_signal)
-    return stop
-
-
 def main(arguments: list[str] | None = None) -> int:
     """`python -m host.run.model_process RIG.toml`. Exit status 0 after SIGTERM or SIGINT, 1 where it cannot start."""
     parser = argparse.ArgumentParser(prog="seldinger estimator", description=__doc__)
@@ -119,15 +107,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--clock", choices=("wall", "virtual"), default="wall")
     parser.add_argument("--seed", type=int)
     options = parser.parse_args(arguments)
-    stop = _stop_on_signals()
+    ends = EndSignals()
+    session: Session | None = None
     warnings.simplefilter("ignore", UnusualValue)  # the realtime process reports them
     try:
         rig = load_rig(options.rig)
-        estimator = load_estimator(options.estimator, rig)
-        session = Session.hub(rig)
+        with ends.interrupting():
+            estimator = load_estimator(options.estimator, rig)
+            session = Session.hub(rig)
     except (ValueError, OSError) as error:
         print(f"seldinger estimator: {error}", file=sys.stderr)
         return 1
+    if session is None:  # ended while its models were compiled
+        return 0
     with session:
         recording = None
         process: EstimatorProcess | None = None
@@ -142,7 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
                 recording = RecordingWriter(options.record, header, on_failure)
             process = EstimatorProcess(session, estimator, recording, options.clock)
             print(json.dumps({"ready": True, "recording": str(options.record or "")}), flush=True)
-            process.run(stop)
+            process.run(ends.asked)
         except OSError as error:
             print(f"seldinger estimator: {error}", file=sys.stderr)
             return 1

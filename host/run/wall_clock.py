@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +169,11 @@ class Fleet:
 
     def close(self) -> None:
         """End the processes: realtime first (it disarms), then the recorder, then the rig."""
+        with _undisturbed():
+            self._end_processes()
+        self._folder.cleanup()
+
+    def _end_processes(self) -> None:
         deadline = time.monotonic() + _STOP_TIMEOUT_S
         for name in ("realtime", "host", "rig"):
             process = self.processes.get(name)
@@ -181,7 +188,6 @@ class Fleet:
                 out, _ = process.communicate()
             if name == "rig" and out.strip():
                 self.rig_summary = json.loads(out.strip().splitlines()[-1])
-        self._folder.cleanup()
 
 
 class Operator:
@@ -311,6 +317,20 @@ def _press(operator: Operator, outcome: Outcome, job: ContactJob, progress: Prog
     operator.commander.retract()
     operator.wait(2.0, lambda: operator.mode() == "stopped", lambda share: progress("retract", share, force()))
     operator.commander.disarm()
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore a second Ctrl-C: processes that are not waited for would go on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _in_use(paths: LocalPaths) -> bool:

@@ -26,6 +26,8 @@ def serve(source: Source, port: int, title: str, report: Report) -> None:
     """Serve `source` on 127.0.0.1 until SIGINT. Raises InputError for a port that is in use."""
     check_port(port)
     server = ViewServer(source, port)
+    # Compiles the models, which Ctrl-C ends at once here; in the server it would wait for them.
+    source.frame()
     report(f"{title}: {page_address(port)}  (Ctrl-C ends it)")
     try:
         server.serve()
@@ -76,4 +78,5 @@ def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[P
                 report(f"another rig has the rig file's folder; commands to this one need --rig {fleet.rig_file}")
             yield fleet.rig_file
     finally:
-        report(f"recording: {recording}")
+        if recording.exists():
+            report(f"recording: {recording}")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import signal
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 from host.diagnosis.live.watch import warm_up, watch
+from protocol.end_signals import EndSignals
 from protocol.rig_file import load_rig
 from protocol.topics import Alarm
 from protocol.zenoh_session import Session
@@ -29,16 +27,12 @@ def attach(rig_file: Path, report: Callable[[str], None], on_alarm: Callable[[Al
     """
     os.nice(10)  # below the rig's own processes
     rig = load_rig(rig_file)
-    stopped = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stopped.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-
+    ends = EndSignals()
     report("loading models")
-    warm_up(rig)
+    with ends.interrupting():
+        warm_up(rig)
+    if ends.asked.is_set():
+        return
     with Session.of_rig(rig) as session:
         alarms = session.publisher("alarm")
 
@@ -47,4 +41,4 @@ def attach(rig_file: Path, report: Callable[[str], None], on_alarm: Callable[[Al
             report(f"ALARM at {alarm.stamp_ns * 1e-9:.1f} s of the rig's clock: {alarm.words}")
             on_alarm(alarm)
 
-        watch(rig, session.everything(), publish, lambda text: report(STATES.get(text, text)), stopped.is_set)
+        watch(rig, session.everything(), publish, lambda text: report(STATES.get(text, text)), ends.asked.is_set)
