@@ -100,28 +100,31 @@ class Driver:
 def driving(
     command: str, rig: Path, json: bool, name: str, endpoint: str | None, keys: Path | None, lease: bool = True
 ) -> Iterator[Driver]:
-    """Connect, take the lease where it is needed, and give it back at the end. A refusal ends with exit status 1."""
-    from host.run.connection import CommandRefused, connect, may_run
+    """Connect, take the lease where it is needed, and give it back at the end. A refusal ends with exit status 1.
+
+    Raises InputError (exit status 2) if the rig does not run: nothing was commanded.
+    """
+    from host.run.connection import CommandRefused, connect, may_run, not_running
 
     with connect(rig, name, endpoint=endpoint, keys=keys) as connection:
         driver = Driver(connection, command, json)
         try:
-            patience_s = ANSWERS_WITHIN_S if endpoint is not None or may_run(connection.rig) else NOT_RUNNING_S
-            if not driver.wait(patience_s, lambda state: True) and lease:
-                where = endpoint or str(connection.rig.local.folder)
-                driver.result |= {"accepted": False, "text": f"no message from rig {connection.rig.name} at {where}"}
-                driver.say(
-                    f"no message from rig {connection.rig.name} at {where} within {patience_s:g} s; nothing was "
-                    "commanded. Check that it runs, and that --rig is its rig file"
-                )
-                raise typer.Exit(1)
+            may = endpoint is not None or may_run(connection.rig)
+            seen = driver.wait(ANSWERS_WITHIN_S if may else NOT_RUNNING_S, lambda state: True)
+            # A hold is sent to a rig that may run, even if its states do not come.
+            if not seen and (lease or not may):
+                error = not_running(connection.rig, endpoint)
+                driver.result |= {"accepted": False, "text": str(error)}
+                raise error
             if lease:
                 connection.take()
             yield driver
         except CommandRefused as refused:
-            why = driver.why()
-            driver.result |= {"accepted": False, "text": refused.acknowledgement.reason + why}
-            print(f"seldinger: {refused}{why}", file=sys.stderr)
+            answer = refused.acknowledgement
+            # Why the rig does not move says nothing about a lease that another commander holds.
+            why = "" if refused.action == "take" else driver.why()
+            driver.result |= {"accepted": False, "text": answer.reason + why}
+            print(f"seldinger: {command}: {_without_key(answer.reason, command)}{why}", file=sys.stderr)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             connection.hold()
@@ -130,6 +133,13 @@ def driving(
             raise typer.Exit(130) from None
         finally:
             driver.finish()
+
+
+def _without_key(reason: str, command: str) -> str:
+    """Return a refusal without the protocol's name of the command, which the line names already."""
+    for key in (command, "target"):
+        reason = reason.replace(f"refused: {key}: ", "refused: ", 1)
+    return reason
 
 
 def _plain(command: str, words: str, lease: bool = True) -> Callable[..., None]:
@@ -171,7 +181,9 @@ def jog(
     axis: Annotated[
         str, typer.Argument(help="Axis (insertion, roll, knob), or direction of the tip (e1, e2, e3 or X,Y,Z).")
     ],
-    travel: Annotated[str, typer.Argument(help="Distance or angle, such as 2mm, -0.002, 5deg; the sign is the direction.")],
+    travel: Annotated[
+        list[str], typer.Argument(help="Distance or angle, such as 2mm, -0.002, 5deg; the sign is the direction.")
+    ],
     speed: Annotated[str | None, typer.Option(help="Speed, such as 5mm (per second). Default: half of the maximum.")] = None,
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
@@ -192,10 +204,11 @@ def jog(
     from protocol.jog_limits import LONGEST_JOG, unit_of
 
     unit, most = unit_of(what), LONGEST_JOG[what]
-    way = quantity("travel", travel, unit)
+    text = " ".join(travel)
+    way = quantity("travel", text, unit)
     if not 0.0 < abs(way) <= most:
-        hint = meant(travel, unit, lambda number: 0.0 < abs(number) <= most)
-        raise InputError("travel", travel, f"other than 0, at most {most:g} {unit} either way{hint}")
+        hint = meant(text, unit, lambda number: 0.0 < abs(number) <= most)
+        raise InputError("travel", text, f"other than 0, at most {most:g} {unit} either way{hint}")
     pace = None if speed is None else positive("--speed", speed, unit, FASTEST_PER_S, "per second")
     with driving("jog", rig, json, name, endpoint, keys) as driver:
         driver.rig.jog(what.label, way, pace, along)
@@ -209,7 +222,7 @@ def jog(
 
 
 def goto(
-    place: Annotated[str, typer.Argument(help="Point X,Y,Z of the base frame, such as 0,-10.7mm,21mm.")],
+    place: Annotated[list[str], typer.Argument(help="Point X,Y,Z of the base frame, such as 0,-10.7mm,21mm.")],
     tolerance: Annotated[str, typer.Option(help="Largest accepted distance from the point.")] = "1mm",
     within: Annotated[str, typer.Option(help="Longest time to get there.")] = "20s",
     rig: RigFile = SIMULATED_RIG,
@@ -246,7 +259,7 @@ def goto(
 
 
 def touch(
-    place: Annotated[str, typer.Argument(help="Point X,Y,Z on the tissue, base frame, such as 0,-10.7mm,25mm.")],
+    place: Annotated[list[str], typer.Argument(help="Point X,Y,Z on the tissue, base frame, such as 0,-10.7mm,25mm.")],
     normal: Annotated[str, typer.Option(help="Direction X,Y,Z into the tissue.")] = "0,0,1",
     force: Force = "0.2",
     seconds: Annotated[
@@ -319,7 +332,7 @@ def _pressed(driver: Driver, seconds: float) -> list[tuple[int, float]]:
 
 
 def force(
-    newton: Annotated[str, typer.Argument(help="Contact force, such as 0.15, 150mN or 15g.")],
+    newton: Annotated[list[str], typer.Argument(help="Contact force, such as 0.15, 150mN or 15g.")],
     rig: RigFile = SIMULATED_RIG,
     json: Json = False,
     name: Name = "console",
@@ -327,7 +340,7 @@ def force(
     keys: Keys = None,
 ) -> None:
     """Change the force of the present touch."""
-    force_N = positive("newton", newton, "N", MOST_N)
+    force_N = positive("newton", " ".join(newton), "N", MOST_N)
     with driving("force", rig, json, name, endpoint, keys) as driver:
         driver.rig.force(force_N)
         driver.say(f"accepted; {force_N:g} N wanted")
@@ -362,7 +375,7 @@ def mark(
 
 def status(rig: RigFile = SIMULATED_RIG, json: Json = False, endpoint: Endpoint = None, keys: Keys = None) -> None:
     """Show a running rig on one screen, the first cause of what holds it back first. Commands nothing."""
-    from host.run.connection import may_run, open_session
+    from host.run.connection import may_run, not_running, open_session
     from host.run.rig_status import read_status
     from protocol.rig_file import load_rig
 
@@ -372,12 +385,10 @@ def status(rig: RigFile = SIMULATED_RIG, json: Json = False, endpoint: Endpoint 
         found = read_status(session, read.name, wait_s=patience_s)
     if json:
         write_json(found.as_json())
-    else:
+    elif found.connected:
         print("\n".join(found.lines()))
     if not found.connected:
-        where = endpoint or str(read.local.folder)
-        print(f"seldinger: no message from rig {read.name} at {where}; check that it runs", file=sys.stderr)
-        raise typer.Exit(1)
+        raise not_running(read, endpoint)
 
 
 def _mm(point_m: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from protocol.errors import Description, InputError
 UNITS = {
     "m": ("m", 1.0),
     "mm": ("m", 1e-3),
+    "cm": ("m", 1e-2),
     "um": ("m", 1e-6),
     "rad": ("rad", 1.0),
     "deg": ("rad", math.pi / 180.0),
@@ -26,6 +27,8 @@ UNITS = {
 # No catheter reaches further: such a number is in another unit.
 FARTHEST_M = 1.0
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([a-zA-Z]*)\s*")
+# Spaces before a number: those before a unit separate nothing.
+_QUANTITIES = re.compile(r"\s+(?=[-+.\d])")
 
 
 def quantity(key: str, text: str, unit: str) -> float:
@@ -67,9 +70,10 @@ def meant(text: str, unit: str, fits: Callable[[float], bool]) -> str:
     return f"; did you mean {match[1]}{smaller[0]}?" if smaller else ""
 
 
-def point(key: str, text: str) -> tuple[float, float, float]:
-    """Return the point X,Y,Z in `text`, m. Raises InputError."""
-    parts = text.split(",")
+def point(key: str, words: Sequence[str]) -> tuple[float, float, float]:
+    """Return the point in `words`, m: three quantities with commas or spaces between them. Raises InputError."""
+    text = " ".join(words)
+    parts = text.split(",") if "," in text else _QUANTITIES.split(text.strip())
     if len(parts) != 3:
         raise InputError(key, text, "three numbers with commas between them, such as 0,-10.7mm,21mm")
     x, y, z = (quantity(key, part, "m") for part in parts)

@@ -68,9 +68,7 @@ class Commander(CommandSender):
         self._states.take()
         answer = super().stop()
         if answer.result == "unanswered":
-            return PathAnswer(
-                "zenoh", False, False, "no answer: the model process or the realtime process is dead or stalled"
-            )
+            return PathAnswer("zenoh", False, False, "the model process or the realtime process does not run, or is stalled")
         if not answer.accepted:
             return PathAnswer("zenoh", True, False, answer.reason)
         begin_s, mode, action = time.monotonic(), "no state", ""

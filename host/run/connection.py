@@ -14,7 +14,7 @@ import zenoh
 
 from host.run.commander import Acknowledgement, Commander
 from protocol.enums import JogAxis
-from protocol.errors import InputError
+from protocol.errors import Description, InputError
 from protocol.jog_limits import fastest_jog
 from protocol.local_paths import listens
 from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
@@ -28,11 +28,11 @@ KEY_FILES = (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
 class CommandRefused(RuntimeError):
-    """The rig did not carry out a command. `acknowledgement` holds the result and the reason."""
+    """The rig did not carry out the command `action`. `acknowledgement` holds the result and the reason."""
 
     def __init__(self, action: str, acknowledgement: Acknowledgement) -> None:
         super().__init__(f"{action}: {acknowledgement.reason}")
-        self.acknowledgement = acknowledgement
+        self.action, self.acknowledgement = action, acknowledgement
 
 
 class RigConnection:
@@ -294,6 +294,17 @@ def may_run(rig: Rig) -> bool:
     The sockets that a killed process leaves do not count.
     """
     return bool(rig.zenoh.connect) or listens(rig.local.stop_socket) or listens(rig.local.zenoh_socket)
+
+
+def not_running(rig: Rig, endpoint: str | None = None) -> InputError:
+    """Return the error of a command for a rig from which nothing comes."""
+    where = endpoint or str(rig.local.folder)
+    return InputError(
+        "--endpoint" if endpoint else "--rig",
+        Description(f"no message from rig {rig.name} at {where}"),
+        "a rig that runs; nothing was commanded. Start it (the simulated one by `seldinger view --simulated`), or give "
+        "the rig file with which it was started",
+    )
 
 
 def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[str] | None = None) -> Session:

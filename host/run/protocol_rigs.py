@@ -12,7 +12,7 @@ import zenoh
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from host.run.commander import Commander
-from host.run.connection import may_run
+from host.run.connection import may_run, not_running
 from host.run.protocol_result import ProtocolResult
 from host.run.protocol_run import Job, Progress, StepFailed, blank_result, carry_out
 from protocol.commander import Acknowledgement
@@ -165,7 +165,7 @@ def _taken(subscriber: Any, kind: type[MessageType]) -> list[MessageType]:
 
 
 def run_live(job: Job, ask_operator: Callable[[str], bool], progress: Progress = lambda step, share: None) -> ProtocolResult:
-    """Run the protocol on the running rig of the rig file; its services record. Raises RuntimeError.
+    """Run the protocol on the running rig of the rig file; its services record. Raises InputError, RuntimeError.
 
     The rig is armed where it is disarmed. At the end, and on Ctrl-C, it holds and is left armed.
     """
@@ -179,10 +179,10 @@ def run_live(job: Job, ask_operator: Callable[[str], bool], progress: Progress =
 
         patience_s = STATES_WITHIN_S if may_run(job.rig) else NOT_RUNNING_S
         if not driven.wait(patience_s, came):
-            raise RuntimeError(f"no message of the topic state from the rig within {patience_s:g} s; check that it runs")
+            raise not_running(job.rig)
         taken = commander.take()
         if not taken.accepted:
-            raise RuntimeError(f"lease: {taken.reason}")
+            raise RuntimeError(taken.reason)
         if newest[-1].mode == "disarmed":
             armed = commander.arm()
             if not armed.accepted or not driven.wait(ARM_WITHIN_S, lambda: came() and newest[-1].mode == "hold"):

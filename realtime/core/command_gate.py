@@ -190,7 +190,7 @@ class CommandGate:
         if not lease.active(now_ns):
             return "refused", "lease: found no valid one, wanted one taken before and renewed"
         if not self._holds(command):
-            return "refused", f"lease: held by {lease.holder}, for another {(lease.expires_ns - now_ns) * 1e-9:.1f} s"
+            return "refused", _held(lease)
         if command.sequence <= lease.sequence:
             return "replayed", f"sequence: found {command.sequence}, wanted above {lease.sequence}"
         lease.sequence = command.sequence
@@ -205,19 +205,21 @@ class CommandGate:
         lease = self._lease
         if lease.active(now_ns):
             if not self._holds(command):
-                left_s = (lease.expires_ns - now_ns) * 1e-9
-                return Reply(
-                    stamp_ns=now_ns,
-                    id=command.id,
-                    result="refused",
-                    text=f"lease: held by {lease.holder}, for another {left_s:.1f} s",
-                )
+                return Reply(stamp_ns=now_ns, id=command.id, result="refused", text=_held(lease))
         else:
             lease = self._lease = Lease(command.commander, self._new_lease(), 0, command.sequence)
         lease.expires_ns = now_ns + LEASE_NS
         return Reply(
             stamp_ns=now_ns, id=command.id, result="accepted", lease=lease.id, lease_expires_ns=lease.expires_ns, text=""
         )
+
+
+def _held(lease: Lease) -> str:
+    """Return who holds the lease, and what another commander can do. The time left says little: a holder renews it."""
+    return (
+        f"lease: held by {lease.holder}, wanted it free; it is free as soon as {lease.holder} releases it, or "
+        f"{LEASE_NS * 1e-9:g} s after that program has ended. Hold, mark and stop need no lease"
+    )
 
 
 def without_secrets(command: Command | None, reply: Reply | None) -> tuple[Command, Reply] | None:

@@ -25,6 +25,7 @@ from realtime.drivers.stepper_board import LinkPhase, StepperBoardLink
 _KINDS = {kind.label: kind for kind in CommandKind}
 # The loop leaves a stop, and the stop that ends a retraction, by disarming only (`realtime/control/tick.py`).
 _STOPPED = "found the loop stopped, wanted it to hold or to move; disarm and arm again"
+_DISARMED = "found the rig disarmed, wanted armed; arm it first"
 _JOG_PHASES = (Phase.HOLD, Phase.POSITION, Phase.JOG)
 # A tick this long after a clear has acted on it.
 CLEARED_WITHIN_NS = 20_000_000
@@ -194,14 +195,14 @@ class OperatorCommands:
             self._end_homing()
             return ""
         if not self._record.armed:
-            return "hold: found the rig disarmed, wanted armed"
+            return f"hold: {_DISARMED}"
         self._set(CommandKind.HOLD)
         return ""
 
     def _force(self, command: Command) -> str:
         """Set another force for the present contact target; nothing else changes, so that the count stays."""
         if not self._record.armed or self._record.kind != CommandKind.CONTACT:
-            return "force: found no contact target, wanted the command target contact before"
+            return "force: found no touch in progress, wanted one; touch the tissue first"
         problem = self._too_much(command)
         if not problem and command.force_N is not None:
             self._record.force_N = command.force_N
@@ -209,7 +210,7 @@ class OperatorCommands:
 
     def _target(self, command: Command) -> str:
         if not self._record.armed:
-            return "target: found the rig disarmed, wanted armed"
+            return f"target: {_DISARMED}"
         if self._standing().phase is Phase.STOPPED:
             return f"target: {_STOPPED}"
         problem = self._too_much(command) or ("" if command.target_m is None else self._reach.problem(command.target_m))
@@ -227,7 +228,7 @@ class OperatorCommands:
     def _jog(self, command: Command) -> str:
         """Start or extend a jog, or return the limit that forbids it."""
         if not self._record.armed:
-            return "jog: found the rig disarmed, wanted armed"
+            return f"jog: {_DISARMED}"
         axis, travel, speed = JogAxis[command.axis.upper()], command.travel_unit or 0.0, command.speed_unit_per_s or 0.0
         here = self._standing()
         if here.phase is Phase.STOPPED:

@@ -49,10 +49,18 @@ def test_what_is_no_length_is_refused_and_named(text: str) -> None:
         quantity("travel", text, "m")
 
 
-@pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1;2;3"])
+@pytest.mark.parametrize("text", ["", "1,2", "1,2,3,4", "a,b,c", "1;2;3", "1 2", "1 2 3 4", "1mm2mm3mm", "a b c"])
 def test_what_is_no_point_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"^place: "):
-        point("place", text)
+        point("place", text.split(" "))
+
+
+@pytest.mark.parametrize(
+    "text", ["0,-10.7mm,0.02", "0 -10.7mm 0.02", "0, -10.7 mm, 20mm", "0 -10.7 mm 20 mm", "-0 -1.07cm +.02"]
+)
+def test_a_point_may_have_spaces_instead_of_commas(text: str) -> None:
+    """As the shell gives it: one word for each space."""
+    assert point("place", text.split(" ")) == pytest.approx((0.0, -0.0107, 0.02))
 
 
 @pytest.mark.parametrize("text", ["", "0,0,0", "1,2", "nan,0,1", "inf,0,0", "x,y,z"])
@@ -71,6 +79,10 @@ def called(*words: str) -> Result:
     [
         (("goto", "0,0"), "place"),
         (("goto", "-1,b,0"), "place"),
+        (("goto", "0", "-10mm", "20mm", "30mm"), "place"),
+        (("jog", "e3", "1mm", "2mm"), "travel"),
+        (("jog", "e3", "1", "apple"), "travel"),
+        (("force", "1", "2"), "newton"),
         (("jog", "elbow", "2mm"), "axis"),
         (("jog", "knob", "2mm"), "travel"),
         (("jog", "insertion", "-5deg"), "travel"),
@@ -165,15 +177,35 @@ def rig(virtual: VirtualRig, monkeypatch: pytest.MonkeyPatch) -> VirtualRig:
     return virtual
 
 
-@pytest.mark.parametrize(("words", "says"), [(("arm",), "nothing was commanded"), (("status",), "check that it runs")])
-def test_a_rig_that_does_not_run_is_not_waited_for(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
-    """A rig of this computer without a socket: the wait is the short one, and the line says what to look at."""
+EVERY_DRIVE_COMMAND = [
+    ("status",),
+    ("arm",),
+    ("disarm",),
+    ("jog", "e3", "1mm"),
+    ("goto", "0", "-10mm", "20mm"),
+    ("touch", "0,-10.7mm,25mm"),
+    ("force", "150 mN"),
+    ("hold",),
+    ("retract",),
+    ("zero",),
+    ("mark", "a note"),
+    ("clear",),
+]
+
+
+@pytest.mark.parametrize("words", EVERY_DRIVE_COMMAND, ids=lambda words: words[0])
+def test_a_rig_that_does_not_run_is_not_waited_for(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rig of this computer without a socket: nothing is sent, and the line says what to look at."""
     file = tmp_path / "rig.toml"
     file.write_text(SIMULATED_RIG.read_text().replace('folder = ""', f'folder = "{tmp_path}"'), encoding="utf-8")
     assert not connection.may_run(load_rig(file))
+    monkeypatch.setattr(CommandSender, "give", lambda *arguments, **fields: pytest.fail("a command was sent"))
     result = called(*words, "--rig", str(file))
-    assert result.exit_code == 1 and says in result.stderr and str(tmp_path) in result.stderr
-    assert "3 s" not in result.stderr
+    error = result.exception
+    assert isinstance(error, InputError) and "nothing was commanded" in str(error) and str(tmp_path) in str(error)
+    assert not result.stderr and "\n" not in str(error)
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(tmp_path / "zenoh.sock"))
         listening.listen()
@@ -186,6 +218,41 @@ def said(*words: str) -> dict[str, Any]:
     told: dict[str, Any] = json.loads(result.stdout)
     told["status"] = result.exit_code
     return told
+
+
+MOVES_OR_CHANGES = [words for words in EVERY_DRIVE_COMMAND if words[0] not in ("status", "hold", "mark")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", MOVES_OR_CHANGES, ids=lambda words: words[0])
+def test_a_second_commander_is_told_who_holds_the_lease(rig: VirtualRig, words: tuple[str, ...]) -> None:
+    alice = VirtualCommander(rig, "alice")
+    assert alice.take().accepted
+    refused = called(*words)
+    alice.close()
+    assert refused.exit_code == 1 and refused.stderr.count("\n") == 1
+    assert refused.stderr.startswith(f"seldinger: {words[0]}: refused: lease: held by alice, wanted it free; ")
+    assert "alice releases it" in refused.stderr and "for another" not in refused.stderr
+
+
+@pytest.mark.slow
+def test_hold_and_mark_need_no_lease_of_another_commander(rig: VirtualRig) -> None:
+    alice = VirtualCommander(rig, "alice")
+    assert alice.take().accepted and alice.arm().accepted
+    assert called("hold").exit_code == 0 and called("mark", "the sheath slipped").exit_code == 0
+    assert alice.disarm().accepted
+    alice.close()
+
+
+@pytest.mark.slow
+def test_a_refusal_names_its_command_once_and_what_to_do(rig: VirtualRig) -> None:
+    for words, says in (
+        (("goto", "0,-10.7mm,20mm"), "goto: refused: found the rig disarmed, wanted armed; arm it first"),
+        (("jog", "e3", "1mm"), "jog: refused: found the rig disarmed, wanted armed; arm it first"),
+        (("hold",), "hold: refused: found the rig disarmed, wanted armed; arm it first"),
+        (("force", "0.1"), "force: refused: found no touch in progress, wanted one; touch the tissue first"),
+    ):
+        assert called(*words).stderr.startswith(f"seldinger: {says}")
 
 
 @pytest.mark.slow

@@ -73,7 +73,11 @@ def test_without_a_lease_nothing_but_the_safe_direction(action: str) -> None:
         "lease: found no valid one, wanted one taken before and renewed",
     )
     rig.leased("other")
-    assert rig.said(rig.command(action=action)) == ("refused", "lease: held by other, for another 3.0 s")
+    refused, why = rig.said(rig.command(action=action))
+    assert refused == "refused" and why.startswith(
+        "lease: held by other, wanted it free; it is free as soon as other releases"
+    )
+    assert why.endswith("Hold, mark and stop need no lease")
     assert rig.said(rig.command(action=action, lease="guess"))[1].startswith("lease: held by other")
     assert rig.done == []
     assert rig.said(rig.command(action="hold")) == rig.said(rig.command(action="stop")) == ("accepted", "")
