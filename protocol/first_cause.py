@@ -82,7 +82,7 @@ RULES: dict[str, Rule] = {
     "pose_rejected": Rule(
         "A pose was not finite, out of the workspace or too fast.",
         "Check for metal or motors near the tracker's field generator.",
-        ("loop_late",),
+        ("loop_late", "tracker_moved"),
     ),
     "poses_wild": Rule(
         "Three poses in a row were rejected.", "Check the tracker and its tools.", ("loop_late", "pose_rejected")

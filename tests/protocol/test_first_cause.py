@@ -23,6 +23,8 @@ TABLE = [
     ({"pose_rejected": 0, "poses_wild": 50, "pose_stale": 60, "pose_lost": 150}, "pose_rejected"),
     ({"force_stale": 0, "force_lost": 100, "force_handover": 100}, "force_stale"),
     ({"steps_lost": 0, "over_force": 40}, "steps_lost"),
+    ({"pose_rejected": 0, "tracker_moved": 25, "force_disagrees": 400}, "tracker_moved"),
+    ({"pose_rejected": 0, "tracker_moved": 9_000}, "pose_rejected"),
     ({"over_force": 0, "operator_stop": 900}, "over_force"),
     ({"operator_stop": 0, "board_fault": 20}, "operator_stop"),
     ({"board_silent": 0, "underrun": 91, "pose_stale": 190, "board_fault": 197, "deadman": 241}, "devices_silent"),
