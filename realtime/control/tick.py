@@ -11,14 +11,16 @@ from realtime.control import (
     backlash,
     causes,
     constraint_frame,
+    distal_joint,
     force_predictor,
     force_source,
     free_tip,
     hybrid,
-    inverse_kinematics,
     jog,
+    phases,
     predictive,
     predictor,
+    retraction,
     roll_windup,
     safety,
     stage_limiter,
@@ -30,12 +32,6 @@ from realtime.control import (
 )
 from realtime.control.codes import (
     ACTION_HOLD,
-    ACTION_RETRACT,
-    COMMAND_CONTACT,
-    COMMAND_HOLD,
-    COMMAND_JOG,
-    COMMAND_POSITION,
-    COMMAND_RETRACT,
     JOG_TIP,
     LAW_PREDICTIVE,
     PHASE_APPROACH,
@@ -65,10 +61,6 @@ _SLOW_FACTOR = 4.0
 _NORMAL_S = 2.0
 # How far beyond the given target the approach goes on looking for the wall.
 _SEARCH_m = 0.010
-# A retraction ends when nothing has pressed for this long; if something still does, it goes on for this much further.
-_FREE_S, _RETRACT_MORE_m = 0.1, 0.030
-# An urgent retraction turns the knob by at most this, if that takes the tip away by more than this per radian.
-_BEND_rad, _BENDS_AWAY_m, _NUDGE_rad = 0.5, 0.003, 1e-3
 
 
 @njit(cache=True)
@@ -143,155 +135,6 @@ def _take_force(params: Params, state: State, inputs: Inputs) -> None:
 
 
 @njit(cache=True)
-def _predict_joint(params: Params, state: State) -> None:
-    """Predict where the distal end will be when the stages are where they were sent: backlash, slopes, knob."""
-    insertion_m = backlash.follow(params.backlash, state.backlash, state.stage.position[0])
-    state.predicted_joint[0] = insertion_m + state.home_m
-    state.predicted_joint[1] = backlash.distal_roll(params.backlash, state.stage.position[1]) + state.windup.windup_rad
-    state.predicted_joint[2] = wire_friction.follow(params.wire, params.kinematics, state.wire, state.stage.position[2])
-
-
-@njit(cache=True)
-def _locate(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
-    """Set the joints of a rig at rest: stages as the board says, the insertion such that the free tip is at `tip_m`."""
-    for axis in range(N_AXES):
-        state.stage.position[axis] = inputs.board.position_steps[axis] / params.stage.steps_per_unit[axis]
-        state.stage.speed[axis] = 0.0
-    config, joint = params.backlash, state.hybrid.joint
-    roll_windup.forget(state.windup)
-    state.history.windup_rad = 0.0
-    forward_m = (state.stage.position[0] - 0.5 * backlash.first_width(config)) * config.slope
-    backlash.start(config, state.backlash, forward_m)
-    joint[1] = backlash.distal_roll(config, state.stage.position[1])
-    joint[2] = wire_friction.start(params.wire, params.kinematics, state.wire, state.stage.position[2])
-    joint[0] = forward_m + params.kinematics.insertion_at_home_m
-    joint[0] = inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint)[0]
-    state.home_m = joint[0] - forward_m
-    _predict_joint(params, state)
-
-
-@njit(cache=True)
-def _arm(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
-    """Start from where the stages are, at rest, with nothing learned."""
-    _locate(params, state, inputs, tip_m)
-    force_source.start(params, state.force)
-    witnesses.start(state.witness)
-    hybrid.forget(state.hybrid)
-    state.history.count = 0
-    tip_offset.start(state.tip_offset)
-    wall_observer.forget(state.wall)
-    predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
-    for i in range(3):
-        state.hybrid.goal_m[i] = tip_m[i]
-    state.phase = PHASE_HOLD
-
-
-@njit(cache=True)
-def _enter(params: Params, state: State, phase: int, tip_m: ReadFloats) -> None:
-    """Change the phase without a bump: the goal starts at the tip, the integrators empty, the joint command stays."""
-    if state.phase == phase:
-        return
-    state.phase = phase
-    hybrid.forget(state.hybrid)
-    if params.law == LAW_PREDICTIVE:
-        predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
-    state.hybrid.above_ns = 0
-    state.retract_from_m, state.retract_knob_rad = state.predicted_joint[0], state.hybrid.joint[2]
-    state.free_s = 0.0
-    for i in range(3):
-        state.hybrid.goal_m[i] = tip_m[i]
-
-
-@njit(cache=True)
-def _sensible(params: Params, command: CommandRecord) -> bool:
-    """Whether a command may be acted on: finite target in the workspace, unit normal, force below the limit."""
-    config, square = params.predictor, 0.0
-    for i in range(3):
-        if not (config.workspace_min_m[i] <= command.target_m[i] <= config.workspace_max_m[i]):
-            return False
-        square += command.normal[i] ** 2
-    return abs(square - 1.0) < 1e-3 and 0.0 <= command.force_N < params.safety.over_force_N
-
-
-@njit(cache=True)
-def _retracts_stopped(params: Params, state: State, inputs: Inputs, causes: int) -> bool:
-    """Whether a stop takes the catheter off the tissue first, or a stopped catheter is retracted again.
-
-    A catheter that is stopped in contact stays pressed, and a wall that comes nearer presses harder. So a stop in contact
-    is followed by a retraction, and a stopped catheter retracts when any witness says that something presses on it. The
-    rig file can forbid it (`safety.retract_stopped`); a board that does not move the stages makes it impossible.
-    """
-    if params.safety.retract_stopped == 0 or causes & safety.BOARD_BITS or inputs.board.ready == 0:
-        return False
-    if state.phase == PHASE_STOPPED:
-        return witnesses.standing(params, state.witness, inputs, params.period_s)
-    if state.phase == PHASE_RETRACT:
-        return not _retracted(params, state)
-    return state.phase == PHASE_CONTACT or witnesses.pressed(state.witness, inputs)
-
-
-@njit(cache=True)
-def _follow_failsafe(params: Params, state: State, inputs: Inputs, action: int, causes: int, tip_m: ReadFloats) -> None:
-    """Set the phase of an armed loop that retracts, stops or is stopped."""
-    away = action == ACTION_RETRACT and state.phase != PHASE_STOPPED
-    if away or _retracts_stopped(params, state, inputs, causes):
-        _enter(params, state, PHASE_RETRACT, tip_m)
-    else:
-        _enter(params, state, PHASE_STOPPED, tip_m)
-
-
-@njit(cache=True)
-def _follow_operator(params: Params, state: State, inputs: Inputs, action: int, causes: int, tip_m: ReadFloats) -> None:
-    """Set the phase that the command and the failsafe action lead to. Only disarming leads out of a stop."""
-    command = inputs.command
-    ready = inputs.board.ready != 0 and state.predictor.started != 0
-    if command.armed == 0:
-        state.phase = PHASE_DISARMED
-        return
-    if action >= ACTION_RETRACT or state.phase == PHASE_STOPPED:
-        if state.phase != PHASE_DISARMED:
-            _follow_failsafe(params, state, inputs, action, causes, tip_m)
-        return
-    if state.phase == PHASE_DISARMED:
-        if ready and command.count != state.command_seen:
-            _arm(params, state, inputs, tip_m)
-            state.command_seen = command.count
-        return
-    if command.count == state.command_seen:
-        return
-    state.command_seen = command.count
-    _follow_command(params, state, command, tip_m)
-
-
-@njit(cache=True)
-def _start_jog(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
-    """Begin the commanded jog, or hold if it cannot be done. A jog that goes on is extended without a bump."""
-    continued = state.phase == PHASE_JOG
-    if jog.is_sensible(params.predictor, command, state.hybrid.goal_m if continued else tip_m):
-        _enter(params, state, PHASE_JOG, tip_m)
-        jog.start(state.jog, command, state.hybrid.goal_m, continued)
-    else:
-        _enter(params, state, PHASE_HOLD, tip_m)
-
-
-@njit(cache=True)
-def _follow_command(params: Params, state: State, command: CommandRecord, tip_m: ReadFloats) -> None:
-    """Set the phase that a new command requests of the armed loop."""
-    if command.kind == COMMAND_HOLD:
-        _enter(params, state, PHASE_HOLD, tip_m)
-    elif command.kind == COMMAND_RETRACT:
-        _enter(params, state, PHASE_RETRACT, tip_m)
-    elif command.kind == COMMAND_JOG:
-        _start_jog(params, state, command, tip_m)
-    elif not _sensible(params, command):
-        _enter(params, state, PHASE_HOLD, tip_m)
-    elif command.kind == COMMAND_POSITION:
-        _enter(params, state, PHASE_POSITION, tip_m)
-    elif command.kind == COMMAND_CONTACT and state.phase != PHASE_CONTACT:
-        _enter(params, state, PHASE_APPROACH, tip_m)
-
-
-@njit(cache=True)
 def _watch_contact(params: Params, state: State, now_ns: int, force_N: float, tip_m: ReadFloats) -> None:
     """Turn approach into contact and back, each after its debouncing time."""
     config, hy = params.hybrid, state.hybrid
@@ -306,41 +149,11 @@ def _watch_contact(params: Params, state: State, now_ns: int, force_N: float, ti
     if hy.above_ns == 0:
         hy.above_ns = now_ns
     if now_ns - hy.above_ns >= (_CONTACT_NS if approaching else _LOST_NS):
-        _enter(params, state, PHASE_CONTACT if approaching else PHASE_APPROACH, tip_m)
+        phases.enter(params, state, PHASE_CONTACT if approaching else PHASE_APPROACH, tip_m)
         if approaching:
             wall_observer.forget(state.wall)
             tip_offset.touch(state.tip_offset)
             predictive.touch(state.predictive, force_N, _depth_m(params, state))
-
-
-@njit(cache=True)
-def _retracted(params: Params, state: State) -> bool:
-    """Whether a retraction is over: far enough with no witness that presses, or as far as it may go."""
-    least_m = params.safety.retract_distance_m
-    far_m, asked_m = state.retract_from_m - state.predicted_joint[0], state.retract_from_m - state.hybrid.joint[0]
-    return (far_m >= least_m and state.free_s > _FREE_S) or asked_m >= least_m + _RETRACT_MORE_m
-
-
-@njit(cache=True)
-def _retract(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> None:
-    """Pull back until nothing presses; after an urgent cause at full speed, with the knob bending away from the wall."""
-    hy, period_s = state.hybrid, params.period_s
-    state.free_s = 0.0 if witnesses.pressed(state.witness, inputs) else state.free_s + period_s
-    if _retracted(params, state):
-        _enter(params, state, PHASE_STOPPED, tip_m)
-        return
-    # A stopped catheter that is pressed (`pressed_s`) is pressed by a wall that comes nearer.
-    if state.latched & safety.URGENT_BITS == 0 and state.witness.pressed_s == 0.0:
-        hy.joint[0] -= params.safety.retract_speed_m_per_s * period_s
-        return
-    hy.joint[0] -= params.stage.max_speed[0] * params.backlash.slope * period_s
-    # The insertion has to cross its backlash first; the knob has none to speak of.
-    here_m = dot(free_tip.apply(params.kinematics, hy.joint), state.normal)
-    nudged = (hy.joint[0], hy.joint[1], hy.joint[2] + _NUDGE_rad)
-    outward_m = (dot(free_tip.apply(params.kinematics, nudged), state.normal) - here_m) / _NUDGE_rad
-    bent_rad = hy.joint[2] + math.copysign(params.stage.max_speed[2] * period_s, outward_m)
-    if abs(outward_m) > _BENDS_AWAY_m and abs(bent_rad - state.retract_knob_rad) < _BEND_rad:
-        hy.joint[2] = min(max(bent_rad, params.stage.min_unit[2]), params.stage.max_unit[2])
 
 
 @njit(cache=True)
@@ -421,14 +234,15 @@ def _end_jog(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) ->
     fresh = inputs.now_ns - state.force.age_from_ns <= params.safety.force_timeout_ns
     touches = fresh and jog.touches(state.jog, inputs.command, state.force.force_N, threshold_N)
     if touches or jog.is_done(state.jog, state.stage, params.stage, inputs.command.jog_axis, state.hybrid.goal_m):
-        _enter(params, state, PHASE_HOLD, tip_m)
+        phases.enter(params, state, PHASE_HOLD, tip_m)
 
 
 @njit(cache=True)
 def _control(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats, force_N: float) -> None:
     """Advance the joint command by one tick according to the phase."""
     if state.phase == PHASE_RETRACT:
-        _retract(params, state, inputs, tip_m)
+        if retraction.apply(params, state, inputs):
+            phases.enter(params, state, PHASE_STOPPED, tip_m)
         return
     if state.phase == PHASE_APPROACH or state.phase == PHASE_CONTACT:
         _watch_contact(params, state, inputs.now_ns, force_N, tip_m)
@@ -586,15 +400,15 @@ def tick(params: Any, state: Any, inputs: Any, outputs: Any) -> None:
     action, latched = safety.decide(flags, s.latched, clear)
     s.action, s.latched = action, latched
     # 4. Phase, joint command, stages.
-    _follow_operator(p, s, u, action, flags | latched, tip_m)
+    phases.apply(p, s, u, action, flags | latched, tip_m)
     if s.phase == PHASE_DISARMED and s.predictor.started != 0:
-        _locate(p, s, u, tip_m)
+        distal_joint.locate(p, s, u, tip_m)
     if action < ACTION_HOLD or s.phase == PHASE_RETRACT:
         _control(p, s, u, tip_m, force_N)
     elif is_predictive:
         predictive.stay(s.predictive, s.hybrid, s.predicted_joint)
     _move_stages(p, s, is_predictive and s.phase != PHASE_RETRACT)
-    _predict_joint(p, s)
+    distal_joint.predict(p, s)
     free_tip.remember(s.history, u.now_ns + p.setpoint_lead_ns, s.predicted_joint, s.backlash.flank)
     # 5. The set-point, and what telemetry shows.
     s.ticks += 1
