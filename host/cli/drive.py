@@ -128,9 +128,9 @@ def driving(
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             connection.hold()
-            driver.say("interrupted: the rig holds")
+            driver.say("the rig holds")
             driver.result |= {"done": False, "text": "interrupted; the rig holds"}
-            raise typer.Exit(130) from None
+            raise
         finally:
             driver.finish()
 

@@ -102,6 +102,8 @@ COMPILES = (
 
 
 ENDED = "seldinger: interrupted before the end"
+# Exit status after Ctrl-C or SIGTERM.
+INTERRUPTED = 130
 
 
 def build(argv: list[str]) -> typer.Typer:
@@ -291,10 +293,13 @@ def _run(argv: list[str]) -> int:
     program = typer.main.get_command(build(argv))
     _refuse_unknown_options(program, argv)
     try:
-        return int(program.main(argv, "seldinger", standalone_mode=False) or 0)
-    except typer.Abort:  # Ctrl-C, or "no" to a question
+        status = int(program.main(argv, "seldinger", standalone_mode=False) or 0)
+    except typer.Abort:  # "no" to a question, or Ctrl-C at one
         print(ENDED, file=sys.stderr)
         return 1
+    if status == INTERRUPTED:  # typer makes it of the KeyboardInterrupt that leaves a command
+        print(ENDED, file=sys.stderr)
+    return status
 
 
 def _refuse_unknown_options(program: Any, argv: list[str]) -> None:
@@ -330,9 +335,9 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def main() -> None:
     """Run the command line.
 
-    Exit status: 0 done; 2 bad input, one line on standard error; 1 anything else, one line on standard error, and the
-    traceback of an unexpected error in a log file. SIGTERM, and the end of its terminal, end a command as Ctrl-C does: what
-    it has started is stopped in order.
+    Exit status: 0 done; 2 bad input, one line on standard error; 130 interrupted; 1 anything else, one line on standard
+    error, and the traceback of an unexpected error in a log file. SIGTERM, and the end of its terminal, end a command as
+    Ctrl-C does: what it has started is stopped in order.
     """
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
@@ -358,7 +363,7 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         if _Interrupted.yes or isinstance(error, KeyboardInterrupt):
             print(ENDED, file=sys.stderr)
-            sys.exit(1)
+            sys.exit(INTERRUPTED)
         sys.exit(_report(error, argv))
     finally:
         if signal.getsignal(signal.SIGTERM) is _interrupt:  # a server passes the signal on as it ends: nothing is left to do

@@ -66,7 +66,7 @@ def run(
         checked = protocol_file.dry_run(steps, loaded)
     except InputError as error:
         raise error.in_file(protocol) from None
-    earlier = () if resume is None else protocol_result.read_result(resume, steps)
+    earlier = () if resume is None else protocol_result.read_result(resume, steps, loaded.name, simulated)
     if resume is not None and not dry_run:
         writable_file("--resume", resume)
     _show(steps, checked, loaded)
@@ -81,7 +81,11 @@ def run(
         result = _carry_out(job, simulated, yes, directory, board, seed, effects)
     except RuntimeError as error:
         print(f"seldinger: run: {error}", file=sys.stderr)
+        _print_resume(target)
         raise typer.Exit(1) from None
+    except BaseException:  # Ctrl-C, a full disk, ...: said by the command line
+        _print_resume(target)
+        raise
     report = write_protocol_report(result.as_json(), target.with_suffix(".html"))
     _print_result(result, target, report)
     if json:
@@ -123,6 +127,12 @@ def _show(steps: ScriptedProtocol, checked: DryRun, rig: Rig) -> None:
     print("\n".join(rows), file=sys.stderr)
 
 
+def _print_resume(target: Path) -> None:
+    """Say how a protocol that ended early is continued, if anything of it was written."""
+    if target.exists():
+        print(f"to continue: the same command with --resume {target}", file=sys.stderr)
+
+
 def _print_result(result: ProtocolResult, target: Path, report: Path) -> None:
     """Print a line for each action, and the paths of the files."""
     for item in result.results:
@@ -137,7 +147,7 @@ def _print_result(result: ProtocolResult, target: Path, report: Path) -> None:
         print(f"{item.id:>6}  {item.kind:<6}{item.verdict:<17}{figures or '  ' + item.says}", file=sys.stderr)
     if result.ended:
         print(f"ended at {result.ended}", file=sys.stderr)
-        print(f"to continue: the same command with --resume {target}", file=sys.stderr)
-    if result.recording:
-        print(f"recording  {result.recording}", file=sys.stderr)
+        _print_resume(target)
+    for recording in result.recordings:
+        print(f"recording  {recording}", file=sys.stderr)
     print(f"result     {target}\nreport     {report}", file=sys.stderr)

@@ -32,11 +32,18 @@ def write_protocol_report(result: dict[str, Any], target: Path) -> Path:
             touches=[_row(item) for item in touches],
             others=[_other(item) for item in result["results"] if not item["touch"]],
             ended=result["ended"],
-            footer=f"Made by seldinger {software_version()}. Recording: {result['recording'] or 'of the rig itself'}.",
+            footer=f"Made by seldinger {software_version()}. {_recordings(result)}",
         )
     )
     target.write_text(text, encoding="utf-8")
     return target
+
+
+def _recordings(result: dict[str, Any]) -> str:
+    names = result["recordings"]
+    if not names:
+        return "Recording: of the rig itself."
+    return f"Recording: {names[0]}." if len(names) == 1 else f"Recordings, one of each run: {', '.join(names)}."
 
 
 def _lead(result: dict[str, Any]) -> str:

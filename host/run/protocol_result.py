@@ -44,7 +44,10 @@ class TouchResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ActionResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of one action: verdict (ok, out_of_tolerance, failed), reason in words, and its figures."""
+    """Result of one action: verdict (ok, out_of_tolerance, failed), reason in words, and its figures.
+
+    recording: the file in which started_s is a time; empty on a real rig. A run that continues another has a new one.
+    """
 
     id: str
     kind: str
@@ -55,6 +58,7 @@ class ActionResult(msgspec.Struct, frozen=True, kw_only=True):
     point_m: tuple[float, float, float] | None = None
     error_m: float | None = None
     touch: TouchResult | None = None
+    recording: str = ""
 
 
 class ProtocolResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,6 +83,11 @@ class ProtocolResult(msgspec.Struct, frozen=True, kw_only=True):
         """Whether every action was carried out within its tolerances."""
         return self.done and all(item.verdict == OK for item in self.results)
 
+    @property
+    def recordings(self) -> list[str]:
+        """Return the recordings of this run and of those that it continues, oldest first."""
+        return list(dict.fromkeys(name for name in (*(item.recording for item in self.results), self.recording) if name))
+
     def as_json(self) -> dict[str, Any]:
         """Return the result as one JSON object."""
         touches = [item.touch for item in self.results if item.touch is not None]
@@ -94,7 +103,7 @@ class ProtocolResult(msgspec.Struct, frozen=True, kw_only=True):
                 "contact_loss_share": float(np.mean([touch.contact_loss_share for touch in touches])),
                 "tip_error_m": float(np.mean(errors_m)) if errors_m else None,
             }
-        return {**msgspec.to_builtins(self), "summary": summary}
+        return {**msgspec.to_builtins(self), "recordings": self.recordings, "summary": summary}
 
 
 def new_result_path(directory: Path) -> Path:
@@ -109,15 +118,26 @@ def write_result(result: ProtocolResult, target: Path) -> None:
     os.replace(part, target)
 
 
-def read_result(path: Path, protocol: ScriptedProtocol) -> tuple[ActionResult, ...]:
-    """Return the results of an earlier run of the same protocol. Raises InputError where it is none, or of another."""
+def read_result(path: Path, protocol: ScriptedProtocol, rig: str, simulated: bool) -> tuple[ActionResult, ...]:
+    """Return the results of an earlier run of the same protocol on the same rig, named `rig`, or in its simulation.
+
+    Raises InputError where it is none, of another protocol, or of another rig: a touch in the simulator is none on the rig.
+    """
     wanted = "the JSON file of an earlier run of this protocol"
     data = json_of(read_text(path, "--resume", wanted), path, "--resume", wanted)
     try:
-        data.pop("summary", None)
+        for derived in ("summary", "recordings"):
+            data.pop(derived, None)
         result = msgspec.convert(data, ProtocolResult)
     except (ValueError, TypeError):
         raise InputError("--resume", str(path), wanted) from None
     if result.sha256 != protocol.sha256:
         raise InputError("--resume", Description(f"{path}, of another protocol or another version of it"), wanted)
+    if (result.rig, result.simulated) != (rig, simulated):
+        found = Description(f"{path}, {_carried_out(result.rig, result.simulated)}")
+        raise InputError("--resume", found, f"the result of an earlier run {_carried_out(rig, simulated)}")
     return result.results
+
+
+def _carried_out(rig: str, simulated: bool) -> str:
+    return f"in the simulation of rig {rig}" if simulated else f"on the running rig {rig}"

@@ -347,7 +347,10 @@ class Job(NamedTuple):
 
 
 def carry_out(job: Job, driven: DrivenRig, blank: ProtocolResult, progress: Progress) -> ProtocolResult:
-    """Run the remaining actions on an armed rig. The result is written to `job.target` (JSON) after each action."""
+    """Run the remaining actions on an armed rig. The result is written to `job.target` (JSON) after each action.
+
+    What interrupts an action, Ctrl-C too, is written as the end of the result and passed on.
+    """
     file = job.protocol.file
     run = _Run(file, driven, job.rig.control.contact_force_N)
     kept = {item.id: item for item in job.earlier if item.verdict != FAILED}
@@ -357,7 +360,15 @@ def carry_out(job: Job, driven: DrivenRig, blank: ProtocolResult, progress: Prog
     for number, action in enumerate(job.protocol.actions):
         progress(f"step {action.id} {action.kind}", number / len(job.protocol.actions))
         done = kept.get(action.id)
-        results.append(done if done is not None else run.do(action))
+        try:
+            made = done or msgspec.structs.replace(run.do(action), recording=blank.recording)
+        except BaseException as error:
+            why = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
+            write_result(
+                msgspec.structs.replace(blank, results=tuple(results), ended=f"step {action.id}: {why}"), job.target
+            )
+            raise
+        results.append(made)
         newest = results[-1]
         ends = done is None and (newest.verdict in stopping or run.look().mode in ENDED)
         ended = f"step {newest.id}: {newest.says}" if ends else ""

@@ -31,6 +31,8 @@ def serve(source: Source, port: int, title: str, report: Report) -> None:
     report(f"{title}: {page_address(port)}  (Ctrl-C ends it)")
     try:
         server.serve()
+    except KeyboardInterrupt:  # the server passes the signal on that has ended it
+        return
     except SystemExit:
         raise InputError("--port", port, "a port that is free") from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -187,4 +188,24 @@ def test_an_interrupt_that_compiled_code_turns_into_another_error_is_an_interrup
     monkeypatch.setattr(command_line, "_report", lambda error, argv: pytest.fail(f"reported as {error!r}"))
     with pytest.raises(SystemExit) as ended:
         command_line.main()
-    assert ended.value.code == 1
+    assert ended.value.code == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_command_says_so(number: signal.Signals) -> None:
+    """Typer turns the KeyboardInterrupt of a command into its exit status, without a word."""
+    script = (
+        "import os, signal, sys, host.cli.main as m, host.cli.drive\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupted(*a, **k): os.kill(os.getpid(), number)\n"
+        "number = int(sys.argv.pop())\n"
+        "host.cli.drive.driving = interrupted\n"
+        "m.main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "mark", "a note", str(int(number))],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"

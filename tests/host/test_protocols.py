@@ -302,7 +302,7 @@ def test_a_protocol_goes_on_where_it_ended(tmp_path: Path) -> None:
     rig.goes_on = False
     first = performed(tmp_path, text, rig)
     assert [item.verdict for item in first.results] == ["ok", "failed"]
-    earlier = read_result(tmp_path / "result.json", written(tmp_path, text))
+    earlier = read_result(tmp_path / "result.json", written(tmp_path, text), RIG.name, True)
     again = ScriptedRig()
     second = performed(tmp_path, text, again, earlier)
     assert second.good and len(second.results) == 3 and second.results[0] == first.results[0]
@@ -313,13 +313,56 @@ def test_a_protocol_goes_on_where_it_ended(tmp_path: Path) -> None:
 def test_what_is_no_result_is_not_resumed(tmp_path: Path, content: str) -> None:
     (tmp_path / "old.json").write_text(content, encoding="utf-8")
     with pytest.raises(InputError, match=r"^--resume: "):
-        read_result(tmp_path / "old.json", written(tmp_path, HEAD + GOTO))
+        read_result(tmp_path / "old.json", written(tmp_path, HEAD + GOTO), RIG.name, True)
 
 
 def test_a_result_of_another_protocol_is_not_resumed(tmp_path: Path) -> None:
     performed(tmp_path, HEAD + GOTO, ScriptedRig())
     with pytest.raises(InputError, match=r"of another protocol"):
-        read_result(tmp_path / "result.json", written(tmp_path, HEAD + GOTO + GOTO))
+        read_result(tmp_path / "result.json", written(tmp_path, HEAD + GOTO + GOTO), RIG.name, True)
+
+
+@pytest.mark.parametrize(("rig", "simulated"), [("simulated", False), ("lab", True), ("lab", False)])
+def test_a_result_of_another_rig_is_not_resumed(tmp_path: Path, rig: str, simulated: bool) -> None:
+    """Touches of the simulator would otherwise pass for touches of the rig."""
+    performed(tmp_path, HEAD + GOTO, ScriptedRig())
+    with pytest.raises(InputError, match=r"^--resume: found .*in the simulation of rig simulated, wanted .* rig " + rig):
+        read_result(tmp_path / "result.json", written(tmp_path, HEAD + GOTO), rig, simulated)
+
+
+@pytest.mark.parametrize(
+    ("stops", "says"), [(KeyboardInterrupt(), "interrupted"), (OSError("the disk is full"), "OSError: the disk is full")]
+)
+def test_what_interrupts_a_step_is_written_and_the_run_can_be_continued(
+    tmp_path: Path, stops: BaseException, says: str
+) -> None:
+    text = HEAD + GOTO + TOUCH
+    rig = ScriptedRig()
+
+    def interrupted(seconds: float) -> float:
+        raise stops
+
+    rig.force_N = interrupted
+    with pytest.raises(type(stops)):
+        performed(tmp_path, text, rig)
+    assert json.loads((tmp_path / "result.json").read_text())["ended"] == f"step 2: {says}"
+    earlier = read_result(tmp_path / "result.json", written(tmp_path, text), RIG.name, True)
+    assert [item.verdict for item in earlier] == ["ok"]
+    assert performed(tmp_path, text, ScriptedRig(), earlier).good
+
+
+def test_a_result_names_the_recording_of_each_step(tmp_path: Path) -> None:
+    """The times of a step that is kept are those of the earlier recording."""
+    text, rig = HEAD + GOTO + TOUCH, _refusing("contact")
+    steps = written(tmp_path, text)
+    first = Job(steps, RIG, tmp_path / "result.json")
+    carry_out(first, rig, blank_result(first, True, "first.mcap"), lambda step, share: None)
+    second = first._replace(earlier=read_result(first.target, steps, RIG.name, True))
+    result = carry_out(second, ScriptedRig(), blank_result(second, True, "second.mcap"), lambda step, share: None)
+    assert [item.recording for item in result.results] == ["first.mcap", "second.mcap"]
+    assert result.as_json()["recordings"] == ["first.mcap", "second.mcap"]
+    page = write_protocol_report(result.as_json(), tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "first.mcap, second.mcap" in page
 
 
 def test_the_report_has_a_row_for_each_touch_and_says_why_it_ended(tmp_path: Path) -> None:
@@ -335,9 +378,9 @@ def test_the_report_has_a_row_for_each_touch_and_says_why_it_ended(tmp_path: Pat
     assert "Ended early" in page and json.loads((tmp_path / "result.json").read_text())["summary"]["done"] is False
 
 
-def _refusing() -> ScriptedRig:
+def _refusing(command: str = "position") -> ScriptedRig:
     rig = ScriptedRig()
-    rig.refuse = "position"
+    rig.refuse = command
     return rig
 
 
@@ -356,4 +399,4 @@ def test_six_points_of_a_line_on_the_beating_wall(tmp_path: Path) -> None:
     assert len(touches) == 6
     assert all(abs(touch.mean_force_N - 0.2) < 0.05 and touch.peak_force_N < 0.4 for touch in touches)
     assert all(touch.contact_loss_share < 0.05 and touch.force_time_integral_Ns > 0.4 for touch in touches)
-    assert read_result(tmp_path / "result.json", steps) == result.results
+    assert read_result(tmp_path / "result.json", steps, RIG.name, True) == result.results
