@@ -10,15 +10,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import zenoh
-
 from host.run.commander import Acknowledgement, Commander
 from protocol.enums import JogAxis
 from protocol.errors import Description, InputError
 from protocol.jog_limits import fastest_jog
 from protocol.local_paths import listens
 from protocol.rig_file import AXES, SIMULATED_RIG, Rig, load_rig
-from protocol.topics import TOPICS, Log, Message, decode, key
+from protocol.topics import TOPICS, Log, Message, decode
 from protocol.zenoh_access import CA_FILE, CERTIFICATE_FILE, KEY_FILE
 from protocol.zenoh_session import Latest, Session
 
@@ -208,8 +206,7 @@ class RigConnection:
     def logged(self, source: str) -> list[str]:
         """Return the lines of `source` in the rig's log since the last call, oldest first; at most the newest 64 lines."""
         if self._log is None:
-            keyed = key(self._session.rig, "log")
-            self._log = self._session.zenoh.declare_subscriber(keyed, zenoh.handlers.RingChannel(64))
+            self._log = self._session.ring("log", 64)
         lines: list[str] = []
         while (sample := self._log.try_recv()) is not None:
             with contextlib.suppress(ValueError):

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import zenoh
-
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter, new_recording_path
 from host.run.commander import Commander
@@ -18,7 +16,7 @@ from host.run.protocol_run import Job, Progress, StepFailed, blank_result, carry
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.messages import MessageType
-from protocol.topics import Message, PlannedStep, Pose, RigState, decode, key
+from protocol.topics import Message, PlannedStep, Pose, RigState, decode
 from protocol.zenoh_session import Session
 from sim.board import SimulatedBoard
 from sim.effects import parse
@@ -116,10 +114,8 @@ class LiveDrive:
     def __init__(self, session: Session, commander: Commander, ask_operator: Callable[[str], bool]) -> None:
         self._commander, self._ask = commander, ask_operator
         self._steps = session.publisher("plan")
-        self._subscriber = session.zenoh.declare_subscriber(key(session.rig, "state"), zenoh.handlers.RingChannel(1024))
-        self._pose_subscriber = session.zenoh.declare_subscriber(
-            key(session.rig, "pose/tip"), zenoh.handlers.RingChannel(512)
-        )
+        self._subscriber = session.ring("state", 1024)
+        self._pose_subscriber = session.ring("pose/tip", 512)
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
         """Give one command over zenoh; see DrivenRig.give."""

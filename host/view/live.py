@@ -8,7 +8,6 @@ import time
 from typing import Any, Literal
 
 import msgpack
-import zenoh
 from pydantic import Field, ValidationError
 
 from host.recordings.rig_picture import Picture
@@ -19,7 +18,7 @@ from protocol.enums import JogAxis
 from protocol.jog_limits import fastest_jog
 from protocol.requests import Request, wanted_of
 from protocol.rig_file import AXES, Rig
-from protocol.topics import TOPICS, decode, key
+from protocol.topics import TOPICS, decode
 from protocol.zenoh_session import Session
 
 # Messages kept between two frames: all of the traces' topics, the newest of the others.
@@ -77,10 +76,7 @@ class LiveRig:
         self._rig, self._session = rig, session
         self._commander = Commander(session, f"view-{os.getpid()}")
         self._picture = Picture(rig.effective(), dataclasses.asdict(load_catheter(rig.catheter.name)))
-        self._subscribers = {
-            topic: session.zenoh.declare_subscriber(key(rig.name, topic), zenoh.handlers.RingChannel(depth))
-            for topic, depth in DEPTHS.items()
-        }
+        self._subscribers = {topic: session.ring(topic, depth) for topic, depth in DEPTHS.items()}
         self._received_s: float | None = None
         self.malformed = 0
 
