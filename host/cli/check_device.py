@@ -58,5 +58,5 @@ def _print_table(report: DeviceReport) -> None:
     if report.figures:
         console.print(table)
     for problem in report.problems:
-        print(f"seldinger: {report.device}: {problem}", file=sys.stderr)
+        print(f"seldinger: {report.device}: {problem.removeprefix(f'{report.device}: ')}", file=sys.stderr)
     print(f"{report.device}: {'good' if report.good else 'not fit for an experiment'}", file=sys.stderr)

@@ -20,6 +20,7 @@ from realtime.core.lines import force_config, tracker_config
 from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.net_ft import RDT_PORT, ForceSample
 from realtime.drivers.pose_sample import PoseSample
+from realtime.drivers.sample_checks import checked_force, checked_pose
 from realtime.drivers.sensor_threads import AuroraThread, NetFtThread, OnEvent, SensorThread
 from realtime.drivers.transport import open_serial
 
@@ -93,7 +94,10 @@ def source_of(group: str, kind: str) -> Callable[[Any], DeviceSource[Any]]:
 
 
 class SourceThread(SensorThread, Generic[Sample]):
-    """Opens a source, reads it, and opens it again after a loss. `kind` names it in events."""
+    """Opens a source, reads it, and opens it again after a loss. `kind` names it in events.
+
+    checked: returns a sample as it may be used, None for one to be dropped; raises TypeError for what is no sample.
+    """
 
     def __init__(
         self,
@@ -102,9 +106,11 @@ class SourceThread(SensorThread, Generic[Sample]):
         callback: Callable[[Sample], object],
         on_event: OnEvent | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        checked: Callable[[Sample], Sample | None] = lambda sample: sample,
     ) -> None:
         super().__init__(kind, on_event, now_ns)
         self.samples = 0
+        self._checked = checked
         self._kind, self._open, self._callback = kind, open_source, callback
         self._flows, self._flowed, self._reported = False, False, ""
 
@@ -112,11 +118,11 @@ class SourceThread(SensorThread, Generic[Sample]):
         """Call into the driver. Raises OSError for anything that it raises: a plug-in's fault is reported like a loss."""
         try:
             return call()
-        except OSError:
-            raise
+        except OSError as error:
+            raise OSError(f"{self._kind}: {error.strerror or error}") from error
         except InputError as error:
             raise OSError(str(error)) from error
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             said = " ".join(str(error).split())
             raise OSError(
                 f"{self._kind}: {what} failed with {type(error).__name__}: {said}; check its section of the rig file "
@@ -128,21 +134,31 @@ class SourceThread(SensorThread, Generic[Sample]):
         # What a source's own checks have found, where it has any.
         take_events: Callable[[], list[DeviceEvent]] = getattr(source, "take_events", list)
         try:
-            newest_ns = self._now_ns()
+            newest_ns, dropped = self._now_ns(), 0
             while not self._halt.is_set():
-                samples = self._driver("read", source.read)
+                given, samples = self._driver("read", lambda: self._read(source))
+                dropped += given - len(samples)
                 now_ns = self._now_ns()
                 if samples:
-                    newest_ns = now_ns
+                    newest_ns, dropped = now_ns, 0
                     self._begin(now_ns)
                 elif now_ns - newest_ns > SILENT_S * 1e9:
-                    raise OSError(f"{self._kind}: no sample for {SILENT_S:g} s")
+                    what = f"{dropped} samples that are not finite, and no other," if dropped else "no sample"
+                    raise OSError(f"{self._kind}: {what} for {SILENT_S:g} s")
                 for sample in samples:
                     self.samples += 1
                     self._callback(sample)
                 self._report(take_events())
         finally:
             source.close()
+
+    def _read(self, source: DeviceSource[Sample]) -> tuple[int, list[Sample]]:
+        """Return how many samples the source gave, and those that may be used. Raises TypeError for what is no sample."""
+        given: Any = source.read()
+        if not isinstance(given, (list, tuple)):
+            raise TypeError(f"read returned {type(given).__name__}, wanted a list of samples")
+        checked = [self._checked(sample) for sample in given]
+        return len(given), [sample for sample in checked if sample is not None]
 
     def _begin(self, now_ns: int) -> None:
         if self._flows:
@@ -167,7 +183,7 @@ def tracker_thread(
     if tracker.kind == AURORA:
         return AuroraThread(lambda: open_serial(tracker.port, 9600), callback, tracker_config(rig), on_event)
     open_tracker = source_of(TRACKERS, tracker.kind)
-    return SourceThread(tracker.kind, lambda: open_tracker(tracker), callback, on_event)
+    return SourceThread(tracker.kind, lambda: open_tracker(tracker), callback, on_event, checked=checked_pose)
 
 
 def force_thread(
@@ -178,4 +194,4 @@ def force_thread(
     if sensor.kind == NET_FT:
         return NetFtThread(sensor.address, callback, force_config(rig), on_event, port)
     open_sensor = source_of(FORCE_SENSORS, sensor.kind)
-    return SourceThread(sensor.kind, lambda: open_sensor(sensor), callback, on_event)
+    return SourceThread(sensor.kind, lambda: open_sensor(sensor), callback, on_event, checked=checked_force)

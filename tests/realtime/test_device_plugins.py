@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 import socket
 import sys
+import time
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +20,9 @@ from protocol.rig_file import SIMULATED_RIG, Rig, parse_rig, read_rig_data
 from realtime.core.device_sources import FORCE_SENSORS, TRACKERS, SourceThread, force_thread, tracker_thread
 from realtime.drivers.device_events import DeviceEvent, DeviceEventKind
 from realtime.drivers.nano17_daq import Nano17Source, open_force_sensor
+from realtime.drivers.net_ft import ForceSample
+from realtime.drivers.pose_sample import PoseFlag, PoseSample
+from realtime.drivers.sample_checks import checked_force, checked_pose
 from tests.waiting import until
 
 PAGE = (Path(__file__).parents[2] / "docs" / "devices.md").read_text(encoding="utf-8")
@@ -175,3 +181,75 @@ def test_a_driver_that_fails_while_it_reads_is_opened_again() -> None:
     thread.stop()
     assert thread.error is None and closed
     assert any("mine: read failed with ZeroDivisionError" in event.text for event in events)
+
+
+def pose(**changes: Any) -> PoseSample:
+    good = PoseSample("0A", 1, 1, 2, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0.0, False)
+    return replace(good, **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"position_m": np.array([0.0, np.nan, 0.0])},
+        {"position_m": np.array([0.0, 0.0, 4.0])},
+        {"quaternion_wxyz": np.array([1.0, 1.0, 0.0, 0.0])},
+        {"quaternion_wxyz": np.full(4, np.nan)},
+    ],
+)
+def test_what_is_no_pose_counts_as_missing(changes: dict[str, Any]) -> None:
+    """A plug-in's NaN was called a good pose by `check-device`."""
+    seen = checked_pose(pose(**changes))
+    assert seen.missing and PoseFlag.NOT_A_POSE in seen.flags and np.isnan(seen.position_m).all()
+    assert checked_pose(pose()) is not None and not checked_pose(pose()).missing
+
+
+def force(newton: Any) -> ForceSample:
+    return ForceSample(1, 1, newton, np.zeros(3), 1, 0, 0)
+
+
+def test_a_force_that_is_not_finite_is_dropped() -> None:
+    assert checked_force(force(np.array([0.0, np.inf, 0.0]))) is None and checked_force(force(np.zeros(3))) is not None
+
+
+class Giving:
+    """A source that returns the same each time."""
+
+    def __init__(self, given: Any) -> None:
+        self._given = given
+
+    def read(self) -> Any:
+        time.sleep(0.01)
+        if isinstance(self._given, BaseException):
+            raise self._given
+        return self._given
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (None, "mine: read failed with TypeError: read returned NoneType, wanted a list of samples"),
+        ([3.0], "mine: read failed with TypeError: found float in what read returned, wanted ForceSample"),
+        ([force(np.zeros(2))], "found float64 of shape (2,) as ForceSample.force_N, wanted 3 floating-point numbers"),
+        ([force([0, 0, 0])], "found int64 of shape (3,) as ForceSample.force_N"),
+        ([force(np.full(3, np.nan))], "samples that are not finite, and no other, for 1 s"),
+        ([], "mine: no sample for 1 s"),
+        (OSError(5, "Input/output error"), "mine: Input/output error"),
+        (SystemExit(3), "mine: read failed with SystemExit: 3"),
+    ],
+)
+def test_what_is_no_sample_is_one_line_and_the_driver_is_opened_again(
+    given: Any, says: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    events: list[DeviceEvent] = []
+    thread: SourceThread[ForceSample] = SourceThread(
+        "mine", lambda: Giving(given), lambda sample: pytest.fail("was passed on"), events.append, checked=checked_force
+    )
+    thread.start()
+    assert until(lambda: thread.failures > 1)
+    thread.stop()
+    assert len(events) == 1 and says in events[0].text and "\n" not in events[0].text, events
+    assert thread.error is None and "Traceback" not in capfd.readouterr().err
