@@ -162,7 +162,7 @@ class Latest:
         self._subscriber.undeclare()
 
 
-class Ring:
+class RecentSamples:
     """The newest `depth` messages of one topic, as zenoh's samples."""
 
     def __init__(self, session: zenoh.Session, rig: str, topic: str, depth: int) -> None:
@@ -211,7 +211,7 @@ class Everything:
             subscriber.undeclare()
 
 
-_Declared = TypeVar("_Declared", Publisher, Latest, Ring, Everything)
+_Declared = TypeVar("_Declared", Publisher, Latest, RecentSamples, Everything)
 
 
 class RequestServer:
@@ -303,7 +303,7 @@ class Session:
         key(rig, "state")
         self.rig, self.local = rig, local
         self._servers: list[RequestServer] = []
-        self._declared: weakref.WeakSet[Publisher | Latest | Ring | Everything] = weakref.WeakSet()
+        self._declared: weakref.WeakSet[Publisher | Latest | RecentSamples | Everything] = weakref.WeakSet()
         self.zenoh = _open(
             configuration(listen, connect, network), listen + list(network.listen if network is not None else ())
         )
@@ -349,9 +349,9 @@ class Session:
         """Return the newest value of `topic`, for a reader that needs only the newest."""
         return self._keep(Latest(self.zenoh, self.rig, topic))
 
-    def ring(self, topic: str, depth: int) -> Ring:
+    def ring(self, topic: str, depth: int) -> RecentSamples:
         """Return the newest `depth` messages of `topic`, for a reader that needs each of them."""
-        return self._keep(Ring(self.zenoh, self.rig, topic, depth))
+        return self._keep(RecentSamples(self.zenoh, self.rig, topic, depth))
 
     def everything(self) -> Everything:
         """Return all topics, for a recorder."""
@@ -411,7 +411,7 @@ class Session:
 
         The session that listens is closed last: one that is closed in the moment in which its link is lost can end with a
         panic of zenoh's router, which prints a Rust traceback. Where the other end answers the close by closing its link,
-        that moment is this one: of zenoh 1.10, 8 of 600 sessions with subscribers panicked, and 0 of 550 that had
+        that moment is this one: of zenoh 1.10, 13 of 1200 sessions with subscribers panicked, and 0 of 1650 that had
         undeclared them before.
         """
         atexit.unregister(self.close)

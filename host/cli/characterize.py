@@ -40,6 +40,7 @@ def characterize(
     from host.commissioning.characterization import characterize as identify
     from host.commissioning.rig_sweeps import PortNames
     from host.recordings.recording import RecordingFile
+    from realtime.core.sweep_ports import check_served
     from sim.board import BoardUnavailable
 
     one_of("--board", board, BOARDS)
@@ -51,7 +52,11 @@ def characterize(
     for option, port in (("--board-port", board_port), ("--tracker-port", tracker_port)):
         if port is not None and not real:
             raise InputError(option, port, "--real with it: without, a simulated rig is characterized")
+    if yes and not real:
+        raise InputError("--yes", Description("it alone"), "--real with it: without, a simulated rig is characterized")
     loaded = load_rig(rig)
+    if real:
+        check_served(loaded)
     if real and not (yes or sys.stdin.isatty()):
         raise InputError(
             "--yes", Description("nothing"), "a terminal, or --yes once the tip hangs free, because the catheter will move"

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import socket
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from protocol.errors import InputError
 from protocol.rig_file import Rig
+from realtime.core.device_sources import AURORA, NET_FT
 from realtime.core.lines import FromRig, ToRig
 from realtime.core.sweep import SweepLoop
 from realtime.drivers.net_ft import RDT_PORT
@@ -36,6 +39,21 @@ class Ports(Protocol):
 
     def send(self, leaving: ToRig) -> None:
         """Send the data. Raises OSError if the board's line is gone."""
+
+
+def check_served(rig: Rig) -> None:
+    """Refuse a rig whose tracker or force sensor RigPorts cannot read: a plug-in's, or another kind. Raises InputError."""
+    for key, kind, wanted in (
+        ("tracker.kind", rig.tracker.kind, AURORA),
+        ("force_sensor.kind", rig.force_sensor.kind, NET_FT),
+    ):
+        if kind != wanted:
+            raise InputError(
+                key,
+                kind,
+                f"{wanted}, the only one that sweeps on a rig can read; nothing has moved. With this device, record sweeps "
+                "by other means and pass them with --recording",
+            )
 
 
 class RigPorts:
@@ -63,9 +81,10 @@ class RigPorts:
         try:
             line = open_serial(path, baud)
         except OSError as error:
-            cause = error.__cause__ or error
+            cause = error.__cause__
+            said = os.strerror(cause.errno) if isinstance(cause, OSError) and cause.errno else str(cause or error)
             raise OSError(
-                f"{key}: found {path} that does not open ({cause}), wanted a device that no other process holds "
+                f"{key}: found {path} that does not open ({said}), wanted a device that no other process holds "
                 "(a realtime process must be stopped first)"
             ) from None
         self._opened.append(line)

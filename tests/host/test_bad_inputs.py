@@ -360,6 +360,7 @@ CASES: list[Case] = [
     (("tune", "--gains", "colour"), "colour"),
     (("characterize", "--repeats", "0"), "--repeats"),
     (("characterize", "--real"), "--yes"),
+    (("characterize", "--yes"), "--real"),
     (("characterize", "--real", "--recording", "cut.mcap"), "--real"),
     (("prove", "--cases", "0"), "--cases"),
     (("prove", "--world", "flat"), "--world"),

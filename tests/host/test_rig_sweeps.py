@@ -13,11 +13,12 @@ import pytest
 from host.commissioning.characterization import record_simulated, standard_sweeps
 from host.commissioning.rig_sweeps import describe, duration_s
 from host.recordings.recording import RecordingFile
-from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
+from protocol.errors import InputError
+from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig, read_rig_data
 from protocol.topics import Message
 from realtime.core.lines import FromRig, ToRig
 from realtime.core.sweep import Sweep, SweepLoop
-from realtime.core.sweep_ports import RigPorts, run_sweeps
+from realtime.core.sweep_ports import RigPorts, check_served, run_sweeps
 from sim.board import SimulatedBoard
 from sim.tissue import TissueConfig
 from sim.world import World, simulated_plant
@@ -192,4 +193,16 @@ def test_bad_requests_for_a_real_rig(arguments: list[str], status: int, words: s
         timeout=60,
     )
     assert done.returncode == status and words in done.stderr and "Traceback" not in done.stderr
-    assert not list(tmp_path.glob("*.mcap"))
+    assert "Errno" not in done.stderr and not list(tmp_path.glob("*.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("section", "was", "kind"), [("tracker", "aurora", "openigtlink"), ("force_sensor", "net_ft", "nano17")]
+)
+def test_sweeps_with_a_device_that_they_cannot_read_move_nothing(section: str, was: str, kind: str, tmp_path: Path) -> None:
+    """The sweeps would send the bytes of an Aurora to whatever has the plug-in's port."""
+    data = read_rig_data(SIMULATED_RIG)
+    data[section]["kind"] = kind
+    check_served(load_rig(SIMULATED_RIG))
+    with pytest.raises(InputError, match=rf"^{section}\.kind: found \"{kind}\", wanted {was}, .*nothing has moved"):
+        check_served(parse_rig(data))
