@@ -15,6 +15,7 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
 from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
@@ -29,12 +30,13 @@ from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
+from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.screening import without
-from host.diagnosis.selection.search import Found, search
+from host.diagnosis.selection.search import Found, fit_nominal, search
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
@@ -193,6 +195,9 @@ def _diagnosed(
     right, apart = readings_apart(problem, data.recordings)
     if apart:
         model, problem, full = problems(spec, right, rules)
+    tame, lone = _without_lone_samples(problem, full, right)
+    if lone:
+        model, problem, full = problems(spec, tame, rules)
     problem.budget = budget
     held = hold_between_samples(problem, [full] if full is not problem else [])
     cost = model.announce(problem.segments, model.guess(problem.segments))
@@ -212,7 +217,9 @@ def _diagnosed(
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.remainder = remainder
-    result.findings = [*data.findings, *apart, *held, *uncertain(problem, found.best, spans)]
+    result.findings = [*data.findings, *apart, *lone, *held, *uncertain(problem, found.best, spans)]
+    if not found.best.terms and remainder.sure:
+        result.findings += _jumps(full, found)
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
     piled = remainder.doubtful and len(found.best.terms) > problem.rules.partial_effects
@@ -228,6 +235,38 @@ def _diagnosed(
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
     return result
+
+
+def _without_lone_samples(
+    problem: Problem, full: Problem, recordings: list[Recording]
+) -> tuple[list[Recording], list[Finding]]:
+    """Recordings without samples that stand alone in the residual of the nominal model, and what was found."""
+    read = {output.channel for output in problem.model.outputs} & {name for r in recordings for name in r.channels}
+    if not read:
+        return recordings, []
+    nominal = fit_nominal(problem)
+    return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
+
+
+def _jumps(full: Problem, found: Found) -> list[Finding]:
+    """Sentences on jumps of the nominal residual that no effect explains, such as those of a sensor that was moved."""
+    findings = []
+    for row, output in enumerate(full.model.outputs):
+        jumps = jumps_of([r[row] for r in found.nominal_full.residuals])
+        if not jumps:
+            continue
+        places = []
+        for jump in jumps:
+            recording = full.segments[jump.recording].recording
+            at = recording.begin_s + float(recording.time_s[jump.sample])
+            places.append(
+                f"{jump.size:+.3g} {output.unit} at {at:.4g} {'s' if recording.timed else 'samples'} of {recording.name}"
+            )
+        column = full.columns.get(output.channel, output.channel)
+        says = f"The level of column {column} jumps past what the nominal model predicts: {'; '.join(places)}. "
+        says += "Jumps at other instants in other recordings are events, not a law; they are not corrected."
+        findings.append(Finding("jump", column, says))
+    return findings
 
 
 def candidate_ports(problem: Problem) -> tuple[Port, ...]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines, spread
 
+LEAST_PERIODS = 1.0  # in a recording: less of a sine cannot be separated from an offset, a ramp and a bend (Rayleigh)
 PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
 # Pitch of an angle beyond which it is once a turn, which is whip: midway to twice a turn, as of a universal joint.
 LONGEST_ANGLE = float(np.sqrt(2.0) * np.pi)
@@ -34,7 +35,9 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         *pair,
-        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter(
+            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
+        ),
     )
 
 
@@ -59,7 +62,9 @@ def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (
         Parameter("sine", "m", (3e-4,), linear=True),
         Parameter("cosine", "m", (3e-4,), linear=True),
-        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter(
+            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
+        ),
     )
 
 
@@ -76,7 +81,9 @@ def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
     grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         *pairs,
-        Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True),
+        Parameter(
+            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
+        ),
     )
 
 

@@ -23,6 +23,16 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     return (Parameter("rate", f"{s.unit}/s", (s.need / s.duration_s,), linear=True),)
 
 
+def offset_and_rate(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Offset at the first sample and rate of the drift."""
+    return (Parameter("offset", s.unit, (s.need,), linear=True), *parameters(s, ""))
+
+
+def apply_both(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Shift the reading (n,) by p[0] and add a ramp."""
+    return np.asarray(signal + p[0] + p[1] * c.time_s)
+
+
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Add a ramp, or an exponential approach for the form `warm_up`."""
     if form == "warm_up":
@@ -104,5 +114,19 @@ EFFECTS = (
         forms=("warm_up",),
         contains=("sensor_bias",),
         at_rest=True,
+    ),
+    Effect(
+        "sensor_drift",
+        "drift",
+        80,
+        offset_and_rate,
+        "The reading has an offset of {offset} and drifts with time, independent of motion.",
+        "y = x + offset + rate*t",
+        apply_both,
+        timed=True,
+        forms=("offset",),
+        contains=("sensor_bias",),
+        at_rest=True,
+        joins=(("sensor_bias", ""), ("sensor_drift", "")),  # of opposite sign, each of them hides the other
     ),
 )

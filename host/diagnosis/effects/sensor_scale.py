@@ -22,6 +22,11 @@ def apply_force(force: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(force * (1.0 + p[0]))
 
 
+def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Scale the reading (n,) by 1 + p[0]."""
+    return np.asarray(signal * (1.0 + p[0]))
+
+
 EFFECTS = (
     Effect(
         "sensor_scale",
@@ -40,5 +45,15 @@ EFFECTS = (
         "The force sensor reads {gain_error} too much.",
         "y = x*(1 + gain_error)",
         apply_force,
+    ),
+    Effect(
+        "sensor_scale",
+        "scale",
+        28,
+        parameters,
+        "The gain is off by {gain_error}.",
+        "y = x*(1 + gain_error)",
+        apply,
+        invariant=True,
     ),
 )

@@ -161,6 +161,7 @@ class Effect:
     several: bool = False  # more than one may act at a port
     hides: bool = False  # the nominal parameters cannot be fitted without it
     shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
+    joins: tuple[tuple[str, str], ...] = ()  # effects (id, form) of one parameter each that it is the sum of, in their order
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
 
 

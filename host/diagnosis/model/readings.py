@@ -25,7 +25,7 @@ FEW_LEVELS = 20  # levels up to which a channel may be a switched signal
 @dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped,
-    saturated, outliers, quantized or hold; `channel`: the column's name in the recordings.
+    saturated, outliers, quantized, hold or jump; `channel`: the column's name in the recordings.
     """
 
     id: str

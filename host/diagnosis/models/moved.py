@@ -11,12 +11,13 @@ from host.diagnosis.estimation.noise import estimate, quiescent
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.force_kernel import along, slot_array
 from host.diagnosis.model.model import ActiveEffect, Segment, tolerance_of
-from host.diagnosis.model.operators import smooth_derivatives, smoothing_window
+from host.diagnosis.model.operators import least_error_window, smooth_derivatives, smoothing_window
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.03
 DEGREE = 5  # of the local polynomial that is differentiated,
 WIDER = 1.45  # and its window over that of a cubic that passes as much noise
+SHORTEST = 200  # samples of a motion whose spectrum says how far it may be smoothed
 CLEAN = 0.02  # noise of a motion, in smallest movements, below which it is taken as it is
 
 
@@ -36,9 +37,14 @@ class Moved:
         window = smoothing_window(motion, recording.dt_s, noise, SMOOTHING_S) if recording.timed else 7
         tolerance = tolerance_of(motion, float(np.ptp(motion)))
         clean = noise < CLEAN * tolerance
-        if not clean:
-            window = round(WIDER * window) | 1
-        x, v, a = smooth_derivatives(motion, recording.dt_s, window, DEGREE)
+        windows = [window] * 3
+        if not clean:  # each derivative with the window of its own least error, no wider than the band allows
+            widest, least = round(WIDER * window) | 1, round(WIDER * 7) | 1
+            best = [widest] * 3
+            if recording.timed and motion.size >= SHORTEST:
+                best = [least_error_window(motion, recording.dt_s, noise, DEGREE, order) for order in (0, 1, 2)]
+            windows = [max(min(one, widest), least) for one in best]
+        x, v, a = (smooth_derivatives(motion, recording.dt_s, one, DEGREE)[k] for k, one in enumerate(windows))
         # smoothing a clean motion would round its reversals, and friction with them
         return cls(motion if clean else x, v, a, tolerance)
 

@@ -51,11 +51,12 @@ class TransmissionModel(Model):
             others = tuple(link.others)
             loads = tuple(link.load) or forces_among(others, self.units)
             turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
+            prefix = "" if len(self.links) == 1 else f"{name}_"
+            held = not spec.start(f"{prefix}gain", 1.0)[1]  # a gain that is fitted would absorb an error of the scale
             ports += [
                 Port(name, turn, link.subsystem, (link.output,), loads, others),
-                Port(f"{name}_reading", "drift", link.subsystem, (link.output,)),
+                Port(f"{name}_reading", "drift+scale" if held else "drift", link.subsystem, (link.output,)),
             ]
-            prefix = "" if len(self.links) == 1 else f"{name}_"
             ratio = (
                 ""
                 if self.units[link.input] == self.units[link.output]

@@ -17,6 +17,7 @@ from host.diagnosis.estimation.fit import (
     Problem,
     Term,
     free,
+    free_states,
     get_starts,
     grid_points,
     jacobian,
@@ -35,6 +36,7 @@ Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
 START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
+ABSORBED = 1e-10  # share of a response that the active parameters do not explain, below which they absorb it
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 
@@ -151,12 +153,15 @@ def screen(
             base = problem.stacked(terms, values) if drop else r
             parameters = problem.parameters(terms)
             J = jacobian(problem, terms, values, base, [size_of(p, v) for p, v in zip(parameters, values, strict=True)])
+            begins = free_states(problem, terms, values) if problem.joint_states else None
+            if begins is not None:  # states of a linear plant take over what an offset or a ramp does at first
+                J = np.hstack((J, begins.rates))
             Q = np.linalg.qr(J)[0] if J.shape[1] else J
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
         term = _seeded(problem, fit, term_of(problem, candidate, fit))
         quick = candidate.port.name in slopes
-        if not term.parameters:
+        if not term.parameters or (candidate.effect.joins and _absorbs(problem, (*terms, term), values, term, base, Q)):
             continue
         points = _scan(
             problem, (*terms, term), values, term, base, Q, rest, GRID if quick else problem.model.scan_points, slopes, lines
@@ -172,6 +177,17 @@ def screen(
         begin = [point.begin for point in points[: len(nominal) or 3]]
         found.append(Screened(candidate, term, drop, float(promise), begin, nominal))
     return sorted(found, key=lambda item: item.promise, reverse=True)
+
+
+def _absorbs(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array) -> bool:
+    """Whether the nominal parameters absorb one of the effects that `term` joins: then it is the other one alone."""
+    for p in term.parameters:
+        amplitude = {q.name: size_of(q, 0.0) if q is p else 0.0 for q in term.parameters}
+        change = base - problem.stacked(terms, np.concatenate((values, starts(term, amplitude, {}))))
+        left = change - Q @ (Q.T @ change)
+        if float(left @ left) <= ABSORBED * float(change @ change):
+            return True
+    return False
 
 
 def _resting(problem: Problem) -> set[str]:
@@ -321,7 +337,7 @@ def _scan(
         B = D @ Q
         G, g = D @ D.T - B @ B.T, D @ r
         size = np.sqrt(np.maximum(np.diag(G), 1e-300))
-        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < 1e-10:
+        if not np.all(np.isfinite(G)) or float(np.max(np.diag(G) / (np.sum(D * D, axis=1) + 1e-300))) < ABSORBED:
             continue
         a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
         if linear:

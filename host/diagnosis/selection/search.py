@@ -28,7 +28,7 @@ from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.joint import best_pair, pair_instead
 from host.diagnosis.selection.restart import hidden
-from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, without
+from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
 from host.diagnosis.selection.trial import (
     Trial,
     at_bound,
@@ -277,7 +277,7 @@ def _grow(
         move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
-        best = _taken(problem, winner)
+        best = _parted(problem, _taken(problem, winner), candidate_effects)
         two = pair_instead(problem, found.nominal, best, trials, noise_sd) if len(best.terms) == 1 else None
         if two is not None:
             best, gain = _joined(problem, two), two[1]
@@ -392,7 +392,7 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
     if pair is None:
         set_starts(problem, begun)
         return
-    found.best = _joined(problem, pair)
+    found.best = _parted(problem, _joined(problem, pair), candidate_effects)
     found.steps += [Step("joint", term.candidate.key, pair[1], refused) for term in found.best.terms]
     _grow(problem, found, candidate_effects, noise_sd, pair[1].log_likelihood, progress)
 
@@ -414,6 +414,26 @@ def _taken(problem: Problem, trial: Trial) -> Fit:
     return best
 
 
+def _parted(problem: Problem, fit: Fit, candidate_effects: list[Candidate]) -> Fit:
+    """`fit` with each effect that is a sum of others (`joins`) replaced by these: the same outputs, and each is judged by
+    what it gains itself.
+    """
+    n = len(problem.model.parameters)
+    terms: list[Term] = []
+    values = [fit.values[:n]]
+    for term in fit.terms:
+        joined = term.candidate
+        parts = [
+            next((c for c in candidate_effects if (c.effect.id, c.form, c.port.name) == (*part, joined.port.name)), None)
+            for part in joined.effect.joins
+        ]
+        values.append(fit.values_of(term))
+        terms += [term_of(problem, part, fit) for part in parts if part is not None] if parts and all(parts) else [term]
+    if len(terms) == len(fit.terms):
+        return fit
+    return finish(problem, Fit(tuple(terms), np.concatenate(values), cost=fit.cost))
+
+
 def _detour(
     problem: Problem, found: Found, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
 ) -> Found:
@@ -428,7 +448,7 @@ def _detour(
     for trial in _rivals(first.trials, found.best, found.best.terms[0].candidate)[: problem.rules.alternative_starts]:
         if trial.score < problem.rules.alternative_start_score * top or not good_enough(trial, found.nominal):
             continue
-        base = _taken(problem, trial)
+        base = _parted(problem, _taken(problem, trial), candidate_effects)
         ranked = screen(problem, base, candidate_effects, progress)
         if (
             not ranked
@@ -539,7 +559,7 @@ def _in_place_of(
         + problem.rules.parameter_penalty * more
     ):
         found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
-        found.best = _taken(problem, winner)
+        found.best = _parted(problem, _taken(problem, winner), candidate_effects)
 
 
 def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]:

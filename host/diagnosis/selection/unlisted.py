@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.coloured import only_coloured
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
+from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
@@ -21,6 +23,7 @@ from host.diagnosis.symbolic.equation_search import search_equation
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+MEASURED = ("quiescent parts", REPEATS)  # sources of noise that was seen alone
 # several effects that pile up and still do not fit stand for something that is in no list
 
 
@@ -46,6 +49,7 @@ def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     mattered most; noise may be larger than its estimate by `noise_uncertainty`.
     """
     shares, weights = [], []
+    noise_sd = _levels(problem, found.best, noise_sd)
     for row in range(noise_sd.size):
         before = _power(problem, found.nominal.residuals, row) - noise_sd[row] ** 2
         after = _power(problem, found.best.residuals, row) - (problem.rules.noise_uncertainty * noise_sd[row]) ** 2
@@ -60,15 +64,24 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     guessed.
     """
     measured = problem.rules.residual_over_noise if found.best.terms else problem.rules.residual_over_noise_nominal
+    noise_sd = _levels(problem, found.best, noise_sd)
     return any(
         _power(problem, found.best.residuals, row)
-        > (
-            (measured if noise.source in ("quiescent parts", REPEATS) else problem.rules.residual_over_guessed_noise)
-            * noise_sd[row]
-        )
-        ** 2
+        > ((measured if noise.source in MEASURED else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
+        or (not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals])))  # no noise does that
         for row, noise in enumerate(problem.noise)
     )
+
+
+def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
+    """Noise of each output (outputs,): where it was guessed from a spectrum, and `fit` leaves coloured noise, that noise."""
+    levels = noise_sd.copy()
+    for row, noise in enumerate(problem.noise):
+        if noise.source not in MEASURED and _power(problem, fit.residuals, row) > levels[row] ** 2:
+            inputs = [[segment.inputs[name] for name in problem.model.quiet_inputs] for segment in problem.segments]
+            if only_coloured([r[row] for r in fit.residuals], inputs):
+                levels[row] = np.sqrt(_power(problem, fit.residuals, row))
+    return levels
 
 
 def _power(problem: Problem, residuals: list[Array], row: int) -> float:

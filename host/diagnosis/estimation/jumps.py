@@ -1,0 +1,63 @@
+"""Jumps of a residual's level inside a recording: a bumped prism, a slipped clamp, a sensor that was switched on again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.diagnosis.model.operators import fill
+
+Array = npt.NDArray[np.float64]
+SIDE = 20  # samples before and after a jump whose means are compared
+LEAST = 8.0  # robust standard deviations of such differences, from which one is more than noise
+NEAR = 3  # samples before and after a jump,
+ABRUPT = 0.6  # between which at least this part of it happens: a ramp over the whole span has a seventh there
+MOST = 5  # jumps of a recording: a level that steps more often is no level
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump by `size` before the sample `sample` of recording number `recording`."""
+
+    recording: int
+    sample: int
+    size: float
+
+
+def jumps_of(residuals: Sequence[Array]) -> list[Jump]:
+    """Jumps in residuals (n_i,) of recordings, in order; none where the level steps again and again."""
+    found: list[Jump] = []
+    for number, r in enumerate(residuals):
+        if np.isfinite(r).sum() < 10 * SIDE:
+            continue
+        own = _jumps(fill(r), number)
+        if len(own) > MOST:
+            return []
+        found += own
+    return found
+
+
+def _jumps(r: Array, number: int) -> list[Jump]:
+    shift, abrupt = _shift(r, SIDE), _shift(r, NEAR)
+    level = 1.4826 * float(np.median(np.abs(shift - np.median(shift)))) + 1e-300
+    found: list[Jump] = []
+    left = np.abs(shift)
+    while left.size and np.max(left) > LEAST * level and len(found) <= MOST:
+        place = int(np.argmax(left))
+        at = place + SIDE  # first sample after it
+        near = np.arange(max(at - 2, NEAR), min(at + 3, r.size - NEAR + 1))
+        sizes = abrupt[near - NEAR] * np.sign(shift[place])
+        if sizes.size and np.max(sizes) > ABRUPT * left[place]:
+            found.append(Jump(number, int(near[np.argmax(sizes)]), float(shift[place])))
+        left[max(place - SIDE, 0) : place + SIDE + 1] = 0.0
+    return sorted(found, key=lambda jump: jump.sample)
+
+
+def _shift(r: Array, side: int) -> Array:
+    """Mean of `side` samples from each on less that of as many before it, from sample `side` on."""
+    total = np.concatenate(([0.0], np.cumsum(r)))
+    means = (total[side:] - total[:-side]) / side
+    return np.asarray(means[side:] - means[:-side])

@@ -1,0 +1,199 @@
+"""Kinds that an examination on other data found: lone samples, held gains, input offsets, coloured noise, jumps, filters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import seldinger as sd
+from host.diagnosis.estimation.coloured import only_coloured
+from host.diagnosis.estimation.jumps import jumps_of
+from host.diagnosis.model.operators import least_error_window, smooth_derivatives
+
+Array = np.ndarray
+LINK: dict[str, Any] = {
+    "name": "link",
+    "kind": "transmission",
+    "data": {"time": "t"},
+    "channels": {"drive": {"column": "x", "unit": "m"}, "slide": {"column": "y", "unit": "m"}},
+    "link": [{"subsystem": "link", "input": "drive", "output": "slide"}],
+    "parameters": {"gain": 1.0},
+}
+HEATER: dict[str, Any] = {
+    "name": "heater",
+    "kind": "linear",
+    "data": {"time": "t"},
+    "channels": {"power": {"column": "u", "unit": "W"}, "rise": {"column": "y", "unit": "K"}},
+    "linear": {
+        "inputs": ["power"],
+        "outputs": ["rise"],
+        "numerator": ["gain"],
+        "denominator": ["tau", 1.0],
+        "hold": "zero",
+        "subsystem": "block",
+    },
+    "parameters": {"gain": 0.7, "tau": 5.0},
+}
+MOUNT: dict[str, Any] = {
+    "name": "mount",
+    "kind": "impedance",
+    "data": {"time": "t"},
+    "channels": {"x": {"column": "x", "unit": "m"}, "f": {"column": "f", "unit": "N"}},
+    "impedance": {"subsystem": "mount", "input": "x", "output": "f", "terms": ["damping", "stiffness", "offset"]},
+    "parameters": {"stiffness": 4e4, "damping": 100.0},
+}
+
+
+def sway(seed: int, t: Array, fastest_Hz: float, size: float) -> Array:
+    rng = np.random.default_rng([61, seed])
+    hertz = fastest_Hz * np.array([0.11, 0.31, 0.53, 0.83, 1.0])
+    return size * sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.28)) for f in hertz)
+
+
+def ids(verdict: Any) -> list[str]:
+    return [effect["id"] for effect in verdict.effects]
+
+
+def echoes(seed: int) -> dict[str, Array]:
+    """A slide that is read too seldom for its speed: an echo of 0.25 m is no more than its motion in a few samples."""
+    rng, t = np.random.default_rng([67, seed]), np.arange(0.0, 50.0, 0.05)
+    x = sway(seed, t, 0.7, 0.25)
+    y = 0.99 * x + 0.4 + 0.002 * rng.standard_normal(t.size)
+    lone = rng.choice(np.arange(3, t.size - 3), 12, replace=False)
+    y[lone] += rng.choice((-0.25, 0.25), lone.size)
+    return {"t": t, "x": x, "y": y}
+
+
+def test_echoes_that_a_motion_hides_are_outliers_and_nothing_is_missing() -> None:
+    verdict = sd.diagnose([echoes(k) for k in (1, 2, 3)], LINK)
+    assert verdict.verdict == "nothing_missing"
+    assert "outliers" in {finding["id"] for finding in verdict.data_findings}
+
+
+def test_the_answer_to_a_held_input_is_no_outlier() -> None:
+    """A delay of one sample leaves a single sample after each step of the input: that is its evidence."""
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([71, k]), np.arange(0.0, 40.0, 0.05)
+        x = np.repeat(rng.uniform(-1.0, 1.0, 80), 10)
+        recordings.append({"t": t, "x": x, "y": np.r_[x[:1], x[:-1]] + 0.01 * rng.standard_normal(t.size)})
+    verdict = sd.diagnose(recordings, LINK)
+    assert ids(verdict) == ["latency"] and not verdict.data_findings
+
+
+def test_a_gain_that_is_held_at_a_wrong_value_is_an_error_of_scale() -> None:
+    held = {**LINK, "parameters": {"gain": {"value": 1.0, "free": False}}}
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([73, k]), np.arange(0.0, 30.0, 0.05)
+        x = 3.0 + sway(k, t, 0.5, 0.4)
+        recordings.append({"t": t, "x": x, "y": 0.94 * x + 0.01 * rng.standard_normal(t.size)})
+    (found,) = sd.diagnose(recordings, held).effects
+    assert found["id"] == "sensor_scale" and found["parameters"]["gain_error"]["value"] == pytest.approx(-0.06, rel=0.05)
+
+
+def heated(seed: int, loss_W: float, offset_K: float = 0.0, drift_K_per_s: float = 0.0) -> dict[str, Array]:
+    rng, t = np.random.default_rng([79, seed]), np.arange(0.0, 50.0, 0.1)
+    u = np.repeat(rng.uniform(0.0, 60.0, 10), 50)
+    y, fade = np.empty(t.size), np.exp(-0.1 / 6.0)
+    y[0] = 20.0 * rng.random()
+    for k in range(t.size - 1):
+        y[k + 1] = fade * y[k] + (1.0 - fade) * 0.8 * (u[k] - loss_W)
+    return {"t": t, "u": u, "y": y + offset_K + drift_K_per_s * t + 0.1 * rng.standard_normal(t.size)}
+
+
+def test_an_offset_of_the_input_of_a_plant_that_settles_is_one_of_its_reading() -> None:
+    """The initial state of the plant takes over the first seconds, so the two are one effect."""
+    (found,) = sd.diagnose([heated(k, 8.0) for k in (1, 2, 3)], HEATER).effects
+    assert found["id"] == "sensor_bias" and found["parameters"]["offset_K"]["value"] == pytest.approx(-6.4, rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("offset_K", "drift_K_per_s"), [(1.5, 0.06), (-2.0, 0.08)])
+def test_an_offset_and_a_drift_together_are_two_effects(offset_K: float, drift_K_per_s: float) -> None:
+    verdict = sd.diagnose([heated(k, 0.0, offset_K, drift_K_per_s) for k in (1, 2, 3)], HEATER)
+    assert sorted(ids(verdict)) == ["sensor_bias", "sensor_drift"]
+
+
+def shaken(seed: int, n: int) -> Array:
+    """A floor that rings at 3 Hz when it is hit at random, read 100 times a second; unit standard deviation."""
+    rng = np.random.default_rng([83, seed])
+    kicks, time_s = rng.standard_normal(n + 2000), np.arange(2000) * 0.01
+    out = np.convolve(kicks, np.exp(-time_s / 0.6) * np.sin(2.0 * np.pi * 3.0 * time_s))[2000 : n + 2000]
+    return out / np.std(out)
+
+
+def test_coloured_noise_that_was_never_seen_alone_is_no_mismatch() -> None:
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([89, k]), np.arange(0.0, 40.0, 0.01)
+        x = sway(k, t, 1.3, 0.1)
+        recordings.append({"t": t, "x": x, "y": x + 0.004 * shaken(k, t.size) + 1e-5 * rng.standard_normal(t.size)})
+    verdict = sd.diagnose(recordings, LINK)
+    assert verdict.verdict == "nothing_missing"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_coloured_noise_is_told_from_physics(seed: int) -> None:
+    n, t = 4000, np.arange(4000) * 0.01
+    inputs = [[sway(10 * seed + k, t, 1.7, 0.3)] for k in range(3)]
+    noise = [shaken(10 * seed + k, n) for k in range(3)]
+    assert only_coloured(noise, inputs)
+    small = [0.02 * np.random.default_rng(k).standard_normal(n) for k in range(3)]
+    for physics in (
+        lambda x: x**3,
+        lambda x: np.sign(np.gradient(x)),
+        lambda x: np.r_[np.zeros(9), x[9:] - x[:-9]],
+        lambda x: np.convolve(x, np.exp(-t / 0.5) * 0.02)[:n],
+    ):
+        assert not only_coloured([physics(u[0]) + e for u, e in zip(inputs, small, strict=True)], inputs)
+
+
+def test_jumps_at_other_instants_in_each_recording_are_reported() -> None:
+    recordings = []
+    for k, jumps in enumerate(([(9.0, 0.006)], [(14.0, -0.005), (24.0, 0.007)], [])):
+        rng, t = np.random.default_rng([97, k]), np.arange(0.0, 35.0, 0.05)
+        x = sway(k, t, 0.4, 0.15)
+        y = x + 0.001 * rng.standard_normal(t.size) + sum(size * (t > at) for at, size in jumps)
+        recordings.append({"t": t, "x": x, "y": y})
+    verdict = sd.diagnose(recordings, LINK)
+    assert verdict.verdict == "mismatch_not_identified"
+    (says,) = [finding["says"] for finding in verdict.data_findings if finding["id"] == "jump"]
+    assert "at 9.05 s of recording 1" in says and "at 24.05 s of recording 2" in says and "recording 3" not in says
+
+
+def test_jumps_are_told_from_noise_and_from_friction() -> None:
+    rng, t = np.random.default_rng(5), np.arange(0.0, 40.0, 0.01)
+    assert not jumps_of([rng.standard_t(3, t.size), shaken(1, t.size)])
+    assert not jumps_of([0.3 * np.sign(np.cos(2.0 * np.pi * 0.4 * t)) + 0.01 * rng.standard_normal(t.size)])
+    (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)])
+    assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
+
+
+def test_the_filter_of_a_noisy_motion_is_no_physics() -> None:
+    """A spring so stiff that one percent of its motion is more than the noise of its force."""
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([101, k]), np.arange(0.0, 20.0, 0.005)
+        seeds = np.random.default_rng([103, k]).uniform(0.0, 6.28, 4)
+        w = 2.0 * np.pi * np.array([0.4, 1.1, 2.3, 3.7])
+        x = 0.0015 * np.sin(np.outer(t, w) + seeds).sum(axis=1)
+        v = 0.0015 * (np.cos(np.outer(t, w) + seeds) * w).sum(axis=1)
+        f = 8e4 * x + 200.0 * v + 3.0 + rng.standard_normal(t.size)
+        recordings.append({"t": t, "x": x + 1e-5 * rng.standard_normal(t.size), "f": f})
+    assert sd.diagnose(recordings, MOUNT).verdict == "nothing_missing"
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_a_window_of_least_error_is_the_best_of_those_tried(order: int) -> None:
+    rng, t = np.random.default_rng(7), np.arange(0.0, 20.0, 0.005)
+    w = 2.0 * np.pi * 3.3
+    exact = (np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t))[order]
+    y = np.sin(w * t) + 0.005 * rng.standard_normal(t.size)
+
+    def error(window: int) -> float:
+        return float(np.std((smooth_derivatives(y, 0.005, window, 5)[order] - exact)[100:-100]))
+
+    assert error(least_error_window(y, 0.005, 0.005, 5, order)) < 1.1 * min(error(k) for k in range(7, 91, 4))
