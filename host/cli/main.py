@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import io
 import os
@@ -192,6 +193,10 @@ def _report(error: Exception, argv: list[str]) -> int:
     missing = missing_extra(error, command) if isinstance(error, ModuleNotFoundError) else None
     if missing is not None:
         print(f"seldinger: {missing}", file=sys.stderr)
+        return 1
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"seldinger: {where}{error.strerror}; free some space, or choose another folder", file=sys.stderr)
         return 1
     said = str(error).strip().partition("\n")[0]
     what = f"{type(error).__name__}: {said}" if said else type(error).__name__

@@ -86,8 +86,9 @@ def run(
     except BaseException:  # Ctrl-C, a full disk, ...: said by the command line
         _print_resume(target)
         raise
+    _print_result(result, target)
     report = write_protocol_report(result.as_json(), target.with_suffix(".html"))
-    _print_result(result, target, report)
+    print(f"report     {report}", file=sys.stderr)
     if json:
         write_json({**result.as_json(), "result": str(target), "report": str(report)})
     if not result.good:
@@ -133,7 +134,7 @@ def _print_resume(target: Path) -> None:
         print(f"to continue: the same command with --resume {target}", file=sys.stderr)
 
 
-def _print_result(result: ProtocolResult, target: Path, report: Path) -> None:
+def _print_result(result: ProtocolResult, target: Path) -> None:
     """Print a line for each action, and the paths of the files."""
     for item in result.results:
         touch = item.touch
@@ -150,4 +151,4 @@ def _print_result(result: ProtocolResult, target: Path, report: Path) -> None:
         _print_resume(target)
     for recording in result.recordings:
         print(f"recording  {recording}", file=sys.stderr)
-    print(f"result     {target}\nreport     {report}", file=sys.stderr)
+    print(f"result     {target}", file=sys.stderr)

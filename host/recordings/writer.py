@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -103,6 +104,11 @@ class GuardedFile:
         self._position += len(data)
         return len(data)
 
+    @property
+    def whole(self) -> int:
+        """Return the number of bytes that are on the disk and readable by themselves."""
+        return self._whole
+
     def tell(self) -> int:
         """Return the number of bytes written so far."""
         return self._position
@@ -152,14 +158,21 @@ def new_recording_path(directory: Path, name: str) -> Path:
     return path
 
 
+def _print_failure(text: str) -> None:
+    print(f"seldinger: {text}", file=sys.stderr, flush=True)
+
+
 class RecordingWriter:
     """Writes one recording. Not thread-safe: one thread records.
 
     path: a file that does not exist yet (FileExistsError otherwise). on_failure: called once, with one sentence,
-    when the disk is full or gone; writing then goes on doing nothing, so that nothing else has to stop.
+    when the disk is full or gone (default: prints it on standard error); writing then goes on doing nothing, so that
+    nothing else has to stop.
     """
 
-    def __init__(self, path: str | Path, header: RecordingHeader, on_failure: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self, path: str | Path, header: RecordingHeader, on_failure: Callable[[str], None] = _print_failure
+    ) -> None:
         self.path = Path(path)
         self.failure = ""
         self._on_failure = on_failure
@@ -265,9 +278,9 @@ class RecordingWriter:
         if error is None or self.failure:
             return
         cause = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error.strerror or error)
-        self.failure = f"recording {self.path} ended early: {cause}; what was written before is readable"
-        if self._on_failure is not None:
-            self._on_failure(self.failure)
+        kept = "what was written before is readable" if self._file.whole else "nothing of it was written"
+        self.failure = f"recording {self.path} ended early: {cause}; {kept}"
+        self._on_failure(self.failure)
 
     def close(self) -> None:
         """Finish the file with its index. Safe to call twice."""

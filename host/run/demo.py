@@ -82,7 +82,6 @@ def run_lockstep(settings: DemoSettings, progress: Progress = lambda phase, shar
             run.counts = _counts(scenario, world, run.outcome)
         if recording.failure:
             run.recording_failure = recording.failure
-            run.outcome.notes.append(recording.failure)
     return run
 
 

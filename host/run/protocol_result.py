@@ -112,10 +112,14 @@ def new_result_path(directory: Path) -> Path:
 
 
 def write_result(result: ProtocolResult, target: Path) -> None:
-    """Write the result as JSON, so that a crash leaves the one before it."""
+    """Write the result as JSON, so that a crash or a full disk leaves the one before it. Raises OSError with the path."""
     part = target.with_suffix(".part")
-    part.write_text(json.dumps(plain(result.as_json()), allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, target)
+    try:
+        part.write_text(json.dumps(plain(result.as_json()), allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(part, target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(target)) from None
 
 
 def read_result(path: Path, protocol: ScriptedProtocol, rig: str, simulated: bool) -> tuple[ActionResult, ...]:

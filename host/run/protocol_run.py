@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -364,9 +365,9 @@ def carry_out(job: Job, driven: DrivenRig, blank: ProtocolResult, progress: Prog
             made = done or msgspec.structs.replace(run.do(action), recording=blank.recording)
         except BaseException as error:
             why = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
-            write_result(
-                msgspec.structs.replace(blank, results=tuple(results), ended=f"step {action.id}: {why}"), job.target
-            )
+            broken_off = msgspec.structs.replace(blank, results=tuple(results), ended=f"step {action.id}: {why}")
+            with contextlib.suppress(OSError):
+                write_result(broken_off, job.target)
             raise
         results.append(made)
         newest = results[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -209,3 +210,10 @@ def test_an_interrupted_command_says_so(number: signal.Signals) -> None:
         check=False,
     )
     assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"
+
+
+def test_a_full_disk_below_a_result_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line._report(OSError(errno.ENOSPC, "No space left on device", "runs/result.json"), ["run"]) == 1
+    assert capsys.readouterr().err == (
+        "seldinger: runs/result.json: No space left on device; free some space, or choose another folder\n"
+    )

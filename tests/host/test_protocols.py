@@ -14,7 +14,7 @@ import pytest
 from host.recordings.rig_picture import Picture
 from host.report.protocol_report import write_protocol_report
 from host.run.protocol_file import ScriptedProtocol, dry_run, read_protocol
-from host.run.protocol_result import ProtocolResult, read_result
+from host.run.protocol_result import ProtocolResult, read_result, write_result
 from host.run.protocol_rigs import run_simulated
 from host.run.protocol_run import Job, blank_result, carry_out
 from protocol.commander import Acknowledgement
@@ -349,6 +349,25 @@ def test_what_interrupts_a_step_is_written_and_the_run_can_be_continued(
     earlier = read_result(tmp_path / "result.json", written(tmp_path, text), RIG.name, True)
     assert [item.verdict for item in earlier] == ["ok"]
     assert performed(tmp_path, text, ScriptedRig(), earlier).good
+
+
+def test_a_result_that_the_disk_does_not_take_leaves_the_one_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = HEAD + GOTO + GOTO
+    target = tmp_path / "result.json"
+    performed(tmp_path, text, ScriptedRig())
+    before = target.read_text()
+
+    def full(path: Path, content: str, **options: Any) -> int:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left on device") as failed:
+        write_result(blank_result(Job(read_protocol(tmp_path / "protocol.toml", RIG), RIG, target), True), target)
+    assert failed.value.filename == str(target) and target.read_text() == before
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_result_names_the_recording_of_each_step(tmp_path: Path) -> None:

@@ -309,3 +309,14 @@ def test_texts_and_flags_keep_their_types(tmp_path: Path) -> None:
     assert recording.table("state")["cause"].tolist() == ["no fresh pose"]
     assert recording.table("force/estimate")["converged"].dtype == np.bool_
     assert np.isnan(recording.table("force/estimate")["czz_N2"]).all()
+
+
+def test_a_full_disk_is_told_without_a_listener_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`seldinger run --simulated` recorded into nothing and said that the recording was there."""
+    fill_up(monkeypatch, 0)
+    with RecordingWriter(tmp_path / "full.mcap", HEADER) as writer:
+        assert writer.failure
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "full.mcap ended early: the disk is full; nothing of it was written" in said

@@ -196,9 +196,7 @@ def test_bad_requests_for_a_real_rig(arguments: list[str], status: int, words: s
     assert "Errno" not in done.stderr and not list(tmp_path.glob("*.mcap"))
 
 
-@pytest.mark.parametrize(
-    ("section", "was", "kind"), [("tracker", "aurora", "openigtlink"), ("force_sensor", "net_ft", "nano17")]
-)
+@pytest.mark.parametrize(("section", "was", "kind"), [("tracker", "aurora", "mine"), ("force_sensor", "net_ft", "mine")])
 def test_sweeps_with_a_device_that_they_cannot_read_move_nothing(section: str, was: str, kind: str, tmp_path: Path) -> None:
     """The sweeps would send the bytes of an Aurora to whatever has the plug-in's port."""
     data = read_rig_data(SIMULATED_RIG)
