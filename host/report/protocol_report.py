@@ -26,7 +26,7 @@ def write_protocol_report(result: dict[str, Any], target: Path) -> Path:
         .render(
             title=result["protocol"],
             lead=_lead(result),
-            eyebrow=f"seldinger run · rig {result['rig']}{', simulated' if result['simulated'] else ''}",
+            eyebrow=f"seldinger run · rig {result['rig']}{', in the simulator' if result['simulated'] else ''}",
             lines=_lines(result),
             pictures=[_places(touches), _traces(touches)] if touches else [],
             touches=[_row(item) for item in touches],

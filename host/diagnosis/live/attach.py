@@ -9,7 +9,7 @@ from pathlib import Path
 from host.diagnosis.live.watch import warm_up, watch
 from protocol.end_signals import EndSignals
 from protocol.rig_file import load_rig
-from protocol.topics import Alarm
+from protocol.topics import Alarm, Log
 from protocol.zenoh_session import Session
 
 STATES = {
@@ -23,6 +23,7 @@ def attach(rig_file: Path, report: Callable[[str], None], on_alarm: Callable[[Al
     """Watch the rig of `rig_file` until SIGINT or SIGTERM.
 
     Arguments: `report` gets a line for each change of state and each alarm; `on_alarm` gets each alarm once it is published.
+    An alarm is published on the topic alarm, and its words on the topic log.
     Raises: InputError for a bad rig file.
     """
     os.nice(10)  # below the rig's own processes
@@ -34,10 +35,12 @@ def attach(rig_file: Path, report: Callable[[str], None], on_alarm: Callable[[Al
     if ends.asked.is_set():
         return
     with Session.of_rig(rig) as session:
-        alarms = session.publisher("alarm")
+        alarms, logs = session.publisher("alarm"), session.publisher("log")
 
         def publish(alarm: Alarm) -> None:
             alarms.put(alarm)
+            # The same words on the page, in the rig's log and in the recording.
+            logs.put(Log(stamp_ns=alarm.stamp_ns, level="warning", source="diagnosis", text=alarm.words))
             report(f"ALARM at {alarm.stamp_ns * 1e-9:.1f} s of the rig's clock: {alarm.words}")
             on_alarm(alarm)
 

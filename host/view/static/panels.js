@@ -40,7 +40,7 @@ export function showSafety(frame, live) {
   const force = silent || frame.force_N === null ? "–" : `${frame.force_N.toFixed(3)} N`;
   set("force", force);
   const first = frame.first;
-  const story = first && [first.says, first.remedy, ...(first.followed.length ? [`Then: ${first.followed.join(" ")}`] : [])].join("\n");
+  const story = first && [first.says, first.remedy, ...(first.followed.length ? ["Then:", ...first.followed] : [])].join("\n");
   const said = story || frame.causes.map(cause => `${cause[0].toUpperCase()}${cause.slice(1)}.`).join("\n") || IDLE[frame.mode] || "No safety cause is active.";
   set("cause", !silent ? said : frame.silent_s === null ? "No message of the rig yet. Check that it runs, with the endpoints of this rig file."
     : `No message of the rig for ${frame.silent_s.toFixed(0)} s. The values shown are old.`);
@@ -67,7 +67,7 @@ export function showModel(model) {
   const known = value => value !== null && value !== undefined;
   const rows = [];
   if (known(model.scale)) {
-    rows.push(["stiffness of the file's", `${(100 * model.scale).toFixed(1)} ± ${(100 * model.sd).toFixed(1)} %`],
+    rows.push(["stiffness relative to the file", `${(100 * model.scale).toFixed(1)} ± ${(100 * model.sd).toFixed(1)} %`],
       ["adaptation", model.adaptation + (model.text ? `: ${model.text}` : ""), model.adaptation === "limited" ? "bad" : ""]);
   }
   if (known(model.place)) {
