@@ -31,7 +31,8 @@ _LOCATORS = (
     "IPythonCacheLocator",
     "ZipCacheLocator",
 )
-_IMPORT = re.compile(r"^\s*(?:from\s+([\w.]+)\s+import\s+(\([^)]*\)|[\w, ]*)|import\s+([\w.]+))", re.MULTILINE)
+_IMPORT = re.compile(r"^\s*(?:from\s+([\w.]+)\s+import\s+(\([^)]*\)|[\w, ]*)|import\s+([\w., ]+))", re.MULTILINE)
+_COMMENT = re.compile(r"#.*")
 
 
 def sources_state(module: Path, root: Path = ROOT) -> str:
@@ -55,20 +56,28 @@ def sources_state(module: Path, root: Path = ROOT) -> str:
 def _imported(root: Path, text: str) -> Iterator[Path]:
     """Files of the project that the imports of a source load, packages without code of their own left out."""
     for match in _IMPORT.finditer(text):
-        module, names, plain = match.groups()
-        parts = (module or plain).split(".")
-        if parts[0] not in PACKAGES:
-            continue
-        folder = root.joinpath(*parts)
-        if folder.with_suffix(".py").is_file():
-            yield folder.with_suffix(".py")
-            continue
-        for name in re.findall(r"\w+", names or ""):
-            inside = folder / f"{name}.py"
-            if inside.is_file():
-                yield inside
-            elif not (folder / name).is_dir() and (folder / "__init__.py").is_file():
-                yield folder / "__init__.py"
+        module, names, modules = match.groups()
+        for imported in [module] if module else _imported_names(modules):
+            parts = imported.split(".")
+            if parts[0] not in PACKAGES:
+                continue
+            folder = root.joinpath(*parts)
+            if folder.with_suffix(".py").is_file():
+                yield folder.with_suffix(".py")
+                continue
+            # "": `import package` runs the package's own code.
+            for name in _imported_names(names) if module else [""]:
+                inside = folder / f"{name}.py"
+                if inside.is_file():
+                    yield inside
+                elif not (name and (folder / name).is_dir()) and (folder / "__init__.py").is_file():
+                    yield folder / "__init__.py"
+
+
+def _imported_names(text: str) -> list[str]:
+    """Names in the list of an import, in parentheses or not, without what `as` calls them."""
+    entries = _COMMENT.sub("", text).strip("() \n").split(",")
+    return [entry.split()[0] for entry in entries if entry.split()]
 
 
 def base() -> Path:

@@ -35,6 +35,13 @@ def test_an_edited_kernel_is_another_state(tmp_path: Path) -> None:
         "import protocol.gains",
         "from protocol import (\n    frames,\n    gains,\n)",
         "from protocol import GAIN_OF_THE_PACKAGE",
+        "from protocol import gains as g",
+        "from protocol.gains import GAIN as G",
+        "import protocol.gains as g",
+        "import protocol.frames, protocol.gains",
+        "import numpy, protocol.gains as g",
+        "import protocol",
+        "from protocol import (  # noqa\n    frames as f,  # one, two\n    gains as g,\n)",
     ],
 )
 def test_what_a_kernel_imports_counts_and_what_it_does_not_import_does_not(tmp_path: Path, line: str) -> None:
@@ -48,6 +55,19 @@ def test_what_a_kernel_imports_counts_and_what_it_does_not_import_does_not(tmp_p
     assert sources_state(tick, tmp_path) == first
     write(tmp_path, "protocol/limits.py", "LIMIT = 2\n")
     assert sources_state(tick, tmp_path) != first
+
+
+@pytest.mark.parametrize("line", ["from protocol import gains as g", "import protocol.gains as limits"])
+def test_the_name_after_as_is_no_import(tmp_path: Path, line: str) -> None:
+    """It was read as a name in the package, whose own code then counted."""
+    tick = write(tmp_path, TICK, f"{line}\n")
+    write(tmp_path, "protocol/gains.py", "GAIN = 1\n")
+    write(tmp_path, "protocol/__init__.py", "A = 1\n")
+    write(tmp_path, "protocol/limits.py", "LIMIT = 1\n")
+    first = sources_state(tick, tmp_path)
+    write(tmp_path, "protocol/__init__.py", "A = 2\n")
+    write(tmp_path, "protocol/limits.py", "LIMIT = 2\n")
+    assert sources_state(tick, tmp_path) == first
 
 
 def test_the_state_holds_no_path_of_the_checkout(tmp_path: Path) -> None:
