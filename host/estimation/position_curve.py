@@ -50,7 +50,7 @@ class Chord(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def cross_into(a: Array, b: Array, out: Array) -> None:
-    """Set out (3,) = a x b."""
+    """Set `out` (3,) to the cross product a x b of vectors (3,), without allocating."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]

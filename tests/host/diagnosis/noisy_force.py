@@ -35,7 +35,7 @@ def write(drawn: ConcealedCase, force_noise_N: float, folder: Path) -> list[Path
 
 
 def judged(folder: Path, files: list[Path]) -> Diagnosis:
-    """What the finder says."""
+    """Return the diagnosis of the recordings `files` with the nominal model of `folder`; no progress is shown."""
     return diagnose(read_nominal(folder / "nominal.toml"), files, lambda what, part: None)
 
 

@@ -21,7 +21,7 @@ Array = np.ndarray
 
 
 def silent(text: str, share: float) -> None:
-    """No progress is shown."""
+    """Take the progress of a diagnosis and show none of it."""
 
 
 def late(x: Array, t: Array) -> Array:

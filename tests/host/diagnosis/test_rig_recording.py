@@ -42,7 +42,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def of_plain(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What is said of it."""
+    """Return the verdict on the recording without a planted effect."""
     return verdict_of(tmp_path_factory.mktemp("verdict"), plain)
 
 
