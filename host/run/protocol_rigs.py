@@ -16,7 +16,7 @@ from host.run.protocol_run import Job, Progress, StepFailed, blank_result, carry
 from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.messages import MessageType
-from protocol.topics import Message, PlannedStep, Pose, RigState, decode
+from protocol.topics import Message, PlannedStep, Pose, RigCause, RigState, decode
 from protocol.zenoh_session import Session
 from sim.board import SimulatedBoard
 from sim.effects import parse
@@ -35,10 +35,13 @@ class SimulatedDrive:
         self._scenario, self._publish = scenario, publish
         self._states: list[RigState] = []
         self._poses: list[Pose] = []
+        self._cause = ""
 
     def take(self, message: Message) -> None:
-        """Keep a state, or a pose of the tip, that the loop published."""
-        if isinstance(message, RigState):
+        """Keep a state, a pose of the tip or the first cause that the loop published."""
+        if isinstance(message, RigCause):
+            self._cause = _cause_text(message)
+        elif isinstance(message, RigState):
             self._states.append(message)
         elif isinstance(message, Pose):
             self._poses.append(message)
@@ -60,6 +63,10 @@ class SimulatedDrive:
         """Return the loop's states since the last call; see DrivenRig.states."""
         taken, self._states = self._states, []
         return taken
+
+    def first_cause(self) -> str:
+        """Return the cause that the loop published last; see DrivenRig.first_cause."""
+        return self._cause
 
     def operator(self, message: str) -> bool:
         """Confirm at once; see DrivenRig.operator."""
@@ -93,7 +100,7 @@ def run_simulated(
 
         def publish(topic: str, message: Message) -> None:
             recording.write(topic, message, world.now_ns)
-            if topic in ("state", "pose/tip"):
+            if topic in ("state", "pose/tip", "cause"):
                 for listener in listeners:
                     listener(message)
 
@@ -113,7 +120,7 @@ class LiveDrive:
 
     def __init__(self, session: Session, commander: Commander, ask_operator: Callable[[str], bool]) -> None:
         self._commander, self._ask = commander, ask_operator
-        self._steps = session.publisher("plan")
+        self._steps, self._causes, self._cause = session.publisher("plan"), session.latest("cause"), ""
         self._subscriber = session.ring("state", 1024)
         self._pose_subscriber = session.ring("pose/tip", 512)
 
@@ -141,6 +148,13 @@ class LiveDrive:
         """Return the tracker's poses since the last call; see DrivenRig.poses. Malformed ones are omitted."""
         return _taken(self._pose_subscriber, Pose)
 
+    def first_cause(self) -> str:
+        """Return the newest cause that the rig published; see DrivenRig.first_cause."""
+        newest = self._causes.take()
+        if isinstance(newest, RigCause):
+            self._cause = _cause_text(newest)
+        return self._cause
+
     def operator(self, message: str) -> bool:
         """Ask the operator; see DrivenRig.operator."""
         return self._ask(message)
@@ -148,6 +162,10 @@ class LiveDrive:
     def publish_step(self, step: PlannedStep) -> None:
         """Publish a step of a plan; see DrivenRig.publish_step."""
         self._steps.put(step)
+
+
+def _cause_text(cause: RigCause) -> str:
+    return f"{cause.says} {cause.remedy}" if cause.name else ""
 
 
 def _taken(subscriber: Any, kind: type[MessageType]) -> list[MessageType]:

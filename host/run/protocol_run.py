@@ -21,6 +21,8 @@ from protocol.topics import PlannedStep, Pose, RigState
 THERE_S = 0.3
 # Commands of a plan a second: half of what the rig lets through.
 PLAN_HZ = 20.0
+# After a stop its causes come in within this time; then the first of them is known.
+CAUSES_S = 0.3
 # Samples of the force a second in a result's trace.
 TRACE_HZ = 20.0
 GRAM_N = 9.80665e-3
@@ -45,6 +47,10 @@ class DrivenRig(Protocol):
 
     def poses(self) -> list[Pose]:
         """Return the tracker's poses of the tip since the last call, oldest first."""
+        ...
+
+    def first_cause(self) -> str:
+        """Return the first cause of what holds the rig back, with its remedy; empty if nothing does."""
         ...
 
     def operator(self, message: str) -> bool:
@@ -94,8 +100,16 @@ class _Run:
 
         ended = self._driven.wait(seconds, looking)
         if self._now.mode in ENDED:
-            raise StepFailed(f"the rig went to {self._now.mode}" + (f": {self._now.cause}" if self._now.cause else ""))
+            raise StepFailed(self._why_ended())
         return ended
+
+    def _why_ended(self) -> str:
+        """Return the phase in which the rig has ended, and the first cause. What followed from it is in the rig's log."""
+        mode, causes = self._now.mode, self._now.cause
+        with contextlib.suppress(StepFailed):  # a lease that is lost as well
+            self._driven.wait(CAUSES_S)
+        cause = self._driven.first_cause() or causes
+        return f"the rig went to {mode}" + (f": {cause}" if cause else "")
 
     def ask(self, action: str, target: str = "none", **fields: Any) -> None:
         """Give a command; raise StepFailed if it is refused."""

@@ -13,6 +13,7 @@ import pytest
 
 from host.recordings.rig_picture import Picture
 from host.report.protocol_report import write_protocol_report
+from host.run import protocol_rigs
 from host.run.protocol_file import ScriptedProtocol, dry_run, read_protocol
 from host.run.protocol_result import ProtocolResult, read_result, write_result
 from host.run.protocol_rigs import run_simulated
@@ -21,6 +22,8 @@ from protocol.commander import Acknowledgement
 from protocol.errors import InputError
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import STEP_STATUS, PlannedStep, Pose, RigState
+from sim.sensor_faults import SensorFault
+from sim.world import World
 
 ROOT = Path(__file__).parents[2]
 SIX_POINTS = ROOT / "docs" / "examples" / "six_points.toml"
@@ -110,6 +113,7 @@ class ScriptedRig:
         self._states: list[RigState] = []
         self._poses: list[Pose] = []
         self.published: list[PlannedStep] = []
+        self.cause = ""
         self.off_m, self.tracked = 0.0, True  # of the tracker's tip from the predicted one, along e1
 
     def give(self, action: str, target: str = "none", **fields: Any) -> Acknowledgement:
@@ -163,6 +167,9 @@ class ScriptedRig:
     def states(self) -> list[RigState]:
         taken, self._states = self._states, []
         return taken
+
+    def first_cause(self) -> str:
+        return self.cause
 
     def operator(self, message: str) -> bool:
         return self.goes_on
@@ -294,6 +301,17 @@ def test_a_rig_that_stops_ends_the_protocol_whatever_it_says(tmp_path: Path) -> 
     rig.force_N = stopping
     result = performed(tmp_path, HEAD + '[stop]\nafter = "never"\n' + TOUCH + GOTO, rig)
     assert len(result.results) == 1 and "the rig went to stopped" in result.ended
+    rig = ScriptedRig(stopping)
+    rig.cause = "The control loop was late. Close other programs."
+
+    def stopping_again(seconds: float) -> float:
+        rig.mode = "stopped" if seconds > 1.0 else rig.mode
+        return 0.2
+
+    rig.force_N = stopping_again
+    assert performed(tmp_path, HEAD + TOUCH, rig).ended == (
+        "step 1: the rig went to stopped: The control loop was late. Close other programs."
+    )
 
 
 def test_a_protocol_goes_on_where_it_ended(tmp_path: Path) -> None:
@@ -407,6 +425,32 @@ def _shorter(rig: Rig) -> ScriptedProtocol:
     """The shipped line with touches of 3 s."""
     steps = read_protocol(SIX_POINTS, rig)
     return steps._replace(actions=tuple(action._replace(seconds=min(action.seconds, 3.0)) for action in steps.actions))
+
+
+@pytest.mark.slow
+def test_a_device_that_fails_in_a_touch_ends_it_with_its_first_cause_and_the_run_is_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tracker falls silent in the first touch; the line that ends the run names it, not all that followed."""
+    steps = _shorter(RIG)
+    steps = steps._replace(actions=steps.actions[:2])
+    made = protocol_rigs.World
+
+    def failing(*arguments: Any) -> World:
+        world = made(*arguments)
+        world.tracker.faults.append(SensorFault("silent", 4_000_000_000, 1_000_000_000_000))
+        return world
+
+    monkeypatch.setattr(protocol_rigs, "World", failing)
+    job = Job(steps, RIG, tmp_path / "result.json")
+    ended = run_simulated(job, tmp_path, "native", 1)
+    assert [item.verdict for item in ended.results] == ["ok", "failed"]
+    assert ended.ended.startswith("step 2.1: the rig went to ") and "racker" in ended.ended.partition(": ")[2]
+    assert ";" not in ended.ended, ended.ended
+    monkeypatch.undo()
+    earlier = read_result(job.target, steps, RIG.name, True)
+    done = run_simulated(job._replace(earlier=earlier), tmp_path, "native", 1)
+    assert done.good and len(done.recordings) == 2
 
 
 @pytest.mark.slow
