@@ -27,7 +27,8 @@ Array = npt.NDArray[np.float64]
 ORDER = 20  # of the autoregression
 FEWEST = 30.0  # independent samples of all recordings together, from which on a residual is judged
 SIGNIFICANCE = 1e-3  # of each test, over all its bins, samples and features
-AVERAGES = 8  # parts of a recording by which a coherence is estimated
+LONGEST = 512  # samples of a part of a recording, of which at least
+AVERAGES = 8  # of a recording estimate a coherence: 1 - (p)^(1 / (parts - 1)) is exceeded by chance with p (Carter 1987)
 
 
 def only_coloured(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]]) -> bool:
@@ -79,21 +80,19 @@ def _follow(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
         tables = [_features(fill(u[channel])[ORDER:]) for u in inputs]
         for feature in range(len(tables[0])):
             by_length: dict[int, list[Array]] = {}
-            parts = 0.0
             for e, table in zip(new, tables, strict=True):
-                size = min(512, e.size // AVERAGES)
+                size = min(LONGEST, e.size // AVERAGES)
                 x = table[feature]
                 if np.ptp(x) == 0.0:
                     continue
-                given = {"nperseg": size, "detrend": "constant"}
-                sums = np.array([np.abs(welch(x, **given)[1]), welch(e, **given)[1], csd(x, e, **given)[1]])
-                by_length.setdefault(size, []).append(sums * e.size / size)
-                parts += e.size / size
-            for sums_ in by_length.values():
+                given = {"nperseg": size, "noverlap": 0, "detrend": "constant"}  # parts that overlap are not independent
+                sums = np.array([welch(x, **given)[1], welch(e, **given)[1], csd(x, e, **given)[1]])
+                by_length.setdefault(size, []).append(sums * (e.size // size))
+            for size, sums_ in by_length.items():
                 xx, ee, xe = np.sum(sums_, axis=0)
                 coherence = np.abs(xe[1:-1]) ** 2 / np.maximum((xx * ee)[1:-1].real, 1e-300)
-                # overlapping Hann windows: 1.85 times as many averages as parts (Carter 1987)
-                limit = 1.0 - (SIGNIFICANCE / (tests * coherence.size)) ** (1.0 / max(1.85 * parts - 1.0, 1.0))
+                parts = sum(e.size // size for e in new if min(LONGEST, e.size // AVERAGES) == size)
+                limit = 1.0 - (SIGNIFICANCE / (tests * coherence.size)) ** (1.0 / max(parts - 1, 1))
                 if np.max(coherence) > limit:
                     return True
     return False

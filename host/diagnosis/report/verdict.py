@@ -153,7 +153,8 @@ def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Po
     """Probabilities at the place of one effect; raw: before calibration."""
     rules = result.problem.rules
     rules = replace(rules, effect_slope=1.0, effect_shift=0.0) if raw else rules
-    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), result.remainder.share, rules)
+    rivals, left = list(standing.rivals), result.remainder.share
+    return posterior(standing.both, standing.gain, standing.parameters, rivals, left, rules, standing.share)
 
 
 def _none_stated(result: Diagnosis) -> float:

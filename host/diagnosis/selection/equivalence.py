@@ -31,6 +31,7 @@ class Standing:
     alike: tuple[Candidate, ...]
     rivals: tuple[tuple[Candidate, float], ...] = ()  # refitted in its place, with the coarsened difference of likelihoods
     parameters: int = 1
+    share: float = np.inf  # part of the nominal mismatch that it alone removes; infinite where it is the only effect
     rests_on: str = ""  # recording without which the others are not evidence enough
 
 
@@ -52,8 +53,24 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
         alone = _rests_on(problem, less, found.best, noise_sd, len(term.parameters))
-        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters), alone))
+        share = _share(problem, found, less, noise_sd) if terms else np.inf
+        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters), share, alone))
     return out
+
+
+def _share(problem: Problem, found: Found, less: Fit, noise_sd: Array) -> float:
+    """Part of the nominal mismatch above noise that an effect removes from the model `less` without it, in the output where
+    that is most.
+    """
+    largest = 0.0
+    for row, sigma in enumerate(noise_sd):
+        nominal, without_it, best = (
+            float(np.nanmean(np.concatenate([r[row] for r in fit.residuals]) ** 2))
+            for fit in (found.nominal, less, found.best)
+        )
+        if nominal > sigma**2:
+            largest = max(largest, (without_it - best) / (nominal - sigma**2))
+    return largest
 
 
 def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameters: int) -> str:

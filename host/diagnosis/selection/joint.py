@@ -10,11 +10,13 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, Term, finish, get_starts, minimize, set_starts
+from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.screening import above_noise
 from host.diagnosis.selection.trial import Trial, bound_by, related, sure_together
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+Restart = Callable[[Problem, Fit, Candidate], Fit]
 FitNext = Callable[[Fit, list[dict[str, float]]], list[Trial]]
 
 
@@ -69,13 +71,14 @@ def best_pair(
 
 
 def pair_instead(
-    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array
+    problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array, restart: Restart
 ) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
     """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
 
     A loop with a dead band both rests after a reversal and is late. It outdoes play or a delay alone where both are there,
     and hides them: past it, neither earns much. Pairs of an effect that it contains and any unlike one at its port have to
-    be likelier than it is. The arguments and what is returned are those of `best_pair`.
+    be likelier than it is. The arguments and what is returned are those of `best_pair`; restart: fits again
+    with the memory of a candidate started, in each recording, where that recording fits best.
     """
     rules, term = problem.rules, one.terms[0]
     here = [t for t in _singles(trials, len(trials)) if t.candidate.port.name == term.candidate.port.name]
@@ -94,6 +97,9 @@ def pair_instead(
         starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
         set_starts(problem, starts)
         fit = _fitted(problem, nominal, a, b)
+        for which in (a, b):  # what the memory of each began with alone is not what it begins with past the other
+            fit = restart(problem, fit, which.candidate)
+        starts = get_starts(problem)
         passed = _passed(problem, nominal, fit, noise_sd)
         ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd)
         more = len(fit.values) - len(one.values)

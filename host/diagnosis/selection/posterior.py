@@ -10,12 +10,15 @@ which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
 
     w(effect) = 1,   w(rival) = exp(-r dl + c dk),   w(nothing) = max(exp(-dl + c dk), p-value on held-out blocks)
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
+    w(other)  = prior_none / (1 - prior_none) * exact_share / share      only where further effects are named
 
 where `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
 rivals that are indistinguishable (`equivalence`) have at least the weight `prior_equal` together.
 The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
 independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
 is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.
+w(other): an effect that removes the `share` of the mismatch may stand for what the inexact formula of another one leaves, up
+to `exact_share`; its prior is scale-free. It counts as none of these at the place of the small effect.
 
 What is stated is calibrated: slope and shift of the log-odds, frozen in `SelectionRules`, fitted on suites apart from those
 that judge (host.studies.proof.calibrate). The probabilities before that are kept as raw.
@@ -58,17 +61,25 @@ def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
 
 
 def posterior(
-    gain: Gain, heldout: Gain, parameters: int, rivals: list[tuple[Candidate, float]], left: float, rules: SelectionRules
+    gain: Gain,
+    heldout: Gain,
+    parameters: int,
+    rivals: list[tuple[Candidate, float]],
+    left: float,
+    rules: SelectionRules,
+    share: float = np.inf,
 ) -> Posterior:
     """Probabilities at the place of one effect.
 
     gain, heldout: of the effect on all and on held-out samples; parameters: their number; rivals: each with its coarsened
-    difference; left: share of the mismatch that the extended model leaves.
+    difference; left: share of the mismatch that the extended model leaves; share: that this effect alone removes, infinite
+    where it is the only one.
     """
     weights = [(rival, _exp(-difference)) for rival, difference in rivals]
     nothing = max(_exp(-(gain.log_likelihood - rules.parameter_penalty * parameters)), min(heldout.p_value, 1.0))
     odds = rules.prior_none / (1.0 - rules.prior_none)
     none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
+    none += odds * min(rules.exact_share / max(share, 1e-300), 1.0 / odds)
     total = 1.0 + sum(weight for _, weight in weights) + nothing + none
     raw = 1.0 / total
     stated = calibrated(raw, rules.effect_slope, rules.effect_shift)

@@ -278,7 +278,7 @@ def _grow(
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
         best = _parted(problem, _taken(problem, winner), candidate_effects)
-        two = pair_instead(problem, found.nominal, best, trials, noise_sd) if len(best.terms) == 1 else None
+        two = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart) if len(best.terms) == 1 else None
         if two is not None:
             best, gain = _joined(problem, two), two[1]
             steps += [Step("joint", term.candidate.key, gain, trials) for term in best.terms]

@@ -9,8 +9,11 @@ import pytest
 
 import seldinger as sd
 from host.diagnosis.estimation.coloured import only_coloured
+from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.jumps import jumps_of
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.operators import least_error_window, smooth_derivatives
+from host.diagnosis.selection.posterior import posterior
 
 Array = np.ndarray
 LINK: dict[str, Any] = {
@@ -197,3 +200,25 @@ def test_a_window_of_least_error_is_the_best_of_those_tried(order: int) -> None:
         return float(np.std((smooth_derivatives(y, 0.005, window, 5)[order] - exact)[100:-100]))
 
     assert error(least_error_window(y, 0.005, 0.005, 5, order)) < 1.1 * min(error(k) for k in range(7, 91, 4))
+
+
+@pytest.mark.slow
+def test_play_before_a_lag_is_two_effects_and_no_dead_band_of_a_loop() -> None:
+    """The memory of each begins elsewhere past the other than alone: without that, the pair loses."""
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([107, k]), np.arange(0.0, 40.0, 0.02)
+        x = sway(k, t, 0.6, 0.5)
+        held, y, slow = x[0], np.empty(t.size), x[0]
+        for i, now in enumerate(x):
+            held = min(max(held, now - 0.08), now + 0.08)
+            slow += (held - slow) * (1.0 - np.exp(-0.02 / 0.15))
+            y[i] = slow
+        recordings.append({"t": t, "x": x, "y": y + 0.005 * rng.standard_normal(t.size)})
+    assert sorted(ids(sd.diagnose(recordings, LINK))) == ["backlash", "rate_lag"]
+
+
+def test_an_effect_that_removes_little_is_less_sure_than_one_that_removes_much() -> None:
+    gain = Gain(400.0, 1e-12, 0.5, independent=np.array([300.0]), log_ratio=np.array([2.7]))
+    alone, large, small = (posterior(gain, gain, 2, [], 0.0, RULES, share).effect for share in (np.inf, 0.3, 0.004))
+    assert alone > 0.94 and large > 0.93 and small < 0.6
