@@ -22,6 +22,7 @@ from protocol.zenoh_session import Latest, Session
 
 READABLE = tuple(name for name, topic in TOPICS.items() if topic.kind != "query")
 POLL_S = 0.002
+_NOTHING = "nothing was commanded"
 KEY_FILES = (CA_FILE, CERTIFICATE_FILE, KEY_FILE)
 
 
@@ -294,14 +295,29 @@ def may_run(rig: Rig) -> bool:
 
 
 def not_running(rig: Rig, endpoint: str | None = None) -> InputError:
-    """Return the error of a command for a rig from which nothing comes."""
-    where = endpoint or str(rig.local.folder)
-    return InputError(
-        "--endpoint" if endpoint else "--rig",
-        Description(f"no message from rig {rig.name} at {where}"),
-        "a rig that runs; nothing was commanded. Start it (the simulated one by `seldinger view --simulated`), or give "
-        "the rig file with which it was started",
-    )
+    """Return the error of a command for a rig from which nothing comes: which of its processes runs, and what to do."""
+    if endpoint:
+        return InputError(
+            "--endpoint", Description(f"no message from rig {rig.name} at {endpoint}"), f"a rig that runs; {_NOTHING}"
+        )
+    here = f"rig {rig.name} at {rig.local.folder}"
+    realtime, model = listens(rig.local.stop_socket), listens(rig.local.zenoh_socket)
+    if realtime and not model and not rig.zenoh.connect:
+        found = f"the realtime process of {here} without its model process, through which commands go"
+        wanted = f"both; {_NOTHING}. Start the model process again, or the whole rig. `seldinger stop` works without it"
+    elif model and not realtime:
+        found = f"the model process of {here} without its realtime process"
+        wanted = f"both; {_NOTHING}. Start the realtime process again, or the whole rig"
+    elif realtime:
+        found = f"no message from {here}, though its processes are there"
+        wanted = f"a rig that runs; {_NOTHING}. It may still be starting; if not, start it again"
+    else:
+        found = f"no message from {here}"
+        wanted = (
+            f"a rig that runs; {_NOTHING}. Start it (the simulated one by `seldinger view --simulated`), or give the rig "
+            "file with which it was started"
+        )
+    return InputError("--rig", Description(found), wanted)
 
 
 def open_session(rig: Rig, endpoint: str | None = None, keys: str | os.PathLike[str] | None = None) -> Session:

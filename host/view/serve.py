@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +21,13 @@ from protocol.rig_file import load_rig
 from protocol.zenoh_session import Session
 
 Report = Callable[[str], None]
+# How often the processes of a simulated rig are looked at.
+WATCH_S = 0.5
+PROCESSES = {
+    "rig": "the simulated hardware",
+    "host": "the model process, which records,",
+    "realtime": "the realtime process",
+}
 
 
 def serve(source: Source, port: int, title: str, report: Report) -> None:
@@ -69,6 +77,27 @@ def serve_recording(recording: RecordingFile, speed: float, diagnosis: str | Non
 
 
 @contextlib.contextmanager
+def _watched(fleet: Fleet, report: Report) -> Iterator[None]:
+    """Report each process of the simulated rig that ends by itself."""
+    ending = threading.Event()
+
+    def watch() -> None:
+        said: set[str] = set()
+        while not ending.wait(WATCH_S):
+            for name in set(fleet.dead()) - said:
+                said.add(name)
+                report(f"{PROCESSES[name]} has ended by itself ({fleet.last_log_line(name)}); Ctrl-C, then start again")
+
+    thread = threading.Thread(target=watch, name="watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+
+
+@contextlib.contextmanager
 def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[Path]:
     """Run the simulated rig of `rig_file`, recorded into `directory`; gives its rig file, with an endpoint of its own."""
     report("starting the simulated rig")
@@ -78,7 +107,8 @@ def simulated_rig(rig_file: Path, directory: Path, report: Report) -> Iterator[P
             fleet.wait_for_state()
             if load_rig(rig_file).local.endpoint != fleet.endpoint:
                 report(f"another rig has the rig file's folder; commands to this one need --rig {fleet.rig_file}")
-            yield fleet.rig_file
+            with _watched(fleet, report):
+                yield fleet.rig_file
     finally:
         if recording.exists():
             report(f"recording: {recording}")

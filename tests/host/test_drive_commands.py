@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import socket
@@ -211,6 +212,27 @@ def test_a_rig_that_does_not_run_is_not_waited_for(
         listening.listen()
         assert connection.may_run(load_rig(file)), "a rig that may run is given its time"
     assert (tmp_path / "zenoh.sock").exists() and not connection.may_run(load_rig(file)), "left by a killed process"
+
+
+@pytest.mark.parametrize(
+    ("sockets", "says"),
+    [
+        (["stop.sock"], "without its model process, through which commands go, wanted both; nothing"),
+        (["zenoh.sock"], "without its realtime process, wanted both; nothing"),
+        (["stop.sock", "zenoh.sock"], "though its processes are there, wanted a rig that runs"),
+        ([], "no message from rig simulated at"),
+    ],
+)
+def test_the_process_that_is_missing_is_named(sockets: list[str], says: str, tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text(SIMULATED_RIG.read_text().replace('folder = ""', f'folder = "{tmp_path}"'), encoding="utf-8")
+    with contextlib.ExitStack() as stack:
+        for name in sockets:
+            listening = stack.enter_context(socket.socket(socket.AF_UNIX))
+            listening.bind(str(tmp_path / name))
+            listening.listen()
+        error = connection.not_running(load_rig(file))
+    assert says in str(error) and "nothing was commanded" in str(error)
 
 
 def said(*words: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ import host.view.serve as serve
 import realtime.__main__ as realtime_process
 from host.run.demo import DemoSettings
 from protocol.rig_file import SIMULATED_RIG
+from tests.waiting import until
 
 
 @pytest.fixture(autouse=True)
@@ -114,3 +116,16 @@ def test_a_second_ctrl_c_leaves_no_process_behind(number: signal.Signals, tmp_pa
         fleet.close()
     left, _ = child.poll(), child.kill()
     assert left == -signal.SIGKILL and not Path(fleet.rig_file).parent.exists()
+
+
+def test_a_process_of_the_simulated_rig_that_ends_by_itself_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model process that was killed left `view` without a word, and without a recording."""
+    fleet: Any = SimpleNamespace(dead=lambda: ["host"], last_log_line=lambda name: "Killed")
+    monkeypatch.setattr(serve, "WATCH_S", 0.01)
+    lines: list[str] = []
+    with serve._watched(fleet, lines.append):
+        until(lambda: bool(lines), "the line")
+        time.sleep(0.05)
+    assert lines == ["the model process, which records, has ended by itself (Killed); Ctrl-C, then start again"]
