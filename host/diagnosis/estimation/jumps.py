@@ -11,7 +11,7 @@ import numpy.typing as npt
 from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
-SIDE = 20  # samples before and after a jump whose means are compared
+SIDE = 20  # samples before and after a jump whose medians are compared
 LEAST = 8.0  # robust standard deviations of such differences, from which one is more than noise
 NEAR = 3  # samples before and after a jump,
 ABRUPT = 0.6  # between which at least this part of it happens: a ramp over the whole span has a seventh there
@@ -48,16 +48,17 @@ def _jumps(r: Array, number: int) -> list[Jump]:
     while left.size and np.max(left) > LEAST * level and len(found) <= MOST:
         place = int(np.argmax(left))
         at = place + SIDE  # first sample after it
-        near = np.arange(max(at - 2, NEAR), min(at + 3, r.size - NEAR + 1))
+        near = np.arange(max(at - SIDE // 2, NEAR), min(at + SIDE // 2, r.size - NEAR) + 1)  # medians are flat about it
         sizes = abrupt[near - NEAR] * np.sign(shift[place])
-        if sizes.size and np.max(sizes) > ABRUPT * left[place]:
-            found.append(Jump(number, int(near[np.argmax(sizes)]), float(shift[place])))
+        near = near[sizes > ABRUPT * left[place]]
+        if near.size:
+            steps = (r[near] - r[near - 1]) * np.sign(shift[place])
+            found.append(Jump(number, int(near[np.argmax(steps)]), float(shift[place])))
         left[max(place - SIDE, 0) : place + SIDE + 1] = 0.0
     return sorted(found, key=lambda jump: jump.sample)
 
 
 def _shift(r: Array, side: int) -> Array:
-    """Mean of `side` samples from each on less that of as many before it, from sample `side` on."""
-    total = np.concatenate(([0.0], np.cumsum(r)))
-    means = (total[side:] - total[:-side]) / side
-    return np.asarray(means[side:] - means[:-side])
+    """Median of `side` samples from each on less that of as many before it, from sample `side` on: an outlier is no jump."""
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(r, side), axis=1)
+    return np.asarray(medians[side:] - medians[:-side])

@@ -171,6 +171,9 @@ def test_jumps_are_told_from_noise_and_from_friction() -> None:
     rng, t = np.random.default_rng(5), np.arange(0.0, 40.0, 0.01)
     assert not jumps_of([rng.standard_t(3, t.size), shaken(1, t.size)])
     assert not jumps_of([0.3 * np.sign(np.cos(2.0 * np.pi * 0.4 * t)) + 0.01 * rng.standard_normal(t.size)])
+    lone = 0.01 * rng.standard_normal(t.size)
+    lone[::397] += 0.5
+    assert not jumps_of([lone])
     (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)])
     assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
 
