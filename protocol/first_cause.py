@@ -75,8 +75,8 @@ RULES: dict[str, Rule] = {
         ("board_reset", "limit", "board_fault", "over_force"),
     ),
     "tracker_moved": Rule(
-        "The tracker moved against the rig.",
-        "Fix the field generator and the rig's table, register the tracker again (base_from_tracker_*), then clear.",
+        "Tracker or sheath moved against the rig, or the catheter slips in its holder.",
+        "Fix field generator, sheath and catheter, register the tracker again (base_from_tracker_*), then clear.",
         ("loop_late",),
     ),
     "pose_rejected": Rule(
@@ -116,12 +116,12 @@ RULES: dict[str, Rule] = {
         ("force_rejected", "force_stale", "force_lost"),
     ),
     "force_disagrees": Rule(
-        "Force sensor and estimate disagree.",
+        "Force sensor, estimate and tip deflection disagree.",
         "Zero the force sensor in free space; if they still disagree, check its mounting and the catheter's stiffness.",
         ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
     ),
     "force_undecided": Rule(
-        "Force sensor and estimate began to disagree.",
+        "Force sensor, estimate and tip deflection began to disagree.",
         "Wait; if they still disagree, the catheter retracts. Zero the force sensor in free space.",
         ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
     ),

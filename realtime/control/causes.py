@@ -72,7 +72,7 @@ def _of_witnesses(params: Params, state: State, inputs: Inputs) -> int:
     flags, witness = 0, state.witness
     if witnesses.over(params, witness, state.force, inputs):
         flags |= safety.OVER_FORCE
-    differ = witnesses.disagree(witness, inputs, params.period_s)
+    differ = witnesses.disagree(params, witness, inputs, state.phase)
     if differ == 2:
         flags |= safety.FORCE_DISAGREES
     elif differ == 1:

@@ -25,14 +25,24 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         True,
         "encoder and steps disagree: retracting; look for a jam or a loose encoder plug, clear, and home the axes",
     ),
-    ("force_disagrees", ACTION_RETRACT, True, "force sensor and model disagree: retracting; check and bias the sensor"),
+    (
+        "force_disagrees",
+        ACTION_RETRACT,
+        True,
+        "force sensor, estimate and tip deflection disagree: retracting; check and zero the sensor",
+    ),
     (
         "force_handover",
         ACTION_WARN,
         False,
         "the force sensor sends nothing or is frozen: the estimate closes the loop",
     ),
-    ("force_undecided", ACTION_HOLD, False, "force sensor and estimate disagree: holding until it is clear which is wrong"),
+    (
+        "force_undecided",
+        ACTION_HOLD,
+        False,
+        "force sensor, estimate and tip deflection disagree: holding until it is clear which is wrong",
+    ),
     ("host_silent", ACTION_HOLD, False, "the model process does not answer: holding; see that it runs"),
     ("host_lost", ACTION_RETRACT, True, "the model process did not come back in time: retracting; start it, then clear"),
     (
@@ -52,7 +62,8 @@ CAUSES: tuple[tuple[str, int, bool, str], ...] = (
         "tracker_moved",
         ACTION_RETRACT,
         True,
-        "the tracker moved against the rig: retracting; fix the field generator, register it again, then clear",
+        "tracker or sheath moved against the rig, or the catheter slips in its holder: retracting; fix it, register the "
+        "tracker again, then clear",
     ),
 )
 CAUSE_BIT = {name: 1 << index for index, (name, _, _, _) in enumerate(CAUSES)}

@@ -315,7 +315,8 @@ class RigCore:
             record = self._records[name]
             self._intake.pose(record, sample.stamp_ns, sample.arrival_ns, sample.position_m, sample.quaternion_wxyz)
             self._leaving.changed.add(name)
-            if self._moves:
+            # A retraction from a hard contact displaces a bent tip along the wall without turning it.
+            if self._moves and self.action < SafetyAction.RETRACT:
                 self._report(self.supervision.pose(name == "tip", record))
             self._publish(f"pose/{name}", telemetry.pose_message(record, sample.frame, sample.quality_m))
 

@@ -111,7 +111,8 @@ class Supervision:
         ratios = [rig.stage(axis).encoder_counts_per_step for axis in range(3)]
         self.steps = StepCheck((ratios[0], ratios[1], ratios[2]))
         self.host = HostCheck(round(rig.safety.host_lost_after_s * 1e9))
-        self.tracker = TrackerCheck(rig.tracker.position_noise_m, rig.catheter.distal_length_m)
+        tracker, backlash_m = rig.tracker, rig.transmission.insertion_backlash_m
+        self.tracker = TrackerCheck(tracker.position_noise_m, tracker.orientation_noise_rad, backlash_m)
         stage = rig.stages.insertion
         self._m_per_step = rig.transmission.insertion_slope / stage.steps_per_unit
         self._m_per_count = self._m_per_step / stage.encoder_counts_per_step
@@ -146,7 +147,7 @@ class Supervision:
         if not displaced_m or self._lasting & safety.TRACKER_MOVED:
             return None
         self._lasting |= safety.TRACKER_MOVED
-        text = f"tip and shaft were displaced together by at least {displaced_m * 1e3:.1f} mm, and no stage moved them"
+        text = f"tip and shaft are at least {displaced_m * 1e3:.1f} mm from where the stages moved them"
         return SupervisionFinding(safety.TRACKER_MOVED, text)
 
     def host_answered(self, estimate: ForceEstimate, now_ns: int) -> SupervisionFinding | None:

@@ -1,12 +1,16 @@
-"""Detects that the tracker's frame moved against the rig: the field generator, its table or the sheath was displaced.
+"""Detects that the tracker moved against the rig: the field generator, its table or the sheath was displaced.
 
 All positions are then wrong by one vector, while every pose is plausible. Three facts tell such a displacement from a motion
 of the catheter:
 
-1. Knob, roll and every load on the catheter turn the sensors that they displace. A displaced tracker turns neither sensor.
-2. The displacement of tip and shaft is the same vector.
-3. The insertion displaces both sensors alike as well, but only along the sheath's axis (z of the base frame), in the
-   direction of the stage and at most as far: a backlash only takes away motion.
+1. The displacement of tip and shaft is the same vector.
+2. Knob, roll and every load on the catheter turn the sensors that they displace. If the whole part outside the sheath turned
+   by R about the sheath's exit, a sensor at p would be displaced by (R - 1) p. A part that bends along its length displaces
+   it by less in each direction. A displaced tracker turns neither sensor.
+3. The insertion displaces both sensors alike as well, but only along the sheath's axis (z of the base frame), and by what
+   the stage moved, less its backlash.
+
+A catheter that slips in its holder, or a sheath that is displaced, looks the same and is as dangerous.
 """
 
 from __future__ import annotations
@@ -18,22 +22,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from realtime.core.intake import quaternion_product
+from realtime.core.intake import quaternion_product, rotation
 
 Vector = NDArray[np.float64]
 
-# A pose is compared with the frame two before it, which shows a jump, and with the oldest of this time, which shows a push.
-WINDOW_NS = 250_000_000
-# Smallest displacement that is reported. 1.5 mm of the free tip are 0.15 N on the stiffest catheter file.
-LEAST_M = 0.0015
-# In standard deviations of the tracker: a difference of two positions has 1.4 of them on each axis.
-POSITION_SIGMAS = 6.0
+# A frame is compared with at most COMPARED frames of this time before it: a jump shows between near ones, a push between
+# distant ones, and where a heart turns the tip some are turned alike.
+WINDOW_NS, COMPARED = 250_000_000, 8
+# Smallest displacement beyond the noise that is reported.
+LEAST_M = 0.0005
+# In standard deviations of the tracker. A difference of two poses has 1.4 of them on each axis, the mean of two sensors 1.
+POSITION_SIGMAS, TURN_SIGMAS = 6.0, 3.0
+# Beyond this turn a catheter that bends along its length leaves the bounds of (R - 1) p, by 1/8 of the turn squared times
+# the length: 0.5 mm of 100 mm.
+LARGEST_TURN_rad = 0.2
+# The backlash may differ from its stated width: the insertion is followed with these multiples of it.
+WIDTHS = (0.75, 1.0, 1.25)
 # Tip and shaft may differ by this share of their displacement: the heart moves a tip in contact meanwhile.
 UNEQUAL_SHARE = 0.25
-# Displacement per turn, in lengths of the distal shaft: at most 0.57 on average over tip and shaft, for a cantilever with a
-# load at its tip (tip 2/3 of the length per turn of the tip, a sensor at 0.8 of the length 0.47); a knob makes 0.42, and a
-# roll the radius of the tip.
-LEVER_SHARE = 0.6
 # So many frames in a row must be displaced.
 FRAMES = 2
 # The stamp of a pose and the time of a board's status agree to this.
@@ -62,31 +68,41 @@ class _TrackerFrame(NamedTuple):
 
 
 class TrackerCheck:
-    """Compares the motion of both sensors with that of the insertion stage.
+    """Compares the motion of both sensors with their turn and with the insertion stage.
 
     Args:
         position_noise_m: standard deviation of the tracker's positions on one axis (m).
-        length_m: length of the distal shaft (m).
+        orientation_noise_rad: standard deviation of its orientations about one axis (rad).
+        backlash_m: width of the insertion's backlash (m).
     """
 
-    def __init__(self, position_noise_m: float, length_m: float) -> None:
-        self._least_m = max(POSITION_SIGMAS * position_noise_m, LEAST_M)
-        self._noise_m, self._lever_m = POSITION_SIGMAS * position_noise_m, LEVER_SHARE * length_m
+    def __init__(self, position_noise_m: float, orientation_noise_rad: float, backlash_m: float) -> None:
+        self._noise_m, self._turn_noise_rad = POSITION_SIGMAS * position_noise_m, TURN_SIGMAS * orientation_noise_rad
+        self._widths_m = backlash_m * np.array(WIDTHS)
         self.restart()
 
     def restart(self) -> None:
         """Forget everything seen so far; for arming."""
         self._shaft: _Pose | None = None
         self._frames: deque[_TrackerFrame] = deque()
-        # (time in ns, insertion by steps, insertion by the encoder), at the distal end in m
-        self._insertion: deque[tuple[int, float, float]] = deque()
+        # (time in ns, possible insertions of the distal end in m)
+        self._insertion: deque[tuple[int, Vector]] = deque()
         self._displaced = 0
 
     def take_stage(self, now_ns: int, by_steps_m: float, by_encoder_m: float) -> None:
-        """Note the insertion at `now_ns` (m), as the steps and as the encoder show it."""
+        """Note the insertion of the stage at `now_ns` (m), as the steps and as the encoder show it.
+
+        Steps and encoder both count, since either may be wrong. The distal end follows each by a play operator: at first it
+        may be anywhere in the backlash.
+        """
         if self._insertion and now_ns <= self._insertion[-1][0]:
             self.restart()  # the clock was set back
-        self._insertion.append((now_ns, by_steps_m, by_encoder_m))
+        stage_m = np.array([[[by_steps_m], [by_encoder_m]]])
+        if self._insertion:
+            before_m = self._insertion[-1][1]
+        else:
+            before_m = stage_m - np.array([0.0, 1.0])[:, None, None] * self._widths_m
+        self._insertion.append((now_ns, np.clip(before_m, stage_m - self._widths_m, stage_m)))
         oldest_ns = (self._frames[0].stamp_ns if self._frames else now_ns - WINDOW_NS) - 2 * STAMP_ERROR_NS
         while len(self._insertion) > 2 and self._insertion[1][0] < oldest_ns:
             self._insertion.popleft()
@@ -115,46 +131,58 @@ class TrackerCheck:
             frames.popleft()
         if len(frames) <= FRAMES:
             return 0.0
-        displaced_m = max(self._unexplained_m(before, frame) for before in (frames[0], frames[-1 - FRAMES]))
-        self._displaced = self._displaced + 1 if displaced_m > self._least_m else 0
-        return displaced_m if self._displaced >= FRAMES else 0.0
+        # The last before this one is left out: a jump has to show against the frame before both.
+        compared = list(frames)[:-FRAMES][:: -(-len(frames) // COMPARED)]
+        known_m = [found_m for before in compared if (found_m := self._unexplained_m(before, frame)) is not None]
+        if known_m:
+            self._displaced = self._displaced + 1 if max(known_m) > LEAST_M else 0
+        return max(known_m, default=0.0) if self._displaced >= FRAMES else 0.0
 
-    def _unexplained_m(self, before: _TrackerFrame, now: _TrackerFrame) -> float:
-        """Return the length of the common displacement between two frames, less what insertion and turn explain."""
-        turn_rad = max(_turn_rad(old.quaternion, new.quaternion) for old, new in zip(before, now, strict=True))
+    def _unexplained_m(self, before: _TrackerFrame, now: _TrackerFrame) -> float | None:
+        """Return the length of the common displacement between two frames, less what noise, insertion and turn explain.
+
+        None where the sensors turned too far to tell.
+        """
         tip_m, shaft_m = (new.position_m - old.position_m for old, new in zip(before, now, strict=True))
+        turns = [_turn(old.quaternion, new.quaternion) for old, new in zip(before, now, strict=True)]
+        largest_rad = max(2.0 * float(np.linalg.norm(turn[1:])) for turn in turns)
+        if largest_rad > LARGEST_TURN_rad:
+            return None
+        # The bounds of the displacement on each axis: none, a turn of the whole catheter, the insertion.
+        place_m = (before.tip.position_m + before.shaft.position_m) / 2
+        turned_m = rotation((turns[0] + turns[1]) / 2) @ place_m - place_m
+        least_m, most_m = np.minimum(turned_m, 0.0), np.maximum(turned_m, 0.0)
+        inserted_m = self._inserted_m(before.stamp_ns, now.stamp_ns)
+        least_m[2] += inserted_m[0]
+        most_m[2] += inserted_m[1]
         moved_m = (tip_m + shaft_m) / 2
-        least_m, most_m = self._inserted_m(before.stamp_ns, now.stamp_ns)
-        moved_m[2] -= min(max(moved_m[2], least_m), most_m)
-        length_m = float(np.linalg.norm(moved_m))
+        length_m = float(np.linalg.norm(moved_m - np.clip(moved_m, least_m, most_m)))
         apart_m = float(np.linalg.norm(now.tip.position_m - now.shaft.position_m))
         unequal_m = float(np.linalg.norm(tip_m - shaft_m))
-        if unequal_m > self._noise_m + UNEQUAL_SHARE * length_m + apart_m * turn_rad:
+        if unequal_m > self._noise_m + UNEQUAL_SHARE * length_m + apart_m * largest_rad:
             return 0.0
-        return length_m - self._lever_m * turn_rad
+        return length_m - float(np.hypot(self._noise_m, self._turn_noise_rad * np.linalg.norm(place_m)))
 
     def _inserted_m(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
-        """Return the least and the greatest displacement along the sheath that the insertion explains (m).
-
-        They are the largest fall and the largest rise of the stage in this time: of a stage that went back and forth,
-        backlash may have taken away either part. Steps and encoder both count, since either may be wrong.
-        """
+        """Return the least and the greatest displacement along the sheath that the insertion explains (m)."""
         if not self._insertion:
             return -np.inf, np.inf
-        history = np.array([item[1:] for item in self._insertion])
-        stamps_ns = [item[0] for item in self._insertion]
-        # The samples within the stamps' error, one more at each end: between two samples the stage may have moved.
-        first = max(bisect.bisect_left(stamps_ns, begin_ns - STAMP_ERROR_NS) - 1, 0)
-        last = bisect.bisect_right(stamps_ns, end_ns + STAMP_ERROR_NS) + 1
-        part = history[first:last]
-        if not len(part):
-            part = history[-1:]
-        fall_m = np.max(np.maximum.accumulate(part, axis=0) - part)
-        rise_m = np.max(part - np.minimum.accumulate(part, axis=0))
-        return -float(fall_m), float(rise_m)
+        stamps_ns = [stamp_ns for stamp_ns, _ in self._insertion]
+        insertion_m = np.array([possible_m for _, possible_m in self._insertion])
+        begin_m, end_m = insertion_m[_around(stamps_ns, begin_ns)], insertion_m[_around(stamps_ns, end_ns)]
+        least_m = np.min(end_m.min(axis=0) - begin_m.max(axis=0))
+        most_m = np.max(end_m.max(axis=0) - begin_m.min(axis=0))
+        return float(least_m), float(most_m)
 
 
-def _turn_rad(before: Vector, after: Vector) -> float:
-    """Return the angle between two orientations, unit quaternions (4,), in rad."""
-    conjugate = before * np.array([1.0, -1.0, -1.0, -1.0])
-    return 2.0 * float(np.linalg.norm(quaternion_product(after, conjugate)[1:]))
+def _around(stamps_ns: list[int], stamp_ns: int) -> slice:
+    """Return the samples within STAMP_ERROR_NS of a time, and one more on either side: the stage may move between two."""
+    first = max(bisect.bisect_left(stamps_ns, stamp_ns - STAMP_ERROR_NS) - 1, 0)
+    last = bisect.bisect_right(stamps_ns, stamp_ns + STAMP_ERROR_NS) + 1
+    return slice(min(first, len(stamps_ns) - 1), last)
+
+
+def _turn(before: Vector, after: Vector) -> Vector:
+    """Return the rotation from one orientation to another as a unit quaternion (4,), scalar first and not negative."""
+    turn = quaternion_product(after, before * np.array([1.0, -1.0, -1.0, -1.0]))
+    return turn if turn[0] >= 0 else -turn

@@ -238,12 +238,23 @@ def test_each_fault_breaks_no_rule() -> None:
     assert len(results) == len(FAULTS) and not broken(results)
 
 
+DEAD, REVERSED = ("force_scaled", -0.037, 1.5, 0.194), ("force_scaled", -0.646, 1.5, 0.141)
+SLOW = ("host_slow", 0.2136, 0.8, 0.2398)
+
+
 @pytest.mark.slow
-def test_a_displaced_tracker_followed_by_a_dead_force_sensor_retracts_before_the_wall() -> None:
-    """Neither source of force sees the wall then: without the check of the tracker this rig pressed with 0.91 N."""
-    plan = RunPlan(0, 55, "tracker_moved", "approach", 0.00705, 0.001, 0.431, "force_scaled", -0.037, 1.5, 0.194)
-    (one,) = run_plans([plan], 604422)
-    assert not one.violations and "tracker_moved" in one.outcome["causes"] and one.outcome["action"] == "retract"
+@pytest.mark.parametrize(
+    ("seed", "plan", "cause"),
+    [
+        (604422, RunPlan(0, 55, "tracker_moved", "approach", 0.00705, 0.001, 0.431, *DEAD), "tracker_moved"),
+        (604424, RunPlan(0, 25, "tracker_moved", "approach", 0.00547, 0.245, 0.0203, *REVERSED), "tracker_moved"),
+        (773, RunPlan(0, 1, "force_turned", "approach", 0.9966, 1.5, 0.3601, *SLOW), "force_disagrees"),
+    ],
+)
+def test_two_faults_that_hide_the_force_retract_before_the_catheter_bends_back(seed: int, plan: RunPlan, cause: str) -> None:
+    """With sensor and poses, or sensor and estimate, wrong together these rigs pressed with 0.91, 2.29 and 1.41 N."""
+    (one,) = run_plans([plan], seed)
+    assert not one.violations and cause in one.outcome["causes"] and one.outcome["action"] == "retract"
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import pytest
 
 from realtime.core.tracker_check import WINDOW_NS, TrackerCheck
 
-NOISE_M, NOISE_RAD, LENGTH_M = 0.00029, 0.0035, 0.06
+NOISE_M, NOISE_RAD, BACKLASH_M = 0.00029, 0.0035, 0.003
 FRAME_NS, STATUS_NS = 25_000_000, 5_000_000
 TIP_M, SHAFT_M = np.array([0.01, 0.0, 0.06]), np.array([0.004, 0.0, 0.042])
 FRAMES, MOVED_AT = 80, 40
@@ -38,7 +38,7 @@ def found(
 ) -> list[int]:
     """Return the frames in which the check reports a displacement, of FRAMES frames with the tracker's noise."""
     rng = np.random.default_rng(seed)
-    check = TrackerCheck(NOISE_M, LENGTH_M)
+    check = TrackerCheck(NOISE_M, NOISE_RAD, BACKLASH_M)
     reported, poses = [], [(TIP_M, np.array([1.0, 0, 0, 0]))] * 2
     for frame in range(FRAMES):
         begin_ns = 10**12 + frame * FRAME_NS
@@ -108,22 +108,45 @@ def test_noise_alone_is_no_displacement(seed: int) -> None:
     assert found(seed=seed) == []
 
 
+def behind_play(insertion: Insertion, width_m: float) -> Displacement:
+    """The motion of a distal end behind a play of a width, by small steps from time 0."""
+    times = np.arange(0.0, FRAMES * FRAME_NS * 1e-9, 0.002)
+    places = [-width_m / 2]
+    for seconds in times[1:]:
+        stage_m = insertion(float(seconds))
+        places.append(min(max(places[-1], stage_m - width_m), stage_m))
+    return along(lambda seconds: float(np.interp(seconds, times, places)) - places[0])
+
+
 @pytest.mark.parametrize("speed_m_per_s", [-0.05, 0.05])
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_an_insertion_at_full_speed_is_none_whether_the_catheter_follows_or_is_still_in_its_backlash(
-    speed_m_per_s: float, share: float
+@pytest.mark.parametrize("width", [0.7, 1.0, 1.3])
+def test_an_insertion_at_full_speed_is_none_also_if_the_backlash_is_not_as_stated(
+    speed_m_per_s: float, width: float
 ) -> None:
     insertion = approach(speed_m_per_s)
-    moved = along(lambda seconds: share * insertion(seconds))
+    moved = behind_play(insertion, width * BACKLASH_M)
     assert found(moved, moved, insertion) == []
 
 
-def test_a_reversal_of_which_the_backlash_takes_the_way_back_is_none() -> None:
+@pytest.mark.parametrize("hertz", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("width", [0.7, 1.0, 1.3])
+def test_reversals_are_none_also_if_the_backlash_is_not_as_stated(width: float, hertz: float) -> None:
     def insertion(seconds: float) -> float:
-        return 0.003 * float(np.sin(2 * np.pi * 4 * seconds))
+        return 0.004 * float(np.sin(2 * np.pi * hertz * seconds))
 
-    moved = along(lambda seconds: max(insertion(seconds), 0.0))
+    moved = behind_play(insertion, width * BACKLASH_M)
     assert found(moved, moved, insertion) == []
+
+
+def test_a_push_against_an_advancing_catheter_is_found() -> None:
+    """It seems to stand still: only its stage shows that it should have moved."""
+    insertion = approach(0.02)
+    moved = plus(along(insertion), step(2, -0.0055, ramp_s=0.25))
+    assert MOVED_AT < found(moved, moved, insertion)[0] <= MOVED_AT + 11
+
+
+def test_a_catheter_that_slips_in_its_holder_is_found() -> None:
+    assert found(insertion=lambda seconds: 0.03 * max(seconds - 1.0, 0.0)) != []
 
 
 def test_a_rotor_that_is_turned_by_its_load_is_none_since_the_encoder_shows_it() -> None:
@@ -137,6 +160,7 @@ def test_a_motion_that_turns_the_sensors_is_none() -> None:
     """A knob's motion displaces both sensors alike in the worst case, but it turns them."""
     moved = step(1, 0.004)
     assert found(moved, moved, turn=lambda seconds: -0.08 * float(moved(seconds)[1] > 0)) == []
+    assert found(moved, moved, turn=lambda seconds: 0.08 * float(moved(seconds)[1] > 0)) != []  # a turn the other way
 
 
 def test_one_sensor_that_is_displaced_is_none() -> None:
@@ -159,7 +183,7 @@ def test_a_displacement_while_the_tracker_saw_nothing_is_found_when_it_sees_agai
 
 
 def test_a_clock_that_is_set_back_starts_the_comparison_again() -> None:
-    check = TrackerCheck(NOISE_M, LENGTH_M)
+    check = TrackerCheck(NOISE_M, NOISE_RAD, BACKLASH_M)
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     reported = []
     for stamp_ns, place in [(10**12 + k * FRAME_NS, 0.0) for k in range(10)] + [(k * FRAME_NS, 0.02) for k in range(10)]:

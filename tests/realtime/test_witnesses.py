@@ -7,7 +7,7 @@ import pytest
 
 from protocol.rig_file import SIMULATED_RIG, load_rig
 from realtime.control import witnesses
-from realtime.control.codes import SOURCE_ESTIMATE, SOURCE_SENSOR
+from realtime.control.codes import PHASE_APPROACH, PHASE_CONTACT, SOURCE_ESTIMATE, SOURCE_SENSOR
 from realtime.control.configure import tick_parameters
 from realtime.control.records import INPUTS, STATE, new
 from realtime.core.telemetry import witness_text
@@ -23,6 +23,7 @@ class Witnesses:
         self.params, self.state, self.inputs = tick_parameters(load_rig(SIMULATED_RIG))[0], new(STATE)[0], new(INPUTS)[0]
         witnesses.start(self.state.witness)
         self.rng = np.random.default_rng(4)
+        self.phase = PHASE_CONTACT
 
     def run(self, seconds: float, sensor_N: float, estimate_N: float, adapted: float = 1.0) -> int:
         """Return the greatest answer of `disagree` over a time with these forces, in noise."""
@@ -43,8 +44,21 @@ class Witnesses:
                 force.arrival_ns[SOURCE_ESTIMATE] = inputs.estimate.arrival_ns = inputs.now_ns
             force.new[SOURCE_SENSOR], force.new[SOURCE_ESTIMATE] = 1, new_estimate
             witnesses.take_forces(self.state.witness, force, 1e-3)
-            worst = max(worst, witnesses.disagree(self.state.witness, inputs, 1e-3))
+            worst = max(worst, witnesses.disagree(self.params, self.state.witness, inputs, self.phase))
         return worst
+
+
+def test_a_tip_that_is_held_back_in_an_approach_without_a_force_makes_the_loop_hold_and_then_retract() -> None:
+    """Both sources may be wrong at once: a sensor with two axes swapped, and estimates that come late."""
+    rig = Witnesses()
+    rig.phase = PHASE_APPROACH
+    rig.state.witness.geometry_N = 0.2  # 2 mm behind the free tip
+    assert rig.run(1.0, 0.0, 0.0) == 0
+    rig.state.witness.geometry_N = 0.5
+    assert rig.run(0.25, 0.0, 0.0) == 1
+    assert rig.run(0.1, 0.0, 0.0) == 2
+    rig.phase = PHASE_CONTACT  # a loop that feels its contact knows why
+    assert rig.run(0.5, 0.2, 0.2) == 0
 
 
 def test_readings_that_agree_within_noise_never_differ() -> None:
@@ -65,7 +79,7 @@ def test_without_one_of_them_nothing_is_compared() -> None:
     rig = Witnesses()
     rig.run(0.5, 0.0, 0.3)
     rig.inputs.now_ns += 300 * MS
-    assert witnesses.disagree(rig.state.witness, rig.inputs, 1e-3) == 0
+    assert witnesses.disagree(rig.params, rig.state.witness, rig.inputs, PHASE_CONTACT) == 0
 
 
 @pytest.mark.parametrize(("sensor_N", "estimate_N", "geometry_N"), [(0.51, 0.0, 0.0), (0.0, 0.7, 0.0), (0.0, 0.0, 2.6)])
