@@ -99,8 +99,8 @@ def test_a_gain_that_is_held_at_a_wrong_value_is_an_error_of_scale() -> None:
 
 def heated(seed: int, loss_W: float, offset_K: float = 0.0, drift_K_per_s: float = 0.0) -> dict[str, Array]:
     rng, t = np.random.default_rng([79, seed]), np.arange(0.0, 50.0, 0.1)
-    u = np.repeat(rng.uniform(0.0, 60.0, 10), 50)
-    y, fade = np.empty(t.size), np.exp(-0.1 / 6.0)
+    u = np.repeat(rng.uniform(0.0, 60.0, 8), 70)[: t.size]
+    y, fade = np.empty(t.size), np.exp(-0.1 / 8.0)
     y[0] = 20.0 * rng.random()
     for k in range(t.size - 1):
         y[k + 1] = fade * y[k] + (1.0 - fade) * 0.8 * (u[k] - loss_W)
@@ -211,13 +211,13 @@ def test_play_before_a_lag_is_two_effects_and_no_dead_band_of_a_loop() -> None:
     recordings = []
     for k in (1, 2, 3):
         rng, t = np.random.default_rng([107, k]), np.arange(0.0, 40.0, 0.02)
-        x = sway(k, t, 0.6, 0.5)
+        x = sway(k, t, 0.6, 0.6)
         held, y, slow = x[0], np.empty(t.size), x[0]
         for i, now in enumerate(x):
-            held = min(max(held, now - 0.08), now + 0.08)
-            slow += (held - slow) * (1.0 - np.exp(-0.02 / 0.15))
+            held = min(max(held, now - 0.15), now + 0.15)
+            slow += (held - slow) * (1.0 - np.exp(-0.02 / 0.1))
             y[i] = slow
-        recordings.append({"t": t, "x": x, "y": y + 0.005 * rng.standard_normal(t.size)})
+        recordings.append({"t": t, "x": x, "y": y + 0.007 * rng.standard_normal(t.size)})
     assert sorted(ids(sd.diagnose(recordings, LINK))) == ["backlash", "rate_lag"]
 
 
