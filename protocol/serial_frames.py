@@ -157,7 +157,8 @@ FRAMES: tuple[Frame, ...] = (
         0x01,
         "mcu",
         (_HASH,),
-        "Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both.",
+        "Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both, ARM that "
+        "of the set-points.",
     ),
     Frame(
         "CONFIGURE",

@@ -72,8 +72,12 @@ static void hello(uint8_t sequence, const frame_hello_t *frame) {
 static uint8_t arm(const frame_arm_t *frame) {
     if (frame->boot_count != boot.boot_count) return RESULT_BOOT_MISMATCH;
     if (!gate_configured()) return RESULT_NOT_CONFIGURED;
-    gate_rearm();
-    return safety_arm();
+    uint8_t result = safety_arm();
+    if (result == RESULT_OK) { /* another writer may send the set-points from now on: a homing, then the control loop */
+        gate_rearm();
+        link_restart_setpoints();
+    }
+    return result;
 }
 
 static uint8_t set_position(const frame_set_position_t *frame) {

@@ -81,7 +81,7 @@ enum {  /* Bits of STATUS.inputs; a set bit is an open switch (hit, or a broken 
     INPUT_BIT_ESTOP = 6,
 };
 
-#define FRAME_HELLO 0x01  /* Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both. */
+#define FRAME_HELLO 0x01  /* Opens a session: answered by IDENTITY. Commands and set-points have a sequence each; HELLO restarts both, ARM that of the set-points. */
 #define FRAME_HELLO_BYTES 4
 typedef struct __attribute__((packed)) {
     uint32_t protocol_hash;  /* code: PROTOCOL_HASH of the sender */

@@ -32,8 +32,10 @@ void link_start(void) {
 void link_restart_sequence(uint8_t number) {
     sequence[STREAM_COMMANDS].known = true;
     sequence[STREAM_COMMANDS].last = number;
-    sequence[STREAM_SETPOINTS].known = false;
+    link_restart_setpoints();
 }
+
+void link_restart_setpoints(void) { sequence[STREAM_SETPOINTS].known = false; }
 
 /* False for a frame seen before or overtaken by a later one. */
 static bool in_order(uint8_t stream, uint8_t number) {

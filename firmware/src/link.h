@@ -41,4 +41,7 @@ bool link_pump(uint8_t budget);
 /* Takes the number of this HELLO as the start of the commands' sequence; set-points start anew. */
 void link_restart_sequence(uint8_t sequence);
 
+/* Takes the next set-point's number as the start of their sequence. */
+void link_restart_setpoints(void);
+
 #endif

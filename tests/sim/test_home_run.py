@@ -82,11 +82,36 @@ def test_the_axis_is_homed_and_the_rig_is_armed_and_moves_after_it(homed: Homed)
     assert not [line for line in homed.log if line.level == "error"]
     assert run.arm()
     run.run(0.1)
+    assert not [line for line in homed.log if "not homed" in line.text]
     assert homed.modes[-1] == "hold"
     before = homed.steps
     assert run.command("jog", axis="insertion", travel_unit=0.001, speed_unit_per_s=0.005).accepted
     run.run(1.0)
     assert homed.steps[0] > before[0] and homed.modes[-1] == "hold" and run.loop.outputs[0].action == 0
+
+
+def test_arming_without_a_homing_is_warned_of_and_again_after_a_reset_of_the_board(homed: Homed) -> None:
+    run = homed.run
+    assert run.arm()
+    run.run(0.1)
+    assert [line.level for line in homed.ended()] == ["warning"]
+    assert homed.ended()[0].text.startswith("armed, but insertion not homed since the board was connected")
+    assert run.command("disarm").accepted
+    run.run(0.3)
+    homed.log.clear()
+    assert run.command("home", axis="insertion").accepted
+    ended = homed.home()
+    assert ended.level == "info", ended
+    homed.log.clear()
+    assert run.arm()
+    run.run(0.3)
+    assert homed.modes[-1] == "hold" and {line.level for line in homed.log} == {"info"}
+    homed.world.board.reset()
+    run.run(1.0)
+    run.command("clear_fault")
+    assert run.run(5.0, run.ready) and run.arm()
+    run.run(0.1)
+    assert [line.level for line in homed.ended()] == ["warning"]
 
 
 @pytest.mark.parametrize("ending", ["stop", "hold", "disarm"])
