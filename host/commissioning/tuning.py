@@ -19,6 +19,7 @@ from scipy.optimize import differential_evolution, minimize
 from protocol.enums import Phase
 from protocol.errors import InputError
 from protocol.rig_file import Rig, parse_rig
+from protocol.worker_process import end_with_parent
 from realtime.control import inverse_kinematics
 from realtime.control.configure import tick_parameters
 from sim.heart import HeartConfig
@@ -239,7 +240,7 @@ def tune(
             )
     start = {name: float(control[name]) for name in names}
     cost = _Cost(rig, start, iterations)
-    with ProcessPoolExecutor(processes) as pool:
+    with ProcessPoolExecutor(processes, initializer=end_with_parent) as pool:
         simplex = _both_simplexes(cost, len(start), evaluations, pool)
         progress(f"simplex: J = {simplex.cost_N * 1e3:.2f} mN after {simplex.evaluations} evaluations")
         spread = _evolution(cost, len(start), evaluations, seed, pool)

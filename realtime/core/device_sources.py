@@ -143,7 +143,8 @@ class SourceThread(SensorThread, Generic[Sample]):
                     newest_ns, dropped = now_ns, 0
                     self._begin(now_ns)
                 elif now_ns - newest_ns > SILENT_S * 1e9:
-                    what = f"{dropped} samples that are not finite, and no other," if dropped else "no sample"
+                    # Without their number: the same line again is not logged again.
+                    what = "only samples that are not finite" if dropped else "no sample"
                     raise OSError(f"{self._kind}: {what} for {SILENT_S:g} s")
                 for sample in samples:
                     self.samples += 1

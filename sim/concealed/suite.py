@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from protocol.worker_process import end_with_parent
 from sim.concealed import generic as concealed_generic
 from sim.concealed import rig as concealed_rig
 from sim.concealed import system as concealed_system
@@ -402,7 +403,7 @@ def suite(seed: int, cases: int, folder: Path, jobs: int = 1, progress: Callable
         parts.mkdir(parents=True, exist_ok=True)
         todo = [plan for plan in plans(seed, cases) if not (parts / f"{plan.id}.json").exists()]
         done = cases - len(todo)
-        with ProcessPoolExecutor(max_workers=jobs) as pool:
+        with ProcessPoolExecutor(max_workers=jobs, initializer=end_with_parent) as pool:
             for made in (pool.map if jobs > 1 else map)(partial(_keep, folder), todo):
                 done += made
                 progress(done)

@@ -235,7 +235,7 @@ class Giving:
         ([3.0], "mine: read failed with TypeError: found float in what read returned, wanted ForceSample"),
         ([force(np.zeros(2))], "found float64 of shape (2,) as ForceSample.force_N, wanted 3 floating-point numbers"),
         ([force([0, 0, 0])], "found int64 of shape (3,) as ForceSample.force_N"),
-        ([force(np.full(3, np.nan))], "samples that are not finite, and no other, for 1 s"),
+        ([force(np.full(3, np.nan))], "mine: only samples that are not finite for 1 s"),
         ([], "mine: no sample for 1 s"),
         (OSError(5, "Input/output error"), "mine: Input/output error"),
         (SystemExit(3), "mine: read failed with SystemExit: 3"),

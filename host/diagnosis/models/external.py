@@ -20,6 +20,7 @@ from host.diagnosis.model.model import Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.models.simulated import SimulatedModel, SimulatorRun
 from protocol.errors import InputError
+from protocol.worker_process import end_with_parent
 
 Array = npt.NDArray[np.float64]
 Function = Callable[..., Mapping[str, Array]]
@@ -84,6 +85,7 @@ _in_worker: list[Function] = []  # the function of a worker process
 
 
 def _begin_worker(function: Function) -> None:
+    end_with_parent()
     _in_worker[:] = [function]
 
 

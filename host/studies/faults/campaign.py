@@ -25,6 +25,7 @@ from host.recordings.writer import RecordingWriter
 from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig
 from protocol.topics import Message
+from protocol.worker_process import end_with_parent
 from sim.fault_run import FaultyScenario, Watcher
 from sim.fault_table import BY_NAME, FAULTS, PEAK_N, PHASES
 from sim.forked_board import ForkableBoard, forkable_board
@@ -204,7 +205,7 @@ def run_plans(plans: Sequence[RunPlan], seed: int, jobs: int = 1, board: str = "
         for group in of_rig:
             yield from run_on_rig(group, seed, board)
         return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
         for future in as_completed([pool.submit(_all_on_rig, group, seed, board) for group in of_rig]):
             yield from future.result()
 

@@ -23,6 +23,7 @@ from host.studies.proof.scoring import Facts, judge, mean
 from host.studies.proof.worlds.suite import OWN
 from protocol.errors import InputError
 from protocol.requests import plain
+from protocol.worker_process import end_with_parent
 from sim.concealed.generic import OUTPUTS
 from sim.concealed.label import Label
 
@@ -244,7 +245,7 @@ def _baselines(settings: Settings, labels: list[Label], folders: dict[str, Path]
     done = len(labels) - len(todo)
     progress("baselines", done, len(labels))
     jobs = max(1, settings.jobs)
-    with ProcessPoolExecutor(max_workers=jobs) as executor:
+    with ProcessPoolExecutor(max_workers=jobs, initializer=end_with_parent) as executor:
         made: Iterable[None] = (executor.map if jobs > 1 else map)(partial(_compare, kept, folders), todo)
         for _ in made:
             done += 1

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from host.studies.proof.worlds import case
 from protocol.errors import InputError
+from protocol.worker_process import end_with_parent
 from sim.concealed import suite as own
 from sim.concealed.label import Label
 
@@ -73,7 +74,7 @@ def suite(
         parts.mkdir(parents=True, exist_ok=True)
         todo = [plan for plan in planned if not (parts / f"{plan.id}.json").exists()]
         done = cases - len(todo)
-        with ProcessPoolExecutor(max_workers=jobs) as pool:
+        with ProcessPoolExecutor(max_workers=jobs, initializer=end_with_parent) as pool:
             for made in (pool.map if jobs > 1 else map)(partial(_keep, folder), todo):
                 done += made
                 progress(done)
