@@ -11,15 +11,15 @@ import pytest
 
 from tests.waiting import until
 
-SCRIPT = """
+SCRIPT = r"""
 import sys, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from os import getpid
+from os import getpid, write
 from protocol.worker_process import end_with_parent
 
 def work(seconds):
-    print(getpid(), flush=True)
+    write(1, b"%d\n" % getpid())  # one write: two workers share the pipe
     time.sleep(seconds)
 
 if __name__ == "__main__":
