@@ -1,5 +1,7 @@
 """Settings of the whole suite: the same examples in every run, and no deadline on the wall clock."""
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,3 +42,12 @@ def avr_tools() -> None:
         ensure_built("avr")
     except BoardUnavailable as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture
+def signal_handlers() -> Iterator[None]:
+    """Restore the handlers of SIGTERM and SIGINT after a test that sets them."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -152,9 +152,8 @@ class RigCore:
         self._tick_ns = 0
         self._cause_seen_ns: dict[int, int] = {}
         self._causes = CauseWatch()
-        # Axes with a switch that were not homed since the board was connected or reset: their positions are not known.
-        self._with_switch = [name for axis, name in enumerate(AXES) if rig.stage(axis).home_end]
-        self._unhomed = set(self._with_switch)
+        # Axes that were homed since the board was connected or reset.
+        self._homed: set[str] = set()
 
     def step(self, now_ns: int, arrived: Arrived) -> Leaving:
         """Process the data that has arrived by `now_ns` (the rig's clock, ns) and return the data to be sent.
@@ -206,7 +205,7 @@ class RigCore:
         if homing.done:
             self.commands.homing = None
             if not homing.problem:
-                self._unhomed.discard(homing.axis)
+                self._homed.add(homing.axis)
             self._log("error" if homing.problem else "info", "home", homing.text)
 
     def shut_down(self) -> Leaving:
@@ -304,13 +303,13 @@ class RigCore:
             if is_error:
                 self.board_errors.append(event.message)
             if event.kind is BoardEventKind.RESET:
-                self._unhomed = set(self._with_switch)
+                self._homed.clear()
             self._log("error" if is_error else "info", "board", event.message)
         if lost:
             self._log("error", "board", lost)
             self._disarm_after_return("board")
             self.link.unplugged()
-            self._unhomed = set(self._with_switch)
+            self._homed.clear()
 
     def _take_poses(self, samples: Sequence[PoseSample]) -> None:
         tracker = self.rig.tracker
@@ -431,18 +430,20 @@ class RigCore:
             if command.action in ("arm", "clear_fault"):
                 self.supervision.restart()
                 self._hand_over_causes()
-            if command.action == "arm" and self._unhomed:
-                self._log("warning", "home", self._unhomed_text())
+            if command.action == "arm":
+                self._warn_of_unhomed()
             self._command_changed()
         return reply
 
-    def _unhomed_text(self) -> str:
-        """Return the warning that an axis with a switch was not homed: the board does not keep that it was."""
-        axes = [name for name in self._with_switch if name in self._unhomed]
-        return (
-            f"armed, but {' and '.join(axes)} not homed since the board was connected: its travel limits count from where "
-            f"the board was switched on. Disarm, then `seldinger home {axes[0]}`"
-        )
+    def _warn_of_unhomed(self) -> None:
+        """Log the axes with a switch that were not homed. The board does not keep whether they were."""
+        axes = [name for axis, name in enumerate(AXES) if self.rig.stage(axis).home_end and name not in self._homed]
+        if axes:
+            text = (
+                f"armed, but {' and '.join(axes)} not homed since the board was connected: its travel limits count from "
+                f"where the board was switched on. Disarm, then `seldinger home {axes[0]}`"
+            )
+            self._log("warning", "home", text)
 
     def _command_changed(self) -> None:
         self._leaving.changed.add("command")

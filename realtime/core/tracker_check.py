@@ -67,6 +67,23 @@ class _TrackerFrame(NamedTuple):
         return all(np.array_equal(one.position_m, two.position_m) for one, two in zip(self, other, strict=True))
 
 
+class _InsertionHistory(NamedTuple):
+    """Possible insertions of the distal end, (n, ...) in m, at n times in ns."""
+
+    stamps_ns: list[int]
+    possible_m: Vector
+
+    def moved_m(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
+        """Return the least and the greatest displacement along the sheath that the insertion explains (m)."""
+        if not self.stamps_ns:
+            return -np.inf, np.inf
+        begin_m = self.possible_m[_around(self.stamps_ns, begin_ns)]
+        end_m = self.possible_m[_around(self.stamps_ns, end_ns)]
+        least_m = np.min(end_m.min(axis=0) - begin_m.max(axis=0))
+        most_m = np.max(end_m.max(axis=0) - begin_m.min(axis=0))
+        return float(least_m), float(most_m)
+
+
 class TrackerCheck:
     """Compares the motion of both sensors with their turn and with the insertion stage.
 
@@ -133,12 +150,14 @@ class TrackerCheck:
             return 0.0
         # The last before this one is left out: a jump has to show against the frame before both.
         compared = list(frames)[:-FRAMES][:: -(-len(frames) // COMPARED)]
-        known_m = [found_m for before in compared if (found_m := self._unexplained_m(before, frame)) is not None]
+        insertion = self._insertion_history()
+        found = [self._unexplained_m(before, frame, insertion) for before in compared]
+        known_m = [displaced_m for displaced_m in found if displaced_m is not None]
         if known_m:
             self._displaced = self._displaced + 1 if max(known_m) > LEAST_M else 0
         return max(known_m, default=0.0) if self._displaced >= FRAMES else 0.0
 
-    def _unexplained_m(self, before: _TrackerFrame, now: _TrackerFrame) -> float | None:
+    def _unexplained_m(self, before: _TrackerFrame, now: _TrackerFrame, insertion: _InsertionHistory) -> float | None:
         """Return the length of the common displacement between two frames, less what noise, insertion and turn explain.
 
         None where the sensors turned too far to tell.
@@ -152,7 +171,7 @@ class TrackerCheck:
         place_m = (before.tip.position_m + before.shaft.position_m) / 2
         turned_m = rotation((turns[0] + turns[1]) / 2) @ place_m - place_m
         least_m, most_m = np.minimum(turned_m, 0.0), np.maximum(turned_m, 0.0)
-        inserted_m = self._inserted_m(before.stamp_ns, now.stamp_ns)
+        inserted_m = insertion.moved_m(before.stamp_ns, now.stamp_ns)
         least_m[2] += inserted_m[0]
         most_m[2] += inserted_m[1]
         moved_m = (tip_m + shaft_m) / 2
@@ -163,16 +182,9 @@ class TrackerCheck:
             return 0.0
         return length_m - float(np.hypot(self._noise_m, self._turn_noise_rad * np.linalg.norm(place_m)))
 
-    def _inserted_m(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
-        """Return the least and the greatest displacement along the sheath that the insertion explains (m)."""
-        if not self._insertion:
-            return -np.inf, np.inf
+    def _insertion_history(self) -> _InsertionHistory:
         stamps_ns = [stamp_ns for stamp_ns, _ in self._insertion]
-        insertion_m = np.array([possible_m for _, possible_m in self._insertion])
-        begin_m, end_m = insertion_m[_around(stamps_ns, begin_ns)], insertion_m[_around(stamps_ns, end_ns)]
-        least_m = np.min(end_m.min(axis=0) - begin_m.max(axis=0))
-        most_m = np.max(end_m.max(axis=0) - begin_m.min(axis=0))
-        return float(least_m), float(most_m)
+        return _InsertionHistory(stamps_ns, np.array([possible_m for _, possible_m in self._insertion]))
 
 
 def _around(stamps_ns: list[int], stamp_ns: int) -> slice:

@@ -12,6 +12,13 @@ PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has
 LONGEST_ANGLE = float(np.sqrt(2.0) * np.pi)
 
 
+def frequency(s: Scale, highest_Hz: float) -> Parameter:
+    """The frequency (Hz) of a sine over time, tried up to `highest_Hz`."""
+    tried = lines(s, 2.0 / s.duration_s, min(0.2 / s.dt_s, highest_Hz), 0.4)
+    least, most, step = LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, 0.1 / s.duration_s
+    return Parameter("frequency", "Hz", tried, least, most, step=step, spectral=True)
+
+
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine, and frequency or pitch."""
     pair = (Parameter("sine", s.unit, (s.need,), linear=True), Parameter("cosine", s.unit, (s.need,), linear=True))
@@ -31,14 +38,7 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
                 step=3e-3,
             ),
         )
-    top = min(0.2 / s.dt_s, 8.0)
-    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
-    return (
-        *pair,
-        Parameter(
-            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
-        ),
-    )
+    return (*pair, frequency(s, 8.0))
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
@@ -57,14 +57,10 @@ SAYS = "A periodic disturbance is added to the signal."
 
 def wall(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Motion of the wall along its normal."""
-    top = min(0.2 / s.dt_s, 5.0)
-    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         Parameter("sine", "m", (3e-4,), linear=True),
         Parameter("cosine", "m", (3e-4,), linear=True),
-        Parameter(
-            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
-        ),
+        frequency(s, 5.0),
     )
 
 
@@ -77,13 +73,9 @@ def apply_wall(law: dict, c: Context, p: Array, form: str) -> dict:
 def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Amplitudes of sine and cosine along the base axes, and frequency."""
     pairs = tuple(Parameter(f"{part}_{a}", s.unit, (s.need,), linear=True) for a in "xyz" for part in ("sine", "cosine"))
-    top = min(0.2 / s.dt_s, 5.0)
-    grid = lines(s, 2.0 / s.duration_s, top, 0.4)
     return (
         *pairs,
-        Parameter(
-            "frequency", "Hz", grid, LEAST_PERIODS / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s, spectral=True
-        ),
+        frequency(s, 5.0),
     )
 
 
