@@ -245,7 +245,10 @@ class ViewServer:
 
     def serve(self) -> None:
         """Serve until SIGINT or SIGTERM. Raises SystemExit where the port is taken."""
-        uvicorn.Server(self.configuration()).run()
+        server = uvicorn.Server(self.configuration())
+        # The server takes signals only once its event loop runs; an exception before that would leave the loop half made.
+        with server.capture_signals():
+            server.run()
 
 
 async def _nothing(request: Request) -> Response:
