@@ -211,7 +211,8 @@ def _said(reply: Reply | None) -> Acknowledgement:
     if reply is None:
         return Acknowledgement(
             False,
-            "no answer: the rig may or may not have received the command; look at its state, then repeat",
+            "no answer: the rig may or may not have received the command; look at its state, then repeat. "
+            "`seldinger stop` has a path of its own",
             "unanswered",
         )
     accepted = reply.result == "accepted"

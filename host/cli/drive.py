@@ -124,7 +124,7 @@ def driving(
             # Why the rig does not move says nothing about a lease that another commander holds.
             why = "" if refused.action == "take" else driver.why()
             driver.result |= {"accepted": False, "text": answer.reason + why}
-            print(f"seldinger: {command}: {_without_key(answer.reason, command)}{why}", file=sys.stderr)
+            print(f"seldinger: {command}: {answer.reason}{why}", file=sys.stderr)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             connection.hold()
@@ -133,13 +133,6 @@ def driving(
             raise
         finally:
             driver.finish()
-
-
-def _without_key(reason: str, command: str) -> str:
-    """Return a refusal without the protocol's name of the command, which the line names already."""
-    for key in (command, "target"):
-        reason = reason.replace(f"refused: {key}: ", "refused: ", 1)
-    return reason
 
 
 def _plain(command: str, words: str, lease: bool = True) -> Callable[..., None]:

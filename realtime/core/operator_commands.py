@@ -149,21 +149,21 @@ class OperatorCommands:
 
     def _arm(self, command: Command) -> str:
         if self._link.phase is not LinkPhase.READY:
-            return f"arm: found the board link in phase {self._link.phase.value}, wanted ready"
+            return f"found the board link in phase {self._link.phase.value}, wanted ready"
         if self._link.status is not None and self._link.status.fault != Fault.NONE:
-            return f"arm: found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
+            return f"found board fault {Fault(self._link.status.fault).name}, wanted none; clear it first"
         if self._record.armed:
-            return "arm: found the rig armed, wanted disarmed"
+            return "found the rig armed, wanted disarmed"
         if self.homing is not None:
-            return f"arm: found {self.homing.axis} being homed, wanted the rig disarmed and at rest"
+            return f"found {self.homing.axis} being homed, wanted the rig disarmed and at rest"
         standing = self._standing()
         causes = standing.causes & ~safety.OPERATOR_STOP  # that one ends as the rig is disarmed
         seen = standing.now_ns > self._cleared_ns + CLEARED_WITHIN_NS
         if seen and safety.action_of(causes) >= SafetyAction.RETRACT:
-            return f"arm: found {', '.join(safety.names(causes))}, wanted no cause that stops the rig; clear it first"
+            return f"found {', '.join(safety.names(causes))}, wanted no cause that stops the rig; clear it first"
         silent = self._silent_sensors()
         if silent:
-            return f"arm: found nothing from {silent}, wanted fresh readings"
+            return f"found nothing from {silent}, wanted fresh readings"
         self._frames.append(self._link.arm())
         self._record.armed = 1
         self._set(CommandKind.HOLD)
@@ -195,14 +195,14 @@ class OperatorCommands:
             self._end_homing()
             return ""
         if not self._record.armed:
-            return f"hold: {_DISARMED}"
+            return _DISARMED
         self._set(CommandKind.HOLD)
         return ""
 
     def _force(self, command: Command) -> str:
         """Set another force for the present contact target; nothing else changes, so that the count stays."""
         if not self._record.armed or self._record.kind != CommandKind.CONTACT:
-            return "force: found no touch in progress, wanted one; touch the tissue first"
+            return "found no touch in progress, wanted one; touch the tissue first"
         problem = self._too_much(command)
         if not problem and command.force_N is not None:
             self._record.force_N = command.force_N
@@ -210,9 +210,9 @@ class OperatorCommands:
 
     def _target(self, command: Command) -> str:
         if not self._record.armed:
-            return f"target: {_DISARMED}"
+            return _DISARMED
         if self._standing().phase is Phase.STOPPED:
-            return f"target: {_STOPPED}"
+            return _STOPPED
         problem = self._too_much(command) or ("" if command.target_m is None else self._reach.problem(command.target_m))
         if problem:
             return problem
@@ -228,13 +228,13 @@ class OperatorCommands:
     def _jog(self, command: Command) -> str:
         """Start or extend a jog, or return the limit that forbids it."""
         if not self._record.armed:
-            return f"jog: {_DISARMED}"
+            return _DISARMED
         axis, travel, speed = JogAxis[command.axis.upper()], command.travel_unit or 0.0, command.speed_unit_per_s or 0.0
         here = self._standing()
         if here.phase is Phase.STOPPED:
-            return f"jog: {_STOPPED}"
+            return _STOPPED
         if here.phase not in _JOG_PHASES:
-            return f"jog: found the loop in phase {here.phase.label}, wanted hold, position or jog; hold first"
+            return f"found the loop in phase {here.phase.label}, wanted hold, position or jog; hold first"
         direction = np.array(command.direction if command.direction is not None else (0.0, 0.0, 0.0))
         problem = (
             self._too_far(axis, travel, speed)
@@ -252,9 +252,9 @@ class OperatorCommands:
     def _too_far(self, axis: JogAxis, travel: float, speed: float) -> str:
         unit, fastest = unit_of(axis), fastest_jog(self._rig, axis)
         if not abs(travel) <= LONGEST_JOG[axis]:
-            return f"travel_unit: found {travel:g} {unit}, wanted at most {LONGEST_JOG[axis]:g} {unit} in one jog"
+            return f"travel: found {travel:g} {unit}, wanted at most {LONGEST_JOG[axis]:g} {unit} in one jog"
         if not 0.0 < speed <= fastest * (1.0 + 1e-9):
-            return f"speed_unit_per_s: found {speed:g} {unit}/s, wanted above 0 and at most {fastest:g} {unit}/s"
+            return f"speed: found {speed:g} {unit}/s, wanted above 0 and at most {fastest:g} {unit}/s"
         return ""
 
     def _pressing(self, axis: JogAxis, travel: float, direction: npt.NDArray[np.float64], here: RigPosition) -> str:
@@ -267,7 +267,7 @@ class OperatorCommands:
         if backwards or away:
             return ""
         return (
-            f"jog: found a force of {force_N:.3f} N on the tip, wanted a jog away from it, or less than "
+            f"found a force of {force_N:.3f} N on the tip, wanted a jog away from it, or less than "
             f"control.contact_force_N {self._rig.control.contact_force_N}; zero the sensor if the tip hangs free"
         )
 
@@ -282,7 +282,7 @@ class OperatorCommands:
             return ""
         unit = unit_of(axis)
         return (
-            f"jog: found {axis.label} {end:.4f} {unit} at the end of the jog, "
+            f"found {axis.label} {end:.4f} {unit} at the end of the jog, "
             f"wanted {stage.min_unit:g} to {stage.max_unit:g} {unit} (the stage's travel)"
         )
 
@@ -290,7 +290,7 @@ class OperatorCommands:
         phase = self._standing().phase
         if phase not in _ZERO_PHASES:
             return (
-                f"zero: found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
+                f"found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
             )
         return self._zero_force()
 
@@ -298,18 +298,18 @@ class OperatorCommands:
         """Start to move an axis to its switch, or return the reason against it. Stop, hold and disarm end the motion."""
         axis = AXES.index(command.axis)
         if self._record.armed:
-            return "home: found the rig armed, wanted disarmed"
+            return "found the rig armed, wanted disarmed"
         if self.homing is not None:
-            return f"home: found {self.homing.axis} being homed, wanted one axis at a time"
+            return f"found {self.homing.axis} being homed, wanted one axis at a time"
         if self._link.phase is not LinkPhase.READY:
-            return f"home: found the board link in phase {self._link.phase.value}, wanted ready"
+            return f"found the board link in phase {self._link.phase.value}, wanted ready"
         if self._link.status is None or self._link.status.fault != Fault.NONE:
             fault = "no status" if self._link.status is None else f"fault {Fault(self._link.status.fault).name}"
-            return f"home: found {fault} of the board, wanted none of its faults; clear it first"
+            return f"found {fault} of the board, wanted none of its faults; clear it first"
         force_N = float(np.linalg.norm(self._standing().force_N))
         if force_N > self._rig.control.contact_force_N:
             return (
-                f"home: found a force of {force_N:.3f} N on the tip, wanted less than control.contact_force_N "
+                f"found a force of {force_N:.3f} N on the tip, wanted less than control.contact_force_N "
                 f"{self._rig.control.contact_force_N}; zero the sensor if the tip hangs free"
             )
         try:

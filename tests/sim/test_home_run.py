@@ -155,7 +155,7 @@ def test_what_may_not_be_homed_is_refused_and_does_not_move(homed: Homed) -> Non
     run = homed.run
     assert "stages.roll.home_end" in run.command("home", axis="roll").reason
     assert run.arm()
-    assert run.command("home", axis="insertion").reason.endswith("home: found the rig armed, wanted disarmed")
+    assert run.command("home", axis="insertion").reason.endswith("refused: found the rig armed, wanted disarmed")
     run.command("disarm")
     run.run(0.3)
     homed.world.estop = True
