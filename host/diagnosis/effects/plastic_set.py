@@ -53,7 +53,7 @@ EFFECTS = (
         "motion",
         57,
         parameters,
-        "A motion beyond {yield} shifts the rest position permanently, by {set_per_excess} of the excess.",
+        "A motion beyond {yield} shifts the position at rest permanently, by {set_per_excess} of the excess.",
         "y = x + set_per_excess*max excess of |x| over yield so far",
         apply,
     ),

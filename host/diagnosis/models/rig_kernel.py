@@ -68,7 +68,7 @@ class Wall(NamedTuple):
 
 
 class _Arc(NamedTuple):
-    """The shaft of one sample at roll 0: length (m), straight part (m), curvature of the rest (1/m), 1/EI and 1/GJ."""
+    """The shaft of one sample at roll 0: length (m), straight part (m), curvature of the other part (1/m), 1/EI and 1/GJ."""
 
     length: float
     straight: float
