@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -105,10 +107,10 @@ class RunFigures:
                 axes.annotate(
                     "limit", (0, self.summary.force_limit_N), (4, 3), textcoords="offset points", color=TRUTH, fontsize=8
                 )
-            low_N, high_N = axes.get_ylim()
-            axes.set_ylim(max(low_N, -1.0), min(high_N, 2.0))
+            axes.set_ylim(low_N, high_N)
             legend_above(axes, 2 if narrow else 4)
 
+        low_N, high_N, outside = self._force_span()
         return report_figure(
             draw,
             3.0,
@@ -116,7 +118,35 @@ class RunFigures:
             "Force on the wall",
             "Set-point, measured and estimated force over the run.",
             "Force along the wall's normal. Coloured bands are the phases of the timeline. The estimate comes from "
-            "the tracked poses alone; its band is two standard deviations.",
+            "the tracked poses alone; its band is two standard deviations."
+            + (f" The axis does not show {outside}." if outside else ""),
+        )
+
+    def _force_span(self) -> tuple[float, float, str]:
+        """Return the ends of the force axis (N), and which estimates lie outside; empty if none does.
+
+        The axis shows all of the measured force, the set-point and the limit. Of the estimate it shows what lies between
+        the 1st and the 99th percentile: the first estimates after the start may be far off.
+        """
+        shown = [0.0, self.summary.force_limit_N, self.summary.target_force_N]
+        force, estimate = table_or_none(self.recording, "force/sensor"), table_or_none(self.recording, "force/estimate")
+        if force is not None:
+            pressing_N = stack(force, "fx_N", "fy_N", "fz_N") @ self.summary.direction
+            shown += [np.nanmin(pressing_N, initial=0.0), np.nanmax(pressing_N, initial=0.0)]
+        along_N = np.empty(0) if estimate is None else estimate_along(estimate, self.summary.direction)[0]
+        along_N = along_N[np.isfinite(along_N)]
+        if len(along_N):
+            shown += list(np.percentile(along_N, (1.0, 99.0)))
+        finite = [value for value in shown if math.isfinite(value)]
+        margin_N = 0.05 * max(max(finite) - min(finite), 0.1)
+        low_N, high_N = min(finite) - margin_N, max(finite) + margin_N
+        beyond_N = along_N[(along_N < low_N) | (along_N > high_N)]
+        if not len(beyond_N):
+            return low_N, high_N, ""
+        return (
+            low_N,
+            high_N,
+            (f"{len(beyond_N)} of {len(along_N)} estimates, {beyond_N.min():.2f} to {beyond_N.max():.2f} N"),
         )
 
     def force_detail(self) -> ReportFigure | None:

@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from host.recordings.recording import RecordingFile
 from host.report.run_figures import RunFigures
-from host.report.run_summary import SETTLE_S, RunSummary, summarize
+from host.report.run_summary import SETTLE_S, BoardHealth, RunSummary, summarize
 
 # Keeps a number and its unit on one line.
 NBSP = "\u00a0"
@@ -119,6 +119,26 @@ def _with_first_cause(verdict: RunVerdict, summary: RunSummary) -> RunVerdict:
     return verdict._replace(sentence=f"{verdict.sentence} {first.says}", remedy=first.remedy, followed=followed)
 
 
+# Why the board refuses a set-point (`protocol.serial_frames.Reject`).
+_REFUSED_FOR = {
+    "state": "it was not armed",
+    "order": "their numbers or times were not in order",
+    "horizon": "their times were too far ahead",
+    "expired": "they came too late",
+    "overflow": "its queue was full, because they came faster than it carried them out",
+    "speed": "they exceeded the speed limit of an axis",
+    "soft_limit": "they lay outside the travel of an axis",
+    "limit_switch": "a limit switch was open",
+}
+
+
+def _refused(board: BoardHealth) -> str:
+    """Return the sentence on refused set-points, with the reasons from the most frequent one on."""
+    ordered = sorted(board.refusals.items(), key=lambda item: -item[1])
+    reasons = [f"{_REFUSED_FOR[reason]} ({count})" for reason, count in ordered if reason in _REFUSED_FOR]
+    return f"The board refused {board.rejected} set-points" + (f": {'; '.join(reasons)}." if reasons else ".")
+
+
 def _remarks(summary: RunSummary) -> tuple[str, ...]:
     """Return a sentence for each irregularity of the run."""
     board, ticks = summary.board, summary.ticks
@@ -135,7 +155,7 @@ def _remarks(summary: RunSummary) -> tuple[str, ...]:
         (bool(board.faults), "The stepper board latched: " + "; ".join(board.faults) + "."),
         (board.crc_errors > 0, f"{board.crc_errors} damaged frames on the serial line."),
         (board.underruns > 0, f"The board ran out of set-points {board.underruns} times while moving."),
-        (board.rejected > 0, f"The board refused {board.rejected} set-points."),
+        (board.rejected > 0, _refused(board)),
         (board.resets > 0, f"The board was reset {board.resets} times."),
         (ticks.missed > 0, f"{ticks.missed} ticks of the loop were late."),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,6 +60,7 @@ class BoardHealth:
     crc_errors: int = 0
     underruns: int = 0
     rejected: int = 0
+    refusals: dict[str, int] = field(default_factory=dict)  # reason of `protocol.serial_frames.Reject` -> set-points
     resets: int = 0
     encoder_gap_steps: tuple[int, int, int] = (0, 0, 0)
 
@@ -287,9 +289,19 @@ def _board(recording: RecordingFile) -> BoardHealth:
         crc_errors=int((table["crc_errors"] + table["host_crc_errors"]).max()),
         underruns=int(table["underruns"].max()),
         rejected=int(table["rejected"].max()),
+        refusals=_refusals(table["rejected"], table["last_reject"]),
         resets=int(table["boot_count"].max() - table["boot_count"].min()),
         encoder_gap_steps=(gaps[0], gaps[1], gaps[2]),
     )
+
+
+def _refusals(rejected: Array, reasons: Array) -> dict[str, int]:
+    """Count refused set-points by reason, as far as the statuses show it: each has the reason of its newest refusal."""
+    more = np.diff(rejected, prepend=0)
+    counts: dict[str, int] = {}
+    for count, reason in zip(more[more > 0], reasons[more > 0], strict=True):
+        counts[str(reason)] = counts.get(str(reason), 0) + int(count)
+    return counts
 
 
 def _as_steps(recording: RecordingFile, table: dict[str, Array], axis: str) -> Array:
@@ -332,14 +344,29 @@ def estimate_along(table: dict[str, Array], direction: Array) -> tuple[Array, Ar
 
 
 def _lost(recording: RecordingFile) -> dict[str, int]:
-    """Topic -> messages that its numbering says are missing (a publisher that restarts counts from 0 again)."""
-    lost = {}
-    for topic in recording.topics:
-        steps = np.diff(recording.table(topic)["sequence"])
-        missing = int((steps[steps > 1] - 1).sum())
-        if missing:
-            lost[topic] = missing
-    return lost
+    """Topic -> messages that their numbers say are missing."""
+    lost = {topic: missing_numbers(recording.table(topic)["sequence"]) for topic in recording.topics}
+    return {topic: count for topic, count in lost.items() if count}
+
+
+def missing_numbers(numbers: Array) -> int:
+    """Return how many messages of a topic are missing between those with `numbers` (n,).
+
+    Each publisher counts from 0, and again from 0 after a restart. A topic can have several of them, as the log has, and a
+    message does not name its own: it is taken for the next one of the publisher whose newest number is closest below.
+    """
+    if len(numbers) < 2 or np.all(np.diff(numbers) == 1):
+        return 0
+    newest: list[int] = []
+    missing = 0
+    for number in map(int, numbers):
+        at = bisect.bisect_left(newest, number)
+        if at == 0 or number == 0:
+            newest.insert(0, number)
+        else:
+            missing += number - newest[at - 1] - 1
+            newest[at - 1] = number
+    return missing
 
 
 __all__ = [

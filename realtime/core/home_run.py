@@ -19,7 +19,9 @@ def home_of(rig: Rig, axis: int) -> Home:
     """Read the home of `axis` from the rig file, in steps. Raises InputError where the axis has no switch."""
     stage = rig.stage(axis)
     if not stage.home_end:
-        raise InputError(f"stages.{AXES[axis]}.home_end", stage.home_end, "min or max; only an axis with a home switch can be homed")
+        raise InputError(
+            f"stages.{AXES[axis]}.home_end", stage.home_end, "min or max; only an axis with a home switch can be homed"
+        )
     return Home(
         axis,
         -1 if stage.home_end == "min" else 1,

@@ -289,9 +289,7 @@ class OperatorCommands:
     def _zero(self, command: Command) -> str:
         phase = self._standing().phase
         if phase not in _ZERO_PHASES:
-            return (
-                f"found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
-            )
+            return f"found the loop in phase {phase.label}, wanted disarmed, hold or stopped, with the tip hanging free"
         return self._zero_force()
 
     def _home(self, command: Command) -> str:

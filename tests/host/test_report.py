@@ -23,8 +23,9 @@ from host.recordings.recording import RecordingFile
 from host.recordings.rig_picture import Picture
 from host.recordings.writer import RecordingWriter
 from host.report.demo_summary import demo_result, print_summary
+from host.report.run_figures import RunFigures
 from host.report.run_report import lateness_of, render, verdict_of, write_report
-from host.report.run_summary import spans, summarize
+from host.report.run_summary import BoardHealth, _refusals, missing_numbers, spans, summarize
 from host.report.style import thinned
 from protocol.enums import SafetyAction
 from protocol.requests import plain
@@ -66,6 +67,7 @@ class Story:
     fault: int = 0
     crc_errors: int = 0
     estimate_off_N: float = 0.02
+    wild_until_ms: int = 0
     log: str = "hello"
     first: RigCause | None = None
     fault_from_ms: int = 0
@@ -135,7 +137,7 @@ class Story:
                     stamp_ns=time_ns,
                     frame="base",
                     converged=True,
-                    force_N=(0.0, 0.0, self.force_N + self.estimate_off_N),
+                    force_N=(0.0, 0.0, 5.0 if ms < self.wild_until_ms else self.force_N + self.estimate_off_N),
                     covariance_N2=np.diag([1.0, 1.0, 0.03**2]),
                     published_ns=time_ns + 5 * MS,
                     compute_us=50.0,
@@ -294,6 +296,40 @@ def test_missing_messages_are_counted(tmp_path: Path) -> None:
             writer._sequence["log"] = number
             writer.write("log", Log(stamp_ns=number, level="info", source="a", text="b"))
     assert summarize(RecordingFile(tmp_path / "a.mcap")).lost == {"log": 4}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [
+        ([0, 1, 2, 0, 3, 4, 0, 5, 1], 0),  # three publishers of one topic
+        ([0, 1, 2, 3, 0, 1, 2, 3, 4], 0),  # one that was started again
+        ([0, 1, 0, 5, 1, 6], 3),
+        ([7, 8, 10], 1),
+        ([3], 0),
+        ([], 0),
+    ],
+)
+def test_each_publisher_of_a_topic_has_its_own_numbers(numbers: list[int], missing: int) -> None:
+    assert missing_numbers(np.array(numbers)) == missing
+
+
+def test_refused_set_points_are_named_with_their_reasons(tmp_path: Path) -> None:
+    recording = Story().write(tmp_path / "run.mcap")
+    rejected, reasons = np.array([0, 2, 2, 5, 6]), np.array(["", "overflow", "overflow", "overflow", "expired"])
+    summary = replace(summarize(recording), board=BoardHealth(rejected=6, refusals=_refusals(rejected, reasons)))
+    remarks = " ".join(verdict_of(summary).remarks)
+    assert "refused 6 set-points: its queue was full, because they came faster than it carried them out (5); " in remarks
+    assert "they came too late (1)" in remarks
+
+
+def test_the_axis_shows_all_of_the_measured_force_and_not_the_first_estimates(tmp_path: Path) -> None:
+    recording = Story(swing_N=0.9).write(tmp_path / "run.mcap")
+    low_N, high_N, outside = RunFigures(recording, summarize(recording))._force_span()
+    assert low_N < -0.7 and high_N > 1.1 and not outside
+    calm = Story(swing_N=0.0, wild_until_ms=100).write(tmp_path / "calm.mcap")
+    low_N, high_N, outside = RunFigures(calm, summarize(calm))._force_span()
+    assert -0.1 < low_N < 0.0 and 0.5 < high_N < 0.6
+    assert outside == "4 of 667 estimates, 5.00 to 5.00 N"
 
 
 def test_a_time_without_change_is_one_span() -> None:
