@@ -419,7 +419,7 @@ class RigCore:
     def _execute(self, command: Command, now_ns: int) -> Reply:
         """Carry out a command that the command gate has accepted."""
         if command.action != "stop" and not self._loop_runs:
-            text = f"{command.action}: found the loop not running yet, wanted it to: it is being compiled"
+            text = "found the loop not running yet, wanted it to: it is being compiled"
             return Reply(stamp_ns=now_ns, id=command.id, result="refused", text=text)
         reply = self.commands.execute(command, now_ns)
         if command.action == "mark" and reply.result == "accepted":
