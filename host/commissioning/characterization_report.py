@@ -152,7 +152,8 @@ def _in_time(
         5.0,
         title,
         f"{title}: stage and tip.",
-        f"As {figure_name}: the stage's encoder, the tip's answer, and what the fitted transmission makes of it.",
+        f"As {figure_name} of the thesis: the stage's encoder, the tip's answer, and what the fitted transmission makes of "
+        "it.",
     )
 
 
@@ -183,7 +184,7 @@ def _loops(
         axes.plot([-reach, reach], [-reach, reach], color=MUTED, linestyle=(0, (4, 2)), label="ideal")
         axes.set_xlabel(f"stage, {name}")
         axes.set_ylabel(f"distal end, {name}")
-        legend_above(axes, 3)
+        legend_above(axes, 2 if narrow else 3)
 
     return report_figure(
         draw,
@@ -191,7 +192,8 @@ def _loops(
         3.2,
         title,
         f"{title}, loop.",
-        f"As {figure_name}: all amplitudes and rates over one another, the fitted loop, and an ideal transmission.",
+        f"As {figure_name} of the thesis: all amplitudes and rates over one another, the fitted loop, and an ideal "
+        "transmission.",
     )
 
 
@@ -231,9 +233,8 @@ def knob_picture(found: Characterization) -> ReportFigure:
         3.2,
         "Knob to curvature",
         "Curvature over the knob with its dead zones.",
-        "As Fig. 6.8: dead where the shaft passes through straight and at both ends of the knob's travel; the "
-        "dotted "
-        "lines are the edges found.",
+        "As Fig. 6.8 of the thesis: dead where the shaft passes through straight and at both ends of the knob's travel; "
+        "the dotted lines are the edges found.",
     )
 
 
@@ -272,5 +273,6 @@ def tip_picture(found: Characterization) -> ReportFigure:
         5.0,
         "Knob to tip",
         "Tip across and along the axis over the knob.",
-        "As Figs. 6.10 and 6.11, both halves: past about 41° the tip comes back across, so two knob angles reach one place.",
+        "As Figs. 6.10 and 6.11 of the thesis, both halves: past about 41° the tip comes back across, so two knob angles "
+        "reach one place.",
     )

@@ -31,7 +31,8 @@ from host.report.style import (
 Array = npt.NDArray[np.float64]
 FAULT, SHADE = "#b03a32", "#f6e3da"
 ORDER = ("base", "insertion", "roll", "knob", "shape", "contact", "pose_sensor", "force_sensor")  # along the rig
-ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9}
+# Arrows go from box to box; the gap at both ends is in points.
+ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9, "shrinkA": 4.0, "shrinkB": 4.0}
 SIDE_BY_SIDE = ("pose_sensor", "force_sensor")
 
 
@@ -65,10 +66,11 @@ def chain(result: Diagnosis) -> ReportFigure:
         per_row = 3 if narrow else 4
         rows = int(np.ceil(len(names) / per_row))
         axes.set(xlim=(-0.5, per_row - 0.5), ylim=(-rows + 0.45, 0.55))
+        boxes = []
         for k, name in enumerate(names):
             x, y = k % per_row, -(k // per_row)
             colour = FAULT if name in bad else INK
-            axes.text(
+            box = axes.text(
                 x,
                 y,
                 name.replace("_", " "),
@@ -83,11 +85,17 @@ def chain(result: Diagnosis) -> ReportFigure:
                     "ec": colour if name in bad else FAINT,
                 },
             )
-            if x == 0 and k > 0:
-                axes.annotate("", (-0.31, y), (-0.48, y), arrowprops=ARROW)
-            if k + 1 < len(names) and (name, names[k + 1]) != SIDE_BY_SIDE:
+            boxes.append(box)
+        for k, box in enumerate(boxes):
+            x, y = k % per_row, -(k // per_row)
+            if x == 0 and k > 0:  # the arrow from the row above goes on here
+                axes.annotate("", (x, y), (x - 0.5, y), arrowprops=ARROW | {"patchB": box.get_bbox_patch()})
+            if k + 1 < len(names) and (names[k], names[k + 1]) != SIDE_BY_SIDE:
                 last = x == per_row - 1
-                axes.annotate("", (x + (0.48 if last else 0.62), y), (x + (0.31 if last else 0.40), y), arrowprops=ARROW)
+                to = {} if last else {"patchB": boxes[k + 1].get_bbox_patch()}
+                axes.annotate(
+                    "", (x + (0.5 if last else 1.0), y), (x, y), arrowprops=ARROW | {"patchA": box.get_bbox_patch()} | to
+                )
 
     words = f"Links: {', '.join(names)}. At fault: {', '.join(sorted(bad)) or 'none'}."
     height = 0.55 * np.ceil(len(names) / 4) + 0.1

@@ -279,6 +279,7 @@ def _effect(
         "rests_on": standing.rests_on,
         "indistinguishable_from": [other.name for other in standing.alike],
         "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
+        "experiment_separates": any(design.separates for design in result.designs if design.candidate == candidate),
     }
 
 
