@@ -53,6 +53,7 @@ EFFECT = {
     "evidence",
     "indistinguishable_from",
     "experiment_to_tell_apart",
+    "experiment_separates",
 }
 
 
