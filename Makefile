@@ -117,8 +117,9 @@ proof:
 
 # Random kills, stalls, unplugged ports and full disks in contact, over all processes on the wall clock; some 40 s a run.
 RUNS ?= 100
+JOBS ?= 1
 chaos: setup
-	@$(BIN)/python -m host.studies.chaos --runs $(RUNS) --seed $(SEED) --docs docs/reliability.md
+	@$(BIN)/python -m host.studies.chaos --runs $(RUNS) --seed $(SEED) --jobs $(JOBS) --docs docs/reliability.md
 
 soak: setup
 	@$(BIN)/seldinger soak --minutes 120 --docs docs/reliability.md

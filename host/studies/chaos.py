@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
 import math
+import multiprocessing
 import os
 import resource
 import signal
@@ -30,6 +32,7 @@ from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet, Operator
 from host.studies.reliability_page import write_section
 from protocol.stop_client import stop_by_socket, stop_over
+from protocol.worker_process import end_with_parent
 from sim.scenario import TARGET_M, ContactJob
 
 LIMIT_N = 0.55
@@ -268,20 +271,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m host.studies.chaos", description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="runs at the same time; each has three processes")
     parser.add_argument("--docs", type=Path, help="page whose section is to be written again")
     parser.add_argument("--results", type=Path, help="file for one JSON line a run; finished runs in it are not repeated")
     options = parser.parse_args(arguments)
     runs = _finished(options.results)
-    with tempfile.TemporaryDirectory(prefix="seldinger-chaos-") as folder:
+    # Each run in a fresh process: nothing of one run is left to the next.
+    fresh = multiprocessing.get_context("spawn").Pool(options.jobs, end_with_parent, maxtasksperchild=1)
+    with tempfile.TemporaryDirectory(prefix="seldinger-chaos-") as folder, fresh as pool:
         settings = DemoSettings(board="native", directory=Path(folder), force_N=0.15)
-        for number in range(options.runs):
-            if number in {run.number for run in runs}:
-                continue
-            runs.append(run_once(number, options.seed, settings))
-            print(_progress(runs[-1]), file=sys.stderr, flush=True)
+        left = sorted(set(range(options.runs)) - {run.number for run in runs})
+        one = functools.partial(run_once, seed=options.seed, settings=settings)
+        for run in pool.imap_unordered(one, left):
+            runs.append(run)
+            print(_progress(run), file=sys.stderr, flush=True)
             if options.results is not None:
                 with options.results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(runs[-1])) + "\n")
+                    file.write(json.dumps(asdict(run)) + "\n")
+    runs.sort(key=lambda run: run.number)
     if options.docs is not None:
         write_section(options.docs, "chaos", section(runs, options.seed))
     print(section(runs, options.seed))
