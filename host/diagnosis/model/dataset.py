@@ -185,8 +185,10 @@ def _one(
 def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:
     if spec.data.time is not None:
         if spec.data.time not in columns:
-            raise InputError("data.time", spec.data.time, f"a column of {name}: {', '.join(sorted(columns))}")
-        time_s = columns[spec.data.time]
+            raise InputError(
+                "data.time", spec.data.time, f"a column of {name} with numbers or dates: {', '.join(sorted(columns))}"
+            )
+        time_s = columns[spec.data.time] * spec.data.time_scale
         if not np.all(np.isfinite(time_s)) or np.any(np.diff(time_s) < 0) or time_s[-1] <= time_s[0]:
             raise InputError("data.time", f"{spec.data.time} of {name} not increasing", "seconds that increase")
         return time_s, True

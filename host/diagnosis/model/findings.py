@@ -182,7 +182,10 @@ def _stamps(column: str | None, recordings: list[Recording], findings: list[Find
         says = (
             f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples. If it is in milliseconds or "
         )
-        says += "microseconds, every rate and time constant below is in that unit, not in seconds: set its scale."
+        says += (
+            "microseconds, every rate and time constant below is in that unit, not in seconds: set data.time_scale (0.001 "
+        )
+        says += "for milliseconds)."
         findings.append(Finding("unit", column, says))
 
 

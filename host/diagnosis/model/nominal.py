@@ -60,6 +60,7 @@ class DataSpec(Request):
 
     files: list[str] = []
     time: str | None = None
+    time_scale: float = Field(default=1.0, gt=0)  # seconds = time_scale * column
     rate_Hz: float | None = Field(default=None, gt=0)
     heldout: list[str] | None = None
     segments: list[SegmentSpec] = Field(default=[], validation_alias=AliasChoices("segments", "pieces"))

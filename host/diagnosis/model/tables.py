@@ -1,4 +1,4 @@
-"""Tables of any of the five file kinds, as one dictionary from column name to float array."""
+"""Tables of every file kind in SUFFIXES, as one dictionary from column name to float array."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from protocol.errors import Description, InputError, reason
 from protocol.text_files import kind_of
 
 Array = npt.NDArray[np.float64]
-SUFFIXES = (".csv", ".csv.gz", ".parquet", ".mat", ".npz", ".mcap")
+SUFFIXES = (".csv", ".csv.gz", ".tsv", ".parquet", ".mat", ".npz", ".mcap")
 # A packed table may unpack to so much, or to so many times its own size where that is more.
 UNPACKED_LIMIT_BYTES, UNPACKED_PER_PACKED = 256 * 2**20, 64
 _BLOCK_BYTES = 2**20
-_HEAD_BYTES = 4096
+_HEAD_BYTES = 65536
+_COMMENTS = ("#", "%", "//")  # that begin a line of comment before the heading
 _MAT_COMPRESSED, _MAT_HEAD_BYTES = 15, 128
 
 
@@ -49,13 +50,16 @@ def table_of(source: Any, number: int) -> Table | Path:
     if not isinstance(source, Mapping) and not (hasattr(source, "columns") and hasattr(source, "__getitem__")):
         raise InputError("recordings", type(source).__name__, "paths, dictionaries of arrays or DataFrames")
     columns: dict[str, Array] = {}
-    for key in source if isinstance(source, Mapping) else source.columns:
+    signals: dict[Any, Any] = dict(source) if isinstance(source, Mapping) else {key: source[key] for key in source.columns}
+    index = None if isinstance(source, Mapping) else getattr(source, "index", None)
+    if index is not None and index.name is not None:  # a DataFrame with its time as index
+        signals = {index.name: index} | signals
+    for key in signals:
         try:
-            array = np.asarray(source[key])
-            values = np.array(array, dtype=np.float64) if array.dtype.kind in "fiubO" else None
+            values = _numbers_of(signals[key])
         except (TypeError, ValueError):
             values = None
-        if values is None:  # words, dates: not a signal
+        if values is None:  # words: not a signal
             continue
         if values.ndim != 1:
             raise InputError(f"{name}, {key}", f"shape {values.shape}", "one-dimensional arrays (n,)")
@@ -63,6 +67,16 @@ def table_of(source: Any, number: int) -> Table | Path:
     if not columns:
         raise InputError(name, "no numeric column", "at least one numeric column")
     return Table(name, columns)
+
+
+def _numbers_of(given: Any) -> Array | None:
+    """Numbers or instants as floats, instants in seconds since 1970; None for anything else."""
+    if getattr(getattr(given, "dtype", None), "tz", None) is not None:  # instants of pandas with a time zone
+        given = given.to_numpy(dtype="datetime64[ns]")
+    array = np.asarray(given)
+    if array.dtype.kind == "M":
+        return _seconds_of(array)
+    return np.array(array, dtype=np.float64) if array.dtype.kind in "fiubO" else None
 
 
 def is_table(path: Path) -> bool:
@@ -106,7 +120,7 @@ def read_table(path: Path, unpacked_limit_bytes: int | None = None) -> dict[str,
 
 def _read(path: Path, limit: int) -> dict[str, Array]:
     name = path.name.lower()
-    if name.endswith((".csv", ".csv.gz")):
+    if name.endswith((".csv", ".csv.gz", ".tsv")):
         return _from_arrow(_read_csv(path, limit))
     if name.endswith(".parquet"):
         return _from_arrow(_read_parquet(path, limit))
@@ -117,51 +131,78 @@ def _read(path: Path, limit: int) -> dict[str, Array]:
     return _read_mcap(path, limit)
 
 
+@dataclass(frozen=True)
+class _TextForm:
+    """How a text table is written: mark between columns, mark of the fraction, lines of comment before the heading."""
+
+    separator: str
+    decimal_point: str
+    comment_lines: int
+
+
 def _read_csv(path: Path, limit: int) -> Any:
     import pyarrow
     import pyarrow.csv
 
-    options = pyarrow.csv.ConvertOptions(null_values=["", "nan", "NaN", "NA", "null"], strings_can_be_null=True)
     source: Any = path
     if path.name.lower().endswith(".gz"):
         with gzip.open(path) as stream:
             content = stream.read(limit + 1)
         if len(content) > limit:
             raise _TooLarge
-        source = pyarrow.BufferReader(content)
-    _refuse_other_separators(path, content if path.name.lower().endswith(".gz") else None)
-    table = pyarrow.csv.read_csv(source, convert_options=options)
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        if pyarrow.types.is_string(column.type):
-            _refuse_text_among_numbers(path.name, name, column.to_pylist())
+        source, head = pyarrow.BufferReader(content), content[:_HEAD_BYTES]
+    else:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    form = _text_form(path.name, head)
+    table = pyarrow.csv.read_csv(
+        source,
+        read_options=pyarrow.csv.ReadOptions(skip_rows=form.comment_lines),
+        parse_options=pyarrow.csv.ParseOptions(delimiter=form.separator),
+        convert_options=pyarrow.csv.ConvertOptions(
+            null_values=["", "nan", "NaN", "NA", "null"], strings_can_be_null=True, decimal_point=form.decimal_point
+        ),
+    )
+    texts = {
+        name: column.to_pylist()
+        for name, column in zip(table.column_names, table.columns, strict=True)
+        if pyarrow.types.is_string(column.type)
+    }
+    for name, cells in texts.items():
+        _refuse_text_among_numbers(path.name, form.comment_lines + 2, name, cells, len(texts) == len(table.column_names))
     return table
 
 
-def _refuse_other_separators(path: Path, unpacked: bytes | None) -> None:
-    """Raise InputError for a table that is no UTF-8 text, or has semicolons or tabs between its columns."""
-    if unpacked is None:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
-    else:
-        head = unpacked[:_HEAD_BYTES]
+def _text_form(file: str, head: bytes) -> _TextForm:
+    """Find how the text table with the first bytes `head` is written. Raises InputError for what is no UTF-8 text.
+
+    A comma is the mark of the fraction only where semicolons or tabs separate the columns.
+    """
     found = kind_of(head)
-    heading = head.partition(b"\n")[0]
-    if not found and b"," not in heading:
-        found = {b";": "semicolons between the columns", b"\t": "tabs between the columns"}.get(
-            next((mark for mark in (b";", b"\t") if mark in heading), b""), ""
-        )
     if found:
-        wanted = "a text (UTF-8) with commas between the columns and points in the numbers"
-        raise InputError("recording", Description(f"{path.name}: {found}"), wanted)
+        wanted = "a text (UTF-8) with commas, semicolons or tabs between the columns"
+        raise InputError("recording", Description(f"{file}: {found}"), wanted)
+    lines = head.decode("utf-8-sig", errors="replace").splitlines()
+    comments = next((number for number, line in enumerate(lines) if not line.startswith(_COMMENTS)), 0)
+    heading, body = (lines[comments], lines[comments + 1 :]) if lines else ("", [])
+    first = body[0] if body else heading
+    separator = next((mark for mark in (";", "\t") if 0 < heading.count(mark) == first.count(mark)), ",")
+    comma = separator != "," and any("," in line for line in body) and not any("." in line for line in body)
+    return _TextForm(separator, "," if comma else ".", comments)
 
 
-def _refuse_text_among_numbers(file: str, column: str, cells: list[str | None]) -> None:
-    """Raise InputError for the first text in a column of numbers; a column of texts, such as notes, is left out later."""
-    texts = [(line, cell) for line, cell in enumerate(cells, start=2) if cell is not None and not _is_number(cell)]
+def _refuse_text_among_numbers(file: str, first_line: int, column: str, cells: list[str | None], all_texts: bool) -> None:
+    """Raise InputError for the first text in a column of numbers; a column of texts, such as notes, is left out later.
+
+    first_line: of the first cell in the file. all_texts: no column of the file has numbers alone, as with a row of units.
+    """
+    texts = [(line, cell) for line, cell in enumerate(cells, start=first_line) if cell is not None and not _is_number(cell)]
     given = sum(cell is not None for cell in cells)
     if texts and len(texts) < 0.5 * given:
         line, cell = texts[0]
-        raise InputError(f"{file}: line {line}: {column}", cell, f"a number, as in the other {given - len(texts)} cells")
+        units = "; delete a row of units, and give the units in [channels]" if all_texts and line == first_line else ""
+        wanted = f"a number, as in the other {given - len(texts)} cells{units}"
+        raise InputError(f"{file}: line {line}: {column}", cell, wanted)
 
 
 def _is_number(text: str) -> bool:
@@ -219,7 +260,18 @@ def _from_arrow(table: Any) -> dict[str, Array]:
             columns[name.strip()] = column.cast(pyarrow.float64()).to_numpy().astype(np.float64)
         elif pyarrow.types.is_null(column.type):
             columns[name.strip()] = np.full(len(column), np.nan)
+        elif pyarrow.types.is_timestamp(column.type):
+            columns[name.strip()] = _seconds_of(column.cast(pyarrow.timestamp("ns")).to_numpy())
+        elif pyarrow.types.is_time(column.type):  # of a day
+            since_ns = column.cast(pyarrow.time64("ns")).cast(pyarrow.int64()).cast(pyarrow.float64(), safe=False)
+            columns[name.strip()] = since_ns.to_numpy().astype(np.float64) * 1e-9
     return columns
+
+
+def _seconds_of(instants: npt.NDArray[Any]) -> Array:
+    """Instants (datetime64) as seconds since 1970, to 0.3 us; NaN where there is none."""
+    since_ns = instants.astype("datetime64[ns]").astype(np.int64)
+    return np.where(np.isnat(instants), np.nan, since_ns * 1e-9)
 
 
 def _columns(arrays: dict[str, Any]) -> dict[str, Array]:
@@ -227,8 +279,9 @@ def _columns(arrays: dict[str, Any]) -> dict[str, Array]:
     columns = {}
     for key, value in arrays.items():
         array = np.asarray(value)
-        if key.startswith("__") or array.dtype.kind not in "fiub":
+        if key.startswith("__") or array.dtype.kind not in "fiubM":
             continue
+        array = _seconds_of(array) if array.dtype.kind == "M" else array
         array = np.squeeze(array).astype(np.float64)
         if array.ndim == 1:
             columns[key] = array

@@ -11,7 +11,7 @@ from host.diagnosis.model.dataset import Recording, find_files, load, read_table
 from host.diagnosis.model.findings import _dead
 from host.diagnosis.model.nominal import NominalSpec, read_nominal
 from host.diagnosis.model.readings import Finding
-from host.diagnosis.model.tables import read_table
+from host.diagnosis.model.tables import Table, read_table, table_of
 from host.diagnosis.models import channels_of
 from protocol.errors import InputError
 
@@ -63,6 +63,58 @@ def test_every_kind_of_file_gives_the_same_columns(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "x.csv", a, header="a", comments="")
     for name in ("x.npz", "x.mat", "x.parquet", "x.csv"):
         assert np.allclose(read_table(tmp_path / name)["a"], a)
+
+
+HEADING_ROWS = [("time_s", "a"), ("0.5", "1.25"), ("0.75", "-2.5"), ("1", "3")]
+
+
+@pytest.mark.parametrize(
+    ("name", "separator", "point", "before"),
+    [
+        ("x.csv", ",", ".", ""),
+        ("x.csv", ";", ",", ""),
+        ("x.csv", ";", ".", "# logger of the bench\n# rig 7, a and b\n"),
+        ("x.csv", "\t", ",", "% exported\n"),
+        ("x.tsv", "\t", ".", "\ufeff"),
+    ],
+)
+def test_text_tables_as_programs_write_them(tmp_path: Path, name: str, separator: str, point: str, before: str) -> None:
+    rows = [separator.join(cell.replace(".", point) for cell in row) for row in HEADING_ROWS]
+    (tmp_path / name).write_text(before + "\n".join(rows) + "\n", encoding="utf-8")
+    columns = read_table(tmp_path / name)
+    assert columns["time_s"].tolist() == [0.5, 0.75, 1.0] and columns["a"].tolist() == [1.25, -2.5, 3.0]
+
+
+def test_a_comma_within_a_heading_of_commas_stays_a_separator(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("a,b;c\n1,2\n3,4\n")
+    assert read_table(tmp_path / "x.csv") == {"a": pytest.approx([1, 3]), "b;c": pytest.approx([2, 4])}
+
+
+def test_dates_count_in_seconds_since_1970(tmp_path: Path) -> None:
+    import pandas as pd
+
+    instants = pd.Timestamp("2026-03-01 12:00:00") + pd.to_timedelta([0.0, 0.25, 0.5], unit="s")
+    frame = pd.DataFrame({"t": instants, "a": [1.0, 2.0, 3.0]})
+    frame.to_csv(tmp_path / "x.csv", index=False)
+    frame.assign(t=instants.tz_localize("UTC")).to_parquet(tmp_path / "x.parquet")
+    np.savez(tmp_path / "x.npz", t=instants.to_numpy(), a=frame["a"])
+    in_python = [frame, frame.set_index("t"), frame.set_index("t").tz_localize("UTC"), {"t": instants, "a": frame["a"]}]
+    read_columns = [read_table(tmp_path / name) for name in ("x.csv", "x.parquet", "x.npz")]
+    for columns in read_columns + [made.columns for made in map(table_of, in_python, range(4)) if isinstance(made, Table)]:
+        assert np.allclose(columns["t"] - 1772366400.0, [0.0, 0.25, 0.5], atol=3e-7), columns
+    assert len(in_python) == 4
+
+
+def test_a_missing_date_is_a_missing_number(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("t,a\n2026-03-01 12:00:00,1\n,2\n")
+    assert np.isnan(read_table(tmp_path / "x.csv")["t"]).tolist() == [False, True]
+
+
+def test_times_in_milliseconds_are_scaled(tmp_path: Path) -> None:
+    path = table(tmp_path / "x.csv")
+    (plain,) = read(tmp_path, [path])
+    (scaled,) = read(tmp_path, [path], TOML.replace('time = "t"', 'time = "t"\ntime_scale = 1e-3'))
+    assert scaled.dt_s == pytest.approx(1e-3 * plain.dt_s)
 
 
 def test_empty_fields_are_missing(tmp_path: Path) -> None:
