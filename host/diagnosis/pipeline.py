@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from host.diagnosis.design.experiment import Design, design
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
+from host.diagnosis.estimation.coloured import independent_samples
 from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.jumps import jumps_of
@@ -31,13 +32,13 @@ from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.equivalence import Standing, standings, with_unlisted_rival
+from host.diagnosis.selection.equivalence import Standing, most_probable, standings, with_unlisted_rival
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
-from host.diagnosis.selection.unlisted import Remainder, explain_remainder
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -209,9 +210,13 @@ def _diagnosed(
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
     found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])
-    remainder = explain_remainder(problem, found, noise_sd, overall.part(0.7, 0.8))
-    overall.part(0.8, 0.85)("comparing rivals in the place of each effect", 0.0)
-    standing = with_unlisted_rival(standings(problem, found, noise_sd), remainder)
+    overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
+    standing = most_probable(problem, found, noise_sd)
+    named_before = found.best
+    remainder = explain_remainder(problem, found, noise_sd, overall.part(0.75, 0.85))
+    if found.best is not named_before:  # an equation took the place of effects
+        standing = standings(problem, found, noise_sd)
+    standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
@@ -231,6 +236,8 @@ def _diagnosed(
         if remainder.sure or found.best.terms
         else "nothing_missing"
     )
+    if result.verdict == "nothing_missing":
+        result.findings += _too_slow(full, found, slow_outputs(problem, found.best, noise_sd))
     if not located and remainder.sure and remainder.predicted is not None:
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
@@ -246,6 +253,19 @@ def _without_lone_samples(
         return recordings, []
     nominal = fit_nominal(problem)
     return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
+
+
+def _too_slow(full: Problem, found: Found, rows: list[int]) -> list[Finding]:
+    """Sentences on outputs whose residual wanders so slowly that it is noise or a mismatch, and data cannot tell which."""
+    findings = []
+    for row in rows:
+        output, residuals = full.model.outputs[row], [r[row] for r in found.best_full.residuals]
+        column = full.columns.get(output.channel, output.channel)
+        says = f"The residual of column {column}, {rms(residuals):.3g} {output.unit} RMS, has only "
+        says += f"{independent_samples(residuals):.0f} independent samples. No structure is common to the recordings. "
+        says += "These data cannot separate slow noise from a mismatch: record five times as long, or repeat the motion."
+        findings.append(Finding("slow_noise", column, says))
+    return findings
 
 
 def _jumps(full: Problem, found: Found) -> list[Finding]:

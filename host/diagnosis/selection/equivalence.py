@@ -13,8 +13,8 @@ from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.posterior import coarse
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, begun_again
-from host.diagnosis.selection.trial import Trial, at_bound
+from host.diagnosis.selection.search import Found, Step, begun_again, refined
+from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for
 from host.diagnosis.symbolic.dictionary import equation_at
 
@@ -56,6 +56,48 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         share = _share(problem, found, less, noise_sd) if terms else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters), share, alone))
     return out
+
+
+def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
+    """Standings of a structure in which no listed rival is plainly likelier than the effect that it could replace.
+
+    An effect enters by what it gains on held-out samples. Among effects of one step these gains can be alike while all
+    samples speak for another one; the verdict would then state a probability near zero for its own name. The rival takes
+    the place if the effect would be distinguishable from it, were the rival named. Changes `found.best`.
+    """
+    seen = [found.best.names]
+    standing = standings(problem, found, noise_sd)
+    for _ in range(problem.rules.exchange_rounds):
+        behind = [
+            (difference, k, rival)
+            for k, one in enumerate(standing)
+            for rival, difference in one.rivals
+            if rival.effect.listed and difference < -problem.rules.equal_log_likelihood
+        ]
+        if not behind or problem.budget.spent():
+            return standing
+        _, k, rival = min(behind, key=lambda item: item[0])
+        begun, before = get_starts(problem), found.best
+        step = next(s for s in found.steps if any(t.candidate.key == rival.key for t in s.trials))
+        trial = next(t for t in step.trials if t.candidate.key == rival.key)
+        other = _with_rival(problem, found.best, standing[k].candidate, trial)
+        ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd)
+        if other.names in seen or ahead.log_likelihood <= 0.0 or at_bound(other):
+            set_starts(problem, begun)
+            return standing
+        found.best = other
+        found.steps.append(Step("swap", rival.key, ahead, step.trials))
+        seen.append(other.names)
+        standing = standings(problem, found, noise_sd)
+    return standing
+
+
+def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial) -> Fit:
+    """`best` with the effect of `trial` in the place of `candidate`, brought to its end."""
+    terms, values = without(best, problem, (candidate.key,))
+    term = trial.fit.terms[-1]
+    begin = np.concatenate((values, trial.fit.values_of(term)))
+    return refined(problem, finish(problem, minimize(problem, (*terms, term), begin, rounds=10, tolerance=1e-4)))
 
 
 def _share(problem: Problem, found: Found, less: Fit, noise_sd: Array) -> float:
@@ -155,17 +197,21 @@ def _equals(
 
 
 def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:
-    """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did."""
+    """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did.
+
+    A simpler shape of `candidate` is a rival whatever it earned alone: past the other effects it may do as well.
+    """
     active = {term.candidate.key for term in found.best.terms}
     names = {candidate.name, *(term.candidate.name for term in found.best.terms)}
     kept: dict[str, Trial] = {}
     for step in (s for s in found.steps if any(trial.candidate.key == candidate.key for trial in s.trials)):
         most = max(trial.score for trial in step.trials)
         for trial in step.trials:
+            simpler = trial.candidate.effect.id in candidate.effect.contains and related(trial.candidate, candidate)
             if (
                 trial.candidate.key not in active
                 and trial.candidate.name not in names
-                and trial.score > rules.equals_score * most
+                and (simpler or trial.score > rules.equals_score * most)
             ):
                 kept.setdefault(trial.candidate.name, trial)
     return sorted(kept.values(), key=lambda trial: -trial.score)

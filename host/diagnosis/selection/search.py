@@ -37,6 +37,7 @@ from host.diagnosis.selection.trial import (
     only_sampling,
     rank,
     related,
+    richer_gain,
     vanished,
     weighty,
     wider,
@@ -235,6 +236,8 @@ def search(problem: Problem, candidate_effects: list[Candidate], progress: Progr
     _join(problem, found, candidate_effects, noise_sd, progress)
     found = _detour(problem, found, candidate_effects, noise_sd, progress)
     _exchange(problem, found, candidate_effects, noise_sd, progress)
+    if len(found.best.terms) > 1:
+        _reduce(problem, found, noise_sd)
     if found.best.terms:
         found.best = refined(problem, found.best)
     return found
@@ -517,6 +520,55 @@ def _exchange(
         found.best = _prune(problem, found.best, noise_sd, found.steps)
         if found.best.names == before or len(found.best.terms) < 2:
             return
+
+
+def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
+    """Each of several effects replaced by a simpler shape that does nearly as well in its place.
+
+    A richer shape may have entered because the simpler one needed another effect as well: a limit of speed that is never
+    reached outdoes the lag that it contains by chance alone. What the richer one takes more has to be what a richer one
+    has to take to be preferred where single effects are ranked (`rank`).
+    """
+    for term in found.best.terms:
+        if problem.budget.spent():
+            return
+        for trial in _simpler(found, term):
+            rest, values = without(found.best, problem, (term.candidate.key,))
+            simple = trial.fit.terms[-1]
+            own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
+            alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
+            begun, key, less = get_starts(problem), simple.candidate.key, found.nominal
+            if rest:
+                less = finish(problem, minimize(problem, rest, values, rounds=8, tolerance=1e-4))
+            start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
+            begin = np.concatenate((values, start))
+            other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
+            other = _restart(problem, finish(problem, begun_again(problem, other)), simple.candidate)
+            earned = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
+            ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd)
+            more = len(found.best.values) - len(other.values)
+            if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
+                found.steps.append(Step("reduce", key, ahead, [trial]))
+                found.best = other
+                break
+            set_starts(problem, begun)
+
+
+def _simpler(found: Found, term: Term) -> list[Trial]:
+    """Trials of the simpler shapes that `term` contains, at its place, each once."""
+    active = {t.candidate.key for t in found.best.terms}
+    kept: dict[str, Trial] = {}
+    for step in reversed(found.steps):
+        for trial in step.trials:
+            own = trial.fit.terms[-1]
+            if (
+                trial.candidate.effect.id in term.candidate.effect.contains
+                and related(trial.candidate, term.candidate)
+                and len(own.parameters) < len(term.parameters)
+                and trial.candidate.key not in active
+            ):
+                kept.setdefault(trial.candidate.key, trial)
+    return sorted(kept.values(), key=lambda trial: len(trial.fit.terms[-1].parameters))
 
 
 def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:

@@ -113,6 +113,18 @@ def rank(trials: list[Trial], base: Fit) -> None:
         trials.insert(0, best)
 
 
+def richer_gain(earned: Gain, more: int, rules: SelectionRules) -> float:
+    """Log-likelihood by which a richer shape has to outdo a simpler one, as in `rank`.
+
+    earned: gain of the richer one over neither; more: number of its further parameters.
+    """
+    score = earned.log_likelihood
+    left = np.log(1.0 - rules.refinement_error_reduction * np.minimum(1.0, 2.0 * earned.excesses))
+    coarse = 0.5 * float(earned.independent @ -left)
+    least = max(rules.heldout_log_likelihood, rules.refinement_tolerance * score, min(coarse, 0.3 * score))
+    return least + rules.parameter_penalty * more
+
+
 def _zeros(fit: Fit) -> int:
     """Number of parameters of the last effect that ended at a lower bound of zero."""
     term = fit.terms[-1]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.coloured import only_coloured
+from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
 from host.diagnosis.estimation.jumps import jumps_of
@@ -82,6 +82,16 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
             if only_coloured([r[row] for r in fit.residuals], inputs):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
+
+
+def slow_outputs(problem: Problem, fit: Fit, noise_sd: Array) -> list[int]:
+    """Rows of outputs of which `fit` leaves noise so slow that these data cannot separate it from a mismatch."""
+    rules, levels = problem.rules, _levels(problem, fit, noise_sd)
+    return [
+        row
+        for row in range(noise_sd.size)
+        if levels[row] > rules.residual_over_guessed_noise * noise_sd[row] and too_slow([r[row] for r in fit.residuals])
+    ]
 
 
 def _power(problem: Problem, residuals: list[Array], row: int) -> float:

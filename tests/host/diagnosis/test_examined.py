@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import seldinger as sd
-from host.diagnosis.estimation.coloured import only_coloured
+from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.rules import RULES
@@ -154,6 +155,61 @@ def test_coloured_noise_is_told_from_physics(seed: int) -> None:
         assert not only_coloured([physics(u[0]) + e for u, e in zip(inputs, small, strict=True)], inputs)
 
 
+def wander(seed: int, n: int, samples: float) -> Array:
+    """First-order noise of unit standard deviation, correlated over so many samples."""
+    kicks = np.random.default_rng([109, seed]).standard_normal(n + int(10 * samples))
+    keep = np.exp(-1.0 / samples)
+    return signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], kicks)[-n:]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_too_slow_to_be_told_from_a_mismatch_is_a_finding_and_no_alarm(seed: int) -> None:
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([113, seed, k]), np.arange(0.0, 50.0, 0.05)
+        x = sway(10 * seed + k, t, 0.5, 0.25)
+        y = x + 0.02 * wander(10 * seed + k, t.size, 150.0) + 0.0005 * rng.standard_normal(t.size)
+        recordings.append({"t": t, "x": x, "y": y})
+    verdict = sd.diagnose(recordings, LINK)
+    assert verdict.verdict == "nothing_missing"
+    (says,) = [finding["says"] for finding in verdict.data_findings if finding["id"] == "slow_noise"]
+    assert "cannot separate slow noise from a mismatch" in says
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_slow_noise_is_told_from_what_recordings_have_in_common(seed: int) -> None:
+    n = 1000
+    inputs = [[sway(10 * seed + k, np.arange(n) * 0.05, 0.2, 0.25)] for k in range(3)]
+    noise = [wander(10 * seed + k, n, 150.0) for k in range(3)]
+    assert only_coloured(noise, inputs)
+    shared = wander(10 * seed, n, 300.0)
+    fine = [0.05 * e + 0.01 * np.random.default_rng([seed, k]).standard_normal(n) for k, e in enumerate(noise)]
+    assert too_slow([shared] * 3) and not only_coloured([e + shared for e in fine], inputs)
+    forms = (lambda x: x**3, np.abs, lambda x: np.arange(n) / n, lambda x: signal.lfilter([0.005], [1.0, -0.995], x) - x)
+    for physics in forms:
+        shaped = [physics(u[0]) for u in inputs]
+        assert not only_coloured([(f - np.mean(f)) / np.std(f) + e for f, e in zip(shaped, fine, strict=True)], inputs)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_that_a_controller_feeds_back_is_no_physics(seed: int) -> None:
+    """A proportional-integral loop in the same row: the input holds the noise of its own row, and physics acts later."""
+    noise, inputs, rng = [], [], np.random.default_rng([139, seed])
+    for k in range(2):
+        e = 0.01 * wander(10 * seed + k, 3000, 30.0) + 1e-4 * rng.standard_normal(3000)
+        wanted, u, y, total = np.repeat(rng.uniform(1.0, 3.0, 10), 300), np.empty(3000), 1.0, 1.0
+        for i in range(3000):
+            error = wanted[i] - y - e[i]
+            total += 0.01 * error
+            u[i] = 2.0 * error + total
+            y += 0.01 * (u[i] - y)
+        noise.append(e)
+        inputs.append([u])
+    assert only_coloured(noise, inputs)
+    late = [np.r_[np.zeros(6), 0.2 * (u[0][6:] - u[0][:-6])] for u in inputs]
+    assert not only_coloured([a + b for a, b in zip(late, noise, strict=True)], inputs)
+
+
 def test_jumps_at_other_instants_in_each_recording_are_reported() -> None:
     recordings = []
     for k, jumps in enumerate(([(9.0, 0.006)], [(14.0, -0.005), (24.0, 0.007)], [])):
@@ -219,6 +275,52 @@ def test_play_before_a_lag_is_two_effects_and_no_dead_band_of_a_loop() -> None:
             y[i] = slow
         recordings.append({"t": t, "x": x, "y": y + 0.007 * rng.standard_normal(t.size)})
     assert sorted(ids(sd.diagnose(recordings, LINK))) == ["backlash", "rate_lag"]
+
+
+def test_a_speed_limit_without_a_time_constant_is_a_limit() -> None:
+    recordings = []
+    for k in (1, 2, 3):
+        rng, fine = np.random.default_rng([127, k]), np.arange(0.0, 40.0, 0.002)
+        x = sway(k, fine, 0.6, 0.6)
+        y, most = np.empty(fine.size), 1.2 * np.std(np.gradient(x, 0.002)) * 0.002
+        y[0] = x[0]
+        for i in range(1, fine.size):
+            y[i] = y[i - 1] + min(max(x[i] - y[i - 1], -most), most)
+        recordings.append({"t": fine[::10], "x": x[::10], "y": y[::10] + 0.007 * rng.standard_normal(fine[::10].size)})
+    assert ids(sd.diagnose(recordings, LINK)) == ["saturation"]
+
+
+def slack_and_late(seed: int, k: int) -> dict[str, Array]:
+    """Play of 0.2 m before a lag of 0.07 s, by small steps."""
+    rng, fine = np.random.default_rng([131, seed, k]), np.arange(0.0, 40.0, 0.002)
+    x = sway(10 * seed + k, fine, 0.6, 0.6)
+    held, slow, y = x[0], x[0], np.empty(fine.size)
+    for i, now in enumerate(x):
+        held = min(max(held, now - 0.1), now + 0.1)
+        slow += (held - slow) * (1.0 - np.exp(-0.002 / 0.07))
+        y[i] = slow
+    return {"t": fine[::10], "x": x[::10], "y": y[::10] + 0.007 * rng.standard_normal(fine[::10].size)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_lag_next_to_play_is_no_limit_of_speed_that_is_never_reached(seed: int) -> None:
+    verdict = sd.diagnose([slack_and_late(seed, k) for k in (1, 2, 3)], LINK)
+    assert sorted(ids(verdict)) == ["backlash", "rate_lag"]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 5])
+def test_a_named_effect_is_not_plainly_less_probable_than_its_rival(seed: int) -> None:
+    """A curve under slow noise: by held-out samples alone it is a kink, by all samples it is a curve."""
+    recordings = []
+    for k in (1, 2, 3):
+        rng, t = np.random.default_rng([137, seed, k]), np.arange(0.0, 60.0, 0.05)
+        x = sway(10 * seed + k, t, 0.5, 0.25)
+        y = x + 0.3 * x**3 + 0.01 * wander(10 * seed + k, t.size, 160.0) + 0.0005 * rng.standard_normal(t.size)
+        recordings.append({"t": t, "x": x, "y": y})
+    (found,) = sd.diagnose(recordings, LINK).effects
+    assert found["id"] == "static_nonlinearity"
+    assert all(found["probability"] > other["probability"] for other in found["alternatives"])
 
 
 def test_an_effect_that_removes_little_is_less_sure_than_one_that_removes_much() -> None:
