@@ -139,7 +139,7 @@ class RunFigures:
             shown += list(np.percentile(along_N, (1.0, 99.0)))
         finite = [value for value in shown if math.isfinite(value)]
         margin_N = 0.05 * max(max(finite) - min(finite), 0.1)
-        low_N, high_N = min(finite) - margin_N, max(finite) + margin_N
+        low_N, high_N = min(finite) - margin_N, max(finite) + 2.0 * margin_N  # above: the word "limit"
         beyond_N = along_N[(along_N < low_N) | (along_N > high_N)]
         if not len(beyond_N):
             return low_N, high_N, ""
