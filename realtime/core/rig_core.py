@@ -295,8 +295,10 @@ class RigCore:
                 self._leaving.changed.add("board")
                 if self.commands.take_board_status():
                     self._command_changed()
-                if self._moves and board.ready:
-                    self._report(self.supervision.status(board.position_steps, board.encoder_counts, self.now_ns))
+                if self._moves and board.ready and self.link.status is not None:
+                    impossible = self.link.status.encoder_errors
+                    steps, counts = board.position_steps, board.encoder_counts
+                    self._report(self.supervision.status(steps, counts, self.now_ns, impossible))
                 continue
             # A homing moves onto the switch: that fault is what it looks for.
             is_error = event.kind in _BOARD_ERRORS and not (self._homes and event.kind is BoardEventKind.FAULT)

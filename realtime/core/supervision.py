@@ -20,6 +20,9 @@ Vector = NDArray[np.float64]
 # or stops. A difference larger than STEPS_SWING and MOVED times the steps since the status before, in two messages in a
 # row, is an error: found 10 ms after a rotor began to slip at full speed. 40 steps are 0.13 mm of insertion.
 STEPS_SWING, STEPS_MOVED, STEPS_MESSAGES = 40.0, 1.25, 2
+# Both lines of an encoder changed between two samples of the board, so often since the status before: a rotor turns faster
+# than the board counts (20000 counts/s; its stages reach 16000). Single ones come from electric noise.
+IMPOSSIBLE_COUNTS = 10
 # A model process at 40 Hz that sends nothing for this long, or estimates for poses older than that, is logged.
 HOST_SILENT_NS, HOST_LATE_NS = 250_000_000, 200_000_000
 
@@ -39,13 +42,23 @@ class StepCheck:
         self._difference_at_rest: Vector | None = None
         self._steps: Vector | None = None
         self._messages = 0
+        self._impossible: int | None = None
 
     def restart(self) -> None:
         """Take the difference at the next status as the reference; for arming."""
         self._difference_at_rest, self._steps, self._messages = None, None, 0
+        self._impossible = None
 
-    def check(self, position_steps: Vector, encoder_counts: Vector) -> SupervisionFinding | None:
-        """Compare steps (3,) with counts (3,) of one status; return a finding once STEPS_MESSAGES in a row differ."""
+    def check(self, position_steps: Vector, encoder_counts: Vector, impossible: int) -> SupervisionFinding | None:
+        """Compare steps (3,) with counts (3,) of one status; return a finding once STEPS_MESSAGES in a row differ.
+
+        impossible: the board's count of impossible transitions of all encoders, modulo 65536.
+        """
+        unseen = 0 if self._impossible is None else (impossible - self._impossible) % 65536
+        self._impossible = impossible
+        if unseen > IMPOSSIBLE_COUNTS:
+            text = f"a rotor turns faster than the board counts: {unseen} impossible transitions of an encoder"
+            return SupervisionFinding(safety.STEPS_LOST, text)
         steps = np.asarray(position_steps, float)
         difference = np.asarray(encoder_counts) / self._ratio - steps
         if self._difference_at_rest is None or self._steps is None:
@@ -130,13 +143,18 @@ class Supervision:
         self.tracker.restart()
         self._lasting = 0
 
-    def status(self, position_steps: Vector, encoder_counts: Vector, now_ns: int) -> SupervisionFinding | None:
-        """Check a board's status that arrived at `now_ns` while armed; steps and counts (3,). Return a new finding."""
+    def status(
+        self, position_steps: Vector, encoder_counts: Vector, now_ns: int, impossible: int = 0
+    ) -> SupervisionFinding | None:
+        """Check a board's status that arrived at `now_ns` while armed; steps and counts (3,). Return a new finding.
+
+        impossible: as in `StepCheck.check`.
+        """
         by_steps_m, by_encoder_m = position_steps[0] * self._m_per_step, encoder_counts[0] * self._m_per_count
         self.tracker.take_stage(now_ns, float(by_steps_m), float(by_encoder_m))
         if self._lasting & safety.STEPS_LOST:
             return None
-        finding = self.steps.check(position_steps[:N_AXES], encoder_counts[:N_AXES])
+        finding = self.steps.check(position_steps[:N_AXES], encoder_counts[:N_AXES], impossible)
         if finding is not None:
             self._lasting |= finding.cause
         return finding

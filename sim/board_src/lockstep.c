@@ -53,7 +53,11 @@ static void encoders_move(encoders_t *encoders) {
         int64_t way = (int64_t)encoders->target[axis] - encoders->start[axis];
         int64_t due = encoders->moves ? encoders->start[axis] + way * encoders->move / encoders->moves
                                       : encoders->target[axis];
-        if (encoders->count[axis] < due)
+        /* A rotor that turns faster than the board samples: the lines change by more than one count between two samples. */
+        int64_t seen = (int64_t)encoders->moves * CYCLES_PER_COUNT / CYCLES_PER_TICK + COUNTS_OF_JITTER;
+        if (encoders->moves && (way > seen || -way > seen))
+            encoders->count[axis] = (int32_t)due;
+        else if (encoders->count[axis] < due)
             encoders->count[axis]++;
         else if (encoders->count[axis] > due)
             encoders->count[axis]--;

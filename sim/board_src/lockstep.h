@@ -14,7 +14,8 @@
 #define CYCLES_PER_US 16U
 #define CYCLES_PER_TICK 800U /* step timer, 20 kHz */
 #define CYCLES_PER_BYTE 320U /* 500 kbaud, 10 bits */
-#define CYCLES_PER_COUNT 1000U /* 16000 counts/s, the fastest axis; the board samples every 800 */
+#define CYCLES_PER_COUNT 1000U /* 16000 counts/s, the fastest axis; the board samples every tick */
+#define COUNTS_OF_JITTER 4 /* by which a rotor may be ahead in one slice without turning faster than that */
 
 enum {
     OP_RUN = 'X',
@@ -71,7 +72,8 @@ static inline bool rx_line_idle(const rx_line_t *line) { return line->next == li
 /* The byte that has arrived by `now_cycle`, if any. */
 bool rx_line_take(rx_line_t *line, uint64_t now_cycle, uint8_t *byte);
 
-/* Encoders that move evenly to where the parent wants them, by at most one count every CYCLES_PER_COUNT. */
+/* Encoders that move evenly to where the parent wants them, by at most one count every CYCLES_PER_COUNT, unless the parent
+ * wants more counts than the board can sample: those pass by unseen, as on a real board. */
 typedef struct {
     int32_t count[AXES], start[AXES], target[AXES];
     uint32_t moves, move; /* in this slice: all there are, and done */

@@ -64,6 +64,19 @@ def test_a_rotor_that_slips_at_full_speed_is_found_with_the_second_status() -> N
     assert found == [False, True, False]
 
 
+def test_a_rotor_that_turns_faster_than_the_board_counts_is_found_with_its_next_status() -> None:
+    supervision = made()
+    told = [supervision.status(ZERO, ZERO, tick * MS, (65530 + 60 * max(tick - 3, 0)) % 65536) for tick in range(6)]
+    assert [finding is not None for finding in told] == [False] * 4 + [True, False]
+    assert supervision.causes == safety.STEPS_LOST
+
+
+def test_single_impossible_transitions_are_noise() -> None:
+    supervision = made()
+    for tick in range(40):
+        assert supervision.status(ZERO, ZERO, tick * MS, 1000 + 2 * tick) is None
+
+
 def test_a_silent_model_process_holds_and_a_lost_one_retracts() -> None:
     supervision = made()
     supervision.host_overdue(10**12)
