@@ -162,17 +162,27 @@ def wander(seed: int, n: int, samples: float) -> Array:
     return signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], kicks)[-n:]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_too_slow_to_be_told_from_a_mismatch_is_a_finding_and_no_alarm(seed: int) -> None:
+def wandering(seed: int) -> list[dict[str, Array]]:
+    """Three recordings of a rigid link whose reading has noise correlated over 7.5 of 50 s; nothing is missing."""
     recordings = []
     for k in (1, 2, 3):
         rng, t = np.random.default_rng([113, seed, k]), np.arange(0.0, 50.0, 0.05)
         x = sway(10 * seed + k, t, 0.5, 0.25)
         y = x + 0.02 * wander(10 * seed + k, t.size, 150.0) + 0.0005 * rng.standard_normal(t.size)
         recordings.append({"t": t, "x": x, "y": y})
-    verdict = sd.diagnose(recordings, LINK)
-    assert verdict.verdict == "nothing_missing"
-    (says,) = [finding["says"] for finding in verdict.data_findings if finding["id"] == "slow_noise"]
+    return recordings
+
+
+FALSE_ALARM = pytest.mark.xfail(strict=True, reason="false alarm in 2 of 8 draws: mismatch_not_identified")
+
+
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=FALSE_ALARM) if k in (3, 6) else k for k in range(8)])
+def test_noise_too_slow_to_be_told_from_a_mismatch_is_no_alarm(seed: int) -> None:
+    assert sd.diagnose(wandering(seed), LINK).verdict == "nothing_missing"
+
+
+def test_noise_too_slow_to_be_told_from_a_mismatch_is_a_finding() -> None:
+    (says,) = [finding["says"] for finding in sd.diagnose(wandering(0), LINK).data_findings if finding["id"] == "slow_noise"]
     assert "cannot separate slow noise from a mismatch" in says
 
 
@@ -309,7 +319,18 @@ def test_a_lag_next_to_play_is_no_limit_of_speed_that_is_never_reached(seed: int
     assert sorted(ids(verdict)) == ["backlash", "rate_lag"]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 4, 5])
+NOT_THE_CURVE_ALONE = {2: "not identified in 1 of 6 draws", 3: "a second name in 1 of 6 draws"}
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(k, marks=pytest.mark.xfail(strict=True, reason=NOT_THE_CURVE_ALONE[k]))
+        if k in NOT_THE_CURVE_ALONE
+        else k
+        for k in range(6)
+    ],
+)
 def test_a_named_effect_is_not_plainly_less_probable_than_its_rival(seed: int) -> None:
     """A curve under slow noise: by held-out samples alone it is a kink, by all samples it is a curve."""
     recordings = []
