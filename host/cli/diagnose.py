@@ -141,6 +141,8 @@ def _watch(rig: Path, json: bool) -> None:
 
 def summary(verdict: dict[str, Any]) -> list[str]:
     """Write the verdict as lines of text."""
+    from host.diagnosis.report.verdict import likelier
+
     fit = verdict["fit"]
     lines = [f"data: {finding['says']}" for finding in verdict["data_findings"]]
     lines.append(verdict["verdict"].replace("_", " "))
@@ -151,6 +153,8 @@ def summary(verdict: dict[str, Any]) -> list[str]:
             lines.append(f"  {key} = {p['value']:.4g} (95 %: {p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}){mark}")
         if effect["indistinguishable_from"]:
             lines.append("  indistinguishable from " + ", ".join(effect["indistinguishable_from"]))
+        if said := likelier(effect):
+            lines.append(f"  {said}")
     lines += [f"worse: {text}" for text in verdict["worse"]]
     if fit["rmse_before"] is None:
         return [*lines, f"next: {verdict['next']}"]

@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.pictures import pictures, shown
 from host.diagnosis.report.quantities import interval, quantity, short
-from host.diagnosis.report.verdict import at_bound, remains, words
+from host.diagnosis.report.verdict import at_bound, likelier, remains, words
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
@@ -67,7 +67,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         findings=verdict["data_findings"],
         worse=verdict["worse"],
         comparisons=comparisons(result, verdict),
-        probability_none=short(verdict["probability_none"]),
+        probability_none=f"{verdict['probability_none']:.2f}",
         next_step=verdict["next"],
         rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
     )
@@ -167,7 +167,8 @@ def shown_effect(effect: dict[str, Any], units: dict[str, tuple[str, str]]) -> d
             for text in effect["experiment_to_tell_apart"].splitlines()
             for line in wrap(text, 88, subsequent_indent="    ")
         ],
-        "probability": short(effect["probability"]),
+        "probability": f"{effect['probability']:.2f}",
+        "likelier": likelier(effect),
         "others": ", ".join(
             f"{words(other['name'].replace('@', ' at '))} {other['probability']:.2f}" for other in effect["alternatives"][:4]
         ),

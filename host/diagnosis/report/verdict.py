@@ -126,6 +126,19 @@ def placeless(result: Diagnosis) -> list[str]:
     return []
 
 
+def likelier(effect: dict[str, Any]) -> str:
+    """State the alternative that is more probable than the named effect, with its probability; empty if there is none.
+
+    An effect keeps its name if an equation of recorded signals fits better in its place: a formula is no physics.
+    """
+    best = max(effect["alternatives"], key=lambda other: other["probability"], default=None)
+    if best is None or best["probability"] <= effect["probability"]:
+        return ""
+    effect_id, _, place = best["name"].partition("@")
+    name = "an equation of the recorded signals" if effect_id == "unlisted" else words(effect_id)
+    return f"{name} at {words(place)} is more probable in its place ({best['probability']:.2f})"
+
+
 def words(effect_id: str) -> str:
     """Return an effect's id with spaces for underscores."""
     return effect_id.replace("_", " ")

@@ -16,7 +16,7 @@ from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Re
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
-from host.diagnosis.report.verdict import at_bound
+from host.diagnosis.report.verdict import at_bound, likelier
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival
 from host.diagnosis.selection.posterior import calibrated, posterior
 from host.diagnosis.selection.trial import Trial, good_enough, weighty
@@ -118,3 +118,18 @@ def test_steps_of_recordings_without_noise_are_searched_in_bounded_time(step_m: 
     assert bool(step.grid) is found and all(size > place.max() / MOST_STEPS for size in step.grid)
     if found:
         assert min(abs(size / step_m - 1.0) for size in step.grid) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("probability", "alternatives", "says"),
+    [
+        (0.6, [("rate_lag@link", 0.3)], ""),
+        (0.6, [], ""),
+        (0.1, [("rate_lag@link", 0.2), ("unlisted@link", 0.7)], "an equation of the recorded signals at link"),
+        (0.2, [("rate_lag@pose_sensor", 0.5)], "rate lag at pose sensor is more probable in its place (0.50)"),
+    ],
+)
+def test_a_more_probable_alternative_is_stated(probability: float, alternatives: list[tuple[str, float]], says: str) -> None:
+    others = [{"name": name, "probability": p} for name, p in alternatives]
+    found = likelier({"probability": probability, "alternatives": others})
+    assert says in found and bool(says) == bool(found)
