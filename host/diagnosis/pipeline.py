@@ -32,13 +32,20 @@ from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
-from host.diagnosis.selection.equivalence import Standing, most_probable, standings, with_unlisted_rival
+from host.diagnosis.selection.equivalence import (
+    Standing,
+    all_improbable,
+    most_probable,
+    standings,
+    with_unlisted_rival,
+    without_improbable,
+)
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
-from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, remainder_of, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -216,6 +223,12 @@ def _diagnosed(
     remainder = explain_remainder(problem, found, noise_sd, overall.part(0.75, 0.85))
     if found.best is not named_before:  # an equation took the place of effects
         standing = standings(problem, found, noise_sd)
+    while without_improbable(problem, found, standing, remainder.share, noise_sd):
+        standing = standings(problem, found, noise_sd)
+        remainder = remainder_of(problem, found, noise_sd)
+    if all_improbable(standing, remainder.share, problem.rules):
+        found.best, standing = found.nominal, []
+        remainder = remainder_of(problem, found, noise_sd)
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)

@@ -101,6 +101,9 @@ class SelectionRules:
     none_slope: float = 1.0
     none_shift: float = -1.75
     confident: float = 0.9  # probability from which a verdict counts as confident
+    further_probability: float = (
+        0.5  # that an effect next to a likelier one needs: below, leaving it out is right more often
+    )
 
     def as_dict(self) -> dict[str, float]:
         """Rules by name, as a verdict prints them."""

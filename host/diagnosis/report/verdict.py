@@ -13,9 +13,9 @@ from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.pipeline import Diagnosis, Location, rms
-from host.diagnosis.selection.equivalence import Standing
+from host.diagnosis.selection.equivalence import Standing, probability_of
 from host.diagnosis.selection.locate import joined
-from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused, posterior
+from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 REMARKS = ("excitation", "outliers", "quantized", "hold", "slow_noise")  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
@@ -166,8 +166,7 @@ def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Po
     """Probabilities at the place of one effect; raw: before calibration."""
     rules = result.problem.rules
     rules = replace(rules, effect_slope=1.0, effect_shift=0.0) if raw else rules
-    rivals, left = list(standing.rivals), result.remainder.share
-    return posterior(standing.both, standing.gain, standing.parameters, rivals, left, rules, standing.share)
+    return probability_of(standing, result.remainder.share, rules)
 
 
 def _none_stated(result: Diagnosis) -> float:

@@ -11,7 +11,7 @@ from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
-from host.diagnosis.selection.posterior import coarse
+from host.diagnosis.selection.posterior import Posterior, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.search import Found, Step, begun_again, refined
 from host.diagnosis.selection.trial import Trial, at_bound, related
@@ -90,6 +90,37 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         seen.append(other.names)
         standing = standings(problem, found, noise_sd)
     return standing
+
+
+def without_improbable(problem: Problem, found: Found, standing: list[Standing], left: float, noise_sd: Array) -> bool:
+    """Take the least probable effect out of `found.best` where another one is probable and it is not; return whether so.
+
+    An effect enters by what it gains on held-out samples, which formulas that are only nearly true let small further
+    effects do. left: share of the mismatch that the best model leaves.
+    """
+    least = problem.rules.further_probability
+    probable = [probability_of(one, left, problem.rules).effect for one in standing]
+    if len(probable) < 2 or max(probable) < least or min(probable) >= least or problem.budget.spent():
+        return False
+    weakest = standing[int(np.argmin(probable))]
+    terms, values = without(found.best, problem, (weakest.candidate.key,))
+    found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
+    found.steps.append(Step("remove", weakest.candidate.key, weakest.gain, []))
+    return True
+
+
+def all_improbable(standing: list[Standing], left: float, rules: SelectionRules) -> bool:
+    """Return whether each named effect is less probable than that nothing, or physics of no list, is in its place.
+
+    left: share of the mismatch that the best model leaves.
+    """
+    found = [probability_of(one, left, rules) for one in standing]
+    return bool(found) and all(one.effect < one.nothing + one.none for one in found)
+
+
+def probability_of(standing: Standing, left: float, rules: SelectionRules) -> Posterior:
+    """Probabilities at the place of one effect. left: share of the mismatch that the best model leaves."""
+    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), left, rules, standing.share)
 
 
 def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial) -> Fit:

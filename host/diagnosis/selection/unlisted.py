@@ -120,8 +120,13 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
         if not problem.budget.spent() and _equation_instead(
             problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
         ):
-            return _remainder(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
+            return remainder_of(problem, found, noise_sd)
     return replace(remainder, doubtful=bool(crowd))
+
+
+def remainder_of(problem: Problem, found: Found, noise_sd: Array) -> Remainder:
+    """Return what the best model leaves, without a search for its equation."""
+    return _remainder(problem, found, noise_sd, predict_residual(problem, found.best, noise_sd))
 
 
 def _remainder(problem: Problem, found: Found, noise_sd: Array, places: list[PredictedPart]) -> Remainder:

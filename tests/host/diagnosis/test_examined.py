@@ -319,18 +319,10 @@ def test_a_lag_next_to_play_is_no_limit_of_speed_that_is_never_reached(seed: int
     assert sorted(ids(verdict)) == ["backlash", "rate_lag"]
 
 
-NOT_THE_CURVE_ALONE = {2: "not identified in 1 of 6 draws", 3: "a second name in 1 of 6 draws"}
+NOT_IDENTIFIED = pytest.mark.xfail(strict=True, reason="not identified in 1 of 6 draws")
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(k, marks=pytest.mark.xfail(strict=True, reason=NOT_THE_CURVE_ALONE[k]))
-        if k in NOT_THE_CURVE_ALONE
-        else k
-        for k in range(6)
-    ],
-)
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=NOT_IDENTIFIED) if k == 2 else k for k in range(6)])
 def test_a_named_effect_is_not_plainly_less_probable_than_its_rival(seed: int) -> None:
     """A curve under slow noise: by held-out samples alone it is a kink, by all samples it is a curve."""
     recordings = []
@@ -348,3 +340,20 @@ def test_an_effect_that_removes_little_is_less_sure_than_one_that_removes_much()
     gain = Gain(400.0, 1e-12, 0.5, independent=np.array([300.0]), log_ratio=np.array([2.7]))
     alone, large, small = (posterior(gain, gain, 2, [], 0.0, RULES, share).effect for share in (np.inf, 0.3, 0.004))
     assert alone > 0.94 and large > 0.93 and small < 0.6
+
+
+def test_a_further_effect_is_not_named_where_it_is_improbable() -> None:
+    """A limit of speed that is read half a sample late: the friction that would mend the rest is less likely than not."""
+    recordings = []
+    for k in (1, 2, 3):
+        rng, fine = np.random.default_rng([149, k]), np.arange(0.0, 40.0, 0.002)
+        x = sway(k, fine, 0.6, 0.6)
+        y, most = np.empty(fine.size), 1.2 * np.std(np.gradient(x, 0.002)) * 0.002
+        y[0] = slow = x[0]
+        for i in range(1, fine.size):
+            slow += (x[i] - slow) * 0.002 / 0.02
+            y[i] = y[i - 1] + min(max(slow - y[i - 1], -most), most)
+        late = np.r_[np.full(5, y[0]), y[:-5]]
+        recordings.append({"t": fine[::10], "x": x[::10], "y": late[::10] + 0.007 * rng.standard_normal(fine[::10].size)})
+    named = {effect["id"]: effect["probability"] for effect in sd.diagnose(recordings, LINK).effects}
+    assert len(named) == 1 or min(named.values()) >= 0.5
