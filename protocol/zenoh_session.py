@@ -158,7 +158,7 @@ class Latest:
             return None
 
     def undeclare(self) -> None:
-        """End the subscription."""
+        """End the subscription; nothing arrives after it."""
         self._subscriber.undeclare()
 
 
@@ -173,7 +173,7 @@ class RecentSamples:
         return self._subscriber.try_recv()
 
     def undeclare(self) -> None:
-        """End the subscription."""
+        """End the subscription; nothing arrives after it."""
         self._subscriber.undeclare()
 
 

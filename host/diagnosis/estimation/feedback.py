@@ -8,7 +8,7 @@ Here the part of the residual that later input predicts is taken off before two 
 
 A controller that computes the input of a row from the reading of the same row sends its noise into that row. A direct path
 through the plant would look alike, but such a path passes all of the input alike, and noise is in its new part alone:
-the residual then follows the new part and not the rest. Noise of the input's own reading has the same signature.
+the residual then follows the new part and not the other one. Noise of the input's own reading has the same signature.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SAMPLES_PER_LAG = 40  # recorded, at least
 MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
 LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
 COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
-OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the rest of it
+OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the other part
 OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
 
 

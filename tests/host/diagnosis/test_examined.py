@@ -287,15 +287,21 @@ def test_play_before_a_lag_is_two_effects_and_no_dead_band_of_a_loop() -> None:
     assert sorted(ids(sd.diagnose(recordings, LINK))) == ["backlash", "rate_lag"]
 
 
+def limited(x: Array, most: float) -> Array:
+    """Follow `x` by at most so much from one sample to the next."""
+    y = np.empty(x.size)
+    y[0] = x[0]
+    for i in range(1, x.size):
+        y[i] = y[i - 1] + min(max(x[i] - y[i - 1], -most), most)
+    return y
+
+
 def test_a_speed_limit_without_a_time_constant_is_a_limit() -> None:
     recordings = []
     for k in (1, 2, 3):
         rng, fine = np.random.default_rng([127, k]), np.arange(0.0, 40.0, 0.002)
         x = sway(k, fine, 0.6, 0.6)
-        y, most = np.empty(fine.size), 1.2 * np.std(np.gradient(x, 0.002)) * 0.002
-        y[0] = x[0]
-        for i in range(1, fine.size):
-            y[i] = y[i - 1] + min(max(x[i] - y[i - 1], -most), most)
+        y = limited(x, 1.2 * np.std(np.gradient(x, 0.002)) * 0.002)
         recordings.append({"t": fine[::10], "x": x[::10], "y": y[::10] + 0.007 * rng.standard_normal(fine[::10].size)})
     assert ids(sd.diagnose(recordings, LINK)) == ["saturation"]
 
@@ -348,11 +354,8 @@ def test_a_further_effect_is_not_named_where_it_is_improbable() -> None:
     for k in (1, 2, 3):
         rng, fine = np.random.default_rng([149, k]), np.arange(0.0, 40.0, 0.002)
         x = sway(k, fine, 0.6, 0.6)
-        y, most = np.empty(fine.size), 1.2 * np.std(np.gradient(x, 0.002)) * 0.002
-        y[0] = slow = x[0]
-        for i in range(1, fine.size):
-            slow += (x[i] - slow) * 0.002 / 0.02
-            y[i] = y[i - 1] + min(max(slow - y[i - 1], -most), most)
+        slow = signal.lfilter([0.1], [1.0, -0.9], x - x[0]) + x[0]  # a lag of 0.02 s
+        y = limited(slow, 1.2 * np.std(np.gradient(x, 0.002)) * 0.002)
         late = np.r_[np.full(5, y[0]), y[:-5]]
         recordings.append({"t": fine[::10], "x": x[::10], "y": late[::10] + 0.007 * rng.standard_normal(fine[::10].size)})
     named = {effect["id"]: effect["probability"] for effect in sd.diagnose(recordings, LINK).effects}
