@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -10,7 +12,7 @@ import typer
 from host.cli.contract_io import write_json
 from host.cli.options import Json, RigFile, within
 from host.cli.progress import Working
-from protocol.errors import one_of
+from protocol.errors import InputError, one_of
 from protocol.rig_file import SIMULATED_RIG, load_rig
 
 if TYPE_CHECKING:
@@ -26,6 +28,9 @@ def check_device(
     port: Annotated[str, typer.Option(help="Serial port, or the box's address, instead of the rig file's.")] = "",
     udp_port: Annotated[int, typer.Option(help="RDT port of the force box.", hidden=True)] = 49152,
     web_port: Annotated[int, typer.Option(help="Port of the force box's page.", hidden=True)] = 80,
+    trace: Annotated[
+        Path | None, typer.Option(help="File for the dialogue on the serial line, byte by byte (Aurora and board).")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Read a device for some seconds; nothing moves. Exit status 1 if it is not fit for an experiment."""
@@ -36,11 +41,20 @@ def check_device(
     within("--udp-port", udp_port, 1, 65535)
     within("--web-port", web_port, 1, 65535)
     settings = load_rig(rig)
-    with Working(f"reading {device}"):
+    if trace is not None and (device == "force" or (device == "tracker" and settings.tracker.kind != "aurora")):
+        raise InputError("--trace", str(trace), f"the board or an Aurora; this {device} has no serial line of the rig's")
+    with contextlib.ExitStack() as stack:
+        out = None
+        if trace is not None:
+            try:
+                out = stack.enter_context(trace.open("w", encoding="ascii"))
+            except OSError as error:
+                raise InputError("--trace", str(trace), f"a file that can be written ({error.strerror})") from None
+        stack.enter_context(Working(f"reading {device}"))
         if device == "force":
             report = check_force_box(settings, port, seconds, udp_port, web_port)
         else:
-            report = (check_tracker if device == "tracker" else check_board)(settings, port, seconds)
+            report = (check_tracker if device == "tracker" else check_board)(settings, port, seconds, out)
     _print_table(report)
     if json:
         write_json({"device": report.device, "good": report.good, "figures": report.figures, "problems": report.problems})

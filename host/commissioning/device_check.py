@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import TextIO
 
 from host.commissioning.board_inputs import input_lines, input_problems
 from protocol.rig_file import Pins, Rig
@@ -12,15 +13,23 @@ from realtime.core.device_sources import AURORA, NET_FT, force_thread, tracker_t
 from realtime.drivers.aurora import AuroraConfig
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_forces, check_net_ft, check_poses
 from realtime.drivers.stepper_board import FAULT_ADVICE, BoardEventKind, BoardStatus, LinkPhase, StepperBoardLink
-from realtime.drivers.transport import Transport, open_serial
+from realtime.drivers.transport import TracedTransport, Transport, open_serial
 
 STATUS_HZ, BRING_UP_S = 200.0, 5.0
 # A box states its counts with at least six digits.
 COUNTS_TOLERANCE = 1e-3
 
 
-def check_tracker(rig: Rig, port: str, seconds: float) -> DeviceReport:
-    """Read the tracker at `port` (empty: the rig file's) for `seconds`; report its rate, gaps and noise."""
+def _opened(path: str, baud: int, trace: TextIO | None) -> Transport:
+    line = open_serial(path, baud)
+    return line if trace is None else TracedTransport(line, trace)
+
+
+def check_tracker(rig: Rig, port: str, seconds: float, trace: TextIO | None = None) -> DeviceReport:
+    """Read the tracker at `port` (empty: the rig file's) for `seconds`; report its rate, gaps and noise.
+
+    trace: file for the dialogue with an Aurora, byte by byte; other kinds have none.
+    """
     tracker = rig.tracker
     tools = (tracker.tip_handle, tracker.shaft_handle)
     if tracker.kind != AURORA:
@@ -32,7 +41,7 @@ def check_tracker(rig: Rig, port: str, seconds: float) -> DeviceReport:
             tracker.kind,
         )
     config = AuroraConfig(tools=tools, rate_hz=tracker.rate_hz, latency_s=tracker.latency_s)
-    return check_aurora(lambda: open_serial(port or tracker.port, 9600), config, seconds)
+    return check_aurora(lambda: _opened(port or tracker.port, 9600, trace), config, seconds)
 
 
 def check_force_box(rig: Rig, address: str, seconds: float, udp_port: int, web_port: int) -> DeviceReport:
@@ -65,14 +74,14 @@ def _count_problems(rig: Rig, report: DeviceReport) -> list[str]:
     return problems
 
 
-def check_board(rig: Rig, port: str, seconds: float) -> DeviceReport:
+def check_board(rig: Rig, port: str, seconds: float, trace: TextIO | None = None) -> DeviceReport:
     """Bring the stepper board up (protocol, firmware, limits) and count its status for `seconds`. It is never armed.
 
-    Arguments: `port`, empty: the rig file's.
+    Arguments: `port`, empty: the rig file's; `trace`, file for the dialogue, byte by byte.
     """
     report = DeviceReport("board")
     try:
-        transport = open_serial(port or rig.board.port, rig.board.baud)
+        transport = _opened(port or rig.board.port, rig.board.baud, trace)
     except OSError as error:
         report.problems.append(str(error))
         return report

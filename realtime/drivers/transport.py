@@ -1,8 +1,9 @@
 """Where a driver's bytes go: a serial port, or a pair of queues in one process for lock step."""
 
 import os
+import time
 from collections import deque
-from typing import Protocol
+from typing import Protocol, TextIO
 
 import serial
 
@@ -105,6 +106,42 @@ class PipeTransport:
     def close(self) -> None:
         """Drop the bytes that were not read."""
         self._incoming.clear()
+
+
+class TracedTransport:
+    """A byte stream whose dialogue is written to a text file, for a manual to be compared with.
+
+    A line has the seconds since the opening, `>` for what was sent and `<` for what came, the bytes in hexadecimal, and the
+    text that they are in ASCII (a dot for each other byte). The trace is not made in the control loop.
+    """
+
+    def __init__(self, line: Transport, out: TextIO) -> None:
+        self._line, self._out, self._begin_s = line, out, time.monotonic()
+
+    def read(self) -> bytes:
+        """Return the bytes since the last call, possibly none. Raises OSError if the device is gone."""
+        data = self._line.read()
+        self._note("<", data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. Raises OSError if the device is gone or does not accept it."""
+        self._note(">", data)
+        self._line.write(data)
+
+    def fileno(self) -> int:
+        """Return a descriptor to wait on, or -1 if there is none."""
+        return self._line.fileno()
+
+    def close(self) -> None:
+        """Release the device; a second call does nothing. The file stays open."""
+        self._line.close()
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if data:
+            text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in data)
+            self._out.write(f"{time.monotonic() - self._begin_s:10.4f} {direction} {data.hex(' ')}  {text}\n")
+            self._out.flush()
 
 
 def open_serial(path: str, baud: int) -> SerialTransport:

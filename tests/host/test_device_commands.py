@@ -213,3 +213,24 @@ def test_a_port_of_the_simulated_rig_is_named_as_such() -> None:
     assert "found /dev/ttyACM99 that does not open (No such file or directory), wanted a free device" in absent.problems[0]
     file = device_check.check_board(load_rig(RIG_FILE), str(RIG_FILE), 0.1)
     assert file.problems[0].endswith("that does not open (it is not a serial port), wanted a free device")
+
+
+@pytest.mark.parametrize(("device", "sent"), [("tracker", b"TSTART"), ("board", b"")])
+def test_the_dialogue_on_the_line_is_written_byte_by_byte(
+    ports: dict[str, Any], device: str, sent: bytes, tmp_path: Path
+) -> None:
+    trace = tmp_path / "trace.txt"
+    told_of_a_good_one(device, "--port", ports[device], "--trace", str(trace))
+    lines = [line.split(maxsplit=2) for line in trace.read_text(encoding="ascii").splitlines()]
+    assert {direction for _, direction, _ in lines} == {"<", ">"}
+    times = [float(seconds) for seconds, _, _ in lines]
+    assert times == sorted(times)
+    said = [bytes.fromhex(what.partition("  ")[0]) for _, direction, what in lines if direction == ">"]
+    assert all(said) and any(sent in data for data in said)
+
+
+def test_a_trace_needs_a_serial_line_and_a_file_that_can_be_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--trace"):
+        check_device("force", trace=tmp_path / "trace.txt")
+    with pytest.raises(InputError, match="can be written"):
+        check_device("board", trace=tmp_path / "nowhere" / "trace.txt")
