@@ -34,7 +34,6 @@ from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.equivalence import (
     Standing,
-    all_improbable,
     most_probable,
     standings,
     with_unlisted_rival,
@@ -225,9 +224,6 @@ def _diagnosed(
         standing = standings(problem, found, noise_sd)
     while without_improbable(problem, found, standing, remainder.share, noise_sd):
         standing = standings(problem, found, noise_sd)
-        remainder = remainder_of(problem, found, noise_sd)
-    if all_improbable(standing, remainder.share, problem.rules):
-        found.best, standing = found.nominal, []
         remainder = remainder_of(problem, found, noise_sd)
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)

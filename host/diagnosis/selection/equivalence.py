@@ -109,15 +109,6 @@ def without_improbable(problem: Problem, found: Found, standing: list[Standing],
     return True
 
 
-def all_improbable(standing: list[Standing], left: float, rules: SelectionRules) -> bool:
-    """Return whether each named effect is less probable than that nothing, or physics of no list, is in its place.
-
-    left: share of the mismatch that the best model leaves.
-    """
-    found = [probability_of(one, left, rules) for one in standing]
-    return bool(found) and all(one.effect < one.nothing + one.none for one in found)
-
-
 def probability_of(standing: Standing, left: float, rules: SelectionRules) -> Posterior:
     """Probabilities at the place of one effect. left: share of the mismatch that the best model leaves."""
     return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), left, rules, standing.share)
