@@ -222,9 +222,8 @@ def _diagnosed(
     remainder = explain_remainder(problem, found, noise_sd, overall.part(0.75, 0.85))
     if found.best is not named_before:  # an equation took the place of effects
         standing = standings(problem, found, noise_sd)
-    while without_improbable(problem, found, standing, remainder.share, noise_sd):
-        standing = standings(problem, found, noise_sd)
-        remainder = remainder_of(problem, found, noise_sd)
+    while fewer := without_improbable(problem, found, standing, remainder.share, noise_sd):
+        standing, remainder = fewer, remainder_of(problem, found, noise_sd)
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)

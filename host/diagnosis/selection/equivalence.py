@@ -92,21 +92,30 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
     return standing
 
 
-def without_improbable(problem: Problem, found: Found, standing: list[Standing], left: float, noise_sd: Array) -> bool:
-    """Take the least probable effect out of `found.best` where another one is probable and it is not; return whether so.
+def without_improbable(
+    problem: Problem, found: Found, standing: list[Standing], left: float, noise_sd: Array
+) -> list[Standing]:
+    """Standings without the least probable effect, where another one is probable and it is not; none where all stay.
 
     An effect enters by what it gains on held-out samples, which formulas that are only nearly true let small further
-    effects do. left: share of the mismatch that the best model leaves.
+    effects do. It stays if the others are no longer probable without it. left: share of the mismatch that the best model
+    leaves. Changes `found.best`.
     """
     least = problem.rules.further_probability
     probable = [probability_of(one, left, problem.rules).effect for one in standing]
     if len(probable) < 2 or max(probable) < least or min(probable) >= least or problem.budget.spent():
-        return False
+        return []
     weakest = standing[int(np.argmin(probable))]
-    terms, values = without(found.best, problem, (weakest.candidate.key,))
+    begun, before = get_starts(problem), found.best
+    terms, values = without(before, problem, (weakest.candidate.key,))
     found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
+    fewer = standings(problem, found, noise_sd)
+    if max(probability_of(one, left, problem.rules).effect for one in fewer) < least:
+        found.best = before
+        set_starts(problem, begun)
+        return []
     found.steps.append(Step("remove", weakest.candidate.key, weakest.gain, []))
-    return True
+    return fewer
 
 
 def probability_of(standing: Standing, left: float, rules: SelectionRules) -> Posterior:
