@@ -209,7 +209,7 @@ def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[A
             return
         if far and math.isfinite(exposed_m):
             check_reach(f"sensors.{index}.position_m", sensor[1], exposed_m)
-    if len(sensors) > 1 and all(np.size(sensor[1]) == 3 and np.all(np.isfinite(sensor[1])) for sensor in sensors):
+    if len(sensors) > 1 and all(len(sensor[1]) == 3 and math.isfinite(math.hypot(*sensor[1])) for sensor in sensors):
         check_apart("sensors.{}.position_m", [sensor[0] for sensor in sensors], [sensor[1] for sensor in sensors])
 
 

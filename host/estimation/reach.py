@@ -30,18 +30,18 @@ def check_reach(key: str, position_m: ArrayLike, exposed_m: float) -> None:
         )
 
 
-def check_apart(key: str, offsets_m: Sequence[float], positions_m: Sequence[ArrayLike]) -> None:
+def check_apart(key: str, offsets_m: Sequence[float], positions_m: Sequence[Sequence[float] | NDArray[np.float64]]) -> None:
     """Raise InputError where two neighbouring sensors are further apart than the catheter between them is long.
 
     Arguments: `offsets_m` (k,), arc lengths back from the tip; `positions_m`, k positions. `key` has a place for the index.
     """
     for i in range(1, len(positions_m)):
         between_m = abs(offsets_m[i] - offsets_m[i - 1])
-        apart_m = math.dist(np.ravel(positions_m[i]), np.ravel(positions_m[i - 1]))
+        apart_m = math.dist(positions_m[i], positions_m[i - 1])
         if apart_m > between_m + REACH_MARGIN_M:
             raise InputError(
                 key.format(i),
-                [float(part) for part in np.ravel(positions_m[i])],
+                [float(part) for part in positions_m[i]],
                 f"a position at most {1e3 * (between_m + REACH_MARGIN_M):.1f} mm from the sensor before it "
                 f"(catheter between them {1e3 * between_m:.1f} mm and {1e3 * REACH_MARGIN_M:.0f} mm), "
                 f"not {1e3 * apart_m:.1f} mm",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -188,7 +189,7 @@ def estimate_cosserat(  # noqa: PLR0913 - keyword arguments of a public function
     start = np.zeros(FOUND)
     if previous_force_N is not None:
         x = finite("previous_force_N", previous_force_N, (3,), "three finite numbers in N")
-        start[:COVARIANCE] = x * min(1.0, largest / max(float(np.linalg.norm(x)), 1e-300))
+        start[:COVARIANCE] = x * min(1.0, largest / max(math.hypot(*x), 1e-300))
     limits = Limits(largest, thorough, case in ONE_TO_ONE, previous_force_N is not None)
     plain = prior is None and all(
         len(sensor) == 3 or (sensor[3] is None and sensor[4] is None) for sensor in sensors[:count]

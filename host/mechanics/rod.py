@@ -31,7 +31,7 @@ def real(key: str, value: ArrayLike, wanted: str) -> Array:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths
         raise InputError(key, str(value), wanted) from None
-    if array.dtype.kind not in "fiu" or np.ma.is_masked(value):
+    if array.dtype.kind not in "fiu" or (isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)):
         raise InputError(key, str(value), wanted)
     return array.astype(np.float64, copy=False)
 
@@ -55,7 +55,7 @@ def checked_workers(workers: object) -> int | None:
 def finite(key: str, value: ArrayLike, shape: tuple[int, ...], wanted: str) -> Array:
     """`value` as floats of that shape. Raises InputError naming `key` where it is not, or where NaN or infinity is in it."""
     array = real(key, value, wanted)
-    if array.shape != shape or not np.all(np.isfinite(array)):
+    if array.shape != shape or not np.isfinite(array).all():
         raise InputError(key, array.tolist(), wanted)
     return array
 
