@@ -145,7 +145,8 @@ class Tracker(_Section):
     """The tracker. `base_from_tracker_*` registers its frame to the base frame at the sheath's exit.
 
     kind: "aurora" (NDI, serial port), "openigtlink" (a server, `port` is HOST:PORT, handles are names of transforms), or the
-    name of a plug-in; `options` are the plug-in's own keys (docs/devices.md).
+    name of a plug-in; `options` are the plug-in's own keys (docs/devices.md). tip_definition, shaft_definition: file that
+    defines an Aurora tool without a memory of its own; empty for a tool that has one.
     """
 
     kind: Kind = "aurora"
@@ -155,6 +156,8 @@ class Tracker(_Section):
     latency_s: Annotated[float, Field(ge=0, le=0.2)]
     tip_handle: str = "0A"
     shaft_handle: str = "0B"
+    tip_definition: str = ""
+    shaft_definition: str = ""
     shaft_sensor_offset_m: Annotated[float, Field(gt=0, le=0.2)]
     position_noise_m: Annotated[float, Field(gt=0, le=0.01)]
     orientation_noise_rad: Annotated[float, Field(gt=0, le=0.3)]
@@ -174,6 +177,10 @@ class Tracker(_Section):
                     raise ValueError(
                         f'{key} of two characters 0 to 9 and A to F, as the Aurora numbers its tools, such as "0A"'
                     )
+        else:
+            for key in ("tip_definition", "shaft_definition"):
+                if getattr(self, key):
+                    raise ValueError(f'{key}: only for kind = "aurora"; leave it out')
         if self.kind == "openigtlink":
             found = re.fullmatch(r"(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?", self.port)
             if found is None or not 0 < int(found[2] or 1) < 65536:

@@ -13,7 +13,8 @@ SPEEDS = {"0": 9600, "1": 14400, "2": 19200, "3": 38400, "4": 57600, "5": 115200
 # Errors as the device numbers them.
 UNKNOWN, BAD_CRC, PARAMETERS, NO_HANDLE, BAD_PRIORITY = "01", "04", "07", "08", "09"
 WRONG_MODE, NO_TOOL, NOT_INITIALISED, SYSTEM_NOT_INITIALISED, OUT_OF_RANGE = "0C", "0D", "0E", "10", "23"
-NOT_ALLOCATED = "2B"
+NOT_ALLOCATED, NO_MEMORY = "2B", "1D"
+MEMORY_BYTES, PAGE_BYTES = 2048, 64
 
 # Modes in which a command is allowed; before INIT nearly nothing is.
 _ANY, _SETUP, _TRACKING = ("power_up", "setup", "tracking"), ("setup",), ("tracking",)
@@ -28,6 +29,7 @@ _MODES = {
     "PHSR": _SETUP,
     "PHINF": _SETUP,
     "PHF": _SETUP,
+    "PVWR": _SETUP,
     "PINIT": _SETUP,
     "PENA": _SETUP,
     "PDIS": _SETUP,
@@ -92,7 +94,10 @@ class Refused(Exception):
 
 @dataclass
 class AuroraPort:
-    """A port handle and the tool behind it; `defect`: error code with which PINIT fails (an unreadable SROM: 1E)."""
+    """A port handle and the tool behind it; `defect`: error code with which PINIT fails (an unreadable SROM: 1E).
+
+    blank: the tool has no memory of its own, so PINIT fails until the host has written `memory`, which a plug empties.
+    """
 
     handle: str
     serial: str
@@ -102,11 +107,14 @@ class AuroraPort:
     stale: bool = False
     allocated: bool = True
     defect: str = ""
+    blank: bool = False
+    memory: bytes = bytes(MEMORY_BYTES)
 
     def unplug(self) -> None:
         """The tool is pulled; its handle stays, stale, until it is freed."""
         self.occupied = self.initialised = self.enabled = False
         self.stale = self.allocated
+        self.memory = bytes(MEMORY_BYTES)
 
     def plug(self) -> None:
         """A tool is plugged in and has a handle again."""
@@ -142,6 +150,7 @@ class Console:
         for port in self.ports.values():
             port.initialised = port.enabled = port.stale = False
             port.allocated = port.occupied
+            port.memory = bytes(MEMORY_BYTES)
 
     def settle(self) -> None:
         """Take up a new speed; called once the reply to COMM has been put on the line at the old one."""
@@ -214,10 +223,23 @@ class Console:
         port.allocated = port.stale = False
         return "OKAY"
 
+    def _pvwr(self, parameters: str) -> str:
+        port = self._port(parameters[:2])
+        if len(parameters) != 2 + 4 + 2 * PAGE_BYTES:
+            raise Refused(PARAMETERS)
+        address, page = _number(parameters[2:6], 4), parameters[6:]
+        _number(page, 2 * PAGE_BYTES)
+        if address % PAGE_BYTES or address > MEMORY_BYTES - PAGE_BYTES:
+            raise Refused(OUT_OF_RANGE)
+        port.memory = port.memory[:address] + bytes.fromhex(page) + port.memory[address + PAGE_BYTES :]
+        return "OKAY"
+
     def _pinit(self, parameters: str) -> str:
         port = self._port(parameters)
         if not port.occupied:
             raise Refused(NO_TOOL)
+        if port.blank and not any(port.memory):
+            raise Refused(NO_MEMORY)
         if port.defect:
             raise Refused(port.defect)
         port.initialised = True

@@ -35,13 +35,14 @@ def check_device(
 ) -> None:
     """Read a device for some seconds; nothing moves. Exit status 1 if it is not fit for an experiment."""
     from host.commissioning.device_check import check_board, check_force_box, check_tracker
+    from realtime.core.device_sources import AURORA
 
     one_of("device", device, DEVICES)
     within("--seconds", seconds, 0.1, 3600.0, "s")
     within("--udp-port", udp_port, 1, 65535)
     within("--web-port", web_port, 1, 65535)
     settings = load_rig(rig)
-    if trace is not None and (device == "force" or (device == "tracker" and settings.tracker.kind != "aurora")):
+    if trace is not None and (device == "force" or (device == "tracker" and settings.tracker.kind != AURORA)):
         raise InputError("--trace", str(trace), f"the board or an Aurora; this {device} has no serial line of the rig's")
     with contextlib.ExitStack() as stack:
         out = None

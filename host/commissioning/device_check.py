@@ -10,7 +10,7 @@ from protocol.rig_file import Pins, Rig
 from protocol.serial_frames import Fault, Mcu
 from realtime.core.board_intake import axis_limits
 from realtime.core.device_sources import AURORA, NET_FT, force_thread, tracker_thread
-from realtime.drivers.aurora import AuroraConfig
+from realtime.core.lines import tracker_config
 from realtime.drivers.check_device import DeviceReport, check_aurora, check_forces, check_net_ft, check_poses
 from realtime.drivers.stepper_board import FAULT_ADVICE, BoardEventKind, BoardStatus, LinkPhase, StepperBoardLink
 from realtime.drivers.transport import TracedTransport, Transport, open_serial
@@ -40,7 +40,7 @@ def check_tracker(rig: Rig, port: str, seconds: float, trace: TextIO | None = No
             seconds,
             tracker.kind,
         )
-    config = AuroraConfig(tools=tools, rate_hz=tracker.rate_hz, latency_s=tracker.latency_s)
+    config = tracker_config(rig)
     return check_aurora(lambda: _opened(port or tracker.port, 9600, trace), config, seconds)
 
 

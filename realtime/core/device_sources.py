@@ -61,7 +61,8 @@ def _offered(group: str) -> dict[str, str]:
 
 
 def check_kinds(rig: Rig) -> None:
-    """Check that the rig's tracker and force sensor have drivers, and that these can be imported. Raises InputError."""
+    """Check that the rig's tracker and force sensor have drivers, and that these and their files load. Raises InputError."""
+    tracker_config(rig)
     for group, kind in ((TRACKERS, rig.tracker.kind), (FORCE_SENSORS, rig.force_sensor.kind)):
         if kind != _SERVED[group]:
             source_of(group, kind)

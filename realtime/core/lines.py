@@ -11,6 +11,7 @@ from realtime.drivers.aurora_session import LineAction
 from realtime.drivers.device_events import DeviceEvent
 from realtime.drivers.net_ft import ForceSample, NetFtClient, NetFtConfig
 from realtime.drivers.net_ft_calibration import NetFtCalibration
+from realtime.drivers.tool_definition import read_definition
 
 
 @dataclass
@@ -41,10 +42,18 @@ class Readings(NamedTuple):
 
 
 def tracker_config(rig: Rig) -> AuroraConfig:
-    """Return the tracker driver's settings for `rig`."""
+    """Return the tracker driver's settings for `rig`. Raises InputError for a tool definition that cannot be read."""
     tracker = rig.tracker
+    files = {tracker.tip_handle: "tip_definition", tracker.shaft_handle: "shaft_definition"}
     return AuroraConfig(
-        tools=(tracker.tip_handle, tracker.shaft_handle), rate_hz=tracker.rate_hz, latency_s=tracker.latency_s
+        tools=(tracker.tip_handle, tracker.shaft_handle),
+        rate_hz=tracker.rate_hz,
+        latency_s=tracker.latency_s,
+        definitions={
+            handle: read_definition(f"tracker.{key}", getattr(tracker, key))
+            for handle, key in files.items()
+            if getattr(tracker, key)
+        },
     )
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from realtime.drivers import ndi_protocol as ndi
 from realtime.drivers.device_events import DeviceEventKind
+from realtime.drivers.tool_definition import PAGE_BYTES
 
 POWER_UP_BAUD = 9600
 BREAK_S = 0.25
@@ -41,7 +42,8 @@ class AuroraConfig:
     baud: speed after start-up; reply: "BX" (binary) or "TX" (text); poll_gap_s: pause between a reply
     without a new frame and the next poll; settle_frames: frames from which times are learned before poses are reported
     (the first frame seen may be nearly a period old); frozen_after: identical poses in a row, bit for bit, after which
-    the tool counts as frozen (measurements have noise), 0: never."""
+    the tool counts as frozen (measurements have noise), 0: never; definitions: port handle -> content for a tool without
+    a memory of its own, whole pages of 64 bytes (`tool_definition.read_definition`)."""
 
     tools: tuple[str, ...] = ("0A", "0B")
     rate_hz: float = 40.0
@@ -57,6 +59,7 @@ class AuroraConfig:
     max_distance_m: float = 3.0
     settle_frames: int = 20
     frozen_after: int = 8
+    definitions: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         wanted = {
@@ -162,9 +165,18 @@ def _initialise_tools(client: SessionClient) -> Generator[SessionStep, str | Non
         for handle in waiting:
             refused.add(handle)
             try:
+                yield from _write_definition(client, handle)
                 yield from _command(client, "initialising tools", "PINIT", handle)
             except SessionFailed as failed:
                 client.event(DeviceEventKind.ERROR, str(failed))
+
+
+def _write_definition(client: SessionClient, handle: str) -> Generator[SessionStep, str | None, None]:
+    """Write the tool's definition page by page, if it has one: `PVWR` with handle, address and 64 bytes in hexadecimal."""
+    content = client.config.definitions.get(handle, b"")
+    for address in range(0, len(content), PAGE_BYTES):
+        page = content[address : address + PAGE_BYTES].hex().upper()
+        yield from _command(client, "writing tool definitions", "PVWR", f"{handle}{address:04X}{page}")
 
 
 def _command(client: SessionClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:
@@ -176,8 +188,15 @@ def _command(client: SessionClient, phase: str, name: str, parameters: str = "",
         if reply.startswith("ERROR"):
             if reply[5:7] == "04":
                 continue
-            raise SessionFailed(f"{name} {parameters}: {ndi.describe_reply(reply)}")
+            raise SessionFailed(f"{name} {_short(parameters)}: {ndi.describe_reply(reply)}")
         if reply.startswith("WARNING"):
-            client.event(DeviceEventKind.WARNING, f"{name} {parameters}: {ndi.describe_reply(reply)}")
+            client.event(DeviceEventKind.WARNING, f"{name} {_short(parameters)}: {ndi.describe_reply(reply)}")
         return reply
-    raise SessionFailed(f"{name} {parameters}: no answer in {attempts} attempts of {client.config.reply_timeout_s} s")
+    raise SessionFailed(
+        f"{name} {_short(parameters)}: no answer in {attempts} attempts of {client.config.reply_timeout_s} s"
+    )
+
+
+def _short(parameters: str) -> str:
+    """Return a command's parameters for a message, without the content of a memory page."""
+    return parameters if len(parameters) <= 16 else f"{parameters[:6]}..."

@@ -43,7 +43,7 @@ ERROR_TEXTS = {
     0x17: "diagnostic mode could not be stopped",
     0x19: "firmware version could not be read",
     0x1A: "internal error of the measurement system",
-    0x1D: "no SROM found in the tool",
+    0x1D: "the tool has no memory of its own: give its file in the rig file (tracker.tip_definition, shaft_definition)",
     0x1E: "SROM of the tool could not be read",
     0x1F: "SROM of the tool could not be written",
     0x20: "SROM could not be selected",

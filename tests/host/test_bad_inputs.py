@@ -213,6 +213,7 @@ FILES: dict[str, str | bytes] = {
     "rig-same-tool.toml": rig('tip_handle = "0A"', 'tip_handle = "0B"'),
     "rig-no-tool.toml": rig('tip_handle = "0A"', 'tip_handle = ""'),
     "rig-tool.toml": rig('tip_handle = "0A"', 'tip_handle = "0a"'),
+    "rig-definition.toml": rig('tip_definition = ""', 'tip_definition = "absent.rom"'),
     # catheter files
     "catheter-mm.toml": catheter("distal_length_m = 0.110", "distal_length_m = 110.0"),
     "catheter-french.toml": catheter("diameter_m = 0.00233", "diameter_m = 7.0"),
@@ -604,6 +605,7 @@ CASES: list[Case] = [
             ("same-tool", "two different tools"),
             ("no-tool", "two different tools"),
             ("tool", "tip_handle = 0a"),
+            ("definition", 'tracker.tip_definition: found "absent.rom"'),
         )
         for words in (("rig", "check", f"rig-{name}.toml"), ("demo", "--rig", f"rig-{name}.toml"))
     ),
