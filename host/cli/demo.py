@@ -54,13 +54,16 @@ def demo(
     from host.report.demo_summary import demo_result, print_summary
     from host.report.run_report import write_report
     from host.run.demo import DemoSettings, exit_status
+    from realtime.core.lines import tracker_config
     from sim.board import BoardUnavailable
 
     one_of("--board", board, BOARDS)
     one_of("--force-source", force_source, ("sensor", "estimate"))
     checked_seed(seed)
     effects = checked_effects(effect)
-    limit_N = load_rig(rig).safety.over_force_N
+    read = load_rig(rig)
+    tracker_config(read)  # reads the files that it names
+    limit_N = read.safety.over_force_N
     if not 0.02 <= force < limit_N:
         raise InputError("--force", force, f"at least 0.02 and below safety.over_force_N {limit_N} (N)")
     within("--hold", hold, 1.0, 3600.0, "s")
