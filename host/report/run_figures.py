@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,6 +37,21 @@ Array = np.ndarray
 DETAIL_S = 6.0
 
 
+class _Forces(NamedTuple):
+    """Measured and estimated force along the wall's normal: times (n,) in s, forces and standard deviation (n,) in N.
+
+    Empty arrays where the recording has none; has_force, has_estimate: whether it has the topic.
+    """
+
+    has_force: bool
+    time_s: Array
+    pressing_N: Array
+    has_estimate: bool
+    estimate_s: Array
+    along_N: Array
+    sd_N: Array
+
+
 class RunFigures:
     """Draws the figures of one recording. Times are in seconds from its start."""
 
@@ -61,12 +78,28 @@ class RunFigures:
                 zorder=0,
             )
 
+    @cached_property
+    def _forces(self) -> _Forces:
+        """The forces along the wall's normal, computed once for both force figures and their axis."""
+        force, estimate = table_or_none(self.recording, "force/sensor"), table_or_none(self.recording, "force/estimate")
+        none, direction = np.empty(0), self.summary.direction
+        pressing_N = none if force is None else stack(force, "fx_N", "fy_N", "fz_N") @ direction
+        along_N, sd_N = (none, none) if estimate is None else estimate_along(estimate, direction)
+        return _Forces(
+            force is not None,
+            none if force is None else self._seconds(force["stamp_ns"]),
+            pressing_N,
+            estimate is not None,
+            none if estimate is None else self._seconds(estimate["stamp_ns"]),
+            along_N,
+            sd_N,
+        )
+
     def _force_lines(self, axes: Axes, from_s: float, to_s: float) -> None:
-        estimate, force = table_or_none(self.recording, "force/estimate"), table_or_none(self.recording, "force/sensor")
+        forces = self._forces
         state = table_or_none(self.recording, "state")
-        if estimate is not None:
-            time_s = self._seconds(estimate["stamp_ns"])
-            along_N, sd_N = estimate_along(estimate, self.summary.direction)
+        if forces.has_estimate:
+            time_s, along_N, sd_N = forces.estimate_s, forces.along_N, forces.sd_N
             show = (time_s >= from_s) & (time_s <= to_s) & np.isfinite(along_N)
             time_s, along_N, sd_N = time_s[show], along_N[show], sd_N[show]
             step = 1 + len(time_s) // 700
@@ -80,11 +113,11 @@ class RunFigures:
                 label="estimate ± 2 sd",
             )
             axes.plot(*thinned(time_s, along_N), color=ESTIMATED, linewidth=1.0, label="estimated")
-        if force is not None:
-            time_s = self._seconds(force["stamp_ns"])
-            show = (time_s >= from_s) & (time_s <= to_s)
-            pressing_N = stack(force, "fx_N", "fy_N", "fz_N") @ self.summary.direction
-            axes.plot(*thinned(time_s[show], pressing_N[show]), color=MEASURED, linewidth=1.0, label="measured")
+        if forces.has_force:
+            show = (forces.time_s >= from_s) & (forces.time_s <= to_s)
+            axes.plot(
+                *thinned(forces.time_s[show], forces.pressing_N[show]), color=MEASURED, linewidth=1.0, label="measured"
+            )
         if state is not None:
             time_s, wanted_N = self._seconds(state["stamp_ns"]), state["target_force_N"]
             show = (time_s >= from_s) & (time_s <= to_s)
@@ -129,12 +162,10 @@ class RunFigures:
         the 1st and the 99th percentile: the first estimates after the start may be far off.
         """
         shown = [0.0, self.summary.force_limit_N, self.summary.target_force_N]
-        force, estimate = table_or_none(self.recording, "force/sensor"), table_or_none(self.recording, "force/estimate")
-        if force is not None:
-            pressing_N = stack(force, "fx_N", "fy_N", "fz_N") @ self.summary.direction
-            shown += [np.nanmin(pressing_N, initial=0.0), np.nanmax(pressing_N, initial=0.0)]
-        along_N = np.empty(0) if estimate is None else estimate_along(estimate, self.summary.direction)[0]
-        along_N = along_N[np.isfinite(along_N)]
+        forces = self._forces
+        if forces.has_force:
+            shown += [np.nanmin(forces.pressing_N, initial=0.0), np.nanmax(forces.pressing_N, initial=0.0)]
+        along_N = forces.along_N[np.isfinite(forces.along_N)]
         if len(along_N):
             shown += list(np.percentile(along_N, (1.0, 99.0)))
         finite = [value for value in shown if math.isfinite(value)]

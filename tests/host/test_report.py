@@ -332,6 +332,20 @@ def test_the_axis_shows_all_of_the_measured_force_and_not_the_first_estimates(tm
     assert outside == "4 of 667 estimates, 5.00 to 5.00 N"
 
 
+def test_the_forces_are_read_once_for_all_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = Story().write(tmp_path / "run.mcap")
+    summary, table, read = summarize(recording), RecordingFile.table, list[str]()
+
+    def counted(self: RecordingFile, topic: str) -> Any:
+        read.append(topic)
+        return table(self, topic)
+
+    monkeypatch.setattr(RecordingFile, "table", counted)
+    titles = [figure.title for figure in RunFigures(recording, summary).all()]
+    assert titles[0] == "Force on the wall" and titles[1].startswith("Force in the last seconds")
+    assert (read.count("force/sensor"), read.count("force/estimate")) == (1, 1)
+
+
 def test_a_time_without_change_is_one_span() -> None:
     assert spans(np.array([], dtype=int), np.array([], dtype=str)) == []
     found = spans(np.arange(6) * 10, np.array(list("aabbba")))
