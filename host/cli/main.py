@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
@@ -337,25 +338,30 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def main() -> None:
-    """Run the command line.
+def _take_signals(starting: Callable[[int, FrameType | None], object] | None) -> None:
+    """Let SIGINT, SIGTERM and SIGHUP interrupt the command, where they still have their usual handlers or `starting`."""
+    for number, usual in ((signal.SIGTERM, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
+        now = signal.getsignal(number)
+        if now == usual or (starting is not None and now is starting):
+            signal.signal(number, _interrupt)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # a closed terminal; `nohup` ignores it
+        # As SIGTERM, which a server handles in its own way.
+        signal.signal(signal.SIGHUP, lambda number, frame: os.kill(os.getpid(), signal.SIGTERM))
+
+
+def main(starting: Callable[[int, FrameType | None], object] | None = None) -> None:
+    """Run the command line. `starting`: handler of SIGINT and SIGTERM until now, where the caller has set one.
 
     Exit status: 0 done; 2 bad input, one line on standard error; 130 interrupted; 1 anything else, one line on standard
     error, and the traceback of an unexpected error in a log file. SIGTERM, and the end of its terminal, end a command as
     Ctrl-C does: what it has started is stopped in order.
     """
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _interrupt)
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # a closed terminal; `nohup` ignores it
-        # As SIGTERM, which a server handles in its own way.
-        signal.signal(signal.SIGHUP, lambda number, frame: os.kill(os.getpid(), signal.SIGTERM))
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
     argv = sys.argv[1:]
-    _open_standard_streams()
-    warnings.showwarning = _show_warning
-    compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
     try:
+        _take_signals(starting)
+        _open_standard_streams()
+        warnings.showwarning = _show_warning
+        compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
         status = _run(argv)
         sys.stdout.flush()
         sys.exit(status)

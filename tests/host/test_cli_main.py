@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -210,6 +211,56 @@ def test_an_interrupted_command_says_so(number: signal.Signals) -> None:
         check=False,
     )
     assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"
+
+
+START = """
+import os, signal, sys
+
+class Signals:
+    def find_spec(self, name, *rest):
+        if name == "typer":
+            os.kill(os.getpid(), number)
+
+number = int(sys.argv.pop())
+sys.meta_path.insert(0, Signals())
+"""
+
+
+def started(script: str, number: signal.Signals, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", script, *words, str(int(number))]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_during_the_imports_ends_the_command_without_a_word(number: signal.Signals) -> None:
+    done = started(f"{START}\nimport seldinger_start\nseldinger_start.main()", number, "--version")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_is_ignored_stays_ignored_during_the_imports(number: signal.Signals) -> None:
+    ignored = "signal.signal(number, signal.SIG_IGN)"
+    done = started(f"{START}\n{ignored}\nimport seldinger_start\nseldinger_start.main()", number, "--version")
+    assert done.returncode == 0 and done.stdout.startswith("seldinger 0.") and done.stderr == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_after_the_imports_a_command_handles_the_signal_itself(number: signal.Signals) -> None:
+    script = (
+        "import os, sys, seldinger_start, host.cli.drive\n"
+        "def interrupted(*a, **k): os.kill(os.getpid(), number)\n"
+        "number = int(sys.argv.pop())\n"
+        "host.cli.drive.driving = interrupted\n"
+        "seldinger_start.main()"
+    )
+    done = started(script, number, "mark", "a note")
+    assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"
+
+
+def test_the_command_starts_in_a_module_that_loads_nothing() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["project"]["scripts"] == {"seldinger": "seldinger_start:main"}
+    assert loaded("import seldinger_start") - loaded("pass") == {"seldinger_start"}
 
 
 def test_a_full_disk_below_a_result_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

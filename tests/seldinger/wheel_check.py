@@ -14,7 +14,7 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"host", "protocol", "realtime", "sim", "seldinger"}
+PACKAGES = {"host", "protocol", "realtime", "sim", "seldinger", "seldinger_start.py"}
 
 
 def main() -> int:
@@ -46,7 +46,7 @@ def _check(folder: Path) -> int:
         text=True,
         cwd=folder,
     ).stdout.split()
-    installed = {name for name in top if not name.endswith(".dist-info") and not name.startswith("..")}
+    installed = {name for name in top if not name.endswith(".dist-info") and not name.startswith(("..", "__pycache__"))}
     if installed != PACKAGES:
         say(f"the wheel installs {sorted(installed)}, wanted {sorted(PACKAGES)}")
         return 1
