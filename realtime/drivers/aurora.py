@@ -67,6 +67,7 @@ class AuroraClient:
         self.phase = "starting"
         self.firmware = ""
         self.tools: dict[str, ndi.ToolInfo] = {}
+        self.written: dict[str, int] = {}
         self.clock = FrameClock(1.0 / self.config.rate_hz)
         self._reader = ndi.ReplyReader()
         self._counters = AuroraCounters()

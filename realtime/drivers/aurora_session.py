@@ -80,6 +80,7 @@ class SessionClient(Protocol):
 
     config: AuroraConfig
     firmware: str
+    written: dict[str, int]  # bytes of the definition that each handle was given when it was last initialised
 
     def line(self, action: LineAction) -> None:
         """Queue a change of the line for the transport."""
@@ -173,10 +174,13 @@ def _initialise_tools(client: SessionClient) -> Generator[SessionStep, str | Non
 
 def _write_definition(client: SessionClient, handle: str) -> Generator[SessionStep, str | None, None]:
     """Write the tool's definition page by page, if it has one: `PVWR` with handle, address and 64 bytes in hexadecimal."""
+    client.written.pop(handle, None)
     content = client.config.definitions.get(handle, b"")
     for address in range(0, len(content), PAGE_BYTES):
         page = content[address : address + PAGE_BYTES].hex().upper()
         yield from _command(client, "writing tool definitions", "PVWR", f"{handle}{address:04X}{page}")
+    if content:
+        client.written[handle] = len(content)
 
 
 def _command(client: SessionClient, phase: str, name: str, parameters: str = "", attempts: int = ATTEMPTS) -> _Part:

@@ -62,6 +62,10 @@ def check_aurora(
         report.problems.append(f"{counters.damaged} of {counters.replies} replies damaged: cable, speed, interference")
     ages_s = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9
     report.figures |= {"age_median_s": float(np.median(ages_s)), "age_p99_s": float(np.quantile(ages_s, 0.99))}
+    for handle, tool in client.tools.items():
+        report.figures[f"{handle}.serial"] = tool.serial
+        if handle in client.written:
+            report.figures[f"{handle}.definition_bytes"] = client.written[handle]
     for handle in config.tools or tuple(client.tools):
         _check_tool(report, handle, [sample for sample in samples if sample.tool == handle], config.rate_hz)
     return report

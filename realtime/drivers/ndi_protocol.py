@@ -36,7 +36,8 @@ ERROR_TEXTS = {
     0x10: "system not initialised",
     0x11: "tracking could not be stopped",
     0x12: "tracking could not be started",
-    0x13: "tool could not be initialised",
+    0x13: "tool could not be initialised: a tool without a memory of its own needs its file (tracker.tip_definition, "
+    "shaft_definition)",
     0x14: "field generator's characterisation not valid",
     0x15: "measurement system could not be initialised",
     0x16: "diagnostic mode could not be started",
