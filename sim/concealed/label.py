@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 
 class PlantedTruth(TypedDict):
@@ -39,3 +39,6 @@ class Label(TypedDict):
     mismatch_rms_heldout: dict[str, float]
     noise_rms_heldout: dict[str, float]
     plan: dict[str, Any]  # what rebuilds the case
+    findings: NotRequired[
+        list[str]
+    ]  # ids of mistakes in the data that a verdict must state; only the world `domains` has any

@@ -37,12 +37,13 @@ class Facts:
     window_f1: float | None
     exact: bool
     flagged: bool
-    form: bool
+    form: bool | None
     parameter_errors: tuple[float, ...]
     covered: tuple[bool, ...]
     gap_closed: float | None
     seconds: float
     right: bool = field(default=False)
+    windows: bool = True  # whether the label has windows
     named: bool = False  # verdict `missing_physics`
     processor_s: float = math.nan  # for the case, or for 60 s of it where it is longer
     stated: tuple[tuple[float, bool], ...] = ()  # (probability that the verdict gives to a statement, whether it is true)
@@ -82,11 +83,12 @@ def judge(
         "wrong": _wrong(label, kind, _confident(effects, said, calibrate), names),
         "subsystem": _subsystem(label, verdict, effects, places),
         "window_f1": window_f1(label, verdict),
+        "windows": bool(label["windows_s"]),
         "exact": _exact(said, names),
         "flagged": kind == "mismatch_not_identified"
         or any("unlisted" in claim for _, claim in said)
         or (label["category"] == "outside" and first),
-        "form": label["category"] == "outside" and _form(label, effects, heldout),
+        "form": (label["category"] == "outside" and _form(label, effects, heldout)) if label["form"] else None,
         "parameter_errors": errors,
         "covered": covered,
         "gap_closed": gap_closed(label, verdict),
@@ -98,7 +100,14 @@ def judge(
         "stated": _stated(label, verdict, effects if said else [], names, calibrate),
     }
     stray = _wrong(label, kind, said, names)
-    return Facts(**facts, right=_right(label, kind, said, facts) and not (stray and label["category"] != "unidentifiable"))
+    named = _right(label, kind, said, facts) and not (stray and label["category"] != "unidentifiable")
+    return Facts(**facts, right=named and _states_findings(label, verdict))
+
+
+def _states_findings(label: Label, verdict: dict[str, Any]) -> bool:
+    """Whether the verdict states every mistake in the data that it must."""
+    stated = {str(f.get("id")) for f in verdict.get("data_findings") or [] if isinstance(f, dict)}
+    return stated >= set(label.get("findings", []))
 
 
 def _confident(

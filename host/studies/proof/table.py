@@ -105,7 +105,9 @@ def tabulate(facts: Sequence[Facts]) -> Table:
         "confident_wrong_in_library": share(lambda f: f.category in ("single", "pair"), lambda f: f.wrong),
         "confident_wrong_outside": share(lambda f: f.category == "outside", lambda f: f.wrong),
         "subsystem_right": share(big("single", "outside"), lambda f: f.subsystem),
-        "window_f1": mean([f.window_f1 or 0.0 for f in facts if big("single", "pair", "outside")(f) and f.detected]),
+        "window_f1": mean(
+            [f.window_f1 or 0.0 for f in facts if big("single", "pair", "outside")(f) and f.detected and f.windows]
+        ),
         "pairs_exact": share(big("pair"), lambda f: f.exact),
         "outside_flagged": share(lambda f: f.category == "outside", lambda f: f.flagged),
         "equation_form": share(big("outside"), lambda f: f.form),

@@ -16,17 +16,21 @@ from functools import partial
 from pathlib import Path
 
 from host.studies.proof.worlds import case
+from host.studies.proof.worlds.domains import generator as domains
 from protocol.errors import InputError
 from protocol.worker_process import end_with_parent
 from sim.concealed import suite as own
 from sim.concealed.label import Label
 
 OWN = "own"
-WORLDS = (OWN, "mujoco", "ode", "contact")
+WORLDS = (OWN, "mujoco", "ode", "contact", domains.WORLD)
 
 
 def mechanisms(world: str) -> tuple[case.Mechanism, ...]:
-    """Return the mechanisms of `world`. Raises InputError for one that is not known, or where MuJoCo is not installed."""
+    """Return the mechanisms of `world`, one of mujoco, ode and contact.
+
+    Raises InputError for another world, or where MuJoCo is not installed.
+    """
     if world == "mujoco":
         try:
             import mujoco  # noqa: F401
@@ -44,6 +48,13 @@ def mechanisms(world: str) -> tuple[case.Mechanism, ...]:
 
         return contact.MECHANISMS
     raise InputError("--world", world, f"one of {', '.join(WORLDS)}, or all")
+
+
+def plans(world: str, seed: int, cases: int) -> list[case.CasePlan]:
+    """Return the plans of the whole suite of `world`. Raises InputError for a world that is not known or cannot run here."""
+    if world == domains.WORLD:
+        return domains.plans(seed, cases)
+    return case.plans(world, seed, cases, len(mechanisms(world)))
 
 
 def suite(
@@ -70,7 +81,7 @@ def suite(
         return own.suite(seed, cases, folder, jobs, progress)
     seal, parts = folder / "sealed" / "labels.json", folder / "sealed" / "parts"
     if not seal.exists():
-        planned = case.plans(world, seed, cases, len(mechanisms(world)))
+        planned = plans(world, seed, cases)
         parts.mkdir(parents=True, exist_ok=True)
         todo = [plan for plan in planned if not (parts / f"{plan.id}.json").exists()]
         done = cases - len(todo)
@@ -90,7 +101,7 @@ def suite(
 
 def _keep(folder: Path, plan: case.CasePlan) -> int:
     """Make one case and put its label behind the seal. Returns 1."""
-    made = case.make(mechanisms(plan.world), plan)
+    made = domains.make(plan) if plan.world == domains.WORLD else case.make(mechanisms(plan.world), plan)
     case.write(made, folder / "cases" / plan.id)
     part = folder / "sealed" / "parts" / f"{plan.id}.json"
     part.with_suffix(".new").write_text(json.dumps(made.label), encoding="utf-8")
