@@ -1,6 +1,7 @@
 """Write the tables of the worlds to docs/proof.md: as the finder states its probabilities, and leaving one world out.
 
 python -m host.studies.proof.page --dir runs/prove_JUDGED --calibrate-on runs/prove_OTHER --docs docs/proof.md
+python -m host.studies.proof.page --dir runs/prove_JUDGED --world domains --docs docs/proof.md    # one world: a short table
 """
 
 from __future__ import annotations
@@ -9,14 +10,13 @@ import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from host.studies.proof import table
 from host.studies.proof.calibrate import calibrated, read_run
 from host.studies.proof.calibration import Calibration, as_stated
 from host.studies.proof.scoring import Facts, judge
 from host.studies.proof.worlds.suite import OWN
-
-BEGIN, END = "<!-- worlds begin -->", "<!-- worlds end -->"
 
 
 def scored(run: Path, world: str, calibrate: Calibration) -> list[Facts]:
@@ -52,26 +52,53 @@ def block(run: Path, others: Sequence[Path]) -> str:
     return "\n\n".join(parts)
 
 
-def _failures(run: Path) -> str:
+def world_block(run: Path, world: str) -> str:
+    """Return the generated text about one world: what was drawn and right by category, and every case that was not right.
+
+    A wrong name is an effect that is not true, with the probability that the finder states.
+    """
+    note = json.loads((run / "suite.json").read_text(encoding="utf-8"))
+    judged = [(label, judge(label, verdict)) for label, verdict in read_run(run)[world]]
+    lines = ["| category | drawn | right | a wrong name with a probability of 0.9 or more |", "|---|---|---|---|"]
+    for category in ("null", "single", "pair", "outside"):
+        facts = [f for label, f in judged if label["category"] == category]
+        lines.append(f"| {category} | {len(facts)} | {sum(f.right for f in facts)} | {sum(f.wrong for f in facts)} |")
+    facts = [f for _, f in judged]
+    lines.append(f"| all | {len(facts)} | {sum(f.right for f in facts)} | {sum(f.wrong for f in facts)} |")
+    head = f"Seed {note['seed']}, {len(judged)} of {note['cases']} cases:"
+    return "\n\n".join([head, "\n".join(lines), "Cases that were not right:", _failures(run, (world,))])
+
+
+def _failures(run: Path, worlds: Sequence[str] = ()) -> str:
     lines = ["| world | case | kind | planted | rho | verdict |", "|---|---|---|---|---|---|"]
     for world, judged in read_run(run).items():
         for label, verdict in judged:
-            if judge(label, verdict).right:
+            if (worlds and world not in worlds) or judge(label, verdict).right:
                 continue
-            named = ", ".join(f"{e.get('id')}@{e.get('subsystem')}" for e in verdict.get("effects") or [])
+            named = ", ".join(_effect(e) for e in verdict.get("effects") or [])
             said = verdict.get("error") or f"{str(verdict.get('verdict')).replace('_', ' ')} {named}".strip()
             kind = f"{label['kind']}, {'closed' if label['closed_loop'] else 'open'}"
             truth = " + ".join(label["truth"]) or "nothing"
+            if wanted := label.get("findings"):
+                truth += f", finding {', '.join(wanted)}"
+                said += f"; findings: {', '.join(str(f.get('id')) for f in verdict.get('data_findings') or []) or 'none'}"
             lines.append(f"| {world} | {label['id'][5:]} | {kind} | {truth} | {label['rho']:.2f} | {said} |")
     return "\n".join(lines)
 
 
-def write_between(page: Path, text: str) -> None:
-    """Put `text` between the marks of `page`. Raises ValueError where they are missing."""
+def _effect(effect: dict[str, Any]) -> str:
+    """Return id, place and stated probability of an effect."""
+    p = effect.get("probability")
+    return f"{effect.get('id')}@{effect.get('subsystem')}" + (f" ({p:.2f})" if isinstance(p, (int, float)) else "")
+
+
+def write_between(page: Path, text: str, mark: str = "worlds") -> None:
+    """Put `text` between the marks `mark` of `page`. Raises ValueError where they are missing."""
     content = page.read_text(encoding="utf-8")
-    if BEGIN not in content or END not in content:
-        raise ValueError(f"{page}: found no marks {BEGIN} and {END}, wanted both")
-    page.write_text(f"{content.split(BEGIN)[0]}{BEGIN}\n{text}\n{END}{content.split(END)[1]}", encoding="utf-8")
+    begin, end = f"<!-- {mark} begin -->", f"<!-- {mark} end -->"
+    if begin not in content or end not in content:
+        raise ValueError(f"{page}: found no marks {begin} and {end}, wanted both")
+    page.write_text(f"{content.split(begin)[0]}{begin}\n{text}\n{end}{content.split(end)[1]}", encoding="utf-8")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -79,13 +106,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.page")
     parser.add_argument("--dir", type=Path, required=True, help="folder of the judged run")
     parser.add_argument("--calibrate-on", type=Path, action="append", default=[], help="folder of another finished run")
+    parser.add_argument("--world", help="only this world, in a short form between marks of its name")
     parser.add_argument("--docs", type=Path, help="page whose block is to be written; else it is printed")
     given = parser.parse_args(arguments)
-    text = block(given.dir, given.calibrate_on)
+    text = world_block(given.dir, given.world) if given.world else block(given.dir, given.calibrate_on)
     if given.docs is None:
         print(text)
     else:
-        write_between(given.docs, text)
+        write_between(given.docs, text, given.world or "worlds")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The world `domains`: its data sets follow from the seed, and without the effects the nominal law holds."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import cont2discrete, lfilter
 
 from host.diagnosis.model.nominal import read_nominal
+from host.studies.proof import page
 from host.studies.proof.scoring import judge
 from host.studies.proof.worlds import case
 from host.studies.proof.worlds.domains import bench, generator, nominal_laws
@@ -191,6 +193,27 @@ def test_a_label_has_its_size_and_the_finding_that_is_wanted() -> None:
     named = {"verdict": "missing_physics", "effects": [{"id": "backlash", "subsystem": "rudder", "probability": 0.95}]}
     facts = judge(labels["ship_wheel"], named)
     assert facts.right and facts.gap_closed is None and facts.window_f1 is None and facts.form is None
+
+
+def test_the_page_lists_what_was_not_right(tmp_path: Path) -> None:
+    planned = [p for p in generator.plans(SEED, 50) if generator.ALL[p.mechanism].name in ("steering", "ship_wheel")]
+    labels = [generator.make(plan).label for plan in planned]
+    (tmp_path / "suite.json").write_text(json.dumps({"seed": SEED, "cases": 50, "worlds": ["domains"]}))
+    for folder in ("sealed", "verdicts"):
+        (tmp_path / "domains" / folder).mkdir(parents=True)
+    (tmp_path / "domains" / "sealed" / "labels.json").write_text(json.dumps({"labels": labels}))
+    quiet = {"verdict": "nothing_missing", "effects": [], "data_findings": []}
+    named = {"verdict": "missing_physics", "effects": [{"id": "backlash", "subsystem": "rudder", "probability": 0.95}]}
+    for label in labels:
+        content = named if label["kind"] == "ship_wheel" else quiet
+        (tmp_path / "domains" / "verdicts" / f"{label['id']}.json").write_text(json.dumps(content))
+    text = page.world_block(tmp_path, "domains")
+    assert "| null | 1 | 0 | 0 |" in text and "| single | 1 | 1 | 0 |" in text and "| all | 2 | 1 | 0 |" in text
+    assert "| nothing, finding unit | 0.00 | nothing missing; findings: none |" in text and "ship_wheel" not in text
+    document = tmp_path / "page.md"
+    document.write_text("<!-- worlds begin -->\nx\n<!-- worlds end -->\n<!-- domains begin -->\n<!-- domains end -->\n")
+    page.main(["--dir", str(tmp_path), "--world", "domains", "--docs", str(document)])
+    assert document.read_text().startswith("<!-- worlds begin -->\nx\n<!-- worlds end -->") and text in document.read_text()
 
 
 def test_the_integrator_and_the_noise_are_what_they_are_said_to_be() -> None:
