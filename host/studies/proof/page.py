@@ -81,7 +81,8 @@ def _failures(run: Path, worlds: Sequence[str] = ()) -> str:
             truth = " + ".join(label["truth"]) or "nothing"
             if wanted := label.get("findings"):
                 truth += f", finding {', '.join(wanted)}"
-                said += f"; findings: {', '.join(str(f.get('id')) for f in verdict.get('data_findings') or []) or 'none'}"
+                stated = dict.fromkeys(str(f.get("id")) for f in verdict.get("data_findings") or [])
+                said += f"; findings: {', '.join(stated) or 'none'}"
             lines.append(f"| {world} | {label['id'][5:]} | {kind} | {truth} | {label['rho']:.2f} | {said} |")
     return "\n".join(lines)
 
