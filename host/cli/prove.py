@@ -36,7 +36,7 @@ def prove(
     world: Annotated[
         str,
         typer.Option(
-            help="Generators of cases: own, mujoco, ode, contact, domains (comma separated), or all. --cases counts for each."
+            help="Generators of cases: own, mujoco, ode, contact, domains (comma separated), or all. --cases is for each."
         ),
     ] = "own",
     calibration: Annotated[
