@@ -147,9 +147,17 @@ def of_sampling(trial: Trial) -> bool:
 
 
 def only_sampling(trial: Trial, trials: list[Trial]) -> bool:
-    """Whether a delay within one sample does as well at the place of `trial`: how an input was held, under another name."""
-    least = trial.score - trial.rules.heldout_log_likelihood
-    return any(of_sampling(t) and t.candidate.port.name == trial.candidate.port.name and t.score > least for t in trials)
+    """Whether a delay within one sample does as well at the place of `trial`: how an input was held, under another name.
+
+    At another place of the same subsystem the delay has to do better: what it leaves to that place is less than noise.
+    """
+    own, rules = trial.candidate.port, trial.rules
+    for other in trials:
+        port = other.candidate.port
+        least = trial.score - (rules.heldout_log_likelihood if port.name == own.name else 0.0)
+        if of_sampling(other) and port.subsystem == own.subsystem and other.score > least:
+            return True
+    return False
 
 
 def related(simple: Candidate, general: Candidate) -> bool:
