@@ -44,7 +44,7 @@ from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
-from host.diagnosis.selection.unlisted import Remainder, explain_remainder, remainder_of, slow_outputs
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -222,8 +222,8 @@ def _diagnosed(
     remainder = explain_remainder(problem, found, noise_sd, overall.part(0.75, 0.85))
     if found.best is not named_before:  # an equation took the place of effects
         standing = standings(problem, found, noise_sd)
-    while fewer := without_improbable(problem, found, standing, remainder.share, noise_sd):
-        standing, remainder = fewer, remainder_of(problem, found, noise_sd)
+    while fewer := without_improbable(problem, found, standing, remainder, noise_sd):
+        standing, remainder = fewer
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)

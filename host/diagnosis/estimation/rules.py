@@ -100,6 +100,8 @@ class SelectionRules:
     effect_shift: float = 0.0
     none_slope: float = 1.0
     none_shift: float = -1.75
+    absent_slope: float = 1.0  # of "none of these" where nothing is named
+    absent_shift: float = 0.0
     confident: float = 0.9  # probability from which a verdict counts as confident
     further_probability: float = (
         0.5  # that an effect next to a likelier one needs: below, leaving it out is right more often

@@ -171,7 +171,9 @@ def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Po
 
 def _none_stated(result: Diagnosis) -> float:
     rules = result.problem.rules
-    return calibrated(probability_none(result), rules.none_slope, rules.none_shift)
+    named = result.verdict == "missing_physics"
+    slope, shift = (rules.none_slope, rules.none_shift) if named else (rules.absent_slope, rules.absent_shift)
+    return calibrated(probability_none(result), slope, shift)
 
 
 def probability_none(result: Diagnosis) -> float:

@@ -15,7 +15,7 @@ from host.diagnosis.selection.posterior import Posterior, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.search import Found, Step, begun_again, refined
 from host.diagnosis.selection.trial import Trial, at_bound, related
-from host.diagnosis.selection.unlisted import Remainder, equations_for
+from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
 
 Array = npt.NDArray[np.float64]
@@ -93,29 +93,30 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
 
 
 def without_improbable(
-    problem: Problem, found: Found, standing: list[Standing], left: float, noise_sd: Array
-) -> list[Standing]:
-    """Standings without the least probable effect, where another one is probable and it is not; none where all stay.
+    problem: Problem, found: Found, standing: list[Standing], remainder: Remainder, noise_sd: Array
+) -> tuple[list[Standing], Remainder] | None:
+    """Standings and remainder without the least probable effect, where another one is probable and it is not.
 
     An effect enters by what it gains on held-out samples, which formulas that are only nearly true let small further
-    effects do. It stays if the others are no longer probable without it. left: share of the mismatch that the best model
-    leaves. Changes `found.best`.
+    effects do. It stays if no other one is probable without it: what it explained then counts as physics that is in no
+    list. Probabilities are those before calibration. None where all stay. Changes `found.best`.
     """
     least = problem.rules.further_probability
-    probable = [probability_of(one, left, problem.rules).effect for one in standing]
+    probable = [probability_of(one, remainder.share, problem.rules).raw for one in standing]
     if len(probable) < 2 or max(probable) < least or min(probable) >= least or problem.budget.spent():
-        return []
+        return None
     weakest = standing[int(np.argmin(probable))]
     begun, before = get_starts(problem), found.best
     terms, values = without(before, problem, (weakest.candidate.key,))
     found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
     fewer = standings(problem, found, noise_sd)
-    if max(probability_of(one, left, problem.rules).effect for one in fewer) < least:
+    left = remainder_of(problem, found, noise_sd)
+    if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least:
         found.best = before
         set_starts(problem, begun)
-        return []
+        return None
     found.steps.append(Step("remove", weakest.candidate.key, weakest.gain, []))
-    return fewer
+    return fewer, left
 
 
 def probability_of(standing: Standing, left: float, rules: SelectionRules) -> Posterior:

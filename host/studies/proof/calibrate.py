@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from host.studies.proof.calibration import CalibrationTable, Curve, fit
+from host.studies.proof.calibration import KINDS, CalibrationTable, fit, kind_of_none, raw_probability
 from host.studies.proof.scoring import none_listed
 from host.studies.proof.worlds.suite import read_labels
 from sim.concealed.label import Label
@@ -32,18 +32,18 @@ def read_run(folder: Path) -> dict[str, Judged]:
 
 
 def statements(judged: Judged, kind: str) -> list[tuple[float, bool]]:
-    """Return (raw probability, whether true) of all statements of `kind` effect or none."""
+    """Return (raw probability, whether true) of all statements of `kind`: effect, none or absent."""
     found = []
     for label, verdict in judged:
-        if kind == "none":
-            p = verdict.get("probability_none_raw", verdict.get("probability_none"))
-            true = none_listed(label)
-        else:
+        if kind == "effect":
             first = (verdict.get("effects") or [{}])[0]
-            p = first.get("probability_raw", first.get("probability"))
-            true = any(first.get("id") in names for names in label["names"])
-        if isinstance(p, (int, float)):
-            found.append((float(p), true))
+            p, true = raw_probability(kind, first), any(first.get("id") in names for names in label["names"])
+        elif kind == kind_of_none(verdict):
+            p, true = raw_probability(kind, verdict), none_listed(label)
+        else:
+            continue
+        if p is not None:
+            found.append((p, true))
     return found
 
 
@@ -56,9 +56,9 @@ def calibrated(runs: Sequence[Path], left_out: Sequence[str]) -> CalibrationTabl
         taken = {world: judged for world, judged in read_run(folder).items() if world not in left_out}
         used += [pair for judged in taken.values() for pair in judged]
         source["runs"].append({"seed": note["seed"], "cases": note["cases"], "worlds": sorted(taken)})
-    effect, none = (statements(used, kind) for kind in ("effect", "none"))
-    source["statements"] = {"effect": len(effect), "none": len(none)}
-    return CalibrationTable(fit(effect) if effect else Curve(), fit(none) if none else Curve(), source)
+    stated = {kind: statements(used, kind) for kind in KINDS}
+    source["statements"] = {kind: len(found) for kind, found in stated.items()}
+    return CalibrationTable({kind: fit(stated[kind]) for kind in KINDS}, source)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -70,8 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     table = calibrated(given.dir, given.leave_out)
     table.write(given.out)
-    print(f"effect: slope {table.effect.slope:.2f}, shift {table.effect.shift:+.2f}; none: slope {table.none.slope:.2f},")
-    print(f"shift {table.none.shift:+.2f}; {table.source['statements']} statements -> {given.out}")
+    for kind in KINDS:
+        curve, count = table.curves[kind], table.source["statements"][kind]
+        print(f"{kind}: slope {curve.slope:.2f}, shift {curve.shift:+.2f} ({count} statements)")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@ those that judge it:
 
     python -m host.studies.proof.calibrate --dir runs/prove_7 --leave-out ode --out calibration.json
 
-A finder applies the file with `Calibration.read(path)` to the raw probabilities of its effects (`effect`) and of an adequate
-model (`none`), and keeps the raw ones as `probability_raw` and `probability_none_raw`.
+There are three kinds of statements: a named effect is there (`effect`); none of the vocabulary is missing, where an effect
+is named (`none`); the same, where nothing is named (`absent`). A finder keeps the values before calibration as
+`probability_raw` and `probability_none_raw`.
 """
 
 from __future__ import annotations
@@ -24,12 +25,26 @@ from scipy.optimize import minimize
 PRIOR = 2.0  # standard deviation of log slope and shift about 0: a handful of statements moves neither far
 EDGE = 1e-4  # probabilities are kept this far from 0 and 1
 Calibration = Callable[[str, Mapping[str, Any]], float]
-_KEYS = {"effect": ("probability_raw", "probability"), "none": ("probability_none_raw", "probability_none")}
+KINDS = ("effect", "none", "absent")
+_NONE = ("probability_none_raw", "probability_none")
+_KEYS = {"effect": ("probability_raw", "probability"), "none": _NONE, "absent": _NONE}
 
 
 def as_stated(kind: str, source: Mapping[str, Any]) -> float:
-    """Return the probability that the verdict itself states, of `kind` effect or none."""
+    """Return the probability that the verdict itself states, of `kind` effect, none or absent."""
     return float(source[_KEYS[kind][1]])
+
+
+def kind_of_none(verdict: Mapping[str, Any]) -> str:
+    """Return the kind of a verdict's statement on "none of the vocabulary": `none` next to a named effect, else `absent`."""
+    return "none" if verdict.get("verdict") == "missing_physics" else "absent"
+
+
+def raw_probability(kind: str, source: Mapping[str, Any]) -> float | None:
+    """Return the probability before calibration that an effect or a verdict states, or the stated one, or None."""
+    raw, stated = _KEYS[kind]
+    p = source.get(raw, source.get(stated))
+    return float(p) if isinstance(p, (int, float)) else None
 
 
 @dataclass(frozen=True)
@@ -46,28 +61,26 @@ class Curve:
 
 @dataclass(frozen=True)
 class CalibrationTable:
-    """Curves of both kinds of statements, and what they were fitted on."""
+    """A curve for each of KINDS, and what they were fitted on."""
 
-    effect: Curve
-    none: Curve
+    curves: dict[str, Curve]
     source: dict[str, Any]
 
     def __call__(self, kind: str, source: Mapping[str, Any]) -> float:
         """Return the calibrated probability of an effect's or a verdict's raw one (the stated one where there is no raw)."""
-        raw, stated = _KEYS[kind]
-        p = source.get(raw, source.get(stated))
-        return (self.effect if kind == "effect" else self.none)(float(p if p is not None else 1.0))
+        p = raw_probability(kind, source)
+        return self.curves[kind](1.0 if p is None else p)
 
     def write(self, path: Path) -> None:
         """Write the table as JSON."""
-        content = {"effect": asdict(self.effect), "none": asdict(self.none), "source": self.source}
+        content = {**{kind: asdict(self.curves[kind]) for kind in KINDS}, "source": self.source}
         path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read(path: Path) -> CalibrationTable:
     """Return the table that `Table.write` wrote. Raises OSError, KeyError, ValueError for a file that is none."""
     content = json.loads(path.read_text(encoding="utf-8"))
-    return CalibrationTable(Curve(**content["effect"]), Curve(**content["none"]), content["source"])
+    return CalibrationTable({kind: Curve(**content[kind]) for kind in KINDS}, content["source"])
 
 
 def fit(statements: Sequence[tuple[float, bool]]) -> Curve:

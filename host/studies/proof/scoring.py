@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from host.studies.proof.calibration import Calibration, as_stated
+from host.studies.proof.calibration import Calibration, as_stated, kind_of_none
 from host.studies.proof.equation_form import right_form
 from sim.concealed.label import Label, PlantedTruth
 
@@ -129,7 +129,7 @@ def _stated(
     if effects and isinstance(effects[0].get("probability"), (int, float)):
         out.append((calibrate("effect", effects[0]), any(str(effects[0].get("id")) in n for n in names)))
     if isinstance(verdict.get("probability_none"), (int, float)):
-        out.append((calibrate("none", verdict), none_listed(label)))
+        out.append((calibrate(kind_of_none(verdict), verdict), none_listed(label)))
     return tuple(out)
 
 
