@@ -7,19 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.diagnosis.effects import library
+from host.diagnosis.effects import candidates, library
 from host.diagnosis.effects.quantization import MOST_STEPS, from_saw_tooth, stepped
 from host.diagnosis.estimation.evidence import Gain
-from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.fit import Fit, Term, finish
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.report.verdict import at_bound, likelier
-from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival
+from host.diagnosis.selection import equivalence
+from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
 from host.diagnosis.selection.posterior import calibrated, posterior
-from host.diagnosis.selection.trial import Trial, good_enough, weighty
+from host.diagnosis.selection.screening import term_of
+from host.diagnosis.selection.search import Found, fit_nominal
+from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
 from host.diagnosis.selection.unlisted import Remainder
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart
 from tests.host.diagnosis.test_export import COMMON, KINDS
@@ -133,3 +136,53 @@ def test_a_more_probable_alternative_is_stated(probability: float, alternatives:
     others = [{"name": name, "probability": p} for name, p in alternatives]
     found = likelier({"probability": probability, "alternatives": others})
     assert says in found and bool(says) == bool(found)
+
+
+LAG = next(e for e in library() if e.id == "latency")
+LINK = Port("axis_drive", "motion", "axis", ("drive",), held=True)
+
+
+@pytest.mark.parametrize(
+    ("place", "lead", "refused"),
+    [
+        ("axis_drive", 3.0, True),  # at the port of the delay: it does as well
+        ("axis_drive", 8.0, False),
+        ("axis", -1.0, True),  # elsewhere in the subsystem: the delay does better
+        ("axis", 3.0, False),
+    ],
+)
+def test_what_a_delay_within_a_sample_explains_has_no_other_name(place: str, lead: float, refused: bool) -> None:
+    delay = Term(Candidate(LAG, LINK), (Parameter("delay", "s", (0.01,), 0.0, 1.0),))
+    held = Trial(delay.candidate, Fit((delay,), np.array([0.003]), [np.zeros((1, 500))]), NOTHING, NOTHING, NOTHING, 30.0)
+    held.period_s = 0.01
+    other = Candidate(BACKLASH.effect, replace(LINK, name=place))
+    term = Term(other, (Parameter("width", "m", (0.1,), 0.0, 1.0),))
+    named = Trial(other, Fit((term,), np.array([0.1]), [np.zeros((1, 500))]), NOTHING, NOTHING, NOTHING, 30.0 + lead)
+    assert only_sampling(named, [held, named]) is refused
+
+
+@pytest.mark.parametrize(("left", "removed"), [(0.0, True), (0.6, False)])
+def test_an_improbable_effect_stays_if_no_other_is_probable_without_it(
+    monkeypatch: pytest.MonkeyPatch, left: float, removed: bool
+) -> None:
+    """left: share of the mismatch that remains after the removal."""
+    rng, t = np.random.default_rng(5), np.arange(900) * 0.02
+    u = np.sin(2.0 * np.pi * 0.3 * t)
+    y = u + 0.2 * np.cos(2.0 * np.pi * 0.11 * t) + 1e-2 * rng.standard_normal(900)
+    tables = [Table(f"r{k}", {"t": t, "u": u, "y": y, "w": np.cos(2.0 * np.pi * 0.11 * t)}) for k in range(2)]
+    _, problem, _ = prepare(nominal_of({**COMMON, "kind": "transmission", **KINDS["transmission"]}), tables)
+    nominal = fit_nominal(problem)
+    offered = candidates(candidate_ports(problem), timed=True)
+    terms = tuple(
+        term_of(problem, next(c for c in offered if c.effect.id == name), nominal) for name in ("backlash", "compliance")
+    )
+    values = np.concatenate((nominal.values, [1e-3], [0.2]))
+    found = Found(nominal, finish(problem, Fit(terms, values)), [])
+    gain, equal = Gain(80.0, 1e-9, 0.5), ((BACKLASH, -1.0),)
+    strong, weak = (Standing(t.candidate, gain, gain, (), rivals) for t, rivals in zip(terms, ((), equal), strict=True))
+    monkeypatch.setattr(equivalence, "standings", lambda *_: [strong])
+    monkeypatch.setattr(equivalence, "remainder_of", lambda *_: Remainder(None, left))
+    before = found.best
+    fewer = without_improbable(problem, found, [strong, weak], Remainder(None, 0.0), np.array([1e-2]))
+    assert (fewer is not None) is removed
+    assert (found.best is before) is not removed
