@@ -157,8 +157,11 @@ def size_of(p: Parameter, value: float) -> float:
 
 
 def moved(p: Parameter, value: float, by: float) -> float:
-    """`value` moved by `by` in the parameter's own scale, kept in bounds."""
-    new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + by * size_of(p, value)
+    """`value` moved by `by` in the parameter's own scale, kept in bounds and finite.
+
+    Where a simulation has diverged, no parameter changes it and the step of least squares has no bound.
+    """
+    new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + float(np.clip(by, -FAR, FAR)) * size_of(p, value)
     return float(min(max(new, p.low), p.high))
 
 

@@ -396,8 +396,10 @@ def _by_law(
     explained = float(np.median([part[2] for part in straight]))
     force_column, motion_column = columns[path.input], columns[path.output]
     if 1.0 - explained > WRONG_WAY:
-        crossed = float(np.median([regression(recording, path, exchanged=True)[2] for recording in used]))
-        if crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
+        across = [regression(recording, path, exchanged=True) for recording in used]
+        crossed = float(np.median([part[2] for part in across]))
+        passive = abs(_agreement(across)) >= abs(_agreement(straight))
+        if passive and crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
             says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
             says += "The diagnosis continues with them exchanged."
@@ -410,8 +412,7 @@ def _by_law(
             used = [recording for recording in recordings if recording.timed and recording.n >= 100]
             straight = [regression(recording, path) for recording in used]
             explained = crossed
-    agreement = [float(np.sum(np.sign(c) * rms)) / max(float(np.sum(rms)), 1e-300) for c, rms, _ in straight]
-    if explained > 0.5 and max(agreement) < OPPOSITE:
+    if explained > 0.5 and max(map(_signs, straight)) < OPPOSITE:
         says = f"Columns {force_column} and {motion_column} have opposite signs: every term of the nominal law comes out "
         says += f"negative. The diagnosis continues with {force_column} reversed (channels.*.sign)."
         findings.append(Finding("sign", force_column, says))
@@ -419,6 +420,20 @@ def _by_law(
     leading = path.input if spec.impedance is not None else path.output
     recordings = _causal_by_law(recordings, path, leading, columns, findings)
     return _in_units(recordings, path, straight, explained, columns, findings)
+
+
+def _signs(regressed: tuple[Array, Array, float]) -> float:
+    """Return 1 if all terms of a law are positive, -1 if all are negative, weighted by their size in between.
+
+    Mass, damping and stiffness have one sign. The law of exchanged columns is nearly that of a spring at low frequency, with
+    a damping of the other sign.
+    """
+    found, rms, _ = regressed
+    return float(np.sum(np.sign(found) * rms)) / max(float(np.sum(rms)), 1e-300)
+
+
+def _agreement(regressed: list[tuple[Array, Array, float]]) -> float:
+    return float(np.median([_signs(each) for each in regressed]))
 
 
 def _causal_by_law(

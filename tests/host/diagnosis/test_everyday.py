@@ -14,7 +14,10 @@ from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.noise import estimate
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Port, Scale
+from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.operators import lag, quantum, shift
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import inspected
 from host.diagnosis.selection.posterior import posterior
 from host.diagnosis.selection.trial import vanished
 
@@ -84,6 +87,23 @@ def test_exchanged_columns_are_said_to_be() -> None:
     rng = np.random.default_rng(3)
     runs = [{**run, "f": run["x"], "x": run["f"]} for run in (stage(rng), stage(rng))]
     assert "swapped" in ids(diagnose(runs, STAGE).as_dict())
+
+
+SPRUNG = {**STAGE, "axis": {**STAGE["axis"], "terms": ["mass", "damping", "stiffness", "offset"]}}
+
+
+@pytest.mark.parametrize(("damping", "found"), [(-1.7e-5, False), (1.7e-5, True)])
+def test_columns_whose_exchange_needs_a_negative_damping_are_not_exchanged(damping: float, found: bool) -> None:
+    """The position is a law of force, its rate and its acceleration; only passive coefficients make it a force."""
+    t, runs = 0.002 * np.arange(3000), []
+    for seed in (8, 9):
+        rng = np.random.default_rng(seed)
+        amplitude, turn, phase = rng.uniform(0.3, 1.0, 6), 2.0 * np.pi * rng.uniform(0.1, 4.0, 6), rng.uniform(0.0, 6.3, 6)
+        tones = amplitude * np.exp(1j * (np.outer(t, turn) + phase))
+        position = (tones * (2.7e-4 + 1j * turn * damping - 5.4e-7 * turn**2)).imag.sum(axis=1)
+        runs.append({"t": t, "f": tones.imag.sum(axis=1) + 1e-3 * rng.standard_normal(t.size), "x": position})
+    findings = inspected(nominal_of(SPRUNG), [Table(f"r{k}", run) for k, run in enumerate(runs)]).findings
+    assert ("swapped" in {finding.id for finding in findings}) is found
 
 
 @pytest.mark.parametrize(
