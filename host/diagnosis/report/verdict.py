@@ -165,15 +165,19 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
 def posterior_of(result: Diagnosis, standing: Standing, raw: bool = False) -> Posterior:
     """Probabilities at the place of one effect; raw: before calibration."""
     rules = result.problem.rules
-    rules = replace(rules, effect_slope=1.0, effect_shift=0.0) if raw else rules
+    rules = replace(rules, effect_a=1.0, effect_b=1.0, effect_c=0.0) if raw else rules
     return probability_of(standing, result.remainder.share, rules)
 
 
 def _none_stated(result: Diagnosis) -> float:
-    rules = result.problem.rules
-    named = result.verdict == "missing_physics"
-    slope, shift = (rules.none_slope, rules.none_shift) if named else (rules.absent_slope, rules.absent_shift)
-    return calibrated(probability_none(result), slope, shift)
+    rules, curve = result.problem.rules, result.problem.rules.absent_curve
+    if result.verdict == "missing_physics":
+        curve = rules.none_curve if _strongest(result).candidate.effect.listed else rules.effect_curve
+    return calibrated(probability_none(result), *curve)
+
+
+def _strongest(result: Diagnosis) -> Standing:
+    return max(result.standings, key=lambda standing: standing.gain.log_likelihood)
 
 
 def probability_none(result: Diagnosis) -> float:
@@ -181,7 +185,7 @@ def probability_none(result: Diagnosis) -> float:
     is in no list.
     """
     if result.verdict == "missing_physics":
-        strongest = max(result.standings, key=lambda standing: standing.gain.log_likelihood)
+        strongest = _strongest(result)
         found = posterior_of(result, strongest, raw=True)
         equation = 0.0 if strongest.candidate.effect.listed else found.effect  # an equation is physics in no list
         return equation + found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)

@@ -82,18 +82,21 @@ def posterior(
     none += odds * min(rules.exact_share / max(share, 1e-300), 1.0 / odds)
     total = 1.0 + sum(weight for _, weight in weights) + nothing + none
     raw = 1.0 / total
-    stated = calibrated(raw, rules.effect_slope, rules.effect_shift)
+    stated = calibrated(raw, *rules.effect_curve)
     share = (1.0 - stated) / (1.0 - raw) if raw < 1.0 else 0.0  # of what is not the effect, every part alike
     others = tuple((rival, share * weight / total) for rival, weight in weights)
     return Posterior(stated, others, share * nothing / total, share * none / total, raw)
 
 
-def calibrated(p: float, slope: float, shift: float) -> float:
-    """Return the probability that `p` states truly, by slope and shift of its log-odds."""
-    if (slope, shift) == (1.0, 0.0):
+def calibrated(p: float, a: float, b: float, c: float) -> float:
+    """Return the probability that `p` states truly, by beta calibration: log-odds of a log p - b log(1 - p) + c.
+
+    Source: Kull, Silva Filho and Flach, Beta calibration, AISTATS 2017.
+    """
+    if (a, b, c) == (1.0, 1.0, 0.0):
         return p
     q = min(max(p, EDGE), 1.0 - EDGE)
-    return 1.0 / (1.0 + float(np.exp(-(slope * np.log(q / (1.0 - q)) + shift))))
+    return 1.0 / (1.0 + float(np.exp(-(a * np.log(q) - b * np.log1p(-q) + c))))
 
 
 def of_refused(trials: list[Trial]) -> float:

@@ -36,7 +36,7 @@ def statements(judged: Judged, kind: str) -> list[tuple[float, bool]]:
     found = []
     for label, verdict in judged:
         if kind == "effect":
-            first = (verdict.get("effects") or [{}])[0]
+            first = (verdict.get("effects") or [{}])[0]  # further effects have to pass other rules
             p, true = raw_probability(kind, first), any(first.get("id") in names for names in label["names"])
         elif kind == kind_of_none(verdict):
             p, true = raw_probability(kind, verdict), none_listed(label)
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table.write(given.out)
     for kind in KINDS:
         curve, count = table.curves[kind], table.source["statements"][kind]
-        print(f"{kind}: slope {curve.slope:.2f}, shift {curve.shift:+.2f} ({count} statements)")
+        print(f"{kind}: a {curve.a:.2f}, b {curve.b:.2f}, c {curve.c:+.2f} ({count} statements)")
 
 
 if __name__ == "__main__":

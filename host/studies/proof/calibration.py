@@ -1,13 +1,14 @@
-"""Stated probabilities turned into those that held on other suites: a slope and a shift of the log-odds (Platt 1999).
+"""Stated probabilities turned into those that held on other suites: beta calibration (Kull, Silva Filho and Flach 2017).
 
-With slope 1 / T and no shift this is temperature scaling (Guo et al. 2017). It is fitted on worlds and seeds apart from
-those that judge it:
+The log-odds become a log p - b log(1 - p) + c. With a = b this is a slope and a shift of the log-odds (Platt 1999). The
+curve is fitted on worlds and seeds apart from those that judge it:
 
     python -m host.studies.proof.calibrate --dir runs/prove_7 --leave-out ode --out calibration.json
 
-There are three kinds of statements: a named effect is there (`effect`); none of the vocabulary is missing, where an effect
-is named (`none`); the same, where nothing is named (`absent`). A finder keeps the values before calibration as
-`probability_raw` and `probability_none_raw`.
+There are three kinds of statements with a curve each: a named effect is there (`effect`); none of the vocabulary is
+missing, where an effect of it is named (`none`) and where nothing is named (`absent`). Where an equation is named, the
+verdict's statement on the vocabulary is that the equation is right, so it has the curve of effects. A finder keeps the
+values before calibration as `probability_raw` and `probability_none_raw`.
 """
 
 from __future__ import annotations
@@ -22,22 +23,26 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-PRIOR = 2.0  # standard deviation of log slope and shift about 0: a handful of statements moves neither far
-EDGE = 1e-4  # probabilities are kept this far from 0 and 1
+from host.diagnosis.selection.posterior import EDGE, calibrated
+
+PRIOR = 2.0  # standard deviation of log a, log b and c about 0: a handful of statements moves none far
 Calibration = Callable[[str, Mapping[str, Any]], float]
 KINDS = ("effect", "none", "absent")
 _NONE = ("probability_none_raw", "probability_none")
-_KEYS = {"effect": ("probability_raw", "probability"), "none": _NONE, "absent": _NONE}
+_KEYS = {"effect": ("probability_raw", "probability"), "none": _NONE, "absent": _NONE, "equation": _NONE}
+_CURVE = {"equation": "effect"}
 
 
 def as_stated(kind: str, source: Mapping[str, Any]) -> float:
-    """Return the probability that the verdict itself states, of `kind` effect, none or absent."""
+    """Return the probability that the verdict itself states, of `kind` effect, none, absent or equation."""
     return float(source[_KEYS[kind][1]])
 
 
 def kind_of_none(verdict: Mapping[str, Any]) -> str:
-    """Return the kind of a verdict's statement on "none of the vocabulary": `none` next to a named effect, else `absent`."""
-    return "none" if verdict.get("verdict") == "missing_physics" else "absent"
+    """Return the kind of a verdict's statement that no effect of the vocabulary is missing: none, absent or equation."""
+    if verdict.get("verdict") != "missing_physics":
+        return "absent"
+    return "equation" if (verdict.get("effects") or [{}])[0].get("id") == "unlisted" else "none"
 
 
 def raw_probability(kind: str, source: Mapping[str, Any]) -> float | None:
@@ -49,14 +54,15 @@ def raw_probability(kind: str, source: Mapping[str, Any]) -> float | None:
 
 @dataclass(frozen=True)
 class Curve:
-    """p' = 1 / (1 + exp(-(slope * logit(p) + shift)))."""
+    """p' = 1 / (1 + exp(-(a log p - b log(1 - p) + c))), a and b positive."""
 
-    slope: float = 1.0
-    shift: float = 0.0
+    a: float = 1.0
+    b: float = 1.0
+    c: float = 0.0
 
     def __call__(self, p: float) -> float:
         """Return the calibrated probability of a stated one."""
-        return 1.0 / (1.0 + math.exp(-(self.slope * _logit(p) + self.shift)))
+        return calibrated(p, self.a, self.b, self.c)
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class CalibrationTable:
     def __call__(self, kind: str, source: Mapping[str, Any]) -> float:
         """Return the calibrated probability of an effect's or a verdict's raw one (the stated one where there is no raw)."""
         p = raw_probability(kind, source)
-        return self.curves[kind](1.0 if p is None else p)
+        return self.curves[_CURVE.get(kind, kind)](1.0 if p is None else p)
 
     def write(self, path: Path) -> None:
         """Write the table as JSON."""
@@ -87,17 +93,12 @@ def fit(statements: Sequence[tuple[float, bool]]) -> Curve:
     """Return the curve that makes `statements` (raw probability, whether true) likeliest; the identity of none."""
     if not statements:
         return Curve()
-    x = np.array([_logit(p) for p, _ in statements])
+    p = np.clip([stated for stated, _ in statements], EDGE, 1.0 - EDGE)
     y = np.array([float(true) for _, true in statements])
 
     def cost(z: np.ndarray) -> float:
-        odds = math.exp(z[0]) * x + z[1]
+        odds = math.exp(z[0]) * np.log(p) - math.exp(z[1]) * np.log1p(-p) + z[2]
         return float(np.sum(np.logaddexp(0.0, odds) - y * odds) + 0.5 * np.sum((z / PRIOR) ** 2))
 
-    found = minimize(cost, np.zeros(2), method="BFGS").x
-    return Curve(float(math.exp(found[0])), float(found[1]))
-
-
-def _logit(p: float) -> float:
-    q = min(max(p, EDGE), 1.0 - EDGE)
-    return math.log(q / (1.0 - q))
+    found = minimize(cost, np.zeros(3), method="BFGS").x
+    return Curve(float(math.exp(found[0])), float(math.exp(found[1])), float(found[2]))

@@ -103,12 +103,13 @@ def test_steps_by_their_saw_tooth() -> None:
 
 def test_a_calibrated_probability_takes_its_share_from_all_others() -> None:
     gain = Gain(40.0, 1e-6, 0.9, independent=np.array([400.0]), log_ratio=np.array([0.2]), excesses=np.array([0.1]))
-    asis = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, RULES)
-    lower = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, replace(RULES, effect_slope=0.5, effect_shift=-0.3))
+    asis = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, replace(RULES, effect_a=1.0, effect_b=1.0, effect_c=0.0))
+    lower = posterior(gain, gain, 1, [(BACKLASH, 2.0)], 0.1, replace(RULES, effect_a=0.5, effect_b=0.5, effect_c=-0.3))
     assert asis.raw == asis.effect == lower.raw and lower.effect < asis.effect
     for each in (asis, lower):
         assert each.effect + each.rivals[0][1] + each.nothing + each.none == pytest.approx(1.0)
-    assert calibrated(0.8, 0.5, -0.3) == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * np.log(4.0) - 0.3))))
+    assert calibrated(0.8, 0.5, 0.5, -0.3) == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * np.log(4.0) - 0.3))))
+    assert calibrated(0.8, 0.2, 0.9, 0.1) == pytest.approx(1.0 / (1.0 + 0.8**-0.2 * 0.2**0.9 * np.exp(-0.1)))
 
 
 @pytest.mark.parametrize(("step_m", "found"), [(5e-4, True), (1e-16, False)])
