@@ -94,9 +94,9 @@ class SelectionRules:
     coarsening_none: float = 8.0  # independent samples for the comparison with physics that would leave no more than that
     # Beta calibration (Kull et al. 2017): log-odds of a log p - b log(1 - p) + c, of effects that are named, of "none of
     # these" where one is named, and of the same where nothing is named. An equation that is named has the curve of effects.
-    # Fitted on 120 cases of seeds 272013 and 305771 (four worlds), leaving one world out at a time; these are the means (for
-    # absent_b without the fit that leaves out `own`, 3.35). Range over the worlds left out: effects a 0.14 to 0.26, b 0.77 to
-    # 0.90, c -0.12 to 0.36; none a 0.56 to 1.70, b 0.12 to 0.16, c -2.65 to -1.47; absent a 0.43 to 1.23, c 0.06 to 1.75.
+    # Fitted on 120 cases of seeds 272013 and 305771 (four worlds), leaving one world out at a time; these are the means (of
+    # absent_b without the fit that leaves out `own`, 3.35). Range over the worlds left out: effects a 0.14 to 0.26, b 0.77
+    # to 0.90, c -0.12 to 0.36; none a 0.56 to 1.70, b 0.12 to 0.16, c -2.65 to -1.47; absent a 0.43 to 1.23, c 0.06 to 1.75.
     effect_a: float = 0.21
     effect_b: float = 0.81
     effect_c: float = 0.08
