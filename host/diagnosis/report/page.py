@@ -89,9 +89,9 @@ def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
 
 
 def worse_words(verdict: dict[str, Any]) -> str:
-    """Where the held-out error grew: the first output and recording by name, and how many more."""
-    first, more = verdict["worse"][0].partition(":")[0], len(verdict["worse"]) - 1
-    return f"worse in {first.replace('_', ' ', 1)}" + (f" and {more} more" if more else "")
+    """Where the held-out error grew: the first output by name, and how many more."""
+    first, more = verdict["worse"][0].partition(" in ")[0], len(verdict["worse"]) - 1
+    return f"the error of {words(first)} grew" + (f", and {more} more" if more else "")
 
 
 def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:

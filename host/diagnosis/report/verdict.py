@@ -68,13 +68,13 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
 
 def worse(result: Diagnosis) -> list[str]:
     """Outputs and held-out recordings whose error grew with the effects by more than a twentieth, as sentences."""
-    found = []
+    found, units = [], {output.channel: output.unit for output in result.model.outputs}
     for recording, channels in per_recording(result).items():
         for channel, error in channels.items():
-            before, after = error["rmse_before"], error["rmse_after"]
+            before, after, unit = error["rmse_before"], error["rmse_after"], units[channel]
             if after > WORSE * before:
-                says = f"{channel} in {recording}: held-out RMS error {before:.3g} before, {after:.3g} with the effects."
-                found.append(says)
+                says = f"{channel} in {recording}: held-out RMS error {before:.3g} {unit} before, {after:.3g} {unit} with"
+                found.append(says + " the effects.")
     return found
 
 
