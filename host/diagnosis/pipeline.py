@@ -41,7 +41,7 @@ from host.diagnosis.selection.equivalence import (
 )
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
-from host.diagnosis.selection.sampling import hold_between_samples
+from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
 from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
@@ -244,6 +244,8 @@ def _diagnosed(
         if remainder.sure or found.best.terms
         else "nothing_missing"
     )
+    if not found.best.terms:
+        result.findings += late_by_a_sample(problem, found)
     if result.verdict == "nothing_missing":
         result.findings += _too_slow(full, found, slow_outputs(problem, found.best, noise_sd))
     if not located and remainder.sure and remainder.predicted is not None:

@@ -190,9 +190,18 @@ def tolerance_of(values: Array, span: float) -> float:
 
 
 def apply_effects(
-    signal: Array, active: list[ActiveEffect], port: str, segment: Segment, side: str | None, kind: str | None = None
+    signal: Array,
+    active: list[ActiveEffect],
+    port: str,
+    segment: Segment,
+    side: str | None,
+    kind: str | None = None,
+    finer: int = 1,
 ) -> Array:
-    """`signal` after all active effects at `port` (on `side` of the nominal gain), in their order."""
+    """`signal` (n * finer,) after all active effects at `port` (on `side` of the nominal gain), in their order.
+
+    finer: points of `signal` in one sample; it is then held within each of them, as are the other channels in each sample.
+    """
     here = [effect for effect in active if effect[0].port.name == port and (side is None or effect[0].effect.side == side)]
     if not here:
         return signal
@@ -205,19 +214,27 @@ def apply_effects(
         if candidate.effect.apply is None:
             continue
         source = segment.inputs[candidate.source] if candidate.source else None
+        if source is not None and finer > 1:
+            source = np.repeat(source, finer)
         base = segment.inputs.get(f"motion:{port}", motion) if candidate.effect.side == "output" else signal
         context = Context(
-            segment.recording.time_s,
-            segment.recording.dt_s,
+            _finer(segment.recording.time_s, segment.recording.dt_s, finer),
+            segment.recording.dt_s / finer,
             base,
             tolerance,
             segment.start.get(port, 0.0),
             source,
-            segment.equations,
+            segment.equations if finer == 1 else {k: np.repeat(v, finer) for k, v in segment.equations.items()},
             segment.start.get(rate_key(port), 0.0),
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal
+
+
+def _finer(time_s: Array, dt_s: float, finer: int) -> Array:
+    if finer == 1:
+        return time_s
+    return np.asarray((time_s[:, None] + np.arange(finer) * (dt_s / finer)).ravel())
 
 
 def scale_of(model: Model, segments: list[Segment], port: Port, candidate: Candidate, need_rms: float) -> Scale:

@@ -30,6 +30,7 @@ from host.diagnosis.models import balance
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
 UNSEEN_S = 0.05  # scale of an initial position or speed that is not read
+FINER = 8  # points in each sub-step at which a held input is computed that an effect delays
 
 
 @dataclass
@@ -232,10 +233,12 @@ class AxisModel(Model):
             linear[("mass", "damping", "stiffness", "offset").index(term)] = value
         if "mass" not in spec.terms:
             linear[0] = 1.0
-        force = segment.inputs[spec.input]
-        drive = [effect for effect in active if effect[0].port.name == f"{spec.subsystem}_drive"]
-        if drive:
-            force = apply_effects(force, drive, f"{spec.subsystem}_drive", segment, None)
+        recorded, place = segment.inputs[spec.input], f"{spec.subsystem}_drive"
+        drive = [effect for effect in active if effect[0].port.name == place]
+        late = self.hold == "zero" and bool(drive) and all(candidate.effect.shifts == "time" for candidate, _ in drive)
+        finer = FINER * segment.substeps if late else 1  # a held input that is late by a part of a sample jumps within it
+        force = np.repeat(recorded, finer) if late else recorded
+        force = apply_effects(force, drive, place, segment, None, finer=finer)
         slots = [
             candidate.effect.slots(values, candidate.form)
             for candidate, values in active
@@ -254,8 +257,14 @@ class AxisModel(Model):
                 segment.x, segment.v, segment.tolerances[spec.subsystem], segment.start.get(spec.subsystem, 0.0)
             )
             return balance.error(segment.balance, segment, measured, linear, force, p)
+        if segment.stages is not None and not drive:
+            course = segment.stages
+        elif late:
+            course = averaged(force, segment.n, segment.substeps)
+        else:
+            course = stages(force, segment.substeps, self.hold)
         run = run_axis(
-            segment.stages if segment.stages is not None and not drive else stages(force, segment.substeps, self.hold),
+            course,
             segment.substeps,
             segment.recording.dt_s,
             linear,
@@ -332,6 +341,18 @@ def stages(u: Array, substeps: int, hold: str) -> Array:
     points = _between(u, 2 * substeps, hold)
     place = 2 * np.arange(n * substeps)[:, None] + np.arange(3)
     return np.asarray(points[place].reshape(n, substeps, 3))
+
+
+def averaged(u: Array, n: int, substeps: int) -> Array:
+    """Input at the start, middle and end of each sub-step, (n, substeps, 3), of a course `u` (n * substeps * FINER,).
+
+    A straight line in each sub-step, with the course's mean and first moment there: a held input that is late by a part of
+    a sample jumps within it, and the motion depends on when.
+    """
+    cells = u.reshape(n, substeps, -1)
+    at = (np.arange(cells.shape[2]) + 0.5) / cells.shape[2] - 0.5
+    mean, slope = cells.mean(axis=2), cells @ at / float(at @ at)
+    return np.asarray(mean[:, :, None] + slope[:, :, None] * np.array([-0.5, 0.0, 0.5]))
 
 
 def _between(u: Array, factor: int, hold: str) -> Array:

@@ -128,6 +128,13 @@ def _held(s: Array, length: float, dt_s: float, hold: str) -> Array:
     return np.asarray(weights / weights.sum())
 
 
+def _finely(balance: Balance, dt_s: float, finer: int) -> Array:
+    """Weights of a force with `finer` held points in each sample under the test function."""
+    reach = (balance.support.size // 2 + 1) * finer
+    weights = _bump((np.arange(-reach, reach + 1) - 0.5) * (dt_s / finer), balance.length)[0]
+    return np.asarray(weights / weights.sum())
+
+
 def _along_record(values: Array, kernel: Array) -> Array:
     """Convolution (n,), of no meaning within half a kernel of the ends."""
     return np.asarray(fftconvolve(values, kernel, mode="same"))
@@ -152,7 +159,8 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
     An effect of the drive changes the input `force` (n,), which is what is compared here: where it shrinks the
-    input the error counts in the size of the recorded one, so that nothing is gained by shrinking.
+    input the error counts in the size of the recorded one, so that nothing is gained by shrinking. `force` may have several
+    points in each sample, each held until the next one.
     """
     recording = segment.recording
     a, v, x = balance.rows
@@ -171,5 +179,6 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
         )
         need = need + _along_record(dry, balance.bump)
     size = float(np.std(force)) / max(float(np.std(segment.inputs[balance.input])), 1e-300)
-    applied = _along_record(force, balance.held)
+    finer = force.size // segment.n
+    applied = _along_record(force, balance.held if finer == 1 else _finely(balance, recording.dt_s, finer))[::finer]
     return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)

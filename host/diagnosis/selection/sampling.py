@@ -9,7 +9,8 @@ import numpy as np
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Problem
 from host.diagnosis.model.readings import Finding
-from host.diagnosis.selection.search import fit_nominal
+from host.diagnosis.selection.search import Found, fit_nominal
+from host.diagnosis.selection.trial import called_for, of_sampling
 
 WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
 
@@ -42,3 +43,18 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem]) -> list[Fi
     says = f"Between its samples column {column} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
     says += f'The diagnosis continues with this (axis.hold = "{chosen}").'
     return [Finding("hold", column, says)]
+
+
+def late_by_a_sample(problem: Problem, found: Found) -> list[Finding]:
+    """Say that a delay within one sample explains a mismatch that has no other name, if the data call for one."""
+    last = next((step.trials for step in reversed(found.steps) if step.trials), [])
+    delays = [t for t in last if of_sampling(t) and called_for(t, found.best)]
+    if found.best.terms or not delays:
+        return []
+    best, period_s = max(delays, key=lambda t: t.score), problem.segments[0].recording.dt_s
+    port = best.candidate.port
+    says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {best.both.share:.0%} "
+    says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "
+    says += "from an input that is recorded one sample early or late. Record at a higher rate, or shift that column by one "
+    says += "sample."
+    return [Finding("within_sample", problem.columns.get(port.channels[0], port.channels[0]), says)]

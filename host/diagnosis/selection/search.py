@@ -381,6 +381,8 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
     refused = found.steps[-1].trials if found.steps else []
     if found.best.terms or len(refused) < 2 or problem.budget.spent():
         return
+    if called_for(refused[0], found.best) and only_sampling(refused[0], refused):
+        return  # what a delay within a sample leaves is how exactly its moment is known
     begun = get_starts(problem)
 
     def fit_next(base: Fit, starts: list[dict[str, float]]) -> list[Trial]:

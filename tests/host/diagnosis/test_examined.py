@@ -344,7 +344,7 @@ def test_a_named_effect_is_not_plainly_less_probable_than_its_rival(seed: int) -
 
 def test_an_effect_that_removes_little_is_less_sure_than_one_that_removes_much() -> None:
     gain = Gain(400.0, 1e-12, 0.5, independent=np.array([300.0]), log_ratio=np.array([2.7]))
-    alone, large, small = (posterior(gain, gain, 2, [], 0.0, RULES, share).effect for share in (np.inf, 0.3, 0.004))
+    alone, large, small = (posterior(gain, gain, 2, [], 0.0, RULES, share).raw for share in (np.inf, 0.3, 0.004))
     assert alone > 0.94 and large > 0.93 and small < 0.6
 
 
