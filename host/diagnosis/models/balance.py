@@ -131,7 +131,8 @@ def _held(s: Array, length: float, dt_s: float, hold: str) -> Array:
 def _finely(balance: Balance, dt_s: float, finer: int) -> Array:
     """Weights of a force with `finer` held points in each sample under the test function."""
     reach = (balance.support.size // 2 + 1) * finer
-    weights = _bump((np.arange(-reach, reach + 1) - 0.5) * (dt_s / finer), balance.length)[0]
+    at: Array = (np.arange(-reach, reach + 1, dtype=np.float64) - 0.5) * (dt_s / finer)
+    weights = _bump(at, balance.length)[0]
     return np.asarray(weights / weights.sum())
 
 
