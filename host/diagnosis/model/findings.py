@@ -7,6 +7,7 @@ is never changed. A channel that says nothing (constant, all missing) leaves not
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -40,6 +41,7 @@ SLOW_s = 1.0  # sampling period from which the time column is probably not in se
 ONE_TONE = 0.995  # share of an input's power in one spectral line, from which on it is one sinusoid
 CLIPPED = 0.01  # share of samples at the largest reading, from which on it is a limit
 STEADY = 5  # samples in a row at the limit
+SLOWEST_CYCLES = 5  # of a recording: what is slower is left out where an acceleration is integrated
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str]) 
     recordings = without_outliers(recordings, sorted(vital), columns, findings)
     coarse(recordings, sorted(vital), driven, columns, units, findings)
     _counted(recordings, sorted(vital), columns, units, findings)
+    recordings = _exchanged_outputs(recordings, [path for path in paths if not path.law], columns, findings)
     for path in paths:
         recordings = _compared(spec, recordings, path, columns, findings)
         if not recordings:
@@ -89,6 +92,38 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str]) 
     _saturated(recordings, paths, columns, findings)
     _excitation(recordings, paths, columns, findings)
     return Inspected(recordings, list(dict.fromkeys(findings)))
+
+
+def _exchanged_outputs(
+    recordings: list[Recording], paths: list[Pair], columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """Outputs of two pairs that follow the input of the other pair, and hardly their own."""
+    for one, other in itertools.combinations(paths, 2):
+        if len({one.input, other.input, one.output, other.output}) < 4:
+            continue
+        own, crossed = (
+            [_explained(recordings, a.input, b.output) for a, b in both]
+            for both in (((one, one), (other, other)), ((one, other), (other, one)))
+        )
+        if min(crossed) > EXPLAINED and 1.0 - min(crossed) < BETTER * (1.0 - max(own)):
+            says = f"Columns {columns[one.output]} and {columns[other.output]} are probably exchanged: each follows the "
+            says += f"other's input ({min(crossed):.0%} of its variance), not its own ({max(own):.0%}). "
+            says += "The diagnosis continues with them exchanged."
+            findings.append(Finding("swapped", columns[one.output], says))
+            recordings = [
+                _with(_with(r, one.output, r.channels[other.output]), other.output, r.channels[one.output])
+                for r in recordings
+            ]
+    return recordings
+
+
+def _explained(recordings: list[Recording], input: str, output: str) -> float:
+    """Share of the variance of `output` that a gain on `input` explains, the offset of each recording apart."""
+    x, y = (
+        np.concatenate([fill(r.channels[n]) - np.mean(fill(r.channels[n])) for r in recordings]) for n in (input, output)
+    )
+    power = float(x @ x) * float(y @ y)
+    return float(x @ y) ** 2 / power if power > 0.0 else 0.0
 
 
 def pairs_of(spec: NominalSpec) -> list[Pair]:
@@ -390,8 +425,10 @@ def _by_law(
 ) -> list[Recording]:
     """A pair that an equation of motion connects."""
     used = [recording for recording in recordings if recording.timed and recording.n >= 100]
-    if path.reads == "acceleration" or not used:
+    if not used:
         return recordings
+    if path.reads == "acceleration":
+        return _sign_by_law([_by_spectra(recording, path) for recording in used], recordings, path, columns, findings)
     straight = [regression(recording, path) for recording in used]
     explained = float(np.median([part[2] for part in straight]))
     force_column, motion_column = columns[path.input], columns[path.output]
@@ -412,14 +449,51 @@ def _by_law(
             used = [recording for recording in recordings if recording.timed and recording.n >= 100]
             straight = [regression(recording, path) for recording in used]
             explained = crossed
-    if explained > 0.5 and max(map(_signs, straight)) < OPPOSITE:
-        says = f"Columns {force_column} and {motion_column} have opposite signs: every term of the nominal law comes out "
-        says += f"negative. The diagnosis continues with {force_column} reversed (channels.*.sign)."
-        findings.append(Finding("sign", force_column, says))
-        recordings = [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
+    recordings = _sign_by_law(straight, recordings, path, columns, findings)
     leading = path.input if spec.impedance is not None else path.output
     recordings = _causal_by_law(recordings, path, leading, columns, findings)
     return _in_units(recordings, path, straight, explained, columns, findings)
+
+
+def _sign_by_law(
+    straight: list[tuple[Array, Array, float]],
+    recordings: list[Recording],
+    path: Pair,
+    columns: dict[str, str],
+    findings: list[Finding],
+) -> list[Recording]:
+    """A force that has the opposite sign of the motion; straight: the law as regressed in each recording."""
+    explained = float(np.median([part[2] for part in straight]))
+    if explained <= 0.5 or max(map(_signs, straight)) >= OPPOSITE:
+        return recordings
+    says = (
+        f"Columns {columns[path.input]} and {columns[path.output]} have opposite signs: every term of the nominal law comes "
+    )
+    says += f"out negative. The diagnosis continues with {columns[path.input]} reversed (channels.*.sign)."
+    findings.append(Finding("sign", columns[path.input], says))
+    return [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
+
+
+def _by_spectra(recording: Recording, path: Pair) -> tuple[Array, Array, float]:
+    """As `regression`, of a recorded acceleration: speed and place by integration in the spectrum, without what is slow.
+
+    An integral of a reading with an offset drifts. All terms and the force lose the same slow part.
+    """
+    rows = np.vstack([fill(recording.channels[name]) for name in (path.output, path.input)])
+    n = rows.shape[1]
+    window = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
+    spectra = np.fft.rfft((rows - rows.mean(axis=1, keepdims=True)) * window, axis=1)
+    turn = 2.0 * np.pi * np.fft.rfftfreq(n, recording.dt_s)
+    kept = np.arange(turn.size) >= SLOWEST_CYCLES
+    turn[~kept] = 1.0
+    a, force = np.where(kept, spectra, 0.0)
+    table = {"mass": a, "damping": a / (1j * turn), "stiffness": -a / turn**2}
+    terms = np.array([np.fft.irfft(table[term], n) for term in path.law])
+    f = np.fft.irfft(force, n)
+    size = np.linalg.norm(terms, axis=1) + 1e-300
+    found = np.linalg.lstsq((terms / size[:, None]).T, f, rcond=1e-9)[0] / size
+    explained = 1.0 - float(np.var(f - found @ terms)) / max(float(np.var(f)), 1e-300)
+    return found, np.std(terms, axis=1) * np.abs(found), explained
 
 
 def _signs(regressed: tuple[Array, Array, float]) -> float:

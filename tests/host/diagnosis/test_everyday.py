@@ -38,6 +38,9 @@ STAGE = {
 }
 
 
+SPRUNG = {**STAGE, "axis": {**STAGE["axis"], "terms": ["mass", "damping", "stiffness", "offset"]}}
+
+
 def sines(rng: np.random.Generator, t: Array, hertz: tuple[float, ...], size: float) -> tuple[Array, Array, Array]:
     """Sum of sines of amplitude size / f: position, speed, acceleration."""
     out = np.zeros((3, t.size))
@@ -89,6 +92,22 @@ def test_exchanged_columns_are_said_to_be() -> None:
     assert "swapped" in ids(diagnose(runs, STAGE).as_dict())
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_sign_of_an_accelerometer_is_found(sign: float) -> None:
+    """A seat on a spring, shaken; the readings have an offset, whose integral drifts."""
+    runs = []
+    for seed in (41, 42):
+        rng, t = np.random.default_rng(seed), 0.005 * np.arange(4000)
+        turn, phase = 2.0 * np.pi * rng.uniform(0.5, 8.0, 12), rng.uniform(0.0, 6.3, 12)
+        tones = rng.uniform(0.2, 1.0, 12) * np.exp(1j * (np.outer(t, turn) + phase))
+        force = (tones * (40.0 + 500.0 / (1j * turn) - 15e3 / turn**2)).imag.sum(axis=1)
+        reading = sign * tones.imag.sum(axis=1) + 0.3 + 0.05 * rng.standard_normal(t.size)
+        runs.append({"t": t, "f": force, "x": reading})
+    seat = {**SPRUNG, "axis": {**SPRUNG["axis"], "reads": "acceleration", "terms": ["mass", "damping", "stiffness"]}}
+    findings = inspected(nominal_of(seat), [Table(f"r{k}", run) for k, run in enumerate(runs)]).findings
+    assert {finding.id for finding in findings} == ({"sign"} if sign < 0.0 else set())
+
+
 def test_a_delay_within_a_sample_is_stated_and_not_named() -> None:
     """A held force that acts half a sample late: no other effect is named for it, and the finding says what it may be."""
     runs = []
@@ -106,9 +125,6 @@ def test_a_delay_within_a_sample_is_stated_and_not_named() -> None:
     content = diagnose(runs, held).as_dict()
     assert content["verdict"] == "nothing_missing" and ids(content) == {"within_sample"}
     assert content["next"].startswith("A delay of up to one sample (0.02 s)")
-
-
-SPRUNG = {**STAGE, "axis": {**STAGE["axis"], "terms": ["mass", "damping", "stiffness", "offset"]}}
 
 
 @pytest.mark.parametrize(("damping", "found"), [(-1.7e-5, False), (1.7e-5, True)])

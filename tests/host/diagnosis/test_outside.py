@@ -12,7 +12,7 @@ from host.diagnosis import diagnose
 from host.diagnosis.effects import candidates
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.pipeline import inspected, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.search import fit_nominal, search
 
@@ -111,6 +111,24 @@ def test_sign_and_unit_of_a_simulated_output_are_put_right(sign: float, scale: f
     right, findings = readings_apart(problem, recordings)
     assert {finding.id for finding in findings} == wanted
     assert right[0].channels["position"] == pytest.approx(sources[0].columns["y"] / (sign * scale))
+
+
+@pytest.mark.parametrize(("mixed", "found"), [(0.0, True), (0.6, False)])
+def test_exchanged_outputs_of_two_links_are_said_to_be(mixed: float, found: bool) -> None:
+    """mixed: share of the other axis in each; outputs that follow both inputs are coupled, not exchanged."""
+    runs = []
+    for seed in (51, 52):
+        rng, t = np.random.default_rng(seed), 0.02 * np.arange(1500)
+        pan, tilt = walk(rng, t, 0.7, 0.3), walk(rng, t, 0.9, 0.2)
+        y, z = (x + 1e-3 * rng.normal(size=t.size) for x in (tilt + mixed * pan, pan + mixed * tilt))
+        runs.append(Table(f"r{seed}", {"t": t, "a": pan, "b": tilt, "y": y, "z": z}))
+    channels = {name: {"column": name, "unit": "rad"} for name in ("a", "b", "y", "z")}
+    links = [{"subsystem": "pan", "input": "a", "output": "y"}, {"subsystem": "tilt", "input": "b", "output": "z"}]
+    head = {"name": "head", "kind": "transmission", "data": {"time": "t"}, "channels": channels, "link": links}
+    seen = inspected(nominal_of(head), runs)
+    assert ("swapped" in {finding.id for finding in seen.findings}) is found
+    if found:
+        assert seen.recordings[0].channels["y"] == pytest.approx(runs[0].columns["z"])
 
 
 def test_exchanged_outputs_of_a_simulator_are_said_to_be() -> None:
