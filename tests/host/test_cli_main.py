@@ -227,8 +227,16 @@ sys.meta_path.insert(0, Signals())
 
 
 def started(script: str, number: signal.Signals, *words: str) -> subprocess.CompletedProcess[str]:
+    """A start of the command; a job in the background of a shell would inherit that SIGINT is ignored."""
     command = [sys.executable, "-c", script, *words, str(int(number))]
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
