@@ -44,7 +44,7 @@ from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
-from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -247,7 +247,8 @@ def _diagnosed(
     if not found.best.terms:
         result.findings += late_by_a_sample(problem, found)
     if result.verdict == "nothing_missing":
-        result.findings += _too_slow(full, found, slow_outputs(problem, found.best, noise_sd))
+        slow = slow_outputs(problem, found.best, noise_sd)
+        result.findings += _too_slow(full, found, slow) or _above_guess(full, figures, problem.rules)
     if not located and remainder.sure and remainder.predicted is not None:
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
@@ -275,6 +276,21 @@ def _too_slow(full: Problem, found: Found, rows: list[int]) -> list[Finding]:
         says += f"{independent_samples(residuals):.0f} independent samples. No structure is common to the recordings. "
         says += "These data cannot separate slow noise from a mismatch: record five times as long, or repeat the motion."
         findings.append(Finding("slow_noise", column, says))
+    return findings
+
+
+def _above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list[Finding]:
+    """Sentences on outputs whose residual is larger than a noise that was never seen alone: it may be noise all the same."""
+    findings = []
+    for output, left, noise in zip(full.model.outputs, figures.after, full.noise, strict=True):
+        if noise.source in MEASURED or not left > rules.residual_over_noise * noise.sigma:
+            continue
+        column = full.columns.get(output.channel, output.channel)
+        ratio = left / max(noise.sigma, 1e-300)
+        says = f"The residual of column {column}, {left:.3g} {output.unit} RMS, is {ratio:.2g} times the noise that its "
+        says += "spectrum suggests. The noise was never recorded alone, so this may be slower noise, or a mismatch that no "
+        says += "effect explains: record some seconds at rest, or the same motion twice."
+        findings.append(Finding("noise_unseen", column, says))
     return findings
 
 

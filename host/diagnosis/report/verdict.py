@@ -17,7 +17,12 @@ from host.diagnosis.selection.equivalence import Standing, probability_of
 from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
-UNDECIDED = ("slow_noise", "within_sample", "excitation")  # findings that data of this kind cannot decide more
+UNDECIDED = (
+    "slow_noise",
+    "noise_unseen",
+    "within_sample",
+    "excitation",
+)  # findings that data of this kind cannot decide more
 REMARKS = ("outliers", "quantized", "hold", *UNDECIDED)  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
@@ -112,8 +117,8 @@ def next_step(result: Diagnosis) -> str:
         return f"Record a further motion that shows {shown}, and diagnose again: the verdict is not confident yet."
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
-    unseen = next((finding for finding in result.findings if finding.id in UNDECIDED), None)
-    return unseen.says if unseen is not None else "Nothing: the nominal model explains these recordings."
+    undecided = sorted((f for f in result.findings if f.id in UNDECIDED), key=lambda f: UNDECIDED.index(f.id))
+    return undecided[0].says if undecided else "Nothing: the nominal model explains these recordings."
 
 
 def placeless(result: Diagnosis) -> list[str]:

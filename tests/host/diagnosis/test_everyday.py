@@ -108,6 +108,20 @@ def test_the_sign_of_an_accelerometer_is_found(sign: float) -> None:
     assert {finding.id for finding in findings} == ({"sign"} if sign < 0.0 else set())
 
 
+@pytest.mark.parametrize(("rest", "found"), [(0.0, {"noise_unseen"}), (6.0, set())])
+def test_noise_that_was_never_recorded_alone_is_said_to_be_unknown(rest: float, found: set[str]) -> None:
+    """Noise that is correlated over 0.3 s, under a motion without and with a rest before it."""
+    runs = []
+    for seed in (61, 62):
+        rng, t = np.random.default_rng(seed), np.arange(0.0, 40.0, 0.02)
+        x = np.where(t >= rest, sines(rng, t, (0.11, 0.23, 0.37, 0.71), 0.1)[0], 0.0)
+        noise = lag(rng.standard_normal(t.size), 0.02, 0.3, 0.0)
+        runs.append({"t": t, "m": x, "y": x + 0.02 + 0.02 * noise})
+    content = diagnose(runs, GEAR).as_dict()
+    assert content["verdict"] == "nothing_missing" and ids(content) == found
+    assert content["next"].startswith("The residual of column y") is bool(found)
+
+
 def test_a_delay_within_a_sample_is_stated_and_not_named() -> None:
     """A held force that acts half a sample late: no other effect is named for it, and the finding says what it may be."""
     runs = []
