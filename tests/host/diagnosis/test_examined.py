@@ -16,6 +16,8 @@ from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.operators import least_error_window, smooth_derivatives
 from host.diagnosis.selection.posterior import posterior
 
+pytestmark = pytest.mark.slow  # together: each takes some seconds
+
 Array = np.ndarray
 LINK: dict[str, Any] = {
     "name": "link",

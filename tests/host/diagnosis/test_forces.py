@@ -18,6 +18,8 @@ from host.diagnosis.pipeline import diagnose
 from host.studies.proof.worlds.nominal_arm import torques
 from protocol.errors import InputError
 
+pytestmark = pytest.mark.slow  # together: each takes some seconds
+
 LINKS = {"mass_1": 1.2, "mass_2": 0.8, "inertia_1": 0.01, "inertia_2": 0.006}
 LINKS |= {"length_1": 0.3, "centre_1": 0.14, "centre_2": 0.12, "damping_1": 0.2, "damping_2": 0.05}
 NAMES = ("shoulder_rad", "elbow_rad", "shoulder_Nm", "elbow_Nm")

@@ -16,6 +16,8 @@ from host.diagnosis.pipeline import inspected, prepare
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.search import fit_nominal, search
 
+pytestmark = pytest.mark.slow  # together: each takes some seconds
+
 Array = np.ndarray
 SERVO: dict[str, Any] = {
     "name": "servo",
