@@ -39,6 +39,4 @@ class Label(TypedDict):
     mismatch_rms_heldout: dict[str, float]
     noise_rms_heldout: dict[str, float]
     plan: dict[str, Any]  # what rebuilds the case
-    findings: NotRequired[
-        list[str]
-    ]  # ids of mistakes in the data that a verdict must state; only the world `domains` has any
+    findings: NotRequired[list[str]]  # ids of mistakes in the data that a verdict must state, in the world `domains`

@@ -193,26 +193,6 @@ def test_an_interrupt_that_compiled_code_turns_into_another_error_is_an_interrup
     assert ended.value.code == 130
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_command_says_so(number: signal.Signals) -> None:
-    """Typer turns the KeyboardInterrupt of a command into its exit status, without a word."""
-    script = (
-        "import os, signal, sys, host.cli.main as m, host.cli.drive\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "def interrupted(*a, **k): os.kill(os.getpid(), number)\n"
-        "number = int(sys.argv.pop())\n"
-        "host.cli.drive.driving = interrupted\n"
-        "m.main()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script, "mark", "a note", str(int(number))],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"
-
-
 START = """
 import os, signal, sys
 
@@ -252,16 +232,23 @@ def test_a_signal_that_is_ignored_stays_ignored_during_the_imports(number: signa
     assert done.returncode == 0 and done.stdout.startswith("seldinger 0.") and done.stderr == ""
 
 
+INTERRUPTED = """
+import os, signal, sys, seldinger_start, host.cli.drive, host.cli.main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+number = int(sys.argv.pop())
+
+def interrupted(*words, **options):
+    os.kill(os.getpid(), number)
+
+host.cli.drive.driving = interrupted
+"""
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_after_the_imports_a_command_handles_the_signal_itself(number: signal.Signals) -> None:
-    script = (
-        "import os, sys, seldinger_start, host.cli.drive\n"
-        "def interrupted(*a, **k): os.kill(os.getpid(), number)\n"
-        "number = int(sys.argv.pop())\n"
-        "host.cli.drive.driving = interrupted\n"
-        "seldinger_start.main()"
-    )
-    done = started(script, number, "mark", "a note")
+@pytest.mark.parametrize("entry", ["host.cli.main.main", "seldinger_start.main"])
+def test_an_interrupted_command_says_so(entry: str, number: signal.Signals) -> None:
+    """Typer turns the KeyboardInterrupt of a command into its exit status, without a word."""
+    done = started(f"{INTERRUPTED}\n{entry}()", number, "mark", "a note")
     assert done.returncode == 130 and done.stderr == f"{command_line.ENDED}\n"
 
 

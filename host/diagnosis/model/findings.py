@@ -110,18 +110,13 @@ def _exchanged_outputs(
             says += f"other's input ({min(crossed):.0%} of its variance), not its own ({max(own):.0%}). "
             says += "The diagnosis continues with them exchanged."
             findings.append(Finding("swapped", columns[one.output], says))
-            recordings = [
-                _with(_with(r, one.output, r.channels[other.output]), other.output, r.channels[one.output])
-                for r in recordings
-            ]
+            recordings = [_exchanged(recording, one.output, other.output) for recording in recordings]
     return recordings
 
 
 def _explained(recordings: list[Recording], input: str, output: str) -> float:
     """Share of the variance of `output` that a gain on `input` explains, the offset of each recording apart."""
-    x, y = (
-        np.concatenate([fill(r.channels[n]) - np.mean(fill(r.channels[n])) for r in recordings]) for n in (input, output)
-    )
+    x, y = _centred(recordings, input), _centred(recordings, output)
     power = float(x @ x) * float(y @ y)
     return float(x @ y) ** 2 / power if power > 0.0 else 0.0
 
@@ -251,6 +246,16 @@ def _with(recording: Recording, name: str, values: Array) -> Recording:
     return replace(recording, channels={**recording.channels, name: values})
 
 
+def _exchanged(recording: Recording, one: str, other: str) -> Recording:
+    return _with(_with(recording, one, recording.channels[other]), other, recording.channels[one])
+
+
+def _centred(recordings: list[Recording], name: str) -> Array:
+    """Channel `name` of all recordings (n,), gaps bridged, each recording without its mean."""
+    each = [fill(recording.channels[name]) for recording in recordings]
+    return np.concatenate([values - np.mean(values) for values in each])
+
+
 @dataclass(frozen=True)
 class _Copied:
     """A channel that is another one, scaled and shifted. noisy: with the noise of that one, so that it was not measured."""
@@ -328,8 +333,7 @@ def _copied(recording: Recording, a: str, b: str) -> _Copied | None:
 
 def _by_gain(recordings: list[Recording], path: Pair, columns: dict[str, str], findings: list[Finding]) -> list[Recording]:
     """A pair that a gain connects."""
-    x = np.concatenate([fill(r.channels[path.input]) - np.mean(fill(r.channels[path.input])) for r in recordings])
-    y = np.concatenate([fill(r.channels[path.output]) - np.mean(fill(r.channels[path.output])) for r in recordings])
+    x, y = _centred(recordings, path.input), _centred(recordings, path.output)
     if not np.any(x) or not np.any(y):
         return recordings
     correlation = float(x @ y / np.sqrt((x @ x) * (y @ y)))
@@ -413,11 +417,16 @@ def regression(recording: Recording, path: Pair, exchanged: bool = False) -> tup
     f = smooth_derivatives(force, dt, window)[0]
     inside = slice(window, -window) if f.size > 6 * window else slice(None)
     columns = np.array([*(table[term] for term in path.law), np.ones_like(f)])[:, inside]
-    size = np.linalg.norm(columns, axis=1) + 1e-300
-    found = np.linalg.lstsq((columns / size[:, None]).T, f[inside], rcond=1e-9)[0] / size
-    left = f[inside] - found @ columns
-    explained = 1.0 - float(np.var(left)) / max(float(np.var(f[inside])), 1e-300)
-    return found[:-1], np.std(columns[:-1], axis=1) * np.abs(found[:-1]), explained
+    found, rms, explained = _least_squares(columns, f[inside])
+    return found[:-1], rms[:-1], explained
+
+
+def _least_squares(terms: Array, force: Array) -> tuple[Array, Array, float]:
+    """Coefficients of `terms` (k, n) for `force` (n,), RMS of each term, and the share of the variance explained."""
+    size = np.linalg.norm(terms, axis=1) + 1e-300
+    found = np.linalg.lstsq((terms / size[:, None]).T, force, rcond=1e-9)[0] / size
+    explained = 1.0 - float(np.var(force - found @ terms)) / max(float(np.var(force)), 1e-300)
+    return found, np.std(terms, axis=1) * np.abs(found), explained
 
 
 def _by_law(
@@ -441,11 +450,7 @@ def _by_law(
             says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
             says += "The diagnosis continues with them exchanged."
             findings.append(Finding("swapped", force_column, says))
-            exchanged = []
-            for recording in recordings:
-                a, b = recording.channels[path.input], recording.channels[path.output]
-                exchanged.append(_with(_with(recording, path.input, b), path.output, a))
-            recordings = exchanged
+            recordings = [_exchanged(recording, path.input, path.output) for recording in recordings]
             used = [recording for recording in recordings if recording.timed and recording.n >= 100]
             straight = [regression(recording, path) for recording in used]
             explained = crossed
@@ -466,10 +471,8 @@ def _sign_by_law(
     explained = float(np.median([part[2] for part in straight]))
     if explained <= 0.5 or max(map(_signs, straight)) >= OPPOSITE:
         return recordings
-    says = (
-        f"Columns {columns[path.input]} and {columns[path.output]} have opposite signs: every term of the nominal law comes "
-    )
-    says += f"out negative. The diagnosis continues with {columns[path.input]} reversed (channels.*.sign)."
+    says = f"Columns {columns[path.input]} and {columns[path.output]} have opposite signs: every term of the nominal law "
+    says += f"comes out negative. The diagnosis continues with {columns[path.input]} reversed (channels.*.sign)."
     findings.append(Finding("sign", columns[path.input], says))
     return [_with(recording, path.input, -recording.channels[path.input]) for recording in recordings]
 
@@ -489,11 +492,7 @@ def _by_spectra(recording: Recording, path: Pair) -> tuple[Array, Array, float]:
     a, force = np.where(kept, spectra, 0.0)
     table = {"mass": a, "damping": a / (1j * turn), "stiffness": -a / turn**2}
     terms = np.array([np.fft.irfft(table[term], n) for term in path.law])
-    f = np.fft.irfft(force, n)
-    size = np.linalg.norm(terms, axis=1) + 1e-300
-    found = np.linalg.lstsq((terms / size[:, None]).T, f, rcond=1e-9)[0] / size
-    explained = 1.0 - float(np.var(f - found @ terms)) / max(float(np.var(f)), 1e-300)
-    return found, np.std(terms, axis=1) * np.abs(found), explained
+    return _least_squares(terms, np.fft.irfft(force, n))
 
 
 def _signs(regressed: tuple[Array, Array, float]) -> float:

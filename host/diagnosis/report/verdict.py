@@ -17,12 +17,8 @@ from host.diagnosis.selection.equivalence import Standing, probability_of
 from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
-UNDECIDED = (
-    "slow_noise",
-    "noise_unseen",
-    "within_sample",
-    "excitation",
-)  # findings that data of this kind cannot decide more
+# Findings on what these data cannot decide, the most important one first.
+UNDECIDED = ("slow_noise", "noise_unseen", "within_sample", "excitation")
 REMARKS = ("outliers", "quantized", "hold", *UNDECIDED)  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
@@ -195,9 +191,8 @@ def probability_none(result: Diagnosis) -> float:
         found = posterior_of(result, strongest, raw=True)
         equation = 0.0 if strongest.candidate.effect.listed else found.effect  # an equation is physics in no list
         return equation + found.nothing + found.none + sum(p for rival, p in found.rivals if not rival.effect.listed)
-    last = next((step.trials for step in reversed(result.found.steps) if step.trials), [])
     if not result.standings:
-        return 1.0 - of_refused(last)
+        return 1.0 - of_refused(result.found.last_trials)
     return 1.0 - max(posterior_of(result, standing).raw for standing in result.standings)
 
 

@@ -47,8 +47,7 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem]) -> list[Fi
 
 def late_by_a_sample(problem: Problem, found: Found) -> list[Finding]:
     """Say that a delay within one sample explains a mismatch that has no other name, if the data call for one."""
-    last = next((step.trials for step in reversed(found.steps) if step.trials), [])
-    delays = [t for t in last if of_sampling(t) and called_for(t, found.best)]
+    delays = [t for t in found.last_trials if of_sampling(t) and called_for(t, found.best)]
     if found.best.terms or not delays:
         return []
     best, period_s = max(delays, key=lambda t: t.score), problem.segments[0].recording.dt_s

@@ -70,6 +70,11 @@ class Found:
     nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
     best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 
+    @property
+    def last_trials(self) -> list[Trial]:
+        """Trials of the last step that had any."""
+        return next((step.trials for step in reversed(self.steps) if step.trials), [])
+
 
 def settle(problem: Problem, values: Array) -> None:
     """Lets a model that needs it prepare its recordings for these nominal parameters."""

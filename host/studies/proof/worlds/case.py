@@ -216,10 +216,15 @@ class DrawnCase:
     rho: float
 
 
-def plans(world: str, seed: int, cases: int, mechanisms: int) -> list[CasePlan]:
-    """Return the whole suite in the order of its shuffled case numbers. Raises ValueError for less than one case."""
+def check_suite(seed: int, cases: int) -> None:
+    """Raise ValueError for less than one case or a negative seed."""
     if cases < 1 or seed < 0:
         raise ValueError(f"cases and seed: found {cases} and {seed}, wanted at least 1 and at least 0")
+
+
+def plans(world: str, seed: int, cases: int, mechanisms: int) -> list[CasePlan]:
+    """Return the whole suite in the order of its shuffled case numbers. Raises ValueError for less than one case."""
+    check_suite(seed, cases)
     exact = {name: cases * share for name, share in SHARES.items()}
     counts = {name: int(value + 1e-9) for name, value in exact.items()}
     for name in sorted(SHARES, key=lambda n: counts[n] - exact[n])[: cases - sum(counts.values())]:

@@ -212,6 +212,34 @@ def linear(
     return {**_content("linear", place, channels, parameters), "linear": table}
 
 
+def sprung_slide(
+    rng: np.random.Generator,
+    place: str,
+    input: str,
+    output: str,
+    channels: dict[str, dict[str, Any]],
+    mass: float,
+    stiffness: float,
+) -> dict[str, Any]:
+    """Return a nominal axis of a mass on a spring whose position is read, with mass and stiffness stated from `rng`."""
+    terms, values = ("mass", "damping", "stiffness"), {"mass": stated(rng, mass), "stiffness": stated(rng, stiffness)}
+    return axis(place, input, output, channels, terms, "position", "zero", **values)
+
+
+def first_order(
+    rng: np.random.Generator,
+    place: str,
+    input: str,
+    output: str,
+    channels: dict[str, dict[str, Any]],
+    gain: float,
+    lag: float,
+) -> dict[str, Any]:
+    """Return a nominal plant of one lag under a held input, with its gain and lag (s) stated from `rng`."""
+    values = {"gain": stated(rng, gain), "lag": stated(rng, lag)}
+    return linear(place, input, output, channels, ["gain"], ["lag", 1.0], "zero", **values)
+
+
 def stated(rng: np.random.Generator, value: float, error: float = 0.15) -> float:
     """Return a parameter as a data sheet states it: two or three digits, up to `error` off."""
     return float(f"{value * (1.0 + rng.uniform(-error, error)):.3g}")

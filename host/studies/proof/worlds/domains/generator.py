@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from host.studies.proof.worlds.case import Case, CasePlan
+from host.studies.proof.worlds.case import Case, CasePlan, check_suite
 from host.studies.proof.worlds.domains import instruments, machines, materials, thermal_and_fluid
 from host.studies.proof.worlds.domains.dataset import DataSet, Drawn
 from sim.concealed.label import Label, PlantedTruth
@@ -26,8 +26,7 @@ def plans(seed: int, cases: int) -> list[CasePlan]:
 
     Raises ValueError for less than one case or a negative seed.
     """
-    if cases < 1 or seed < 0:
-        raise ValueError(f"cases and seed: found {cases} and {seed}, wanted at least 1 and at least 0")
+    check_suite(seed, cases)
     found: list[CasePlan] = []
     while len(found) < cases:
         turn = len(found) // len(ALL)

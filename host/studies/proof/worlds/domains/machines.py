@@ -27,7 +27,17 @@ from host.studies.proof.worlds.domains.bench import (
     vibration,
     white,
 )
-from host.studies.proof.worlds.domains.dataset import DataSet, Drawn, Sheet, axis, channel, linear, link, stated
+from host.studies.proof.worlds.domains.dataset import (
+    DataSet,
+    Drawn,
+    Sheet,
+    axis,
+    channel,
+    linear,
+    link,
+    sprung_slide,
+    stated,
+)
 
 Rng = np.random.Generator
 KM_H = 1.0 / 3.6  # m/s
@@ -353,17 +363,7 @@ def camera_slider(rng: Rng) -> Drawn:
         sheet.read("carriage_mm", 1e3 * true, 1e3 * plain, white(rng, t.size, 1e3 * sigma))
         sheets.append(sheet)
     channels = {"pull_N": channel("N"), "carriage_mm": channel("m", 1e-3)}
-    nominal = axis(
-        "slider",
-        "pull_N",
-        "carriage_mm",
-        channels,
-        ("mass", "damping", "stiffness"),
-        "position",
-        "zero",
-        mass=stated(rng, mass),
-        stiffness=stated(rng, stiffness),
-    )
+    nominal = sprung_slide(rng, "slider", "pull_N", "carriage_mm", channels, mass, stiffness)
     values = {"mass": mass, "damping": damping, "stiffness": stiffness}
     return Drawn(sheets, nominal, values, ({"kinetic_N": kinetic, "static_N": static, "speed_m_s": sweep},))
 
@@ -466,17 +466,7 @@ def roller_blind(rng: Rng) -> Drawn:
         )
         sheets.append(sheet)
     channels = {"pull_N": channel("N"), "travel_mm": channel("m", 1e-3)}
-    nominal = axis(
-        "blind",
-        "pull_N",
-        "travel_mm",
-        channels,
-        ("mass", "damping", "stiffness"),
-        "position",
-        "zero",
-        mass=stated(rng, mass),
-        stiffness=stated(rng, stiffness),
-    )
+    nominal = sprung_slide(rng, "blind", "pull_N", "travel_mm", channels, mass, stiffness)
     values = {"mass": mass, "damping": damping, "stiffness": stiffness}
     return Drawn(sheets, nominal, values, ({"force_N": friction}, {"delay_s": late}))
 

@@ -18,7 +18,17 @@ from host.studies.proof.worlds.domains.bench import (
     under_control,
     white,
 )
-from host.studies.proof.worlds.domains.dataset import Array, DataSet, Drawn, Sheet, channel, linear, link, stated
+from host.studies.proof.worlds.domains.dataset import (
+    Array,
+    DataSet,
+    Drawn,
+    Sheet,
+    channel,
+    first_order,
+    linear,
+    link,
+    stated,
+)
 
 Rng = np.random.Generator
 BAR = 1e5  # Pa
@@ -53,9 +63,7 @@ def soldering_iron(rng: Rng) -> Drawn:
         sheet.read("tip_degC", rise + ambient, rise + ambient, noise)
         sheets.append(sheet)
     channels = {"power_W": channel("W"), "tip_degC": channel("K", offset=-float(f"{ambient:.6g}"))}
-    nominal = linear(
-        "iron", "power_W", "tip_degC", channels, ["gain"], ["lag", 1.0], "zero", gain=stated(rng, gain), lag=stated(rng, lag)
-    )
+    nominal = first_order(rng, "iron", "power_W", "tip_degC", channels, gain, lag)
     return Drawn(sheets, nominal, {"gain": gain, "lag": lag})
 
 
@@ -75,9 +83,7 @@ def fan_loop(rng: Rng) -> Drawn:
         sheet.read("fan_rpm", speed / RPM, speed / RPM, noise / RPM)
         sheets.append(sheet)
     channels = {"voltage_V": channel("V"), "fan_rpm": channel("rad/s", RPM)}
-    nominal = linear(
-        "fan", "voltage_V", "fan_rpm", channels, ["gain"], ["lag", 1.0], "zero", gain=stated(rng, gain), lag=stated(rng, lag)
-    )
+    nominal = first_order(rng, "fan", "voltage_V", "fan_rpm", channels, gain, lag)
     return Drawn(sheets, nominal, {"gain": gain, "lag": lag})
 
 
@@ -97,17 +103,7 @@ def pressure_loop(rng: Rng) -> Drawn:
         sheet.read("pressure_bar", pressure, pressure, noise)
         sheets.append(sheet)
     channels = {"valve_percent": channel("1", 0.01), "pressure_bar": channel("Pa", BAR)}
-    nominal = linear(
-        "line",
-        "valve_percent",
-        "pressure_bar",
-        channels,
-        ["gain"],
-        ["lag", 1.0],
-        "zero",
-        gain=stated(rng, 100.0 * BAR * gain),
-        lag=stated(rng, lag),
-    )
+    nominal = first_order(rng, "line", "valve_percent", "pressure_bar", channels, 100.0 * BAR * gain, lag)
     return Drawn(sheets, nominal, {"gain": 100.0 * BAR * gain, "lag": lag})
 
 
@@ -127,17 +123,7 @@ def tank_level(rng: Rng) -> Drawn:
         sheets.append(sheet)
     scaled = gain * 1e-3 / LITRE_MIN
     channels = {"inflow_l_min": channel("m3/s", LITRE_MIN), "level_mm": channel("m", 1e-3)}
-    nominal = linear(
-        "tank",
-        "inflow_l_min",
-        "level_mm",
-        channels,
-        ["gain"],
-        ["lag", 1.0],
-        "zero",
-        gain=stated(rng, scaled),
-        lag=stated(rng, lag),
-    )
+    nominal = first_order(rng, "tank", "inflow_l_min", "level_mm", channels, scaled, lag)
     return Drawn(sheets, nominal, {"gain": scaled, "lag": lag})
 
 
@@ -217,17 +203,7 @@ def hot_plate(rng: Rng) -> Drawn:
         sheet.read("plate_degC", true, plain, white(rng, t.size, sigma))
         sheets.append(sheet)
     channels = {"power_W": channel("W"), "plate_degC": channel("K", offset=-float(f"{ambient:.6g}"))}
-    nominal = linear(
-        "plate",
-        "power_W",
-        "plate_degC",
-        channels,
-        ["gain"],
-        ["lag", 1.0],
-        "zero",
-        gain=stated(rng, gain),
-        lag=stated(rng, lag),
-    )
+    nominal = first_order(rng, "plate", "power_W", "plate_degC", channels, gain, lag)
     return Drawn(sheets, nominal, {"gain": gain, "lag": lag}, ({"offset_K": -gain * loss},))
 
 
