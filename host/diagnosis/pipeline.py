@@ -206,14 +206,14 @@ def _diagnosed(
     if lone:
         model, problem, full = problems(spec, tame, rules)
     problem.budget = budget
-    held = hold_between_samples(problem, [full] if full is not problem else [])
-    cost = model.announce(problem.segments, model.guess(problem.segments))
-    if cost:
-        overall.part(0.02, 0.03)(cost, 0.0)
     ports = candidate_ports(problem)
     problem.joint_states = any(port.path for port in ports)
     candidate_effects = candidates(ports, problem.segments[0].recording.timed, model.taken | left_out)
     candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
+    held = hold_between_samples(problem, [full] if full is not problem else [], candidate_effects)
+    cost = model.announce(problem.segments, model.guess(problem.segments))
+    if cost:
+        overall.part(0.02, 0.03)(cost, 0.0)
     found = search(problem, candidate_effects, overall.part(0.03, 0.7))
     noise_sd = np.array([n.sigma for n in problem.noise])
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)

@@ -2,40 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from host.diagnosis.estimation.evidence import compare
-from host.diagnosis.estimation.fit import Problem
+from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
-from host.diagnosis.selection.search import Found, fit_nominal
+from host.diagnosis.selection.screening import screen
+from host.diagnosis.selection.search import Found, fit_nominal, try_fit
 from host.diagnosis.selection.trial import called_for, of_sampling
 
 WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
 
 
-def hold_between_samples(problem: Problem, others: Sequence[Problem]) -> list[Finding]:
+def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates: Sequence[Candidate]) -> list[Finding]:
     """Let a model's input run between samples as its recordings say, and say so where the nominal model says otherwise.
 
     Only a hold that is better by as much as an effect has to be, on all samples, takes the place of the stated one. It is
     not physics: without it, a force that is straight where it should be smooth passes for a faint resonance.
-    others: problems of the same model, which get the same hold.
+    A held input is half a sample late, so a delay makes it look right. The holds are therefore also compared with a free
+    delay each. If no hold is better then, the chosen one has to explain as much without a delay as the stated one with it.
+    others: problems of the same model, which get the same hold. candidates: all effects that will be tried.
     """
     model = problem.model
     if not model.holds:
         return []
-    noise_sd = np.array([noise.sigma for noise in problem.noise])
     stated, column = model.hold, problem.columns.get(model.quiet_inputs[0], "")
     fits = {}
     for hold in (stated, *(other for other in model.holds if other != stated)):
         model.hold_as(problem.segments, hold)
-        fits[hold] = fit_nominal(problem).residuals
-    gains = {hold: compare(problem.segments, "both", fits[stated], fits[hold], noise_sd) for hold in fits}
-    best = max(gains, key=lambda hold: gains[hold].log_likelihood)
-    rules = problem.rules
-    sure = gains[best].log_likelihood > rules.pooled_log_likelihood and gains[best].p_value < rules.significance
-    chosen = best if sure else stated
+        fits[hold] = fit_nominal(problem)
+    chosen = _better(problem, fits[stated], fits) or stated
+    if chosen != stated:
+        late = {hold: _late(problem, hold, candidates) for hold in fits}
+        shaped = _better(problem, late[chosen], late)
+        if shaped is not None:
+            chosen = shaped
+        elif not _better(problem, late[stated], {chosen: late[chosen]}) and _better(
+            problem, fits[chosen], {stated: late[stated]}
+        ):
+            chosen = stated
     for each in (problem, *others):
         model.hold_as(each.segments, chosen)
     if chosen == stated or not model.hold_stated:
@@ -43,6 +51,24 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem]) -> list[Fi
     says = f"Between its samples column {column} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
     says += f'The diagnosis continues with this (axis.hold = "{chosen}").'
     return [Finding("hold", column, says)]
+
+
+def _better(problem: Problem, base: Fit, fits: Mapping[str, Fit]) -> str | None:
+    """The hold of the best of `fits`, if that is better than `base` by as much as an effect has to be; else None."""
+    rules, noise_sd = problem.rules, np.array([noise.sigma for noise in problem.noise])
+    gains = {hold: compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd) for hold, fit in fits.items()}
+    best = max(gains, key=lambda hold: gains[hold].log_likelihood)
+    sure = gains[best].log_likelihood > rules.pooled_log_likelihood and gains[best].p_value < rules.significance
+    return best if sure else None
+
+
+def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
+    """The nominal model with a free delay of the input that `hold` is about."""
+    problem.model.hold_as(problem.segments, hold)
+    nominal, noise_sd = fit_nominal(problem), np.array([noise.sigma for noise in problem.noise])
+    delays = [c for c in candidates if c.port.held and c.effect.shifts == "time"]
+    fits = [try_fit(problem, nominal, item, noise_sd).fit for item in screen(problem, nominal, delays, lambda *_: None)]
+    return min([nominal, *fits], key=lambda fit: fit.cost)
 
 
 def late_by_a_sample(problem: Problem, found: Found) -> list[Finding]:
