@@ -8,6 +8,8 @@ PIP     = $(BIN)/python -m pip --disable-pip-version-check
 PIP_PROGRESS = if [ -t 2 ]; then sed -un 's/^Collecting \([^ ]*\).*/\r\x1b[K  \1/p;s/^Installing.*/\r\x1b[K  installing\n/p' | tr -d '\n' >&2; \
   echo >&2; else grep --line-buffered ^Installing >&2 || true; fi
 BOARD  ?= auto
+# Without bytecode on disk, each of the hundreds of commands that tests start would compile its modules again.
+unexport PYTHONDONTWRITEBYTECODE
 TEST_ARGS ?= -n 2 --dist loadfile
 INPUTS ?= 10000000
 FILES  ?= 100000
