@@ -64,13 +64,17 @@ def design(problem: Problem, found: Found, standing: list[Standing], progress: C
     """Design, for each pair that the recordings cannot separate, a motion that separates them; none where an equation of
     recorded signals is involved, since a motion that was not recorded has no such signals.
     """
-    out = []
+    out: list[Design] = []
+    made: list[tuple[Excitation, Problem]] | None = None
     for stands in standing if all(term.candidate.effect.listed for term in found.best.terms) else ():
         for other in (o for o in stands.alike if o.effect.listed and not alike_everywhere(stands.candidate, o)):
             progress(f"motion that separates {stands.candidate.key} and {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
-            made = None if rival is None else against(problem, found.best, rival, stands.candidate, other)
-            out += [] if made is None else [made]
+            if rival is None:
+                continue
+            made = trials(weighed(problem, found.best), found.best) if made is None else made
+            best = against(problem, found.best, rival, stands.candidate, other, made)
+            out += [] if best is None else [best]
     return out
 
 
@@ -85,13 +89,15 @@ def rival_fit(problem: Problem, found: Found, candidate: Candidate, other: Candi
     return minimize(problem, (*terms, term), np.concatenate((values, start)), rounds=8, tolerance=1e-4)
 
 
-def against(problem: Problem, best: Fit, rival: Fit, candidate: Candidate, other: Candidate) -> Design | None:
-    """The excitation that separates `best` from `rival` most; None where the model's inputs cannot be moved."""
+def against(
+    problem: Problem, best: Fit, rival: Fit, candidate: Candidate, other: Candidate, made: list[tuple[Excitation, Problem]]
+) -> Design | None:
+    """The excitation of `made` (`trials`) that separates `best` from `rival` most; None where there is none."""
     weighted = weighed(problem, best)
     known = information(weighted, rival)
     had = float(np.linalg.norm(difference(weighted, best, rival)))
     ranked = []
-    for excitation, trial in trials(weighted, best):
+    for excitation, trial in made:
         r = trial.stacked(rival.terms, rival.values)
         ranked.append((float(r @ r), excitation, trial))
     ranked.sort(key=lambda item: -item[0])

@@ -88,6 +88,7 @@ class RigSegment(Segment):
     beyond: Array | None = None  # (3, n) part of the recorded force that simulation and noise do not explain
     reference: tuple[Array, ...] = ()  # of tip and shaft
     exact: Array | None = None  # (outputs, n) rod model minus the linear model
+    force_noise: list[tuple[float, float]] = field(default_factory=list)  # of each force row: deviation, correlation time
     kept: dict[Any, tuple[Array, ...]] = field(default_factory=dict)  # shapes of the last two runs
 
 
@@ -172,9 +173,8 @@ class RigModel(Model):
             inputs[f"motion:{axis}"] = inputs[f"handle_{axis}"]
         force = np.vstack([channels.get(name, missing) for name in FORCE])
         poses = [np.vstack([channels.get(name, missing) for name in names]) for names in (TIP, SHAFT)]
-        given = np.vstack(
-            [calm(fill(row), *s) for row, s in zip(force, self._force_noise(recording, inputs, force), strict=True)]
-        )
+        force_noise = self._force_noise(recording, inputs, force)
+        given = np.vstack([calm(fill(row), *s) for row, s in zip(force, force_noise, strict=True)])
         tolerances = {}
         for axis in AXES:
             motion = inputs[f"handle_{axis}"]
@@ -202,7 +202,7 @@ class RigModel(Model):
         inputs["curvature"] = theta[4] * inputs["handle_knob"] + theta[5]
         nothing = np.full((len(self.outputs), n), np.nan)
         segment = RigSegment(recording, nothing, recording.fit, recording.heldout, inputs, units, tolerances)
-        segment.force = np.zeros((3, n))
+        segment.force, segment.force_noise = np.zeros((3, n)), force_noise
         run = self._run(segment, theta, [])
         segment.force = given
         segment.reference = (run["tip_R"], run["shaft_R"])
@@ -233,16 +233,10 @@ class RigModel(Model):
             segment.force = self._run(segment, theta, [])["force"]
             return
         simulated = self.simulate(segment, theta, [])[12:15]
-        sigmas = [
-            by_steps(row, *s)
-            for row, s in zip(
-                recorded - simulated, self._force_noise(segment.recording, segment.inputs, recorded), strict=True
-            )
-        ]
+        sigmas = [by_steps(row, *s) for row, s in zip(recorded - simulated, segment.force_noise, strict=True)]
         beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
         segment.force = simulated + beyond
-        noise = max(self._force_noise(segment.recording, segment.inputs, recorded))[0]
-        if noise > FAINT * float(np.sqrt(np.mean(np.sum(segment.force**2, axis=0)))):
+        if max(segment.force_noise)[0] > FAINT * float(np.sqrt(np.mean(np.sum(segment.force**2, axis=0)))):
             segment.beyond = beyond
         else:
             segment.beyond = None
