@@ -66,8 +66,8 @@ def design(problem: Problem, found: Found, standing: list[Standing], progress: C
     """
     out: list[Design] = []
     made: list[tuple[Excitation, Problem]] | None = None
-    for stands in standing if all(term.candidate.effect.listed for term in found.best.terms) else ():
-        for other in (o for o in stands.alike if o.effect.listed and not alike_everywhere(stands.candidate, o)):
+    for stands in standing if all(not term.candidate.effect.searched for term in found.best.terms) else ():
+        for other in (o for o in stands.alike if not o.effect.searched and not alike_everywhere(stands.candidate, o)):
             progress(f"motion that separates {stands.candidate.key} and {other.key}", 0.0)
             rival = rival_fit(problem, found, stands.candidate, other)
             if rival is None:

@@ -151,7 +151,8 @@ class Effect:
     seeds: Seeds | None = None  # start values out of the residual, where no grid is fine enough
     corner: Corner | None = None  # of a form that spans several ids: the id that values stand for, and what it then says
     spans: tuple[str, ...] = ()  # those ids
-    listed: bool = True  # of the vocabulary; else an equation that was found by search
+    listed: bool = True  # of the vocabulary
+    searched: bool = False  # an equation of recorded signals: it says nothing of a motion that was not recorded
     dissipates: bool = False  # its linear parameters are friction: none is negative, whichever way an output counts
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first
     remembers: bool = False  # its state at a recording's first sample is not known: it is estimated

@@ -153,7 +153,8 @@ class SimulatedModel(Model):
         section, loads = self.section, tuple(self.section.load)
         found = []
         for channel in section.inputs:
-            kind = "motion+turn" if self.units[channel] == "rad" else "motion"
+            # The simulator may have no gain at an input: an error of it is a candidate, too.
+            kind = "motion+turn+scale" if self.units[channel] == "rad" else "motion+scale"
             others = tuple(other for other in section.inputs if other != channel)
             found.append(Port(channel, kind, self.subsystem_of(channel), tuple(section.outputs), loads, others))
         for channel in section.outputs:

@@ -198,7 +198,7 @@ def switches(result: Diagnosis) -> tuple[str, str]:
         values = result.found.best.values[at : at + len(term.parameters)]
         at += len(term.parameters)
         c = term.candidate
-        if not c.effect.listed:
+        if c.effect.searched:
             continue
         texts = {key: text for key, text in (("source", c.source), ("form", c.form)) if text}
         numbers = {p.key: f"{float(v):.6g}" for p, v in zip(term.parameters, values, strict=True) if p.high > p.low}

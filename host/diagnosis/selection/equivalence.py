@@ -72,7 +72,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
             (difference, k, rival)
             for k, one in enumerate(standing)
             for rival, difference in one.rivals
-            if rival.effect.listed and difference < -problem.rules.equal_log_likelihood
+            if not rival.effect.searched and difference < -problem.rules.equal_log_likelihood
         ]
         if not behind or problem.budget.spent():
             return standing
@@ -171,21 +171,25 @@ def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[
     first = max(range(len(standing)), key=lambda k: standing[k].gain.log_likelihood)
     named = standing[first]
     forms = remainder.predicted.forms if remainder.predicted is not None else ()
-    if not forms or any(not other.effect.listed for other in named.alike):
+    if not forms or any(other.effect.searched for other in named.alike):
         return standing
     unknown = equation_at(named.candidate.port, *forms[0])
+    if unknown.name == named.candidate.name:
+        return standing
     return [*standing[:first], replace(named, alike=(*named.alike, unknown)), *standing[first + 1 :]]
 
 
 def _better_said(
     problem: Problem, found: Found, candidate: Candidate, less: Fit, noise_sd: Array
 ) -> tuple[tuple[Candidate, float], ...]:
-    """An equation of no listed effect that does plainly better in the place of `candidate`: then `candidate` may be the
-    wrong name.
+    """An equation that does plainly better in the place of `candidate` and says something else: then `candidate` may be
+    the wrong name.
     """
-    if not candidate.effect.listed:
+    if candidate.effect.searched:
         return ()
     for trial in equations_for(problem, less, candidate.port, noise_sd):
+        if trial.candidate.name == candidate.name:
+            continue
         behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
             more = len(found.best.values) - len(trial.fit.values)

@@ -8,6 +8,7 @@ judged on those held out: sparse regression on a library (Brunton, Proctor, Kutz
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -27,16 +28,21 @@ WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
 MOST_FORMS = 2  # joined to predict_residual
 BEST = 6  # forms that are fitted again
+CURVES = ("abs", "sqrt", "square", "exp", "tanh")  # functions of which an equation of a static curve is made
 NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
 
 @dataclass(frozen=True)
 class Form:
-    """`text` in names of columns; `evaluate` gives (n,) of a recording; `length`: symbols in it."""
+    """`text` in names of columns; `evaluate` gives (n,) of a recording; `length`: symbols in it.
+
+    `curve`: a memoryless function of the port's own signal alone.
+    """
 
     text: str
     evaluate: Callable[[Segment], Array]
     length: int
+    curve: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,14 @@ def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     if timed and signals:
         x, rate = factors[0][0], factors[0][-2]
         out += [_product(_product(x, x), rate), _product(x, _product(rate, rate))]
-    return out
+    own = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
+    return [replace(form, curve=is_curve(form.text, own)) for form in out]
+
+
+def is_curve(text: str, own: str) -> bool:
+    """Whether an equation is a memoryless function of the column `own` alone, neither a gain nor a wave along it."""
+    names = set(re.findall(r"(?<![\w.])[A-Za-z_]\w*", text))
+    return text != own and own in names and names <= {own, *CURVES}
 
 
 @dataclass(frozen=True)
@@ -164,16 +177,20 @@ def equation_at(port: Port, form: Form, size: float = 1.0) -> Candidate:
     def apply(signal: Array, c: Context, p: Array, which: str) -> Array:
         return np.asarray(signal + p[0] * c.equations[form.text])
 
+    says = "None of the known effects: the mismatch follows an equation found by search."
+    if form.curve:
+        says = "The relation from input to output is curved, as an equation found by search says."
     effect = Effect(
-        "unlisted",
+        "static_nonlinearity" if form.curve else "unlisted",
         port.kind.split("+")[0],
         76,
         parameters,
-        "None of the known effects: the mismatch follows an equation found by search.",
+        says,
         form.text,
         apply,
         side="input",
-        listed=False,
+        listed=form.curve,
+        searched=True,
     )
     return Candidate(effect, port, "", "search")
 

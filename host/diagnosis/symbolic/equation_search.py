@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Port
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import lag, play
-from host.diagnosis.symbolic.dictionary import Form
+from host.diagnosis.symbolic.dictionary import Form, is_curve
 
 Array = npt.NDArray[np.float64]
 ROWS = 2500
@@ -125,8 +126,9 @@ def search_equation(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     unique = {
         form.text: (form, on_table) for form, on_table in found if form.length <= LONGEST and form.text.count("exp(") < 2
     }
+    own = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
     ranked = sorted(unique.values(), key=lambda f: float(np.mean((f[1](X) / size - z) ** 2)) * (1.0 + 0.02 * f[0].length))
-    return [form for form, _ in ranked[:3]]
+    return [replace(form, curve=is_curve(form.text, own)) for form, _ in ranked[:3]]
 
 
 def _form(
