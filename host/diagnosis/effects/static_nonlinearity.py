@@ -28,7 +28,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Polynomial of the place in the range; the mean stays with the nominal offset, without `sloped` the slope with its gain."""
+    """Polynomial of the place in the range; mean (and slope, if not `sloped`) stay with the nominal model."""
     u = (signal - p[2]) / p[3]
     bend = p[0] * (u * u - 1.0 / 3.0) + p[1] * (u**3 - 0.6 * u)
     if "sloped" in form:
