@@ -96,7 +96,7 @@ class AxisModel(Model):
         if "stiffness" not in self.spec.terms:
             self.taken |= {"softening:", "contact_nonlinear:"}
         self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
-        self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None and self.free_run else ()
+        self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None else ()
         self.moves = {name: self.spec.output}
         self.quiet_inputs = (self.spec.input,)
 

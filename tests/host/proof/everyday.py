@@ -75,15 +75,18 @@ def _driven(f: Array, hold: str, dt: float, coulomb_N: float) -> tuple[Array, Ar
     return out[:, 0], out[:, 1]
 
 
-def free_mass(number: int, coulomb_N: float = 0.0, seconds: float = 20.0) -> Columns:
-    """The plain case: position of four sines, force = mass a + damping v (+ friction), noise 2 um and 2 mN."""
+def free_mass(number: int, coulomb_N: float = 0.0, seconds: float = 20.0, by_place: float = 0.0) -> Columns:
+    """The plain case: position of four sines, force = mass a + damping v (+ friction), noise 2 um and 2 mN.
+
+    by_place: further damping that grows with the place squared, N s/m3.
+    """
     rng, t = stream(number), np.arange(0.0, seconds, 1.0 / RATE_HZ)
     w = 2 * np.pi * np.array([0.31, 0.73, 1.37, 2.11])
     p, size = rng.uniform(0, 6.28, 4), 0.02 * 2 * np.pi / w
     x = np.sin(np.outer(t, w) + p) @ size
     v = np.cos(np.outer(t, w) + p) @ (size * w)
     a = -np.sin(np.outer(t, w) + p) @ (size * w**2)
-    f = MASS_kg * a + DAMPING * v + coulomb_N * np.tanh(v / 1e-3)
+    f = MASS_kg * a + (DAMPING + by_place * x**2) * v + coulomb_N * np.tanh(v / 1e-3)
     return {"t": t, "f": f + 2e-3 * rng.standard_normal(t.size), "x": x + 2e-6 * rng.standard_normal(t.size)}
 
 

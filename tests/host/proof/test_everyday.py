@@ -126,8 +126,14 @@ for hold in ("zero", "linear"):
     )
 case(
     "free mass with dry friction",
+    "free mass whose damping grows with the place squared",
     lambda: ([make.free_mass(k, coulomb_N=0.2) for k in (1, 2)], make.free_nominal()),
     truth=("coulomb_friction",),
+)
+case(
+    "free mass whose damping grows with the place squared",
+    lambda: ([make.free_mass(k, by_place=400.0) for k in (1, 2)], make.free_nominal()),
+    truth=("unlisted",),
 )
 case(
     "spring with dry friction",
@@ -454,6 +460,7 @@ SLOW = {  # over 3 s of processor time
     "sprung mass with dry friction, zero",
     "sprung mass with dry friction, linear",
     "free mass with dry friction",
+    "free mass whose damping grows with the place squared",
     "gear with a delay of a second",
     "gear with a lag",
     "delay or lag, one slow tone",
