@@ -164,7 +164,7 @@ def _linear(model: LinearModel, values: dict[str, float], gathered: Gathered) ->
     gathered.add(runtime.run_state_space)
     A, B, C, D = model.matrices(values)
     names = (tuple(model.spec.inputs), tuple(model.spec.outputs))
-    hold = "" if model.spec.period_s is not None else model.spec.hold
+    hold = "" if model.spec.period_s is not None else model.hold
     matrices = "".join(f"{key} = {_array(value)}\n" for key, value in zip("ABCD", (A, B, C, D), strict=True))
     return (
         f"PARAMETERS = {values!r}\nNAMES = {names!r}\n{matrices}{SIMULATE}"

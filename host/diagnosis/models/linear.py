@@ -32,6 +32,7 @@ SAME_PERIOD = 1e-3  # deviation of a recording's period from a discrete model's,
 WIDE = 2.0  # standard deviation of a state that is not measured, in spans of what it does to an output
 MOST_ROUNDS = 80  # of the loop with effects inside
 SETTLED = 1e-7  # change of the loop's signals in a round, relative
+HOLDS = ("zero", "linear")
 MEMORY = 6  # rounds that the next one is made of (Anderson acceleration)
 
 
@@ -58,6 +59,8 @@ class LinearModel(SimulatedModel):
         actuation, fed_back = f"{name}_actuation", f"{name}_feedback"
         self.inside = (actuation, fed_back) if self.spec.feedback else ()
         super().__init__(spec, self.spec, spec.offer)
+        self.hold, self.hold_stated = self.spec.hold, "hold" in self.spec.model_fields_set
+        self.holds = HOLDS if self.spec.period_s is None and self.spec.feedback is None else ()
         self.offs = {offer.parameter: offer.off for offer in spec.offer}
         if self.spec.feedback is not None:
             output, channels = self.spec.feedback.output, tuple(self.spec.outputs)
@@ -121,7 +124,13 @@ class LinearModel(SimulatedModel):
             if abs(dt_s / self.spec.period_s - 1.0) > SAME_PERIOD:
                 raise InputError("linear.period_s", self.spec.period_s, f"the period of the recordings, {dt_s:g} s")
             return A, B, np.zeros_like(B), C, D
-        return (*sampled(A, B, dt_s, self.spec.hold), C, D)
+        return (*sampled(A, B, dt_s, self.hold), C, D)
+
+    def hold_as(self, segments: list[Segment], hold: str) -> None:
+        """Let the inputs run between samples as `hold` says."""
+        if hold != self.hold:
+            self.hold = hold
+            self._kept.clear()
 
     def initial_state(self, segment: Segment) -> tuple[list[str], list[float], list[float]]:
         """The free response at the first sample: each output, its rate, and so on to the model's order.

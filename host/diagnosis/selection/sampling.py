@@ -29,7 +29,7 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates
     model = problem.model
     if not model.holds:
         return []
-    stated, column = model.hold, problem.columns.get(model.quiet_inputs[0], "")
+    stated = model.hold
     fits = {}
     for hold in (stated, *(other for other in model.holds if other != stated)):
         model.hold_as(problem.segments, hold)
@@ -48,9 +48,11 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates
         model.hold_as(each.segments, chosen)
     if chosen == stated or not model.hold_stated:
         return []
-    says = f"Between its samples column {column} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
-    says += f'The diagnosis continues with this (axis.hold = "{chosen}").'
-    return [Finding("hold", column, says)]
+    columns = [problem.columns.get(name, name) for name in model.quiet_inputs]
+    which = f"column {columns[0]}" if len(columns) == 1 else "each input"
+    says = f"Between its samples {which} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
+    says += f'The diagnosis continues with this ({model.kind}.hold = "{chosen}").'
+    return [Finding("hold", columns[0], says)]
 
 
 def _better(problem: Problem, base: Fit, fits: Mapping[str, Fit]) -> str | None:
@@ -64,9 +66,11 @@ def _better(problem: Problem, base: Fit, fits: Mapping[str, Fit]) -> str | None:
 
 def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
     """The nominal model with a free delay of the input that `hold` is about."""
-    problem.model.hold_as(problem.segments, hold)
+    model = problem.model
+    model.hold_as(problem.segments, hold)
     nominal, noise_sd = fit_nominal(problem), np.array([noise.sigma for noise in problem.noise])
-    delays = [c for c in candidates if c.port.held and c.effect.shifts == "time"]
+    own = model.quiet_inputs
+    delays = [c for c in candidates if (c.port.held or c.port.name in own) and c.effect.shifts == "time"]
     fits = [try_fit(problem, nominal, item, noise_sd).fit for item in screen(problem, nominal, delays, lambda *_: None)]
     return min([nominal, *fits], key=lambda fit: fit.cost)
 
