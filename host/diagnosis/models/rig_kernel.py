@@ -78,15 +78,16 @@ class _Arc(NamedTuple):
 
 
 @njit(cache=True)
-def _free_point(arc: _Arc, s: float) -> Vector:
-    """(y, z, angle) of the unloaded arc at arc length s, roll 0: bends towards -y."""
+def _free_point(arc: _Arc, s: float) -> tuple[float, float, float, float]:
+    """(y, z, cosine and sine of the angle) of the unloaded arc at arc length s, roll 0: bends towards -y."""
     if s <= arc.straight:
-        return 0.0, s, 0.0
+        return 0.0, s, 1.0, 0.0
     a = s - arc.straight
     theta = arc.kappa * a
+    c, sn = math.cos(theta), math.sin(theta)
     if abs(theta) < 1e-5:
-        return -0.5 * theta * a, arc.straight + a, theta
-    return -(1.0 - math.cos(theta)) / arc.kappa, arc.straight + math.sin(theta) / arc.kappa, theta
+        return -0.5 * theta * a, arc.straight + a, c, sn
+    return -(1.0 - c) / arc.kappa, arc.straight + sn / arc.kappa, c, sn
 
 
 @njit(cache=True)
@@ -116,8 +117,8 @@ def _deflection(arc: _Arc, s1: float, force: Vector, load: Vector, out: Array) -
     out[:] = 0.0
     fx, fy, fz = force
     straight = arc.straight
-    yt, zt, _ = _free_point(arc, arc.length)
-    y1, z1, _ = _free_point(arc, s1)
+    yt, zt, _, _ = _free_point(arc, arc.length)
+    y1, z1, _, _ = _free_point(arc, s1)
     loaded = not _is_zero(load)
     for part in range(2):
         a = 0.0 if part == 0 else min(straight, s1)
@@ -127,14 +128,13 @@ def _deflection(arc: _Arc, s1: float, force: Vector, load: Vector, out: Array) -
         for k in range(_NODES.size):
             s = 0.5 * (a + b) + 0.5 * (b - a) * _NODES[k]
             w = 0.5 * (b - a) * _WEIGHTS[k]
-            y, z, theta = _free_point(arc, s)
+            y, z, c, sn = _free_point(arc, s)
             dy, dz = yt - y, zt - z
             mx, my, mz = dy * fz - dz * fy, dz * fx, -dy * fx
             if loaded:
                 sy, sz = _moments_beyond(arc, s)
                 sy, sz = sy - (arc.length - s) * y, sz - (arc.length - s) * z
                 mx, my, mz = mx + sy * load[2] - sz * load[1], my + sz * load[0], mz - sy * load[0]
-            c, sn = math.cos(theta), math.sin(theta)
             about_b = arc.flex * (my * c + mz * sn)
             about_t = arc.twist * (-my * sn + mz * c)
             kx, ky, kz = w * arc.flex * mx, w * (about_b * c - about_t * sn), w * (about_b * sn + about_t * c)
@@ -152,8 +152,8 @@ def _add_point(arc: _Arc, s1: float, at: float, force: Vector, work: Array, out:
     """Add to `out` (6,) the deflection at s1 by a force at arc length `at`, roll 0; beyond it the shaft only follows."""
     inner = _Arc(at, arc.straight, arc.kappa, arc.flex, arc.twist)
     _deflection(inner, min(s1, at), force, _NO_LOAD, work)
-    y, z, _ = _free_point(arc, at)
-    y1, z1, _ = _free_point(arc, max(s1, at))
+    y, z, _, _ = _free_point(arc, at)
+    y1, z1, _, _ = _free_point(arc, max(s1, at))
     ey, ez = y1 - y, z1 - z
     out += work
     out[0] += work[4] * ez - work[5] * ey
@@ -164,19 +164,16 @@ def _add_point(arc: _Arc, s1: float, at: float, force: Vector, work: Array, out:
 @njit(cache=True)
 def _pose(arc: _Arc, s1: float, roll: float, bend: Array, p: Array, R: Array) -> None:
     """Position p (3,) and rotation R (3, 3) at s1 in the base frame after deflection `bend`."""
-    y, z, theta = _free_point(arc, s1)
+    y, z, ct, st = _free_point(arc, s1)
     c, s = math.cos(roll), math.sin(roll)
-    ct, st = math.cos(theta), math.sin(theta)
     x0, y0, z0 = bend[0], y + bend[1], z + bend[2]
     p[0], p[1], p[2] = c * x0 - s * y0, s * x0 + c * y0, z0
     rx, ry, rz = bend[3], bend[4], bend[5]
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)
     a = math.sin(angle) / angle if angle > 1e-9 else 1.0
     b = (1.0 - math.cos(angle)) / (angle * angle) if angle > 1e-5 else 0.5
-    free = np.zeros((3, 3))
-    free[0, 0], free[1, 1], free[1, 2], free[2, 1], free[2, 2] = 1.0, ct, -st, st, ct
     for j in range(3):
-        vx, vy, vz = free[0, j], free[1, j], free[2, j]
+        vx, vy, vz = (1.0, 0.0, 0.0) if j == 0 else (0.0, ct, st) if j == 1 else (0.0, -st, ct)
         ux, uy, uz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
         wx, wy, wz = ry * uz - rz * uy, rz * ux - rx * uz, rx * uy - ry * ux
         gx, gy, gz = vx + a * ux + b * wx, vy + a * uy + b * wy, vz + a * uz + b * wz
@@ -252,7 +249,7 @@ def shapes(
             _deflection(arc, length, _to_roll_0(c, s, always), even, bend)
         if not _is_zero(press):
             _add_point(arc, length, at, press, unit, bend)
-        y, z, _ = _free_point(arc, length)
+        y, z, _, _ = _free_point(arc, length)
         x0, y0 = bend[0], y + bend[1]
         free[0, i], free[1, i], free[2, i] = c * x0 - s * y0, s * x0 + c * y0, z + bend[2]
         # Its displacement by a unit force along the normal.
@@ -328,9 +325,8 @@ def drag_along(tangent: Array, distance: float) -> Array:
 def rotation_logs(reference: Array, R: Array) -> Array:
     """Rotation vectors (3, n) of reference^T R, both (3, 3, n)."""
     n = R.shape[2]
-    out = np.empty((3, n))
+    out, m = np.empty((3, n)), np.zeros((3, 3))
     for i in range(n):
-        m = np.zeros((3, 3))
         for a in range(3):
             for b in range(3):
                 m[a, b] = reference[0, a, i] * R[0, b, i] + reference[1, a, i] * R[1, b, i] + reference[2, a, i] * R[2, b, i]
