@@ -12,7 +12,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.screening import screen
 from host.diagnosis.selection.search import Found, fit_nominal, try_fit
-from host.diagnosis.selection.trial import called_for, of_sampling
+from host.diagnosis.selection.trial import within_sample
 
 WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
 
@@ -77,10 +77,9 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
 
 def late_by_a_sample(problem: Problem, found: Found) -> list[Finding]:
     """Say that a delay within one sample explains a mismatch that has no other name, if the data call for one."""
-    delays = [t for t in found.last_trials if of_sampling(t) and called_for(t, found.best)]
-    if found.best.terms or not delays:
+    best, period_s = within_sample(found.last_trials, found.best), problem.segments[0].recording.dt_s
+    if best is None:
         return []
-    best, period_s = max(delays, key=lambda t: t.score), problem.segments[0].recording.dt_s
     port = best.candidate.port
     says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {best.both.share:.0%} "
     says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "

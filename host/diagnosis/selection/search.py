@@ -421,6 +421,8 @@ def _taken(problem: Problem, trial: Trial) -> Fit:
     set_starts(problem, trial.starts)
     best = refined(problem, trial.fit)
     reweigh(problem, best)
+    if trial.candidate.effect.hides:  # the nominal parameters that the starts were found with were led astray
+        set_starts(problem, first_needs(problem, best))
     return best
 
 

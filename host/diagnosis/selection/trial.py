@@ -146,6 +146,12 @@ def of_sampling(trial: Trial) -> bool:
     return late_s < 1.05 * trial.period_s
 
 
+def within_sample(trials: list[Trial], base: Fit) -> Trial | None:
+    """The likeliest delay or lag within one sample that the data call for, where `base` names no effect."""
+    late = [] if base.terms else [trial for trial in trials if of_sampling(trial) and called_for(trial, base)]
+    return max(late, key=lambda trial: trial.score, default=None)
+
+
 def only_sampling(trial: Trial, trials: list[Trial]) -> bool:
     """Whether a delay within one sample does as well at the place of `trial`: how an input was held, under another name.
 

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.evidence import compare
-from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize, reweigh
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
-from host.diagnosis.selection.trial import Trial, rank
+from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
 
@@ -106,6 +106,11 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
     progress("testing whether the residual is predictable", 0.0)
+    late = within_sample(found.last_trials, found.best)
+    if late is not None:
+        past = _past(problem, found, late, noise_sd)
+        if not past.sure:
+            return past
     places = predict_residual(problem, found.best, noise_sd)
     remainder = _remainder(problem, found, noise_sd, places)
     crowd = Counter(term.candidate.port.name for term in found.best.terms).most_common(1)
@@ -122,6 +127,15 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
         ):
             return remainder_of(problem, found, noise_sd)
     return replace(remainder, doubtful=bool(crowd))
+
+
+def _past(problem: Problem, found: Found, late: Trial, noise_sd: Array) -> Remainder:
+    """The remainder past a delay within one sample: how the input was held, which no effect is named for."""
+    begun = get_starts(problem)
+    set_starts(problem, late.starts)
+    remainder = remainder_of(problem, replace(found, best=late.fit), noise_sd)
+    set_starts(problem, begun)
+    return remainder
 
 
 def remainder_of(problem: Problem, found: Found, noise_sd: Array) -> Remainder:
