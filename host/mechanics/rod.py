@@ -26,14 +26,18 @@ NO_STATIONS: Array = np.zeros(0)
 
 
 def real(key: str, value: ArrayLike, wanted: str) -> Array:
-    """Return `value` as floats, whatever its shape. Raises InputError naming `key` where it does not hold real numbers."""
+    """Return `value` as floats, whatever its shape. Raises InputError naming `key` where it does not hold real numbers.
+
+    Kernels are compiled for contiguous, writable arrays. Others are copied here: a kernel would be compiled again for each.
+    """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # rows of different lengths
         raise InputError(key, str(value), wanted) from None
     if array.dtype.kind not in "fiu" or (isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)):
         raise InputError(key, str(value), wanted)
-    return array.astype(np.float64, copy=False)
+    array = array.astype(np.float64, copy=False)
+    return array if array.flags.carray else array.copy()
 
 
 def yes_or_no(key: str, value: object) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import math
 import re
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 import seldinger as sd
 
@@ -266,3 +268,35 @@ def test_whatever_is_wrong_with_an_argument_is_bad_input(number: int) -> None:
                         function(**{**right, key: changed})
                     except sd.InputError as error:
                         assert "\n" not in str(error) and ": found " in str(error), (key, changed)
+
+
+def _arranged(values: np.ndarray) -> list[np.ndarray]:
+    """The same numbers read-only, with a stride, in the order of Fortran and in single precision."""
+    fixed = values.copy()
+    fixed.flags.writeable = False
+    return [fixed, np.repeat(values[..., None], 2, axis=-1)[..., 0], np.asfortranarray(values), values.astype(np.float32)]
+
+
+def test_no_order_of_an_array_makes_a_kernel_compile_again() -> None:
+    """Columns of a table are strided, arrays of pandas are read-only: each was another signature, and a minute's wait."""
+
+    def compiled() -> set[tuple[str, str]]:
+        kernels = [each for each in gc.get_objects() if isinstance(each, Dispatcher)]
+        return {(kernel.__qualname__, str(signature)) for kernel in kernels for signature in kernel.signatures}
+
+    catheter, stations, forces = LIVEWIRE, np.array([0.0, 0.03]), np.full((3, 3), [0.0, 0.05, 0.0])
+    shape = sd.solve(catheter, 0.01, 10.0, forces[0], stations_m=stations)
+    position, quaternion = (np.tile(a[0], (3, 1)) for a in (shape.station_positions_m, shape.station_quaternions_wxyz))
+
+    def estimate(p: np.ndarray, q: np.ndarray) -> None:
+        sd.estimate_force(catheter, 0.01, 10.0, [(0.0, p, q)], case=2, ordered=True)
+
+    sd.solve(catheter, 0.01, 10.0, forces, stations_m=stations)
+    estimate(position, quaternion)
+    before = compiled()
+    for f, s in zip(_arranged(forces), _arranged(stations), strict=True):
+        sd.solve(catheter, 0.01, 10.0, f[0], stations_m=s)
+        sd.solve(catheter, 0.01, 10.0, f, stations_m=s)
+    for p, q in zip(_arranged(position), _arranged(quaternion), strict=True):
+        estimate(p, q)
+    assert compiled() == before
