@@ -41,7 +41,7 @@ EFFECTS = (
         "The gain differs by {ratio} on the two sides of {centre}.",
         "y = x + ratio*|x - centre|",
         apply,
-        contains=("sensor_bias", "sensor_scale"),  # with its centre at the edge of the motion it is a gain and an offset
+        contains=("sensor_bias", "sensor_scale", "saturation"),  # centre at the edge of the motion; ratio of 1 or -1
     ),
     Effect(
         "asymmetry",

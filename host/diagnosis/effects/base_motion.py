@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines
@@ -18,6 +20,13 @@ def beat(s: Scale, form: str) -> tuple[Parameter, ...]:
     top = min(0.2 / s.dt_s, 4.0)
     grid = lines(s, 2.0 / s.duration_s, top, 0.5)
     return (*pairs, Parameter("frequency", "Hz", grid, 0.5 / s.duration_s, 0.45 / s.dt_s, step=0.1 / s.duration_s))
+
+
+def line(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Amplitudes along the base axes of a motion on one line, its phase and frequency."""
+    frequency = replace(beat(s, form)[-1], spectral=True)
+    phase = Parameter("phase", "rad", (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0), -np.pi, 2.0 * np.pi, step=0.1)
+    return (*(Parameter(f"amplitude_{a}", "m", (2e-5,), linear=True) for a in "xyz"), phase, frequency)
 
 
 def rock(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -69,6 +78,8 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
     t = c.time_s
     if form == "drift":
         return {**state, "shift": state["shift"] + p[:, None] * t}
+    if form == "line":
+        return {**state, "shift": state["shift"] + np.outer(p[:3], np.sin(2.0 * np.pi * p[4] * t + p[3]))}
     if form in ("beat", "rock"):
         phase = 2.0 * np.pi * p[-1] * t
         moved = {**state, "shift": state["shift"] + _waves(p[:6], phase)}
@@ -86,6 +97,17 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 SAYS = "The sheath's exit moves: all poses move with it."
 EFFECTS = (
+    Effect(
+        "base_motion",
+        "base",
+        56,
+        line,
+        "The sheath's exit moves to and fro on a line at {frequency}: all poses move with it.",
+        "x = x + amplitude*sin(2 pi f t + phase)",
+        apply,
+        timed=True,
+        forms=("line",),
+    ),
     Effect(
         "base_motion",
         "base",

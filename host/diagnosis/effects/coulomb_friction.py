@@ -15,10 +15,16 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Friction force; second form: and the distance, far below the travel, over which what touches yields."""
+    """Friction force; second form: and the distance, far below the travel, over which what touches yields; third: and the
+    speed below which friction grows with speed, as that of a lubricated or simulated contact.
+    """
     level = Parameter("force", s.unit, (s.need,), 0.0, np.inf, linear=True)
     if form == "":
         return (level,)
+    if form == "smooth":
+        speeds = spread(0.02 * s.speed, 0.5 * s.speed, 3)
+        unit = f"{s.motion_unit}/s"
+        return (level, Parameter("speed", unit, speeds, 2e-3 * s.speed, s.speed, log=True, vanishes=True))
     low, high = 1e-5 * s.motion_span, BRISTLES * s.motion_span
     return (level, Parameter("distance", s.motion_unit, spread(3.0 * low, 0.6 * high, 3), low, high, log=True))
 
@@ -29,7 +35,9 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Level of the sliding force, and the distance of its bristles."""
+    """Level of the sliding force, and the distance of its bristles or the speed at which it is nearly reached."""
+    if form == "smooth":
+        return {"smooth": p[0], "smooth_speed": p[1]}
     return {"presliding": p[0], "presliding_distance": p[1]} if form == "bristles" else {"coulomb": p[0]}
 
 
@@ -57,6 +65,19 @@ EFFECTS = (
         forms=("", "bristles"),
         family="dry",
         remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "coulomb_friction",
+        "force",
+        10,
+        force,
+        "A force of up to {force} acts against the motion; below a speed of about {speed} it is smaller.",
+        "F = force*tanh(v/speed)",
+        slots=slots,
+        timed=True,
+        forms=("smooth",),
+        family="dry",
         dissipates=True,
     ),
 )

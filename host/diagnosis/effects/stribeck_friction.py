@@ -32,6 +32,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
             1e-5 * s.motion_span,
             s.motion_span,
             log=True,
+            vanishes=True,
         ),
     )
 

@@ -9,12 +9,13 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, Term, free, jacobian, moved, robust, size_of
+from host.diagnosis.estimation.fit import Fit, Problem, Term, free, jacobian, minimize, moved, robust, size_of
 from host.diagnosis.model.effect import rate_key
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+STATE_STEPS = 3  # of parameters and initial states together
 FARTHEST = 4.0  # standard deviations of the measured state within which the estimated one stays
 
 
@@ -185,3 +186,25 @@ def _weighing(row: Array) -> float:
     """RMS of a residual (n,) times the root of its correlation time (samples)."""
     seen = row[np.isfinite(row)]
     return float(np.sqrt(np.mean(seen**2) * correlation_time(row))) or 1e-300 if seen.size else 1.0
+
+
+def start_again(problem: Problem, fit: Fit) -> None:
+    """Lets a model that runs freely from a measured state find that state again."""
+    if problem.joint_states:
+        fit_with_states(problem, fit, 0)
+        return
+    for segment in problem.segments:
+        unseen = problem.unseen(segment, fit.terms, fit.values)
+        estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values), unseen)
+
+
+def begun_again(problem: Problem, fit: Fit) -> Fit:
+    """`fit` with its own states at the first samples, where the model is a linear path.
+
+    A delay of the input begins with another state of a linear plant than a delay of its reading does. With the state of
+    one of them the other looks worse than it is; with that of the nominal fit, every effect looks better than it is.
+    """
+    if not problem.joint_states:
+        return fit
+    fit = fit_with_states(problem, fit, STATE_STEPS)
+    return minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)

@@ -56,6 +56,7 @@ class SelectionRules:
     wider_fits: int = 4  # other forms that are fitted where one that the data call for ended at a bound
     joint_first: int = 2  # of them, of unlike families, past which further effects are looked for,
     joint_second: int = 3  # and how many of these are fitted
+    crossed_fits: int = 4  # best candidates that are cross-validated where the recordings held out show nothing of them
     split_fits: int = 6  # pairs that are fitted in the place of one effect that joins two kinds
     joint_singles: int = 5  # refused effects of which pairs are fitted, where none passes alone
 

@@ -49,6 +49,8 @@ SLOTS = (
     "slip_ratio",
     "drive_dead_band",
     "drive_limit",
+    "smooth",
+    "smooth_speed",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -91,6 +93,8 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     SLIP_RATIO,
     DRIVE_DEAD,
     DRIVE_LIMIT,
+    SMOOTH,
+    SMOOTH_SPEED,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
@@ -111,6 +115,8 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
         force += p[SINE] * math.sin(TWO_PI * t * p[FREQUENCY]) + p[COSINE] * math.cos(TWO_PI * t * p[FREQUENCY])
     if p[MOMENT_S] != 0.0 or p[MOMENT_C] != 0.0:
         force += p[MOMENT_S] * math.sin(x) + p[MOMENT_C] * math.cos(x)
+    if p[SMOOTH_SPEED] > 0.0:
+        force += p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED])
     depth = x - p[CONTACT_X]
     if p[CONTACT_N] > 0.0 and depth > 0.0:
         force += depth ** p[CONTACT_N] * (p[CONTACT_K] + p[CONTACT_C] * v)

@@ -284,6 +284,8 @@ def _effect(
     says += elsewhere(result, candidate)
     if standing.rests_on and len(result.problem.segments) > 1:
         says += f" The evidence rests on one recording, {standing.rests_on}."
+    if standing.crossed:
+        says += " The samples held out hardly excite it, so each recording was predicted from the others."
     return {
         "id": candidate.effect.id,
         "subsystem": candidate.port.subsystem,
@@ -296,6 +298,7 @@ def _effect(
         "parameters": shown,
         "evidence": {"heldout_log_likelihood_gain": standing.gain.log_likelihood, "p_value": standing.gain.p_value},
         "rests_on": standing.rests_on,
+        "cross_validated": standing.crossed,
         "indistinguishable_from": [other.name for other in standing.alike],
         "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
         "experiment_separates": any(design.separates for design in result.designs if design.candidate == candidate),

@@ -9,11 +9,13 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
+from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
+from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.posterior import Posterior, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, Step, begun_again, refined
+from host.diagnosis.selection.search import Found, Step, refined
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -26,13 +28,14 @@ class Standing:
     """Evidence of one effect of the best model, and what could stand in its place."""
 
     candidate: Candidate
-    gain: Gain  # on held-out samples
+    gain: Gain  # on held-out samples, or of all recordings predicted by one another
     both: Gain  # on all samples
     alike: tuple[Candidate, ...]
     rivals: tuple[tuple[Candidate, float], ...] = ()  # refitted in its place, with the coarsened difference of likelihoods
     parameters: int = 1
     share: float = np.inf  # part of the nominal mismatch that it alone removes; infinite where it is the only effect
     rests_on: str = ""  # recording without which the others are not evidence enough
+    crossed: bool = False  # `gain` is that of recordings that are predicted from one another
 
 
 def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]:
@@ -47,6 +50,8 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
             set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
+        crossed = unexcited(problem, less, found.best, len(term.parameters), noise_sd, gain)
+        gain = crossed or gain
         alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
         said = _better_said(problem, found, term.candidate, less, noise_sd)
         alike += tuple(candidate for candidate, _ in said)
@@ -54,7 +59,9 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
         alone = _rests_on(problem, less, found.best, noise_sd, len(term.parameters))
         share = _share(problem, found, less, noise_sd) if terms else np.inf
-        out.append(Standing(term.candidate, gain, both, alike, differences, len(term.parameters), share, alone))
+        out.append(
+            Standing(term.candidate, gain, both, alike, differences, len(term.parameters), share, alone, crossed is not None)
+        )
     return out
 
 

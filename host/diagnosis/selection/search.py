@@ -22,10 +22,11 @@ from host.diagnosis.estimation.fit import (
     robust,
     set_starts,
 )
-from host.diagnosis.estimation.initial_state import estimate_state, fit_with_states
+from host.diagnosis.estimation.initial_state import begun_again, start_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
+from host.diagnosis.selection.folds import unexcited, with_other_recordings
 from host.diagnosis.selection.joint import best_pair, pair_instead
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
@@ -46,7 +47,6 @@ from host.diagnosis.symbolic.dictionary import Form
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
-STATE_STEPS = 3  # of parameters and initial states together
 
 
 @dataclass
@@ -81,28 +81,6 @@ def settle(problem: Problem, values: Array) -> None:
     for segment in problem.segments:
         problem.model.settle(segment, values)
     start_again(problem, Fit((), values))
-
-
-def start_again(problem: Problem, fit: Fit) -> None:
-    """Lets a model that runs freely from a measured state find that state again."""
-    if problem.joint_states:
-        fit_with_states(problem, fit, 0)
-        return
-    for segment in problem.segments:
-        unseen = problem.unseen(segment, fit.terms, fit.values)
-        estimate_state(problem.model, segment, *problem.parted(fit.terms, fit.values), unseen)
-
-
-def begun_again(problem: Problem, fit: Fit) -> Fit:
-    """`fit` with its own states at the first samples, where the model is a linear path.
-
-    A delay of the input begins with another state of a linear plant than a delay of its reading does. With the state of
-    one of them the other looks worse than it is; with that of the nominal fit, every effect looks better than it is.
-    """
-    if not problem.joint_states:
-        return fit
-    fit = fit_with_states(problem, fit, STATE_STEPS)
-    return minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
 
 
 def refined(problem: Problem, fit: Fit) -> Fit:
@@ -268,6 +246,7 @@ def _grow(
         rank(trials, best)
         trials = _with_simpler(problem, best, trials, ranked, noise_sd)
         trials = with_wider(problem, best, trials, ranked, noise_sd)
+        with_other_recordings(problem, best, trials, noise_sd)
         winner = next(
             (t for t in trials if good_enough(t, best) and weighty(t, earned) and not only_sampling(t, trials)), None
         )
@@ -606,6 +585,7 @@ def _in_place_of(
         for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
     ]
     rank(trials, less)
+    with_other_recordings(problem, less, trials, noise_sd)
     found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
@@ -667,6 +647,8 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
                 term.parameters
             )
             gone = vanished(best, term, problem.rules)
+            if held.log_likelihood < 0.0:
+                held = unexcited(problem, less, best, len(term.parameters), noise_sd) or held
             if gone or few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))

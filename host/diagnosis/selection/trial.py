@@ -28,6 +28,7 @@ class Trial:
     period_s: float = 0.0
     rules: SelectionRules = RULES
     apart: bool = True  # whether whole recordings are held out, not blocks between the fitted ones
+    crossed: Gain | None = None  # of all recordings, each predicted from the others, where those held out show nothing
 
 
 def at_bound(fit: Fit) -> bool:
@@ -195,7 +196,16 @@ def good_enough(trial: Trial, base: Fit) -> bool:
 def called_for(trial: Trial, base: Fit) -> bool:
     """Whether the evidence of a trial is enough, wherever its parameters ended."""
     more = max(len(trial.fit.values) - len(base.values), 0)
+    if trial.crossed is not None and _across(trial, trial.crossed, more):
+        return True
     return _alone(trial, more) or (trial.apart and _together(trial, more)) or _plainly(trial, more)
+
+
+def _across(trial: Trial, crossed: Gain, more: int) -> bool:
+    """Whether recordings that are predicted from one another call for it: no sample was fitted to what it judges."""
+    rules, gained = trial.rules, crossed.log_likelihood - more
+    agreed = gained > rules.pooled_log_likelihood and crossed.p_value < rules.weak_significance
+    return crossed.share > _least(trial, crossed) and (agreed or gained > rules.decisive_log_likelihood)
 
 
 def _alone(trial: Trial, more: int) -> bool:
