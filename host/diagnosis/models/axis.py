@@ -24,7 +24,7 @@ from host.diagnosis.model.model import (
     tolerance_of,
 )
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import fill, smooth_derivatives
+from host.diagnosis.model.operators import calm, fill, smooth_derivatives, white_level
 from host.diagnosis.models import balance
 
 Array = npt.NDArray[np.float64]
@@ -42,6 +42,7 @@ class AxisSegment(Segment):
     substeps: int = 1  # of the integration, in one period
     stages: Array | None = None  # (n, substeps, 3) recorded input at the stages of Runge-Kutta
     balance: balance.Balance | None = None
+    force_noise: Array | None = None  # (n,) of the recorded force, where it is what is compared
 
 
 class AxisModel(Model):
@@ -143,6 +144,8 @@ class AxisModel(Model):
         else:
             segment.y = np.zeros_like(y)
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
+            recorded = segment.inputs[spec.input]
+            segment.force_noise = recorded - calm(recorded, white_level(recorded), 1.0)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
         return segment
 
@@ -237,8 +240,11 @@ class AxisModel(Model):
         drive = [effect for effect in active if effect[0].port.name == place]
         late = self.hold == "zero" and bool(drive) and all(candidate.effect.shifts == "time" for candidate, _ in drive)
         finer = FINER * segment.substeps if late else 1  # a held input that is late by a part of a sample jumps within it
-        force = np.repeat(recorded, finer) if late else recorded
-        force = apply_effects(force, drive, place, segment, None, finer=finer)
+        noise = segment.force_noise if drive else None  # what reads the force is no part of the drive: no effect smooths it
+        true = recorded if noise is None else recorded - noise
+        force = apply_effects(np.repeat(true, finer) if late else true, drive, place, segment, None, finer=finer)
+        if noise is not None:
+            force = force + (np.repeat(noise, finer) if late else noise)
         slots = [
             candidate.effect.slots(values, candidate.form)
             for candidate, values in active

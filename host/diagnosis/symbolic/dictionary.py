@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -26,8 +27,11 @@ PLAYS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)  # widths, parts of the span
 LAGS_S = (0.05, 0.2, 0.6, 2.0, 6.0)
 WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
+OFF_CENTRE = 0.03  # part of the range by which its middle has to be off zero for a product of deviations to be another form
 MOST_FORMS = 2  # joined to predict_residual
 BEST = 6  # forms that are fitted again
+CHOICES = 3  # best forms on the samples to fit, of which those held out choose
+WILD = 3.0  # robust standard deviations beyond which a residual counts less (Huber 1964)
 CURVES = ("abs", "sqrt", "square", "exp", "tanh")  # functions of which an equation of a static curve is made
 NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
@@ -72,6 +76,7 @@ def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
     for i, group in enumerate(factors):
         for k, other in enumerate(factors[i:]):
             out += [_product(a, b) for at, a in enumerate(group) for b in (other[at:] if k == 0 else other)]
+    out += [_product(_centred(a), _centred(b)) for a, b in combinations(signals, 2) if a.offset or b.offset]
     if timed and signals:
         x, rate = factors[0][0], factors[0][-2]
         out += [_product(_product(x, x), rate), _product(x, _product(rate, rate))]
@@ -94,6 +99,7 @@ class _Signal:
     values: Callable[[Segment], Array]
     span: float
     largest: float
+    offset: float = 0.0  # of its middle from zero, where that is seen
 
 
 def _signals(problem: Problem, fit: Fit, port: Port) -> Iterator[_Signal]:
@@ -107,9 +113,9 @@ def _signals(problem: Problem, fit: Fit, port: Port) -> Iterator[_Signal]:
     for key, values in sources.items():
         together = np.concatenate([values(p) for p in problem.segments])
         unit = units.get(key) or units.get(port.name, "") if key == own else units.get(key, "")
-        yield _Signal(
-            problem.columns.get(key, key), unit, values, float(np.ptp(together)), float(np.max(np.abs(together))) or 1.0
-        )
+        span, middle = float(np.ptp(together)), 0.5 * float(np.min(together) + np.max(together))
+        offset = float(f"{middle:.3g}") if abs(middle) > OFF_CENTRE * span else 0.0
+        yield _Signal(problem.columns.get(key, key), unit, values, span, float(np.max(np.abs(together))) or 1.0, offset)
 
 
 def _own(problem: Problem, fit: Fit, port: Port) -> Callable[[Segment], Array]:
@@ -159,6 +165,14 @@ def _memories(signal: _Signal, timed: bool) -> Iterator[Form]:
     yield Form(f"{name}^3", lambda p: x(p) ** 3, 3)
     for seconds in LAGS_S if timed else ():
         yield Form(f"lag({name}, {seconds:g})", lambda p, s=seconds: lag(x(p), p.recording.dt_s, s), 3)  # type: ignore[misc]
+
+
+def _centred(signal: _Signal) -> Form:
+    """The signal measured from the middle of its range, where that is not at zero."""
+    if not signal.offset:
+        return Form(signal.name, signal.values, 1)
+    sign = "-" if signal.offset > 0.0 else "+"
+    return Form(f"({signal.name} {sign} {abs(signal.offset):g})", lambda p: signal.values(p) - signal.offset, 1)
 
 
 def _product(a: Form, b: Form) -> Form:
@@ -316,18 +330,21 @@ def _best(
         if not order:
             break
         worth = worth or tuple((forms[k], float(sums.sizes([k])[0])) for k in order[:BEST])
-        chosen = [*chosen, order[0]]
-        sizes = sums.sizes(chosen)
-        after = [
-            r - response.to(chosen, sizes) + np.tensordot(sums.absorbed(chosen, sizes), slope, 1)
-            for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
-        ]
-        held = compare(problem.segments, "heldout", fit.residuals, after, noise_sd)
-        trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd)
-        likelihood = held.log_likelihood - len(chosen)
+        tried = []
+        for k in order[:CHOICES]:  # chosen by held-out samples, which is paid for
+            sizes = sums.sizes([*chosen, k])
+            after = [
+                r - response.to([*chosen, k], sizes) + np.tensordot(sums.absorbed([*chosen, k], sizes), slope, 1)
+                for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
+            ]
+            tried.append((compare(problem.segments, "heldout", fit.residuals, after, noise_sd), k, after))
+        held, k, after = max(tried, key=lambda one: one[0].log_likelihood)
+        chosen = [*chosen, k]
+        likelihood = held.log_likelihood - len(chosen) * (1.0 + np.log(len(tried)))
         if likelihood > best.log_likelihood:
+            trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd).log_likelihood
             power = fallen(problem, fit.residuals, after, noise_sd)
-            best = PredictedPart(subsystem, port, likelihood, held.p_value, held.share, trained.log_likelihood, worth, power)
+            best = PredictedPart(subsystem, port, likelihood, held.p_value, held.share, trained, worth, power)
     rules = problem.rules
     sure = (
         min(best.log_likelihood, best.trained) > rules.predictable_log_likelihood
@@ -354,6 +371,15 @@ def _by_gain(gain: Array, forms: list[Form], penalty: float) -> list[int]:
     return sorted(order, key=lambda k: -gain[k] * (1.0 - penalty * forms[k].length))
 
 
+def _weights(r: Array) -> Array:
+    """Square roots of Huber's weights of residuals `r` (outputs, n), in units of each output's own scatter."""
+    weights = np.ones_like(r)
+    for row, values in zip(weights, np.abs(r), strict=True):
+        if values.any():  # samples that are not there are zeros
+            row[:] = np.sqrt(np.minimum(1.0, WILD * 1.4826 * np.median(values[values > 0.0]) / np.maximum(values, 1e-300)))
+    return weights
+
+
 class _Sums:
     """Inner products, over the samples to fit and in units of noise, of forms, parameters and residual."""
 
@@ -369,19 +395,21 @@ class _Sums:
             seen = np.isfinite(residual[:, mask])
             r = np.where(seen, residual[:, mask], 0.0) / unit
             r = np.clip(np.where(seen, r, 0.0), -1e6, 1e6)
-            J = np.where(seen, slope[:, :, mask], 0.0) / unit
+            weighed = unit / _weights(r)
+            r = np.where(seen, residual[:, mask], 0.0) / weighed
+            J = np.where(seen, slope[:, :, mask], 0.0) / weighed
             J = np.where(np.any(seen, axis=1)[None, :, None], J, 0.0)
             own += np.einsum("kon,lon->kl", J, J)
             start += np.einsum("kon,on->k", J, r)
             if response.slope is not None:
                 table = response.table[:, mask]
-                s = np.where(seen, response.slope[:, mask], 0.0) / unit
+                s = np.where(seen, response.slope[:, mask], 0.0) / weighed
                 gram += (table * np.sum(s * s, axis=0)) @ table.T
                 cross += table @ np.einsum("on,kon->kn", s, J).T
                 pull += table @ np.sum(s * r, axis=0)
             else:
                 assert response.whole is not None
-                D = (np.where(seen, response.whole[:, :, mask], 0.0) / unit).reshape(count, -1)
+                D = (np.where(seen, response.whole[:, :, mask], 0.0) / weighed).reshape(count, -1)
                 gram += D @ D.T
                 cross += D @ J.reshape(rates, -1).T
                 pull += D @ r.ravel()

@@ -47,6 +47,7 @@ EFFECT = {
     "probability_raw",
     "alternatives",
     "rests_on",
+    "cross_validated",
     "says",
     "equation",
     "parameters",

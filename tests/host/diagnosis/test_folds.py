@@ -60,3 +60,25 @@ def test_friction_that_is_smaller_at_low_speed_is_dry_friction() -> None:
     content = diagnose([dragged(rng, 0.3, 0.01) for _ in range(2)], law).as_dict()
     assert [effect["id"] for effect in content["effects"]] == ["coulomb_friction"]
     assert content["effects"][0]["parameters"]["force_N"]["value"] == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_product_of_deviations_is_found() -> None:
+    """Neither factor is zero at rest: the product of the recorded signals alone is another law."""
+    rng, t, runs = np.random.default_rng(5), np.arange(0.0, 25.0, 0.02), []
+    for _ in range(3):
+        turn, load = (
+            sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.0)) for f in hertz)
+            for hertz in ((0.17, 0.41, 0.9), (0.11, 0.29, 0.67))
+        )
+        motor, bent = 2.0 + 0.3 * turn, 5.0 + load
+        y = 0.8 * motor + 0.02 * (motor - 2.0) * (bent - 5.0) + 2e-3 * rng.standard_normal(t.size)
+        runs.append({"t": t, "m": motor, "b": bent, "y": y})
+    law = {
+        **GEAR,
+        "channels": {**GEAR["channels"], "bend": {"column": "b", "unit": "N"}},
+        "link": [{**GEAR["link"][0], "load": ["bend"]}],
+    }
+    content = diagnose(runs, law).as_dict()
+    assert [effect["id"] for effect in content["effects"]] == ["unlisted"]
+    assert "(m - 2" in content["effects"][0]["equation"] and "(b - " in content["effects"][0]["equation"]
+    assert content["fit"]["rmse_after"] == pytest.approx(2e-3, rel=0.1)
