@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 
 
 def damping(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -26,17 +26,23 @@ def apply(law: dict, c: Context, p: Array, form: str) -> dict:
     return {**law, ("crossley" if form == "crossley" else "damping"): float(p[0])}
 
 
+_DAMPED = Effect(
+    "contact_viscous",
+    "contact",
+    21,
+    damping,
+    "The tissue has viscous damping: {damping}.",
+    "F = k*depth + damping*rate",
+    apply,
+    timed=True,
+)
 EFFECTS = (
-    Effect(
-        "contact_viscous",
-        "contact",
-        21,
-        damping,
-        "The tissue has viscous damping: {damping}.",
-        "F = k*depth + damping*rate",
-        apply,
-        timed=True,
-        forms=("", "crossley"),
+    _DAMPED,
+    in_form(
+        _DAMPED,
+        "crossley",
+        "The tissue has viscous damping that grows with depth: {damping}.",
+        "F = k*depth*(1 + damping*rate)",
     ),
     Effect(
         "contact_viscous",

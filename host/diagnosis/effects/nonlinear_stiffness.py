@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, is_force
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, is_force
 
 
 def per_load(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -47,6 +47,15 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
     return {**state, "push": state["push"] * (1.0 + p[0] * np.sum(state["push"] ** 2, axis=0))}
 
 
+_SPRING = Effect(
+    "nonlinear_stiffness",
+    "force",
+    20,
+    force,
+    "The spring hardens or softens with deflection: cubic coefficient {cubic}.",
+    "F = cubic*x^3",
+    slots=slots,
+)
 EFFECTS = (
     Effect(
         "nonlinear_stiffness",
@@ -69,14 +78,11 @@ EFFECTS = (
         source="load",
         contains=("compliance",),
     ),
-    Effect(
-        "nonlinear_stiffness",
-        "force",
-        20,
-        force,
-        "The spring hardens or softens with deflection: cubic coefficient {cubic}.",
-        "F = cubic*x^3",
-        slots=slots,
-        forms=("", "quadratic"),
+    _SPRING,
+    in_form(
+        _SPRING,
+        "quadratic",
+        "The spring hardens or softens with deflection, not alike in both directions: coefficients {quadratic} and {cubic}.",
+        "F = quadratic*x^2 + cubic*x^3",
     ),
 )

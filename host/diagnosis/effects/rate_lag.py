@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 from host.diagnosis.model.operators import lag, lagged_rows
 
 
@@ -34,6 +34,17 @@ def rows(values: Array, c: Context, time_constant_s: float) -> Array:
 
 
 SAYS = "The output follows with a first-order lag of {time_constant}."
+_TRACKER = Effect(
+    "rate_lag",
+    "pose",
+    81,
+    parameters,
+    "The tracker follows with a lag of {time_constant}.",
+    "time_constant*dy/dt + y = x",
+    apply_pose,
+    timed=True,
+    shifts="time",
+)
 EFFECTS = tuple(
     Effect(
         "rate_lag",
@@ -50,17 +61,12 @@ EFFECTS = tuple(
     )
     for port in ("motion", "timing")
 ) + (
-    Effect(
-        "rate_lag",
-        "pose",
-        81,
-        parameters,
-        "The tracker follows with a lag of {time_constant}.",
+    _TRACKER,
+    in_form(
+        _TRACKER,
+        "positions",
+        "The tracker's positions follow with a lag of {time_constant}, its orientations at once.",
         "time_constant*dy/dt + y = x",
-        apply_pose,
-        timed=True,
-        forms=("", "positions"),
-        shifts="time",
     ),
     Effect(
         "rate_lag",

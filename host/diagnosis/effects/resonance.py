@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import FORCES, Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import FORCES, Array, Context, Effect, Parameter, Scale, in_form, spread
 from host.diagnosis.model.operators import second_order
 
 DRIVES = (*FORCES, "V", "A", "mA")  # units of what drives a mass
@@ -78,39 +78,50 @@ def slots(p: Array, form: str) -> dict[str, float]:
 # Two masses on a spring k and damper d: the drive follows its force as the rigid pair does, times
 # 1 + ratio s^2 / (s^2 + 2 z w s + w^2), ratio = load / drive mass, w^2 = k (1/m1 + 1/m2) (Ellis, Control System Design
 # Guide, 2012, chapter 16).
-EQUATION = (
-    "m'' + 2 z w m' + w^2 m = w^2 x,  y = m; share: y = x + share*(m - x); drive: y = x + load_ratio*(x - m - 2 z/w m')"
+_MODE = "m'' + 2 z w m' + w^2 m = w^2 x"
+_WHOLE = tuple(
+    Effect(
+        "resonance",
+        port,
+        63,
+        parameters,
+        says,
+        f"{_MODE},  y = m",
+        apply,
+        timed=True,
+        contains=("rate_lag",),
+        remembers=True,
+        begins_with_speed=True,
+        invariant=True,
+    )
+    for port, says in (
+        ("motion", "The output oscillates at {frequency}, damping ratio {damping_ratio}."),
+        (
+            "mode",
+            "A spring connects the drive with the measured output; it oscillates at {frequency}, damping ratio "
+            "{damping_ratio}.",
+        ),
+    )
 )
 EFFECTS = (
-    Effect(
-        "resonance",
-        "motion",
-        63,
-        parameters,
-        "The output oscillates at {frequency}, damping ratio {damping_ratio}.",
-        EQUATION,
-        apply,
-        timed=True,
-        forms=("", "share", "drive"),
-        contains=("rate_lag",),
-        remembers=True,
-        begins_with_speed=True,
-        invariant=True,
-    ),
-    Effect(
-        "resonance",
-        "mode",
-        63,
-        parameters,
-        "A spring connects the drive with the measured output; it oscillates at {frequency}, damping ratio {damping_ratio}.",
-        EQUATION,
-        apply,
-        timed=True,
-        forms=("", "share", "drive"),
-        contains=("rate_lag",),
-        remembers=True,
-        begins_with_speed=True,
-        invariant=True,
+    *(
+        each
+        for whole in _WHOLE
+        for each in (
+            whole,
+            in_form(
+                whole,
+                "share",
+                "A mode at {frequency}, damping ratio {damping_ratio}, takes a share of {mode_share} of the motion.",
+                f"{_MODE},  y = x + mode_share*(m - x)",
+            ),
+            in_form(
+                whole,
+                "drive",
+                "A load, {load_ratio} of the drive's mass, oscillates on it at {frequency}, damping ratio {damping_ratio}.",
+                f"{_MODE},  y = x + load_ratio*(x - m - 2 z/w m')",
+            ),
+        )
     ),
     Effect(
         "resonance",

@@ -74,7 +74,10 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"drive_limit": p[0]}
 
 
-SAYS = "The output does not follow beyond {limit}."
+SIDES = (
+    ("upper", "The output does not follow above {limit}.", "y = min(x, limit)"),
+    ("lower", "The output does not follow below {limit}.", "y = max(x, limit)"),
+)
 EFFECTS = (
     (
         Effect(
@@ -107,13 +110,14 @@ EFFECTS = (
             port,
             33,
             parameters,
-            SAYS,
-            "y = min(x, limit)",
+            says,
+            equation,
             apply,
-            forms=("upper", "lower"),
+            forms=(side,),
             natural_bounds=True,
         )
         for port in ("motion", "limit")
+        for side, says, equation in SIDES
     )
     + tuple(
         Effect(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 
 
 def pose(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -38,17 +38,19 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + p[:, None])
 
 
+_TRACKER = Effect(
+    "sensor_bias",
+    "pose",
+    86,
+    pose,
+    "The tracker reads positions shifted by ({offset_x}, {offset_y}, {offset_z}).",
+    "y = x + offset",
+    apply_pose,
+)
+_TIP = "The tip sensor alone reads positions shifted by ({offset_x}, {offset_y}, {offset_z})."
 EFFECTS = (
-    Effect(
-        "sensor_bias",
-        "pose",
-        86,
-        pose,
-        "The tracker reads positions shifted by ({offset_x}, {offset_y}, {offset_z}).",
-        "y = x + offset",
-        apply_pose,
-        forms=("", "tip"),
-    ),
+    _TRACKER,
+    in_form(_TRACKER, "tip", _TIP, "y = x + offset"),
     Effect(
         "sensor_bias",
         "forces",

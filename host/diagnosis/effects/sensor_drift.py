@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 
 
 def warming(s: Scale) -> Parameter:
@@ -66,30 +66,43 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     return np.asarray(signal + _wander(c, p, form))
 
 
+WARMS_UP = "y = x + level*(1 - exp(-t/time_constant))"
+_TRACKER = Effect(
+    "sensor_drift",
+    "pose",
+    88,
+    vector,
+    "The tracker's positions drift with time, independent of motion.",
+    "y = x + rate*t",
+    apply_pose,
+    timed=True,
+    at_rest=True,
+)
+_FORCE_SENSOR = Effect(
+    "sensor_drift",
+    "forces",
+    88,
+    vector,
+    "The force sensor drifts with time, independent of contact.",
+    "y = x + rate*t",
+    apply_force,
+    timed=True,
+    at_rest=True,
+)
 EFFECTS = (
-    Effect(
-        "sensor_drift",
-        "pose",
-        88,
-        vector,
-        "The tracker's positions drift with time, independent of motion.",
-        "y = x + rate*t",
-        apply_pose,
-        timed=True,
-        forms=("", "warm_up"),
-        at_rest=True,
+    _TRACKER,
+    in_form(
+        _TRACKER,
+        "warm_up",
+        "The tracker's positions drift with a time constant of {time_constant}, independent of motion.",
+        WARMS_UP,
     ),
-    Effect(
-        "sensor_drift",
-        "forces",
-        88,
-        vector,
-        "The force sensor drifts with time, independent of contact.",
-        "y = x + rate*t",
-        apply_force,
-        timed=True,
-        forms=("", "warm_up"),
-        at_rest=True,
+    _FORCE_SENSOR,
+    in_form(
+        _FORCE_SENSOR,
+        "warm_up",
+        "The force sensor drifts with a time constant of {time_constant}, independent of contact.",
+        WARMS_UP,
     ),
     Effect(
         "sensor_drift",
@@ -108,7 +121,7 @@ EFFECTS = (
         80,
         parameters,
         "The reading drifts by {level} with a time constant of {time_constant}, independent of motion.",
-        "y = x + level*(1 - exp(-t/time_constant))",
+        WARMS_UP,
         apply,
         timed=True,
         forms=("warm_up",),

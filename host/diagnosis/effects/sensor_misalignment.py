@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -36,7 +36,10 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 SAYS = "The sensor's axes are turned by ({turn_x}, {turn_y}, {turn_z})."
+_TRACKER = Effect("sensor_misalignment", "pose", 87, parameters, SAYS, "y = R x", apply_pose)
+_TIP = "The tip sensor is turned in its own frame by ({turn_x}, {turn_y}, {turn_z})."
 EFFECTS = (
-    Effect("sensor_misalignment", "pose", 87, parameters, SAYS, "y = R x", apply_pose, forms=("", "tip")),
+    _TRACKER,
+    in_form(_TRACKER, "tip", _TIP, "R_tip = R_tip R"),
     Effect("sensor_misalignment", "forces", 87, parameters, SAYS, "y = R x", apply_force),
 )

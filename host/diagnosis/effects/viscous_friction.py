@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -30,6 +30,17 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"drag" if form == "quadratic" else "viscous": p[0]}
 
 
+_LINEAR = Effect(
+    "viscous_friction",
+    "force",
+    14,
+    force,
+    "A force of {coefficient} times the speed acts against the motion.",
+    "F = coefficient*v",
+    slots=slots,
+    timed=True,
+    dissipates=True,
+)
 EFFECTS = (
     Effect(
         "viscous_friction",
@@ -43,16 +54,11 @@ EFFECTS = (
         dissipates=True,
         invariant=True,
     ),
-    Effect(
-        "viscous_friction",
-        "force",
-        14,
-        force,
-        "A force of {coefficient} times the speed acts against the motion.",
-        "F = coefficient*v",
-        slots=slots,
-        timed=True,
-        forms=("", "quadratic"),
-        dissipates=True,
+    _LINEAR,
+    in_form(
+        _LINEAR,
+        "quadratic",
+        "A drag of {coefficient} times the square of the speed acts against the motion.",
+        "F = coefficient*v*|v|",
     ),
 )

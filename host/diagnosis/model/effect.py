@@ -235,6 +235,11 @@ def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     return tuple(float(value) for value in np.geomspace(low, high, count))
 
 
+def in_form(effect: Effect, form: str, says: str, equation: str) -> Effect:
+    """`effect` in another form, which says something else by another equation."""
+    return replace(effect, forms=(form,), says=says, equation=equation)
+
+
 def lines(s: Scale, low_Hz: float, top_Hz: float, spacing: float) -> tuple[float, ...]:
     """Frequencies (Hz) to search, so far apart that the phase differs by `spacing` turns over the recordings.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from host.diagnosis.effects.dead_time import corner
 from host.diagnosis.effects.missed_steps import change_points
 from host.diagnosis.effects.reference import table
 from host.diagnosis.model import operators as op
+from host.diagnosis.model.effect import Scale
 
 Array = np.ndarray
 DT = 0.01
@@ -122,3 +124,14 @@ def test_every_effect_states_its_traits() -> None:
 def test_the_page_holds_the_table_of_effects() -> None:
     page = Path(__file__).parents[3] / "docs" / "diagnosis.md"
     assert table() in page.read_text(encoding="utf-8")
+
+
+def test_a_form_with_other_parameters_states_an_equation_of_its_own() -> None:
+    """A sentence or an equation that holds for one form only would be false of the other."""
+    sized = Scale("N", 2.0, -1.0, 1.0, 5.0, 1e-3, 0.3, DT, 10.0, True, source_unit="N", motion_unit="m")
+    for effect in library():
+        of_form = {form: {p.name for p in effect.parameters(sized, form)} for form in effect.forms}
+        names = of_form[effect.forms[0]]
+        assert all(other == names for other in of_form.values()), (effect.id, effect.port, of_form)
+        for name in re.findall(r"{(\w+)}", effect.says) if names else ():
+            assert name == "source" or name in names, (effect.id, effect.says)
