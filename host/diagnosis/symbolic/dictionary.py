@@ -81,7 +81,8 @@ def forms_at(problem: Problem, fit: Fit, port: Port) -> list[Form]:
         x, rate = factors[0][0], factors[0][-2]
         out += [_product(_product(x, x), rate), _product(x, _product(rate, rate))]
     own = problem.columns.get(problem.model.moves[port.name], problem.model.moves[port.name])
-    return [replace(form, curve=is_curve(form.text, own)) for form in out]
+    # A multiple of the port's own speed is a damping or a lag. What it explains past these is how a motion was smoothed.
+    return [replace(form, curve=is_curve(form.text, own)) for form in out if form.text != f"rate({own})"]
 
 
 def is_curve(text: str, own: str) -> bool:

@@ -63,6 +63,7 @@ def test_forms_are_told_as_they_are_computed(tmp_path: Path) -> None:
     assert np.array_equal(forms["sin(2*motor)*abs(load)"], np.sin(2.0 * motor) * np.abs(load))
     assert all(np.isfinite(values).all() and values.shape == motor.shape for values in forms.values())
     assert len({text.replace(" ", "") for text in forms}) == len(forms)
+    assert "rate(motor)" not in forms  # a lag or a damping says it, but for how a motion was smoothed
 
 
 def test_data_without_time_have_no_rates(tmp_path: Path) -> None:
