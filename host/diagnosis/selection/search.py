@@ -348,11 +348,11 @@ def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Sc
     """
     bounded = [trial for trial in trials if at_bound(trial.fit) and called_for(trial, best)]
     fitted = {trial.candidate.key for trial in trials}
-    missing = [
-        item
-        for item in ranked
-        if item.candidate.key not in fitted and any(wider(item.candidate, trial.candidate) for trial in bounded)
-    ]
+    left = [item for item in ranked if item.candidate.key not in fitted]
+    missing = [item for item in left if any(wider(item.candidate, trial.candidate) for trial in bounded)]
+    if bounded and bounded[0] is trials[0]:  # nothing does as well: what else is there at its place
+        port = bounded[0].candidate.port.name
+        missing += [item for item in left if item not in missing and item.candidate.port.name == port]
     if not missing or problem.budget.spent():
         return trials
     more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.wider_fits])]
