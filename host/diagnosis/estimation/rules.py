@@ -39,8 +39,8 @@ class SelectionRules:
     # Search effort: how many candidates are fitted, never how long.
     screening_log_likelihood: float = 3.0  # projected gain from which a candidate is fitted
     least_fits: int = 4  # candidates that are fitted for any promise, while the residual is above noise
-    fits_per_step: int = 12
-    fits_per_port: int = 7
+    fits_per_step: int = 10
+    fits_per_port: int = 5
     first_iterations: int = 5  # of a fit from each start
     further_iterations: int = 9  # from the best of these on
     most_effects: int = 5

@@ -115,8 +115,6 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
         force += p[SINE] * math.sin(TWO_PI * t * p[FREQUENCY]) + p[COSINE] * math.cos(TWO_PI * t * p[FREQUENCY])
     if p[MOMENT_S] != 0.0 or p[MOMENT_C] != 0.0:
         force += p[MOMENT_S] * math.sin(x) + p[MOMENT_C] * math.cos(x)
-    if p[SMOOTH_SPEED] > 0.0:
-        force += p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED])
     depth = x - p[CONTACT_X]
     if p[CONTACT_N] > 0.0 and depth > 0.0:
         force += depth ** p[CONTACT_N] * (p[CONTACT_K] + p[CONTACT_C] * v)
@@ -127,6 +125,40 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
 def level_at(v: float, p: Array) -> float:
     """Dry friction's level at speed v: Coulomb's, and what it has more at rest."""
     return p[COULOMB] + (p[EXCESS] * math.exp(-((v / p[STRIBECK]) ** 2)) if p[STRIBECK] > 0.0 else 0.0)
+
+
+@njit(cache=True)
+def _rising(v: float, p: Array) -> float:
+    """Friction at speed v of the law that rises with speed; nothing where there is none."""
+    return p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _slowed(v_free: float, lost: float, rise: float) -> float:
+    """Speed v with v + lost*tanh(v/rise) = v_free: friction that rises with speed over one step, by Newton's method.
+
+    Explicit steps would have to be as short as the mass takes to stop from the speed `rise`.
+    """
+    if rise <= 0.0:
+        return v_free
+    if lost <= 0.0:
+        return v_free - lost * math.tanh(v_free / rise)
+    low, high = min(v_free, 0.0), max(v_free, 0.0)
+    slides = abs(v_free) > lost + rise
+    v = v_free - math.copysign(lost, v_free) if slides else rise * math.atanh(0.999 * v_free / (lost + rise))
+    v = min(max(v, low), high)
+    for _ in range(20):
+        bent = math.tanh(v / rise)
+        error = v + lost * bent - v_free
+        if error > 0.0:
+            high = v
+        else:
+            low = v
+        step = error / (1.0 + lost / rise * (1.0 - bent * bent))
+        if abs(step) <= 1e-9 * (abs(v) + rise):
+            break
+        v = v - step if low < v - step < high else 0.5 * (low + high)
+    return v
 
 
 @njit(cache=True)
@@ -233,6 +265,7 @@ def along(
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
         out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
+        out[i] += _rising(v[i], p)
         if dry and p[STRIBECK_D] <= 0.0:
             out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
         if p[MASS2] > 0.0:
@@ -395,6 +428,8 @@ def run_axis(
                 if control.size
                 else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
+            # Half the impulse of friction that rises with speed before the step, half after it (Strang 1968).
+            s = (s[0], _slowed(s[1], 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED]), s[2], s[3])
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
             if short:
@@ -404,10 +439,12 @@ def run_axis(
                 x, v, x2, v2, a = _runge_kutta(s, push, begin_s + i * dt_s + j * h, h, slow, linear, p)
             if j == 0:
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
+                out[2, i] -= _rising(v_old, p) / m
             if dry > 0.0:
                 v_dry, stuck = _dry(v_old, v, a, dry, h, m)
                 x = x_old if stuck else x + 0.5 * h * (v_dry - v)
                 v = v_dry
+            v = _slowed(v, 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED])
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:

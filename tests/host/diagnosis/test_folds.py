@@ -54,12 +54,13 @@ def dragged(rng: np.random.Generator, force_N: float, slow_m_per_s: float) -> di
     return {"t": t, "f": drive, "x": out + 2e-5 * rng.standard_normal(t.size)}
 
 
-def test_friction_that_is_smaller_at_low_speed_is_dry_friction() -> None:
+@pytest.mark.parametrize("slow", [0.0005, 0.01, 0.03])
+def test_friction_that_is_smaller_at_low_speed_is_dry_friction(slow: float) -> None:
     rng = np.random.default_rng(3)
     law = {**SPRUNG, "axis": {**SPRUNG["axis"], "reads": "position", "hold": "linear"}}
-    content = diagnose([dragged(rng, 0.3, 0.01) for _ in range(2)], law).as_dict()
+    content = diagnose([dragged(rng, 0.3, slow) for _ in range(2)], law).as_dict()
     assert [effect["id"] for effect in content["effects"]] == ["coulomb_friction"]
-    assert content["effects"][0]["parameters"]["force_N"]["value"] == pytest.approx(0.3, rel=0.05)
+    assert content["effects"][0]["parameters"]["force_N"]["value"] == pytest.approx(0.3, rel=0.1)
 
 
 def test_a_product_of_deviations_is_found() -> None:
