@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 
 BRISTLES = 2e-3  # of the travel: friction that builds up over less is dry friction, over more presliding
 
@@ -41,6 +43,24 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"presliding": p[0], "presliding_distance": p[1]} if form == "bristles" else {"coulomb": p[0]}
 
 
+_DRY = Effect(
+    "coulomb_friction",
+    "force",
+    10,
+    force,
+    "A constant force of {force} acts against the motion.",
+    "F = force*sign(v)",
+    slots=slots,
+    family="dry",
+    remembers=True,
+    dissipates=True,
+)
+_RISING = in_form(
+    _DRY,
+    "smooth",
+    "A force of up to {force} acts against the motion; below a speed of about {speed} it is smaller.",
+    "F = force*tanh(v/speed)",
+)
 EFFECTS = (
     Effect(
         "coulomb_friction",
@@ -54,42 +74,12 @@ EFFECTS = (
         remembers=True,
         dissipates=True,
     ),
-    Effect(
-        "coulomb_friction",
-        "force",
-        10,
-        force,
-        "A constant force of {force} acts against the motion.",
-        "F = force*sign(v)",
-        slots=slots,
-        family="dry",
-        remembers=True,
-        dissipates=True,
-    ),
-    Effect(
-        "coulomb_friction",
-        "force",
-        10,
-        force,
+    _DRY,
+    in_form(
+        _DRY,
+        "bristles",
         "A constant force of {force} acts against the motion; it builds up within {distance}, far below the travel.",
         "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        forms=("bristles",),
-        family="dry",
-        remembers=True,
-        dissipates=True,
     ),
-    Effect(
-        "coulomb_friction",
-        "force",
-        10,
-        force,
-        "A force of up to {force} acts against the motion; below a speed of about {speed} it is smaller.",
-        "F = force*tanh(v/speed)",
-        slots=slots,
-        timed=True,
-        forms=("smooth",),
-        family="dry",
-        dissipates=True,
-    ),
+    replace(_RISING, timed=True, remembers=False),
 )
