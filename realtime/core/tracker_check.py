@@ -7,8 +7,9 @@ of the catheter:
 2. Knob, roll and every load on the catheter turn the sensors that they displace. If the whole part outside the sheath turned
    by R about the sheath's exit, a sensor at p would be displaced by (R - 1) p. A part that bends along its length displaces
    it by less in each direction. A displaced tracker turns neither sensor.
-3. The insertion displaces both sensors alike as well, but only along the sheath's axis (z of the base frame), and by what
-   the stage moved, less its backlash.
+3. The insertion displaces both sensors alike as well, by what the stage moved, less its backlash. Its direction lies
+   between the sheath's axis (z of the base frame) and the catheter's axis at the sensors: if the knob straightens the
+   catheter while it is inserted, both sensors keep their directions and the whole arc becomes longer.
 
 A catheter that slips in its holder, or a sheath that is displaced, looks the same and is as dangerous.
 """
@@ -42,6 +43,10 @@ WIDTHS = (0.75, 1.0, 1.25)
 UNEQUAL_SHARE = 0.25
 # So many frames in a row must be displaced.
 FRAMES = 2
+# Of the sheath's exit in the base frame, and of the catheter in the frame of each sensor.
+EXIT_AXIS = np.array([0.0, 0.0, 1.0])
+# What the insertion may have moved before the first status of the board.
+ANYWHERE_M = 1.0
 # The stamp of a pose and the time of a board's status agree to this.
 STAMP_ERROR_NS = 30_000_000
 
@@ -76,7 +81,7 @@ class _InsertionHistory(NamedTuple):
     def moved_m(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the least and the greatest displacement along the sheath that the insertion explains (m)."""
         if not self.stamps_ns:
-            return -np.inf, np.inf
+            return -ANYWHERE_M, ANYWHERE_M
         begin_m = self.possible_m[_around(self.stamps_ns, begin_ns)]
         end_m = self.possible_m[_around(self.stamps_ns, end_ns)]
         least_m = np.min(end_m.min(axis=0) - begin_m.max(axis=0))
@@ -171,9 +176,9 @@ class TrackerCheck:
         place_m = (before.tip.position_m + before.shaft.position_m) / 2
         turned_m = rotation((turns[0] + turns[1]) / 2) @ place_m - place_m
         least_m, most_m = np.minimum(turned_m, 0.0), np.maximum(turned_m, 0.0)
-        inserted_m = insertion.moved_m(before.stamp_ns, now.stamp_ns)
-        least_m[2] += inserted_m[0]
-        most_m[2] += inserted_m[1]
+        inserted_m = np.outer(insertion.moved_m(before.stamp_ns, now.stamp_ns), _directions(before)).reshape(-1, 3)
+        least_m += inserted_m.min(axis=0)
+        most_m += inserted_m.max(axis=0)
         moved_m = (tip_m + shaft_m) / 2
         length_m = float(np.linalg.norm(moved_m - np.clip(moved_m, least_m, most_m)))
         apart_m = float(np.linalg.norm(now.tip.position_m - now.shaft.position_m))
@@ -185,6 +190,11 @@ class TrackerCheck:
     def _insertion_history(self) -> _InsertionHistory:
         stamps_ns = [stamp_ns for stamp_ns, _ in self._insertion]
         return _InsertionHistory(stamps_ns, np.array([possible_m for _, possible_m in self._insertion]))
+
+
+def _directions(frame: _TrackerFrame) -> Vector:
+    """Return the axes of the catheter at the sheath's exit and at both sensors, (3, 3): rows of unit vectors."""
+    return np.array([EXIT_AXIS, *(rotation(pose.quaternion) @ EXIT_AXIS for pose in frame)])
 
 
 def _around(stamps_ns: list[int], stamp_ns: int) -> slice:

@@ -163,6 +163,15 @@ def test_a_motion_that_turns_the_sensors_is_none() -> None:
     assert found(moved, moved, turn=lambda seconds: 0.08 * float(moved(seconds)[1] > 0)) != []  # a turn the other way
 
 
+def test_an_insertion_while_the_knob_straightens_is_none() -> None:
+    """The arc becomes longer and the sensors keep their directions: both move along the catheter, not along the sheath."""
+    bend_rad, insertion = 0.9, approach(0.03)
+    direction = np.array([0.0, -np.sin(bend_rad), np.cos(bend_rad)])
+    moved = lambda seconds: insertion(seconds) * direction  # noqa: E731
+    assert found(moved, moved, insertion, turn=lambda seconds: bend_rad) == []
+    assert found(moved, moved, turn=lambda seconds: bend_rad) != []  # without the insertion nothing explains it
+
+
 def test_one_sensor_that_is_displaced_is_none() -> None:
     assert found(tip=step(0, 0.01)) == [] and found(shaft=step(0, 0.01)) == []
     assert found(step(0, 0.01), step(0, -0.01)) == []

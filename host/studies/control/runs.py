@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
 from protocol.enums import Phase
 from protocol.rig_file import Rig, parse_rig
-from protocol.topics import Message
+from protocol.topics import Message, RigCause
 from realtime.control import free_tip, target_predictor
 from realtime.control.configure import tick_parameters
 from realtime.control.records import TARGET_STATE, new
@@ -142,12 +142,16 @@ def still(rig: Rig, seed: int, seconds: float, beat: HeartConfig = REGULAR, job:
 
 
 class Reached(NamedTuple):
-    """Going to points, a row a goal: distance, RMS error after `within_s`, overshoot (m), time to stay within 1 mm (s)."""
+    """Going to points, a row a goal: distance, RMS error after `within_s`, overshoot (m), time to stay within 1 mm (s).
+
+    stopped_by: name of the failsafe's first cause, if it ended the motion; the goals after it were refused.
+    """
 
     distance_m: Array
     rms_m: Array
     overshoot_m: Array
     settled_s: Array
+    stopped_by: str = ""
 
 
 def random_goals(rig: Rig, count: int, seed: int) -> Array:
@@ -170,10 +174,17 @@ def go_to(rig: Rig, goals: Array, seed: int, within_s: float = 2.0, seconds: flo
     plant: parts of `sim.plant.PlantConfig` that are not the default ones, other than the wall, which is far away.
     """
     wall = replace(PlantConfig().tissue, point_m=FAR_AWAY_M)
-    run = _scenario(rig, seed, tissue=wall, **plant)
+    causes: list[str] = []
+
+    def publish(topic: str, message: Message) -> None:
+        if isinstance(message, RigCause) and message.name:
+            causes.append(message.name)
+
+    run = _scenario(rig, seed, publish=publish, tissue=wall, **plant)
     rows: list[tuple[float, ...]] = []
     if not run.arm():
-        return Reached(*np.zeros((4, 0)))
+        none = np.zeros(0)
+        return Reached(none, none, none, none, causes[0] if causes else "not armed")
     for goal in goals:
         path: list[Array] = []
 
@@ -184,7 +195,9 @@ def go_to(rig: Rig, goals: Array, seed: int, within_s: float = 2.0, seconds: flo
         run.command("target", "position", target_m=tuple(map(float, goal)))
         run.run(seconds, watch)
         rows.append(_judged(np.array(path), goal, round(within_s * 1000)))
-    return Reached(*np.array(rows).reshape(-1, 4).T)
+    stopped_by = causes[0] if causes and run.phase != Phase.POSITION else ""
+    distance_m, rms_m, overshoot_m, settled_s = np.array(rows).reshape(-1, 4).T
+    return Reached(distance_m, rms_m, overshoot_m, settled_s, stopped_by)
 
 
 def _judged(tip_m: Array, goal: Array, within: int) -> tuple[float, float, float, float]:

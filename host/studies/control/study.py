@@ -163,9 +163,12 @@ def _positions(runs: _Runs) -> dict[str, Any]:
             "settled_p50_s": float(np.median(there.settled_s)),
             "settled_max_s": float(np.max(there.settled_s)),
             "distance_mean_m": float(np.mean(there.distance_m)),
+            "stopped_by": there.stopped_by,
         }
     ours = table["predictive"]
-    table["reached"] = bool(ours["rms_m"] <= 5e-4 and ours["overshoot_m"] < 1e-3 and ours["settled_max_s"] <= 2.0)
+    stopped = any(table[name]["stopped_by"] for name in ("predictive", "thesis"))
+    accurate = ours["rms_m"] <= 5e-4 and ours["overshoot_m"] < 1e-3 and ours["settled_max_s"] <= 2.0
+    table["reached"] = bool(accurate and not stopped)
     return table
 
 
@@ -233,11 +236,11 @@ def _lines(table: dict[str, Any], depth: int) -> list[str]:
 
 
 _UNITS: Sequence[tuple[str, float, str]] = (
+    ("_m_per_s", 1e3, "mm/s"),
     ("_N", 1e3, "mN"),
     ("_m", 1e3, "mm"),
     ("_s", 1.0, "s"),
     ("_share", 100.0, "%"),
-    ("_m_per_s", 1e3, "mm/s"),
 )
 
 
@@ -248,6 +251,8 @@ def _plain(key: str) -> str:
 
 
 def _number(key: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value or "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     for suffix, scale, unit in _UNITS:

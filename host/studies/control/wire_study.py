@@ -41,7 +41,8 @@ def row(rig: Rig, seeds: list[int], seconds: float, friction: float, turning_rad
     knob = replace(WIRE, wire_friction=friction, wire_turning_rad=turning_rad)
     trips = [go_to(rig, random_goals(rig, GOALS, seed), seed, knob=knob) for seed in seeds]
     settled_s = np.concatenate([trip.settled_s for trip in trips])
-    cells = [f"{np.median(settled_s):.2f} s", f"{np.max(settled_s):.2f} s"]
+    stopped_by = sorted({trip.stopped_by for trip in trips} - {""})
+    cells = [f"{np.median(settled_s):.2f} s", f"{np.max(settled_s):.2f} s", ", ".join(stopped_by) or "-"]
     for source in ("sensor", "estimate"):
         runs = [hold(rig, seed, REGULAR, seconds, source, knob=knob) for seed in seeds]
         touched = [held for held in runs if held.reached]
@@ -60,8 +61,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0, help="after contact")
     options = parser.parse_args()
     plain = load_rig(SIMULATED_RIG)
-    print("| wire | settled within 1 mm, median | longest | RMS error, force sensor | largest | by poses alone | largest |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| wire | settled within 1 mm, median | longest | stopped by | RMS error, force sensor | largest | by poses alone "
+        "| largest |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory(prefix="seldinger-wire-") as folder:
         compensated = rubbing(plain, Path(folder), options.friction, options.turning)
         for name, rig, friction in (
