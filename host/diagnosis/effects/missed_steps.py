@@ -37,11 +37,12 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 def seeds(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
     """Instants at which a piecewise constant curve fits the residual best.
 
-    Several jumps need recordings on one clock: an axis that is homed before each recording forgets them.
+    Recordings without a common clock are laid upon each other from their begin: an axis that is homed before each of
+    them forgets what it lost, and the same motion loses it again at the same instants.
     """
     count = COUNT[form]
-    if not evidence.one_clock:
-        return parameters if count == 1 else ()
+    if count == 1 and not evidence.one_clock:
+        return parameters
     time_s, need = np.concatenate(evidence.time_s), np.concatenate(evidence.need)
     good = np.isfinite(need)
     order = np.argsort(time_s[good], kind="stable")

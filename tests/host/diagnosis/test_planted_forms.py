@@ -107,6 +107,21 @@ def test_several_jumps() -> None:
     assert instants == pytest.approx([6.3, 14.9, 24.1], abs=0.05)
 
 
+def test_jumps_at_the_same_instants_of_recordings_without_a_common_clock() -> None:
+    """An axis that is homed before each recording loses steps at the same places of the same motion."""
+
+    def lost(x: Motion) -> Array:
+        y = x(T).copy()
+        for instant in (7.1, 13.2, 25.7):
+            y[instant <= T] += 0.04
+        return y
+
+    verdict, effect = found(lost)
+    assert len(verdict["effects"]) == 1 and effect["id"] == "missed_steps" and at_noise(verdict)
+    instants = sorted(v["value"] for key, v in effect["parameters"].items() if key.startswith("instant"))
+    assert instants == pytest.approx([7.1, 13.2, 25.7], abs=0.05)
+
+
 def test_wear_with_the_distance_travelled() -> None:
     def worn(x: Motion) -> Array:
         fine = np.arange(0.0, SECONDS, DT / 10)
