@@ -123,6 +123,20 @@ def test_the_same_seed_gives_the_same_suite_and_no_trace_of_the_truth(tmp_path: 
             assert effect.partition("@")[0] not in (tmp_path / "one" / plan.id / "nominal.toml").read_text()
 
 
+def test_a_mechanism_without_a_case_is_followed_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once in about a thousand plans no draw had the wanted size; the whole suite ended with an error."""
+    monkeypatch.setattr(case, "ATTEMPTS", 2)
+    whole = case._attempt
+    first = ode.MECHANISMS[0]
+    monkeypatch.setattr(case, "_attempt", lambda mechanism, plan: None if mechanism is first else whole(mechanism, plan))
+    plan = next(p for p in case.plans("ode", 1, 24, len(ode.MECHANISMS)) if p.mechanism == 0 and p.category == "null")
+    made = case.make(ode.MECHANISMS, plan)
+    assert made.label["kind"] != first.name and made.label["plan"]["mechanism"] == 1
+    monkeypatch.setattr(case, "_attempt", lambda mechanism, plan: None)
+    with pytest.raises(RuntimeError, match="found no null case"):
+        case.make(ode.MECHANISMS, plan)
+
+
 def test_the_mix_is_as_told() -> None:
     planned = case.plans("ode", 9, 100, 4)
     count = {c: sum(p.category == c for p in planned) for c in case.SHARES}

@@ -313,14 +313,17 @@ def _attempt(mechanism: Mechanism, plan: CasePlan) -> DrawnCase | None:
 
 
 def make(mechanisms: Sequence[Mechanism], plan: CasePlan) -> Case:
-    """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if none does."""
-    mechanism = mechanisms[plan.mechanism]
-    for attempt in range(ATTEMPTS):
-        now = replace(plan, attempt=attempt)
-        drawn = _attempt(mechanism, now)
+    """Return the case of `plan`, redrawn until its effect has the wanted size. Raises RuntimeError if none does.
+
+    A mechanism that gives none in ATTEMPTS draws is followed by the next one.
+    """
+    for attempt in range(ATTEMPTS * len(mechanisms)):
+        number = (plan.mechanism + attempt // ATTEMPTS) % len(mechanisms)
+        now = replace(plan, attempt=attempt, mechanism=number)
+        drawn = _attempt(mechanisms[number], now)
         if drawn is not None:
-            return _finished(mechanism, now, drawn)
-    raise RuntimeError(f"{plan.world} {plan.id}: no {plan.category} case of {mechanism.name} and rho {plan.rho}")
+            return _finished(mechanisms[number], now, drawn)
+    raise RuntimeError(f"{plan.world} {plan.id}: found no {plan.category} case of rho {plan.rho} in {attempt + 1} draws")
 
 
 def _finished(mechanism: Mechanism, plan: CasePlan, drawn: DrawnCase) -> Case:
