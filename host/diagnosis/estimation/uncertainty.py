@@ -61,8 +61,8 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
 def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> list[Finding]:
     """Nominal parameters that these recordings do not show: at a bound, or with an interval over a decade.
 
-    A parameter that may be negative has no decades: it counts where half its interval changes the outputs by more than
-    UNSEEN of what the parameter that contributes most does.
+    One that may be negative counts only where half its interval changes the outputs by more than UNSEEN of what the
+    parameter that contributes most does, and of what the outputs vary (the one that contributes most may be held).
     """
     parameters = problem.model.parameters
     sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=False)]
@@ -74,12 +74,17 @@ def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> l
         moved[index] += 1e-3 * sizes[index]
         change = problem.stacked(fit.terms, moved) - base
         rates[index] = float(np.sqrt(np.mean(change**2))) / (1e-3 * sizes[index])
-    varied = max([rates[index] * abs(float(fit.values[index])) for index in moving], default=0.0)
+    outputs = np.hstack([segment.y[:, segment.fit] for segment in problem.segments]) / problem.scale[:, None]
+    outputs = outputs[:, np.isfinite(outputs).all(axis=0)]
+    varied = float(np.sqrt(np.mean(np.var(outputs, axis=1)))) if outputs.size else 0.0
+    varied = max([varied, *(rates[index] * abs(float(fit.values[index])) for index in moving)])
     found = []
     for index in moving:
         p, value, (low, high) = parameters[index], float(fit.values[index]), spans[index]
         at_bound = p.log and (value <= 1.01 * p.low or value >= 0.99 * p.high)
-        wide = high > DECADE * max(low, 1e-300) if p.log else 0.5 * (high - low) * rates[index] > UNSEEN * varied
+        wide = low * high <= 0.0 or low / high <= 1.0 / DECADE or low / high >= DECADE
+        if not p.log:
+            wide = wide and 0.5 * (high - low) * rates[index] > UNSEEN * varied
         if at_bound or wide:
             where = "ended at a bound" if at_bound else "can be anything"
             says = f"The nominal parameter {p.name} {where} from {low:.3g} to {high:.3g} {p.unit}".rstrip()

@@ -171,8 +171,7 @@ def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str],
             where = "in every recording" if len(empty) == len(recordings) else "in " + ", ".join(empty)
             findings.append(Finding("missing", column, f"Column {column} holds no number {where}."))
             unusable |= set(empty) if name in vital else set()
-        elif float(np.mean(~np.isfinite(together))) > MISSING_SHARE:
-            share = float(np.mean(~np.isfinite(together)))
+        elif (share := _lost(recordings, name)) > MISSING_SHARE:
             findings.append(Finding("missing", column, f"{share:.0%} of the samples of column {column} are missing."))
         if any(name in recording.infinite for recording in recordings):
             findings.append(Finding("missing", column, f"Column {column} holds infinite values. They count as missing."))
@@ -185,6 +184,24 @@ def _dead(recordings: list[Recording], vital: set[str], columns: dict[str, str],
     return [recording for recording in recordings if recording.name not in unusable]
 
 
+def _lost(recordings: list[Recording], name: str) -> float:
+    """Share of the samples of a channel that are missing. Where stamps are not even, steps without any sample are none."""
+    lost = total = 0
+    for recording in recordings:
+        if name in recording.channels:
+            sampled = _sampled(recording)
+            lost += int(np.count_nonzero(sampled & ~np.isfinite(recording.channels[name])))
+            total += int(np.count_nonzero(sampled))
+    return lost / max(total, 1)
+
+
+def _sampled(recording: Recording) -> npt.NDArray[np.bool_]:
+    """Steps (n,) that have a sample of some channel; all of them where the stamps are even."""
+    if not recording.timed or recording.jitter <= IRREGULAR:
+        return np.ones(recording.n, dtype=bool)
+    return np.asarray(np.any([np.isfinite(values) for values in recording.channels.values()], axis=0))
+
+
 def _seen(recording: Recording, name: str) -> float:
     values = recording.channels.get(name)
     return 1.0 if values is None else float(np.mean(np.isfinite(values)))
@@ -195,15 +212,12 @@ def _stamps(column: str | None, recordings: list[Recording], findings: list[Find
     uneven = [recording for recording in recordings if recording.timed and recording.jitter > IRREGULAR]
     if uneven:
         worst = max(uneven, key=lambda recording: recording.jitter)
-        findings.append(
-            Finding(
-                "clock",
-                "time",
-                f"Time stamps are not even: in {worst.name} a period differs from the median one, {worst.dt_s:.4g} s, by up "
-                f"to {worst.jitter:.3g} of it. Channels were interpolated to even steps; longer gaps are left out. Behind a "
-                f"gap of more than {GAP_SAMPLES} samples a recording begins again, from a state of its own.",
-            )
-        )
+        empty = 1.0 - float(np.mean(np.concatenate([_sampled(recording) for recording in uneven])))
+        says = f"Time stamps are not even: in {worst.name} periods differ from the median one, {worst.dt_s:.4g} s, by up to "
+        says += f"{worst.jitter:.0%}. Channels were interpolated to even steps; gaps of more than three periods are "
+        says += f"left out ({empty:.0%} of the steps). " if empty > 0.0 else "left out. "
+        says += f"Behind a gap of more than {GAP_SAMPLES} samples a recording begins again, from a state of its own."
+        findings.append(Finding("clock", "time", says))
     periods = [recording.dt_s for recording in recordings if recording.timed]
     if periods and max(periods) > 1.05 * min(periods):
         says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."

@@ -29,7 +29,7 @@ from host.diagnosis.models import balance
 
 Array = npt.NDArray[np.float64]
 SMOOTHING_S = 0.02
-UNSEEN_S = 0.05  # scale of an initial position or speed that is not read
+UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
 FINER = 8  # points in each sub-step at which a held input is computed that an effect delays
 
 
@@ -123,12 +123,16 @@ class AxisModel(Model):
         # Position and speed at the first sample are estimated: one is a derivative of noise, and its error rings on.
         again = self.free_run and spec.controller is None
         spread = _begin_spread(motion, x, recording.dt_s, window)
-        # What is not read is found from the recording; it begins no larger than the largest reading makes it in UNSEEN_S.
+        # What is not read is found from the recording; it begins about as large as the integral of the reading gets.
         largest = float(np.max(np.abs(x)))
+        once = _integrated(x, recording.dt_s, 1)
         if spec.reads == "velocity":
-            spread = np.array([largest * UNSEEN_S, spread[0]])
+            spread = np.array([max(largest * UNSEEN_S, float(np.std(once))), spread[0]])
         elif spec.reads == "acceleration":
-            spread = np.array([largest * UNSEEN_S**2, largest * UNSEEN_S])
+            twice = _integrated(once, recording.dt_s, 2)
+            spread = np.array(
+                [max(largest * UNSEEN_S**2, float(np.std(twice))), max(largest * UNSEEN_S, float(np.std(once)))]
+            )
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
@@ -324,6 +328,13 @@ class AxisModel(Model):
         rate = float(np.std(np.diff(free_of_noise))) / segment.recording.dt_s / moved
         size = mass if self.spec.reads == "acceleration" else law.get("damping", 0.0) + mass * rate
         return np.asarray(residual[0] * size)
+
+
+def _integrated(x: Array, dt_s: float, order: int) -> Array:
+    """Integral (n,) of `x` (n,) without the polynomial of `order` that an unknown start and offset add to it."""
+    at = np.linspace(-1.0, 1.0, x.size)
+    run = np.cumsum(x) * dt_s
+    return np.asarray(run - np.polynomial.polynomial.polyval(at, np.polynomial.polynomial.polyfit(at, run, order)))
 
 
 def _begin_spread(motion: Array, smooth: Array, dt_s: float, window: int) -> Array:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
-from host.diagnosis.model.force_kernel import along
+from host.diagnosis.model.force_kernel import DAMPING2, MASS2, MAXWELL_K, MAXWELL_T, OMEGA2, along
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import signal_band, white_level
 
@@ -41,6 +41,7 @@ class Balance:
     support: Array  # (2 half + 1,) times of the test function, s
     length: float  # half its length, s
     sigma_motion: float  # white noise of the motion
+    sigma_force: float  # and of the force
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bo
     segment.y[:, ~whole] = np.nan
     sigma_motion = white_level(motion)
     held, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
-    return Balance(force, bump, held, rows, noise, kernels, s, length, sigma_motion)
+    sigma_force = white_level(segment.inputs[force])
+    return Balance(force, bump, held, rows, noise, kernels, s, length, sigma_motion, sigma_force)
 
 
 def held_as(balance: Balance, segment: Segment, hold: str) -> Balance:
@@ -156,12 +158,33 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     )
 
 
+def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:
+    """Noise that a second mass or a branch that relaxes leaves in the balance, over that of the nominal law; 1 without them.
+
+    The noise of a motion enters the balance mostly as m a. A spring of fitted frequency and damping pulls against it in just
+    that band, although the force has no such part: a smaller error of this kind is no evidence. linear: m, c, k, offset.
+    """
+    if p[MASS2] <= 0.0 and p[MAXWELL_K] == 0.0:
+        return 1.0
+    size = 1 << (2 * balance.bump.size).bit_length()
+    w = 2j * np.pi * np.fft.rfftfreq(size, dt_s)
+    second = 2.0 * p[DAMPING2] * p[OMEGA2] * w + p[OMEGA2] ** 2
+    added = p[MASS2] * w**2 * second / (w**2 + second) if p[MASS2] > 0.0 else np.zeros_like(w)
+    if p[MAXWELL_K] != 0.0:
+        added = added + p[MAXWELL_K] * w * p[MAXWELL_T] / (1.0 + w * p[MAXWELL_T])
+    law, bump, held = (np.fft.rfft(kernel, size) for kernel in (linear[:3] @ balance.kernels, balance.bump, balance.held))
+    of_motion, of_force = balance.sigma_motion * (law + added * bump), balance.sigma_force * held
+    power = np.abs(of_motion) ** 2 + np.abs(of_force) ** 2
+    return float(np.sqrt((2.0 * power.sum() - power[0] - power[-1]) / size)) / balance.noise.sigma
+
+
 def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, force: Array, p: Array) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
     An effect of the drive changes the input `force` (n,), which is what is compared here: where it shrinks the
-    input the error counts in the size of the recorded one, so that nothing is gained by shrinking. `force` may have several
-    points in each sample, each held until the next one.
+    input the error counts in the size of the recorded one, so that nothing is gained by shrinking; likewise where forces
+    along the motion take noise out of it (`quieted`). `force` may have several points in each sample, each held until the
+    next one.
     """
     recording = segment.recording
     a, v, x = balance.rows
@@ -182,4 +205,5 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
     size = float(np.std(force)) / max(float(np.std(segment.inputs[balance.input])), 1e-300)
     finer = force.size // segment.n
     applied = _along_record(force, balance.held if finer == 1 else _finely(balance, recording.dt_s, finer))[::finer]
+    size *= min(quieted(balance, linear, p, recording.dt_s), 1.0)
     return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)

@@ -114,7 +114,26 @@ def next_step(result: Diagnosis) -> str:
     if named:
         return "Add the effects to the nominal model (the report has the lines), and check it on a new recording."
     undecided = sorted((f for f in result.findings if f.id in UNDECIDED), key=lambda f: UNDECIDED.index(f.id))
-    return undecided[0].says if undecided else "Nothing: the nominal model explains these recordings."
+    if undecided:
+        return undecided[0].says
+    with_values = f" with {moved}" if (moved := refitted(result)) else ""
+    return f"Nothing: the nominal model explains these recordings{with_values}."
+
+
+def refitted(result: Diagnosis) -> str:
+    """State the nominal parameters that were fitted and whose stated value is outside of their interval; empty if none is.
+
+    A fitted parameter contains every error of its kind: a gain contains the wrong scale of a reading. "Nothing is missing"
+    therefore says nothing of the stated value.
+    """
+    fitted = nominal_parameters(result)
+    said = []
+    for parameter in result.model.parameters:
+        stated = result.spec.parameters.get(parameter.name)
+        value, (low, high) = fitted[parameter.key]["value"], fitted[parameter.key]["ci95"]
+        if stated is not None and stated.free and not low <= stated.value <= high:
+            said.append(f"{parameter.name} {value:.4g} (stated: {stated.value:.4g})")
+    return ", ".join(said)
 
 
 def placeless(result: Diagnosis) -> list[str]:

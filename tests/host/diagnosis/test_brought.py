@@ -1,0 +1,130 @@
+"""Kinds of recordings that a stranger brought: noisy motions, speeds and accelerations, random stamps, fitted gains."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim
+
+import seldinger as sd
+from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import inspected
+
+Array = np.ndarray
+RATE_HZ = 100.0
+
+
+def stream(number: int) -> np.random.Generator:
+    return np.random.default_rng([4711, number])
+
+
+def sweep(rng: np.random.Generator, t: Array, fastest_Hz: float, size: float) -> Array:
+    """Five sines of random phase, the faster ones smaller; RMS about `size`."""
+    hertz = fastest_Hz * np.array([0.06, 0.15, 0.31, 0.58, 1.0])
+    part = hertz**-0.6 / np.sqrt(0.5 * np.sum(hertz**-1.2))
+    return np.asarray(size * np.sin(2.0 * np.pi * np.outer(t, hertz) + rng.uniform(0.0, 6.28, 5)) @ part)
+
+
+def driven(force: Array, mass: float, damping: float, stiffness: float, hold: str = "foh") -> Array:
+    """Position, speed and acceleration (n, 3) under a force that is held or runs straight between samples, exactly."""
+    A, B = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]]), np.array([[0.0], [1.0 / mass]])
+    C, D = np.array([[1.0, 0.0], [0.0, 1.0], A[1]]), np.array([[0.0], [0.0], [1.0 / mass]])
+    return np.asarray(dlsim(cont2discrete((A, B, C, D), 1.0 / RATE_HZ, hold), force)[1])
+
+
+def axis(terms: list[str], reads: str, hold: str, **parameters: float) -> dict[str, Any]:
+    unit = {"position": "m", "velocity": "m/s", "acceleration": "m/s2"}[reads]
+    return {
+        "name": "slide",
+        "kind": "axis",
+        "data": {"time": "t"},
+        "channels": {"force": {"column": "f", "unit": "N"}, "slide": {"column": "y", "unit": unit}},
+        "axis": {"subsystem": "slide", "input": "force", "output": "slide", "terms": terms, "reads": reads, "hold": hold},
+        "parameters": parameters,
+    }
+
+
+def transmission(unit: str, **gain: Any) -> dict[str, Any]:
+    return {
+        "name": "meter",
+        "kind": "transmission",
+        "data": {"time": "t"},
+        "channels": {"flow": {"column": "q", "unit": unit}, "meter": {"column": "y", "unit": unit}},
+        "link": [{"subsystem": "meter", "input": "flow", "output": "meter"}],
+        "parameters": {"gain": gain},
+    }
+
+
+@pytest.mark.parametrize("number", [2, 6])
+def test_the_noise_of_a_motion_is_not_cancelled_by_a_second_mass(number: int) -> None:
+    """Without the noise that the effect takes out of the balance, a second mass was named: 0.85 and 0.92."""
+    rng = stream(number)
+    t = np.arange(0.0, 18.0, 1.0 / RATE_HZ)
+    force = sweep(rng, t, 1.6, 4.0)
+    place = driven(force, 1.8, 3.0, 0.0, "zoh")[:, 0]
+    part = slice(300, None)
+    recording = {"t": t[part], "f": force[part], "y": place[part] + 1e-4 * rng.standard_normal(t.size)[part]}
+    verdict = sd.diagnose([recording], axis(["mass", "damping", "offset"], "position", "zero"))
+    assert verdict.verdict == "nothing_missing", verdict.effects
+
+
+def test_a_slow_axis_starts_anywhere_if_its_position_is_not_read() -> None:
+    """An axis of 0.5 Hz that starts 0.3 m from rest: within a scale of 50 ms of its acceleration no start fitted it."""
+    recordings = []
+    for number in (1, 2):
+        rng = stream(10 + number)
+        t = np.arange(0.0, 15.0, 1.0 / RATE_HZ)
+        force = sweep(rng, t, 4.0, 3.0)
+        force[:300] += 4.0  # pushed aside, and let go as the recording begins
+        y = driven(force, 1.0, 0.8, 10.0, "foh")[:, 2]
+        y = y + 0.01 * np.std(y) * rng.standard_normal(t.size)
+        recordings.append({"t": t[300:], "f": force[300:], "y": y[300:]})
+    nominal = axis(["mass", "damping", "stiffness"], "acceleration", "linear", mass=1.2, damping=1.0, stiffness=9.0)
+    verdict = sd.diagnose(recordings, nominal).as_dict()
+    assert verdict["verdict"] == "nothing_missing", verdict["effects"]
+    fitted = verdict["fit"]["nominal_parameters"]
+    assert next(v["value"] for k, v in fitted.items() if k.startswith("mass")) == pytest.approx(1.0, rel=0.02)
+
+
+def metered(factor: float) -> list[dict[str, Array]]:
+    recordings = []
+    for number in range(3):
+        rng = stream(20 + number)
+        t = np.arange(0.0, 30.0, 0.05)
+        q = 6.0 + sweep(rng, t, 1.0, 1.0)
+        recordings.append({"t": t, "q": q, "y": factor * q + 0.05 * rng.standard_normal(t.size)})
+    return recordings
+
+
+def test_a_gain_that_was_fitted_is_stated() -> None:
+    verdict = sd.diagnose(metered(1.08), transmission("l/min", value=1.0)).as_dict()
+    assert verdict["verdict"] == "nothing_missing"
+    assert "gain 1.0" in verdict["next"] and "(stated: 1)" in verdict["next"], verdict["next"]
+    verdict = sd.diagnose(metered(1.0), transmission("l/min", value=1.0)).as_dict()
+    assert verdict["next"] == "Nothing: the nominal model explains these recordings."
+
+
+def test_an_offset_near_zero_is_determined_where_the_gain_is_held() -> None:
+    """0 +- 0.01 l/min of readings that vary by 1 l/min: there is nothing to record again."""
+    verdict = sd.diagnose(metered(1.03), transmission("l/min", value=1.0, free=False)).as_dict()
+    assert verdict["effects"][0]["id"] == "sensor_scale"
+    assert not [f for f in verdict["data_findings"] if f["id"] == "excitation"], verdict["data_findings"]
+
+
+def test_random_stamps_are_no_missing_samples() -> None:
+    """Samples at random times leave steps of an even grid empty. Every sample that was taken is there."""
+    recordings = []
+    for number in range(3):
+        rng = stream(30 + number)
+        t = np.sort(rng.uniform(0.0, 20.0, 2000))
+        q = 6.0 + sweep(rng, t, 1.0, 1.0)
+        recordings.append({"t": t, "q": q, "y": q + 0.05 * rng.standard_normal(t.size)})
+    spec = nominal_of(transmission("l/min", value=1.0))
+    findings = inspected(spec, [Table(f"r{k}", r) for k, r in enumerate(recordings)]).findings
+    assert "missing" not in {f.id for f in findings}
+    assert "% of the steps" in next(f.says for f in findings if "not even" in f.says)
+    half = [{**r, "y": np.where(np.arange(2000) % 2 == 0, r["y"], np.nan)} for r in recordings]
+    assert "missing" in {f.id for f in inspected(spec, [Table(f"r{k}", r) for k, r in enumerate(half)]).findings}
