@@ -6,7 +6,7 @@ import ipaddress
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -141,12 +141,27 @@ class TransmissionSection(_Section):
         return self
 
 
+class TrackedTool(NamedTuple):
+    """A sensor on the catheter: its name in topics and keys, its handle at the tracker, its file, its place."""
+
+    name: str  # "tip", "shaft" or "rear"
+    handle: str
+    definition: str  # file of an Aurora tool without a memory of its own; empty for a tool that has one
+    offset_m: float  # arc length from the tip back to it
+
+    @property
+    def topic(self) -> str:
+        """Return the topic of its poses."""
+        return f"pose/{self.name}"
+
+
 class Tracker(_Section):
     """The tracker. `base_from_tracker_*` registers its frame to the base frame at the sheath's exit.
 
     kind: "aurora" (NDI, serial port), "openigtlink" (a server, `port` is HOST:PORT, handles are names of transforms), or the
-    name of a plug-in; `options` are the plug-in's own keys (docs/devices.md). tip_definition, shaft_definition: file that
-    defines an Aurora tool without a memory of its own; empty for a tool that has one.
+    name of a plug-in; `options` are the plug-in's own keys (docs/devices.md). *_definition: file that defines an Aurora
+    tool without a memory of its own; empty for a tool that has one. rear_*: a third sensor, behind that of the shaft;
+    without rear_handle there is none.
     """
 
     kind: Kind = "aurora"
@@ -159,10 +174,28 @@ class Tracker(_Section):
     tip_definition: str = ""
     shaft_definition: str = ""
     shaft_sensor_offset_m: Annotated[float, Field(gt=0, le=0.2)]
+    rear_handle: str = ""
+    rear_definition: str = ""
+    rear_sensor_offset_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0
     position_noise_m: Annotated[float, Field(gt=0, le=0.01)]
     orientation_noise_rad: Annotated[float, Field(gt=0, le=0.3)]
     base_from_tracker_m: Vector3
     base_from_tracker_wxyz: Quaternion
+
+    @property
+    def tools(self) -> tuple[TrackedTool, ...]:
+        """Return the sensors from the tip backwards: tip, shaft and, where the file has one, rear."""
+        tools = (
+            TrackedTool("tip", self.tip_handle, self.tip_definition, 0.0),
+            TrackedTool("shaft", self.shaft_handle, self.shaft_definition, self.shaft_sensor_offset_m),
+            TrackedTool("rear", self.rear_handle, self.rear_definition, self.rear_sensor_offset_m),
+        )
+        return tools if self.rear_handle else tools[:2]
+
+    @property
+    def tool_offsets_m(self) -> tuple[float, ...]:
+        """Return the sensors' arc lengths from the tip backwards (m), 0 for the first."""
+        return tuple(tool.offset_m for tool in self.tools)
 
     @model_validator(mode="after")
     def _addressed(self) -> Tracker:
@@ -171,20 +204,31 @@ class Tracker(_Section):
             raise ValueError("port that is not empty, such as /dev/serial/by-id/...")
         if not self.tip_handle.strip() or self.tip_handle == self.shaft_handle:
             raise ValueError("tip_handle and shaft_handle of two different tools")
-        if self.kind == "aurora":
-            for key, handle in (("tip_handle", self.tip_handle), ("shaft_handle", self.shaft_handle)):
-                if not re.fullmatch(r"[0-9A-F]{2}", handle):
-                    raise ValueError(
-                        f'{key} of two characters 0 to 9 and A to F, as the Aurora numbers its tools, such as "0A"'
-                    )
-        else:
-            for key in ("tip_definition", "shaft_definition"):
-                if getattr(self, key):
-                    raise ValueError(f'{key}: only for kind = "aurora"; leave it out')
+        for tool in self.tools:
+            if self.kind == "aurora" and not re.fullmatch(r"[0-9A-F]{2}", tool.handle):
+                raise ValueError(
+                    f'{tool.name}_handle of two characters 0 to 9 and A to F, as the Aurora numbers its tools, such as "0A"'
+                )
+            if self.kind != "aurora" and tool.definition:
+                raise ValueError(f'{tool.name}_definition: only for kind = "aurora"; leave it out')
         if self.kind == "openigtlink":
             found = re.fullmatch(r"(\[[0-9A-Fa-f:]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?", self.port)
             if found is None or not 0 < int(found[2] or 1) < 65536:
                 raise ValueError("port: HOST:PORT of the OpenIGTLink server, such as 127.0.0.1:18944")
+        return self
+
+    @model_validator(mode="after")
+    def _third(self) -> Tracker:
+        """Check that a third sensor is described whole, and lies behind the second."""
+        if not self.rear_handle:
+            for key in ("rear_definition", "rear_sensor_offset_m"):
+                if getattr(self, key):
+                    raise ValueError(f"rear_handle: the third sensor's, as {key} is given; or leave {key} out")
+            return self
+        if not self.rear_handle.strip() or self.rear_handle in (self.tip_handle, self.shaft_handle):
+            raise ValueError("rear_handle of a third tool, other than tip_handle and shaft_handle")
+        if self.rear_sensor_offset_m <= self.shaft_sensor_offset_m:
+            raise ValueError("rear_sensor_offset_m above shaft_sensor_offset_m: the third sensor is behind the second")
         return self
 
     @model_validator(mode="after")

@@ -547,6 +547,7 @@ _TABLE = (
     Topic("stage", Stage, 250, "state", "realtime -> host, tools", "handle: commands, encoders, catheter joints"),
     Topic("pose/tip", Pose, 40, "state", "realtime -> host, tools", "tracker tool at the tip"),
     Topic("pose/shaft", Pose, 40, "state", "realtime -> host, tools", "tracker tool down the shaft"),
+    Topic("pose/rear", Pose, 40, "state", "realtime -> host, tools", "third tracker tool, if the rig has one"),
     Topic("force/sensor", ForceSensor, 500, "state", "realtime -> host, tools", "measured force"),
     Topic("force/estimate", ForceEstimate, 40, "state", "host -> realtime, tools", "force estimated from poses"),
     Topic("stiffness", Stiffness, 4, "state", "host -> tools", "adapted stiffness of the catheter"),

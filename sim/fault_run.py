@@ -86,11 +86,11 @@ class FaultyScenario(Scenario):
             watcher.receive(topic, message)
 
     def _estimate_unless_failed(
-        self, tip: Message, shaft: Message | None, stage: Message, state: Message | None
+        self, tip: Message, shaft: Message | None, stage: Message, state: Message | None, *third: Message
     ) -> ForceEstimate | None:
         if self.host != "well" or self._model is None:
             return None
-        estimate = self._model(tip, shaft, stage, state)
+        estimate = self._model(tip, shaft, stage, state, *third)
         return estimate if estimate is None else self.wrong(estimate)
 
     def step(self) -> None:

@@ -70,7 +70,7 @@ class IdealRig:
         with_force: bool = True,
     ) -> None:
         """`extra_delay_s`: poses and forces arrive so much later (stamps stay true), to find a loop's margin."""
-        self.rig, self.plant = rig, Plant(replace(config, tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), seed)
+        self.rig, self.plant = rig, Plant(replace(config, tool_offsets_m=rig.tracker.tool_offsets_m), seed)
         self.params, self.state = tick_parameters(rig, force_source), new(STATE)
         self.inputs, self.outputs = new(INPUTS), new(OUTPUTS)
         self._random = np.random.default_rng([seed, 17])

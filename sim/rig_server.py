@@ -23,10 +23,9 @@ from realtime.drivers.openigtlink import address_of
 from realtime.loop.service_notify import ServiceNotifier
 from sim.board import SimulatedBoard
 from sim.effects import parse
-from sim.plant import Plant, PlantConfig
 from sim.sensor_servers import AuroraPty, NetFtUdp
 from sim.tissue import TissueConfig
-from sim.world import World
+from sim.world import World, simulated_plant
 
 if TYPE_CHECKING:
     from sim.plus_server import PlusServer
@@ -218,9 +217,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     _ask_for_priority()
     rig = load_rig(options.rig)
-    offsets_m = (0.0, rig.tracker.shaft_sensor_offset_m)
     wall = TissueConfig(point_m=(0.0, 0.0, 10.0)) if options.free else TissueConfig()
-    plant = Plant(PlantConfig(tool_offsets_m=offsets_m, tissue=wall, effects=tuple(options.effect)), options.seed)
+    plant = simulated_plant(rig, options.seed, tissue=wall, effects=tuple(options.effect))
     with SimulatedBoard(options.board) as board:
         world = World(rig, plant, board, options.seed)
         world.advance(SLICE_NS, b"")

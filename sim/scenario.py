@@ -22,7 +22,8 @@ from sim.world import World
 # Where the simulated wall stands and how the catheter is bent in front of it.
 TARGET_M = (0.0, -0.0107, 0.025)
 
-Estimator = Callable[[Message, Message | None, Message, Message | None], ForceEstimate | None]
+# Called with the newest poses of tip and shaft, stage and state (or None), and on a rig with a third sensor with its pose.
+Estimator = Callable[..., ForceEstimate | None]
 
 
 @runtime_checkable
@@ -108,8 +109,9 @@ class Scenario:
         self._latest[topic] = message
         if topic != "pose/tip" or self._estimator is None or "stage" not in self._latest:
             return
-        shaft, state = self._latest.get("pose/shaft"), self._latest.get("state")
-        estimate = self._estimator(message, shaft, self._latest["stage"], state)
+        shaft, state, rear = (self._latest.get(name) for name in ("pose/shaft", "state", "pose/rear"))
+        third = () if rear is None else (rear,)
+        estimate = self._estimator(message, shaft, self._latest["stage"], state, *third)
         if estimate is not None:
             assert isinstance(message, Pose)
             self.loop.estimate_at(msgspec.structs.replace(estimate, published_ns=message.arrival_ns + self._delay_ns))

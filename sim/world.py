@@ -17,13 +17,10 @@ from sim.net_ft_emulator import NetFtEmulator, NetFtEmulatorConfig
 from sim.plant import Plant, PlantConfig
 from sim.stages import SimulatedStages, StagesConfig
 
-# Tools of the plant, in the order of its tool_offsets_m.
-TIP, SHAFT = 0, 1
-
 
 def simulated_plant(rig: Rig, seed: int, **changes: Any) -> Plant:
     """The plant that stands for `rig`: its sensors where the rig file has them, at home."""
-    return Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m), **changes), seed)
+    return Plant(PlantConfig(tool_offsets_m=rig.tracker.tool_offsets_m, **changes), seed)
 
 
 class World:
@@ -43,7 +40,7 @@ class World:
         tracker, sensor = rig.tracker, rig.force_sensor
         self.tracker = AuroraEmulator(
             AuroraEmulatorConfig(
-                handles=(tracker.tip_handle, tracker.shaft_handle),
+                handles=tuple(tool.handle for tool in tracker.tools),
                 rate_hz=tracker.rate_hz,
                 latency_s=tracker.latency_s,
                 position_noise_m=tracker.position_noise_m,
@@ -152,7 +149,7 @@ class World:
                 self.force_box.next_sample_ns, self._sensor_from_base @ force_N, self._sensor_from_base @ torque_Nm
             )
         while self.tracker.next_frame_ns <= until_ns:
-            poses = [self._in_tracker_frame(tool) for tool in (TIP, SHAFT)]
+            poses = [self._in_tracker_frame(tool) for tool in range(len(self.rig.tracker.tools))]
             self.tracker.sample(self.tracker.next_frame_ns, poses)
 
     def _in_tracker_frame(self, tool: int) -> Pose | None:

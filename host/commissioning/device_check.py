@@ -31,7 +31,7 @@ def check_tracker(rig: Rig, port: str, seconds: float, trace: TextIO | None = No
     trace: file for the dialogue with an Aurora, byte by byte; other kinds have none.
     """
     tracker = rig.tracker
-    tools = (tracker.tip_handle, tracker.shaft_handle)
+    tools = tuple(tool.handle for tool in tracker.tools)
     if tracker.kind != AURORA:
         return check_poses(
             lambda sample, event: tracker_thread(rig, port or None, sample, event),

@@ -62,14 +62,20 @@ class AdaptedRigEstimator:
         shape = FreeShapeFit.from_rig(rig, catheter)
         return cls(catheter, nominal, adapted, shape, AdaptationConfig.from_rig(rig), rig.estimation.stiffness_sd)
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
+    def estimate(
+        self,
+        pose_tip: PoseReading,
+        pose_shaft: PoseReading | None,
+        actuation: Actuation,
+        pose_rear: PoseReading | None = None,
+    ) -> TipForce:
         """The force by the adapted stiffness, with that by the file's as `nominal`. Raises: InputError (bad input)."""
-        nominal = self._nominal.estimate(pose_tip, pose_shaft, actuation)
+        nominal = self._nominal.estimate(pose_tip, pose_shaft, actuation, pose_rear)
         state, why = self._learn(pose_tip, pose_shaft, actuation)
         self._use(state)
         bent = actuation._replace(curvature_per_m=self._tracker.adapted_curvature(actuation.curvature_per_m))
         try:
-            answer = self._adapted.estimate(pose_tip, pose_shaft, bent)
+            answer = self._adapted.estimate(pose_tip, pose_shaft, bent, pose_rear)
         except (InputError, ArithmeticError):
             answer = nominal  # adapted out of range: what stands without adaptation stands
         self._report(pose_tip.stamp_ns, state, why)

@@ -59,8 +59,17 @@ class TipForce(NamedTuple):
 class Estimator(Protocol):
     """Called once for each tip pose; may keep the branch it is on and what it has learned of the actuation."""
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
-        """The force that explains `pose_tip` (and `pose_shaft`, where it was seen) at that actuation."""
+    def estimate(
+        self,
+        pose_tip: PoseReading,
+        pose_shaft: PoseReading | None,
+        actuation: Actuation,
+        pose_rear: PoseReading | None = None,
+    ) -> TipForce:
+        """The force that explains `pose_tip` (and the others, where they were seen) at that actuation.
+
+        pose_rear is given only where the rig file has a third sensor and it was seen.
+        """
         ...
 
 

@@ -106,7 +106,13 @@ class PlanarRigEstimator:
         self._catheter = catheter
         self._contact = replace(self._contact, stiffness_sd=relative_sd)
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
+    def estimate(
+        self,
+        pose_tip: PoseReading,
+        pose_shaft: PoseReading | None,
+        actuation: Actuation,
+        pose_rear: PoseReading | None = None,
+    ) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: ValueError (bad input)."""
         finite("pose_tip", [*pose_tip.position_m, *pose_tip.quaternion_wxyz], (7,), "finite position and quaternion")
         finite("actuation", actuation[:3], (3,), "three finite numbers")

@@ -25,7 +25,7 @@ def make_estimator(rig: Rig) -> Estimator:
         ActuationKnowledge.from_rig(rig),
         curvature_as_configured(rig) if adapted is None else adapted.free_curvature,
     )
-    return WatchedEstimator(estimator, watch, rig.tracker.shaft_sensor_offset_m, adapted)
+    return WatchedEstimator(estimator, watch, rig.tracker.tool_offsets_m, adapted)
 
 
 def plain_estimator(rig: Rig) -> Estimator:

@@ -34,17 +34,19 @@ class PoseSensor(NamedTuple):
 
 
 class TrackedSensors(NamedTuple):
-    """The sensors of a rig, one at the tip and one on the shaft, and the tracker's noise."""
+    """The sensors of a rig, one at the tip, one on the shaft and perhaps a third, and the tracker's noise."""
 
     shaft_offset_m: float  # arc length from the tip back to the second sensor
     position_std_m: float  # per axis
     angle_std_rad: float  # per axis
+    rear_offset_m: float | None = None  # arc length from the tip back to the third sensor; None: there is none
 
     @classmethod
     def from_rig(cls, rig: Rig) -> TrackedSensors:
         """Return the sensors and the noise of the rig file's tracker."""
         tracker = rig.tracker
-        return cls(tracker.shaft_sensor_offset_m, tracker.position_noise_m, tracker.orientation_noise_rad)
+        rear_m = tracker.rear_sensor_offset_m if tracker.rear_handle else None
+        return cls(tracker.shaft_sensor_offset_m, tracker.position_noise_m, tracker.orientation_noise_rad, rear_m)
 
 
 @dataclass(frozen=True)

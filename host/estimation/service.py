@@ -17,6 +17,7 @@ from protocol.topics import ForceEstimate, Message, Pose, RigState, Stage
 DEFAULT_ESTIMATOR = "host.estimation.rig_estimator:make_estimator"
 HISTORY_NS = 500_000_000
 PAIRED_WITHIN_NS = 5_000_000
+SHAFT, REAR = "pose/shaft", "pose/rear"
 
 
 def load_estimator(name: str, rig: Rig) -> Estimator:
@@ -49,7 +50,7 @@ class EstimationService:
     def __init__(self, estimator: Estimator, timer_ns: Callable[[], int] = time.perf_counter_ns) -> None:
         self._estimator, self._timer_ns = estimator, timer_ns
         self._stages: deque[Stage] = deque()
-        self._shaft: Pose | None = None
+        self._behind: dict[str, Pose] = {}  # newest pose of the sensors behind the tip's, by topic
         self._force_direction: np.ndarray | None = None
         self._mode = ""
         self._waiting: Pose | None = None
@@ -67,8 +68,8 @@ class EstimationService:
             direction = message.force_direction
             self._force_direction = None if direction is None else np.array(direction)
             self._mode = message.mode
-        elif isinstance(message, Pose) and topic == "pose/shaft":
-            self._shaft = message
+        elif isinstance(message, Pose) and topic in (SHAFT, REAR):
+            self._behind[topic] = message
         elif isinstance(message, Pose) and topic == "pose/tip" and not message.missing:
             self._waiting = message
 
@@ -85,13 +86,18 @@ class EstimationService:
             self.unanswered += 1
             self.last_failure = "no stage message from the time of the pose"
             return None
-        return self._ask(tip, self._shaft_of(tip), actuation, now_ns)
+        return self._ask(tip, actuation, now_ns)
 
     def __call__(
-        self, tip: Message, shaft: Message | None, stage: Message, state: Message | None = None
+        self,
+        tip: Message,
+        shaft: Message | None,
+        stage: Message,
+        state: Message | None = None,
+        rear: Message | None = None,
     ) -> ForceEstimate | None:
         """Return the estimate for one pose at once, for lock step; the caller sets `published_ns`."""
-        for topic, message in (("stage", stage), ("state", state), ("pose/shaft", shaft), ("pose/tip", tip)):
+        for topic, message in (("stage", stage), ("state", state), (SHAFT, shaft), (REAR, rear), ("pose/tip", tip)):
             if message is not None:
                 self.receive(topic, message)
         return self.answer(tip.stamp_ns)
@@ -111,16 +117,20 @@ class EstimationService:
         """Return (topic, message) of what the estimator reports in addition to the force, new since the last call."""
         return self._estimator.reports() if isinstance(self._estimator, Reporting) else []
 
-    def _shaft_of(self, tip: Pose) -> PoseReading | None:
-        shaft = self._shaft
-        if shaft is None or shaft.missing or abs(shaft.stamp_ns - tip.stamp_ns) > PAIRED_WITHIN_NS:
+    def _of_frame(self, topic: str, tip: Pose) -> PoseReading | None:
+        """Return the pose of another sensor that was measured with the tip's; None if there is none."""
+        pose = self._behind.get(topic)
+        if pose is None or pose.missing or abs(pose.stamp_ns - tip.stamp_ns) > PAIRED_WITHIN_NS:
             return None
-        return _reading(shaft)
+        return _reading(pose)
 
-    def _ask(self, tip: Pose, shaft: PoseReading | None, actuation: Actuation, now_ns: int) -> ForceEstimate:
+    def _ask(self, tip: Pose, actuation: Actuation, now_ns: int) -> ForceEstimate:
+        shaft, rear = (self._of_frame(topic, tip) for topic in (SHAFT, REAR))
+        # An estimator of two sensors need not take a third: it is given only on a rig that has one.
+        third = {} if rear is None else {"pose_rear": rear}
         begin_ns = self._timer_ns()
         try:
-            answer = self._estimator.estimate(_reading(tip), shaft, actuation)
+            answer = self._estimator.estimate(_reading(tip), shaft, actuation, **third)
         except (ValueError, ArithmeticError, InputError) as error:
             self.last_failure = f"{type(error).__name__}: {error}"
             answer = None

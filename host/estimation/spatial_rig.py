@@ -61,17 +61,27 @@ class SpatialRigEstimator:
         self._catheter = catheter
         self._contact = replace(self._contact, stiffness_sd=relative_sd)
 
-    def estimate(self, pose_tip: PoseReading, pose_shaft: PoseReading | None, actuation: Actuation) -> TipForce:
+    def estimate(
+        self,
+        pose_tip: PoseReading,
+        pose_shaft: PoseReading | None,
+        actuation: Actuation,
+        pose_rear: PoseReading | None = None,
+    ) -> TipForce:
         """The force of the tip on the tissue, base frame, that explains the poses. Raises: InputError (bad input)."""
         rod = rod_record(self._catheter, actuation.insertion_m, actuation.curvature_per_m)
         exposed_m = self._catheter.distal_length_m + actuation.insertion_m
         finite("pose_tip", [*pose_tip.position_m, *pose_tip.quaternion_wxyz], (7,), "three finite numbers in m and four")
         check_reach("pose_tip.position_m", pose_tip.position_m, exposed_m)
         offsets, poses = [0.0], [[*pose_tip.position_m, *pose_tip.quaternion_wxyz]]
-        if pose_shaft is not None and np.isfinite([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz]).all():
-            check_reach("pose_shaft.position_m", pose_shaft.position_m, exposed_m)
-            offsets.append(self._sensors.shaft_offset_m)
-            poses.append([*pose_shaft.position_m, *pose_shaft.quaternion_wxyz])
+        for key, offset_m, pose in (
+            ("pose_shaft", self._sensors.shaft_offset_m, pose_shaft),
+            ("pose_rear", self._sensors.rear_offset_m, pose_rear),
+        ):
+            if offset_m is not None and pose is not None and np.isfinite([*pose.position_m, *pose.quaternion_wxyz]).all():
+                check_reach(f"{key}.position_m", pose.position_m, exposed_m)
+                offsets.append(offset_m)
+                poses.append([*pose.position_m, *pose.quaternion_wxyz])
         self.errors.move_to(actuation)
         known = self.errors.prior(along_wall(actuation), ALL_JOINTS)
         joints = np.array([actuation.insertion_m, actuation.curvature_per_m, actuation.roll_rad])

@@ -33,6 +33,8 @@ MEANINGS: dict[tuple[str, str], Meaning] = {
     ("pose/tip", "quaternion_wxyz"): Meaning("sensor to base", "sensor at the tip, measured"),
     ("pose/shaft", "position_m"): Meaning(BASE, "sensor on the shaft, measured"),
     ("pose/shaft", "quaternion_wxyz"): Meaning("sensor to base", "sensor on the shaft, measured"),
+    ("pose/rear", "position_m"): Meaning(BASE, "third sensor, behind the shaft's, measured"),
+    ("pose/rear", "quaternion_wxyz"): Meaning("sensor to base", "third sensor, behind the shaft's, measured"),
     ("force/sensor", "force_N"): Meaning(BASE, f"{ON_TISSUE}, measured; the tissue's force on the tip is its negative"),
     ("force/sensor", "torque_Nm"): Meaning(BASE, "on the tissue, measured at the sensor's origin"),
     ("force/estimate", "force_N"): Meaning("column frame", f"{ON_TISSUE}, estimated from poses"),
@@ -68,7 +70,7 @@ MEANINGS: dict[tuple[str, str], Meaning] = {
 }
 # Units of what has a place, a direction or a force; and fields with these units that have none.
 SPATIAL_UNITS = ("m", "m/s", "rad", "1/m", "N", "N m", "N^2")
-WITHOUT_FRAME = {("pose/tip", "quality_m"), ("pose/shaft", "quality_m")}
+WITHOUT_FRAME = {(f"pose/{name}", "quality_m") for name in ("tip", "shaft", "rear")}
 
 
 def recorded_topics() -> list[Topic]:

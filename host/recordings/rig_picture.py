@@ -156,7 +156,7 @@ class Picture:
             "estimate_N": self._estimate(),
             "target_m": target if target and any(target) else None,
             "into": state.get("force_direction"),
-            "poses": {name: self._fresh(f"pose/{name}", POSE_LASTS_NS) for name in ("tip", "shaft")},
+            "poses": {name: self._fresh(f"pose/{name}", POSE_LASTS_NS) for name in ("tip", "shaft", "rear")},
         }
 
     def frame(self) -> dict[str, Any]:
@@ -241,6 +241,7 @@ class Picture:
         return {
             **{name: stiffness.get(name) for name in ("scale", "sd", "adaptation", "text")},
             "place": contact.get("place"),
+            "sensors": contact.get("sensors"),
             "body_offset_m": contact.get("body_offset_m"),
             "body_offset_sd_m": contact.get("body_offset_sd_m"),
             "contact_text": contact.get("text"),

@@ -2,7 +2,7 @@
 
 | device | message | content |
 |---|---|---|
-| `TipToBase`, `ShaftToBase` | TRANSFORM | measured pose of the sensor, sensor to base, translation in mm |
+| `TipToBase`, `ShaftToBase`, `RearToBase` | TRANSFORM | measured pose of the sensor, sensor to base, translation in mm |
 | `ForceSensor`, `ForceEstimate` | NDARRAY | force of the tip on the tissue, base frame, 3 numbers in N |
 | `ForceSensorText`, `ForceEstimateText` | STRING | the same as JSON, with the sampling time |
 | `Status` | STRING | phase, safety action, cause, target force: JSON |
@@ -31,7 +31,7 @@ from realtime.core.intake import rotation
 POLL_S = 0.002
 # Guidance displays redraw at 30 Hz; faster topics are thinned to this.
 FORCE_EVERY_NS, STATUS_EVERY_NS = 20_000_000, 100_000_000
-POSES = {"pose/tip": "TipToBase", "pose/shaft": "ShaftToBase"}
+POSES = {"pose/tip": "TipToBase", "pose/shaft": "ShaftToBase", "pose/rear": "RearToBase"}
 FORCES = {"force/sensor": "ForceSensor", "force/estimate": "ForceEstimate"}
 _FLOAT64 = 11  # of OpenIGTLink's scalar types
 

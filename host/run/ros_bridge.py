@@ -46,6 +46,7 @@ class RosTopic(NamedTuple):
 PUBLISHED = {
     "pose/tip": RosTopic("measured_cp", POSE, "MP"),
     "pose/shaft": RosTopic("shaft/measured_cp", POSE, "MP"),
+    "pose/rear": RosTopic("rear/measured_cp", POSE, "MP"),
     "force/sensor": RosTopic("measured_cf", WRENCH, "MP"),
     "force/estimate": RosTopic("estimated/measured_cf", WRENCH, "MP"),
     "state": RosTopic("operating_state", OPERATING_STATE, "MP"),

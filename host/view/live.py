@@ -26,6 +26,7 @@ DEPTHS = {
     "stage": 1,
     "pose/tip": 1,
     "pose/shaft": 1,
+    "pose/rear": 1,
     "force/sensor": 1,
     "board": 1,
     "cause": 1,

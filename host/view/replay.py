@@ -20,7 +20,7 @@ from protocol.text_files import read_json
 
 # Topics whose every message is shown, and those of which only the newest counts.
 EVERY = ("state", "force/estimate", "log", "plan")
-NEWEST = ("stage", "pose/tip", "pose/shaft", "force/sensor", "board", "cause", "loop", "stiffness", "contact")
+NEWEST = ("stage", "pose/tip", "pose/shaft", "pose/rear", "force/sensor", "board", "cause", "loop", "stiffness", "contact")
 # Of the others the last few: a tool that was not seen leaves the pose before it standing.
 LAST = 3
 # After a jump the traces are filled with so much of the past.

@@ -44,15 +44,14 @@ class Readings(NamedTuple):
 def tracker_config(rig: Rig) -> AuroraConfig:
     """Return the tracker driver's settings for `rig`. Raises InputError for a tool definition that cannot be read."""
     tracker = rig.tracker
-    files = {tracker.tip_handle: "tip_definition", tracker.shaft_handle: "shaft_definition"}
     return AuroraConfig(
-        tools=(tracker.tip_handle, tracker.shaft_handle),
+        tools=tuple(tool.handle for tool in tracker.tools),
         rate_hz=tracker.rate_hz,
         latency_s=tracker.latency_s,
         definitions={
-            handle: read_definition(f"tracker.{key}", getattr(tracker, key))
-            for handle, key in files.items()
-            if getattr(tracker, key)
+            tool.handle: read_definition(f"tracker.{tool.name}_definition", tool.definition)
+            for tool in tracker.tools
+            if tool.definition
         },
     )
 

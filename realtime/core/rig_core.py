@@ -21,6 +21,7 @@ from protocol.rig_file import AXES, Rig
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply
 from realtime.control import safety
 from realtime.control.configure import tick_parameters
+from realtime.control.records import POSE, new
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
 from realtime.core.cause_watch import CauseWatch
@@ -115,7 +116,7 @@ class RigCore:
     Args:
         rig: the rig file.
         records: the tick's input records by field name of INPUTS (tip, shaft, sensor, estimate, board, command); the core
-            fills them, the shell hands them to the tick.
+            fills them, the shell hands them to the tick. The pose of a third sensor is not among them: no law uses it.
         timing: returns the loop's timing for a message with the stamp (ns) that it is given; the shell measures it.
         force_source: which force closes the loop, `sensor` or `estimate`.
         new_lease: makes the secret of a lease.
@@ -145,6 +146,8 @@ class RigCore:
         self.supervision = Supervision(rig)
         self._watched = 0
         self._records, self._timing, self._intake = records, timing, Intake(rig)
+        self._names = {tool.handle: tool.name for tool in rig.tracker.tools}
+        self._rear = new(POSE)[0]  # newest pose of a third sensor
         self._force_zero = ForceZero(rig.force_sensor.noise_N, rig.force_sensor.range_N)
         self._outputs: np.record | None = None  # of the newest tick
         self._leaving, self._loop_runs = Leaving(), True
@@ -314,19 +317,19 @@ class RigCore:
             self._homed.clear()
 
     def _take_poses(self, samples: Sequence[PoseSample]) -> None:
-        tracker = self.rig.tracker
-        names = {tracker.tip_handle: "tip", tracker.shaft_handle: "shaft"}
-        # The tip's pose last in its frame: an estimator that answers it then has the shaft's pose of the same time.
+        names = self._names
+        # The tip's pose last in its frame: an estimator that answers it then has the other poses of the same time.
         for sample in sorted(samples, key=lambda one: (one.stamp_ns, names.get(one.tool) == "tip")):
             name = names.get(sample.tool)
             if sample.missing or name is None:
                 continue
-            record = self._records[name]
+            record = self._records[name] if name in self._records else self._rear
             self._intake.pose(record, sample.stamp_ns, sample.arrival_ns, sample.position_m, sample.quaternion_wxyz)
-            self._leaving.changed.add(name)
-            # A retraction from a hard contact displaces a bent tip along the wall without turning it.
-            if self._moves and self.action < SafetyAction.RETRACT:
-                self._report(self.supervision.pose(name == "tip", record))
+            if record is not self._rear:
+                self._leaving.changed.add(name)
+                # A retraction from a hard contact displaces a bent tip along the wall without turning it.
+                if self._moves and self.action < SafetyAction.RETRACT:
+                    self._report(self.supervision.pose(name == "tip", record))
             self._publish(f"pose/{name}", telemetry.pose_message(record, sample.frame, sample.quality_m))
 
     def _take_forces(self, samples: Sequence[ForceSample]) -> None:

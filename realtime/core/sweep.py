@@ -86,7 +86,7 @@ def check_sweeps(rig: Rig, sweeps: Sequence[Sweep]) -> None:
 class SweepLoop:
     """Brings the devices up, arms, runs the sweeps in turn, disarms. `finished` or `problem` say how it ended.
 
-    Publishes `stage` (encoders, stamped with the board's time), `pose/tip`, `pose/shaft`, and a `log` line of source
+    Publishes `stage` (encoders, stamped with the board's time), the poses, and a `log` line of source
     `sweep` with the sweep as JSON at each begin and end. A device without data, a fault, a force above safety.over_force_N
     or `break_off` ends it: the stages brake, the board is disarmed.
     """
@@ -100,10 +100,7 @@ class SweepLoop:
         self.current, self.finished, self.problem = -1, False, ""
         self._intake, self._stage_config = Intake(rig), tick_parameters(rig)[0].stage
         self._stage, self._board = new(STAGE_STATE)[0], new(BOARD)[0]
-        self._records = {
-            rig.tracker.tip_handle: ("pose/tip", new(POSE)[0]),
-            rig.tracker.shaft_handle: ("pose/shaft", new(POSE)[0]),
-        }
+        self._records = {tool.handle: (tool.topic, new(POSE)[0]) for tool in rig.tracker.tools}
         self._force = new(FORCE)[0]
         self._buffer, self._number = np.zeros(BUFFER_BYTES, np.uint8), 0
         self._armed_ns, self._rest_ns, self._start_ns, self._pose_ns, self._force_ns, self._begin_ns = 0, 0, 0, 0, 0, -1

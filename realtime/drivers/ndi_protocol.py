@@ -37,14 +37,15 @@ ERROR_TEXTS = {
     0x11: "tracking could not be stopped",
     0x12: "tracking could not be started",
     0x13: "tool could not be initialised: a tool without a memory of its own needs its file (tracker.tip_definition, "
-    "shaft_definition)",
+    "shaft_definition, rear_definition)",
     0x14: "field generator's characterisation not valid",
     0x15: "measurement system could not be initialised",
     0x16: "diagnostic mode could not be started",
     0x17: "diagnostic mode could not be stopped",
     0x19: "firmware version could not be read",
     0x1A: "internal error of the measurement system",
-    0x1D: "the tool has no memory of its own: give its file in the rig file (tracker.tip_definition, shaft_definition)",
+    0x1D: "the tool has no memory of its own: give its file in the rig file (tracker.tip_definition, "
+    "shaft_definition, rear_definition)",
     0x1E: "SROM of the tool could not be read",
     0x1F: "SROM of the tool could not be written",
     0x20: "SROM could not be selected",

@@ -203,13 +203,13 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 def open_tracker(tracker: Tracker) -> OpenIgtLinkTracker:
-    """Connect to the server that `tracker.port` names; `tip_handle` and `shaft_handle` are names of transforms.
+    """Connect to the server that `tracker.port` names; the handles are names of transforms.
 
     Raises:
         OSError: no server answers there. InputError: the address is none.
     """
     address = address_of(tracker.port)
     try:
-        return OpenIgtLinkTracker(address, (tracker.tip_handle, tracker.shaft_handle), tracker.latency_s)
+        return OpenIgtLinkTracker(address, tuple(tool.handle for tool in tracker.tools), tracker.latency_s)
     except OSError as error:
         raise OSError(f"openigtlink: no server at {tracker.port} ({error.strerror or error})") from None

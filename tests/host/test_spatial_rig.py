@@ -36,12 +36,17 @@ UNSURE = ActuationKnowledge((0.8e-3, 0.5, 0.02), (5e-3, 0.1, 0.02), (1e-4, 0.1, 
 
 
 def poses(
-    force_N: np.ndarray, insertion_m: float, curvature_per_m: float, roll_rad: float, rng: np.random.Generator | None = None
+    force_N: np.ndarray,
+    insertion_m: float,
+    curvature_per_m: float,
+    roll_rad: float,
+    rng: np.random.Generator | None = None,
+    offsets_m: tuple[float, ...] = (0.0, OFFSET_m),
 ) -> list[PoseReading]:
-    """Poses of tip and shaft under a force (3,) on the tip in the base frame, by `solve_cosserat`; with noise if `rng`."""
+    """Poses of the sensors under a force (3,) on the tip in the base frame, by `solve_cosserat`; with noise if `rng`."""
     c, s = math.cos(roll_rad), math.sin(roll_rad)
     turned = np.array([c * force_N[0] + s * force_N[1], c * force_N[1] - s * force_N[0], force_N[2]])
-    found = solve_cosserat(BLAZER, insertion_m, curvature_per_m, turned, "base", stations_m=[0.0, OFFSET_m])
+    found = solve_cosserat(BLAZER, insertion_m, curvature_per_m, turned, "base", stations_m=offsets_m)
     assert found.converged
     about = quaternion_of_vector(np.array([0.0, 0.0, roll_rad]))
     out = []
@@ -103,6 +108,23 @@ def test_exact_poses_give_the_force_on_the_tissue_in_space(roll_rad: float, forc
         assert found.converged and found.residual < 1e-3
         # without noise the prior of 1 N draws the weakest direction towards zero a little
         assert np.linalg.norm(found.force_N + on_tip) < 0.08 * np.linalg.norm(on_tip)
+
+
+def test_a_third_pose_makes_the_force_surer_and_two_answer_as_without_it() -> None:
+    on_tip, joints = np.array([0.05, 0.02, -0.1]), Actuation(-0.03, 0.3, 18.0, 0)
+    tip, shaft, rear = poses(on_tip, -0.03, 18.0, 0.3, offsets_m=(0.0, OFFSET_m, 0.06))
+    sensors = TrackedSensors(OFFSET_m, POSITION_STD_m, ANGLE_STD_rad, 0.06)
+    by_three = SpatialRigEstimator(BLAZER, sensors, UNSURE).estimate(tip, shaft, joints, rear)
+    by_two, alone = (
+        made.estimate(tip, shaft, joints) for made in (SpatialRigEstimator(BLAZER, sensors, UNSURE), estimator(UNSURE))
+    )
+    assert np.array_equal(by_two.force_N, alone.force_N) and np.array_equal(by_two.covariance_N2, alone.covariance_N2)
+    assert by_three.converged and by_three.residual < 1e-2
+    assert np.linalg.norm(by_three.force_N + on_tip) < np.linalg.norm(by_two.force_N + on_tip)
+    assert np.linalg.det(by_three.covariance_N2) < 0.5 * np.linalg.det(by_two.covariance_N2)
+    with pytest.raises(InputError, match="pose_rear"):
+        far = rear._replace(position_m=np.array([0.0, 0.0, 5.0]))
+        SpatialRigEstimator(BLAZER, sensors, UNSURE).estimate(tip, shaft, joints, far)
 
 
 def test_errors_of_the_actuation_are_followed_and_stated() -> None:

@@ -180,7 +180,7 @@ class State:
     def frame(self) -> dict[str, Any]:
         now, pressing = time.monotonic(), self.mode in ("approach", "contact", "retract")
         estimated = (self.force_N or 0.0) + 0.01
-        model = {"scale": 1.02, "sd": 0.03, "adaptation": "frozen", "text": "in contact", "place": "tip"}
+        model = {"scale": 1.02, "sd": 0.03, "adaptation": "frozen", "text": "in contact", "place": "tip", "sensors": 3}
         if self.body:
             text = "the tip presses with 0.02 N, the body with 0.31 N"
             model |= {"place": "body", "body_offset_m": 0.031, "body_offset_sd_m": 0.004, "contact_text": text}
@@ -353,6 +353,7 @@ def test_each_state_is_named_readable_and_fits_the_screen(shown: tuple[Fake, Ope
         assert contrast(page) >= 4.5, (width, scheme)
     model = open_page.page.text_content("#model") or ""
     assert ("31 ± 4 mm behind the tip" in model) == (name == "body contact")
+    assert "(3 sensors)" in model
     disabled = page.locator('[data-home="insertion"]').is_disabled()
     assert disabled == (name != "disarmed"), "an axis is homed while the rig is disarmed"
     assert open_page.complaints == []

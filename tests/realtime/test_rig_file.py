@@ -6,6 +6,7 @@ import pytest
 
 from protocol.errors import InputError
 from protocol.rig_file import load_rig, parse_rig
+from realtime.core.lines import tracker_config
 from tests.realtime.conftest import RIG_FILE
 
 
@@ -51,6 +52,40 @@ def test_a_mistake_is_refused_with_key_value_and_range(key: str, value: object, 
     assert "\n" not in message
     for name in names:
         assert name in message, message
+
+
+REAR = {"rear_handle": "0C", "rear_sensor_offset_m": 0.04}
+
+
+def rig_data(**tracker: object) -> dict:
+    data = tomllib.loads(RIG_FILE.read_text())
+    data["tracker"] |= tracker
+    return data
+
+
+def test_a_third_sensor_is_one_more_tool_behind_the_second() -> None:
+    two, three = parse_rig(rig_data()).tracker, parse_rig(rig_data(**REAR)).tracker
+    assert [tool.topic for tool in two.tools] == ["pose/tip", "pose/shaft"] and two.tool_offsets_m == (0.0, 0.02)
+    assert three.tools[:2] == two.tools and three.tools[2] == ("rear", "0C", "", 0.04)
+    assert tracker_config(parse_rig(rig_data(**REAR))).tools == ("0A", "0B", "0C")
+
+
+@pytest.mark.parametrize(
+    ("tracker", "names"),
+    [
+        ({**REAR, "rear_handle": ""}, ["rear_handle", "rear_sensor_offset_m"]),
+        ({"rear_handle": "0C"}, ["rear_sensor_offset_m above shaft_sensor_offset_m"]),
+        ({**REAR, "rear_sensor_offset_m": 0.01}, ["rear_sensor_offset_m = 0.01"]),
+        ({**REAR, "rear_handle": "0B"}, ["rear_handle = 0B", "third tool"]),
+        ({**REAR, "rear_handle": "third"}, ["rear_handle = third", "two characters"]),
+        ({**REAR, "kind": "udp", "rear_definition": "/a.rom"}, ["rear_definition", 'only for kind = "aurora"']),
+    ],
+)
+def test_a_third_sensor_that_is_not_described_whole_is_refused(tracker: dict, names: list[str]) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_rig(rig_data(**tracker))
+    message = str(refused.value)
+    assert "\n" not in message and all(name in message for name in names), message
 
 
 @pytest.mark.parametrize(

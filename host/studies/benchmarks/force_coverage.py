@@ -41,6 +41,7 @@ class Sample(NamedTuple):
     state: RigState
     force_N: Array
     phase: int
+    rear: Pose | None = None
 
 
 def record(rig: Rig, seed: int, seconds: float, job: ContactJob | None = None, **plant: Any) -> list[Sample]:
@@ -63,7 +64,9 @@ def record(rig: Rig, seed: int, seconds: float, job: ContactJob | None = None, *
                 state = latest.get("state")
                 if isinstance(state, RigState):
                     seen = shaft if fresh and isinstance(shaft, Pose) else None
-                    samples.append(Sample(message, seen, stages[near], state, *truth[at]))
+                    rear = latest.get("pose/rear")
+                    third = rear if isinstance(rear, Pose) else None
+                    samples.append(Sample(message, seen, stages[near], state, *truth[at], third))
 
     world = World(rig, simulated_plant(rig, seed, **plant), forkable_board("native"), seed)
     run = Scenario(rig, world, publish)
@@ -122,7 +125,7 @@ def judge(rig: Rig, runs: Iterable[list[Sample]]) -> Judged:
     for samples in runs:
         service = EstimationService(make_estimator(rig))
         for sample in samples:
-            answer = service(sample.tip, sample.shaft, sample.stage, sample.state)
+            answer = service(sample.tip, sample.shaft, sample.stage, sample.state, sample.rear)
             if sample.phase == Phase.DISARMED:
                 continue
             frames += 1
@@ -141,8 +144,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[201, 202, 203])
     parser.add_argument("--seconds", type=float, default=10.0, help="after contact")
     parser.add_argument("--as-configured", action="store_true", help="the rig file's world in place of drawn ones")
+    parser.add_argument(
+        "--rear-mm", type=float, default=0.0, help="place of a third sensor: the spatial model with and without"
+    )
     options = parser.parse_args()
     rig = load_rig(SIMULATED_RIG)
+    if options.rear_mm:
+        third = {"rear_handle": "0C", "rear_sensor_offset_m": 1e-3 * options.rear_mm}
+        rig = parse_rig({**rig.effective(), "tracker": {**rig.effective()["tracker"], **third}})
     runs = []
     for seed in options.seeds:
         runs.append(record(rig, seed, options.seconds, **({} if options.as_configured else drawn_world(rig, seed))))
@@ -151,8 +160,13 @@ def main() -> None:
     print(
         "model, where: frames; RMS error and mean stated sd (mN; e1, e2, e3); NEES (3 is true); within 95 % bands; answered"
     )
-    for name in ("spatial", "planar"):
-        got = judge(parse_rig({**data, "estimation": {**data["estimation"], "model": name}}), runs)
+    two = [[sample._replace(rear=None) for sample in samples] for samples in runs]
+    judged = [("spatial", two), ("planar", two)]
+    if options.rear_mm:
+        judged = [("spatial, two sensors", two), ("spatial, three sensors", runs)]
+    for name, seen in judged:
+        model = name.partition(",")[0]
+        got = judge(parse_rig({**data, "estimation": {**data["estimation"], "model": model}}), seen)
         for where, rows in (("free", ~got.touching), ("contact", got.touching)):
             rms, sd = np.sqrt(np.mean(got.error_N[rows] ** 2, axis=0)), got.sd_N[rows].mean(axis=0)
             inside = np.mean(np.abs(got.error_N[rows]) < 1.96 * got.sd_N[rows], axis=0)

@@ -72,8 +72,8 @@ export function showModel(model) {
   }
   if (known(model.place)) {
     const where = known(model.body_offset_m) ? `, ${(1000 * model.body_offset_m).toFixed(0)} ± ${(1000 * model.body_offset_sd_m).toFixed(0)} mm behind the tip` : "";
-    const away = model.place !== "tip";
-    rows.push(["contact away from the tip", away ? `${model.place}${where}` : "none", away ? "bad" : ""]);
+    const away = model.place !== "tip", by = known(model.sensors) ? ` (${model.sensors} sensors)` : "";
+    rows.push(["contact away from the tip", (away ? `${model.place}${where}` : "none") + by, away ? "bad" : ""]);
     if (away && model.contact_text) rows.push(["", model.contact_text]);
   }
   fill(element("model"), rows);

@@ -120,10 +120,10 @@ export class Scene {
     this.#target(world);
     this.force = new Arrow(color("force"), 1);
     this.estimate = new Arrow(color("estimate"), 0.6);
-    this.sensors = {tip: new THREE.AxesHelper(4), shaft: new THREE.AxesHelper(4)};
-    world.add(this.force.group, this.estimate.group, this.sensors.tip, this.sensors.shaft);
-    for (const part of [this.wall, this.target, this.force.group, this.estimate.group, this.sensors.tip, this.sensors.shaft])
-      part.visible = false;
+    this.sensors = {tip: new THREE.AxesHelper(4), shaft: new THREE.AxesHelper(4), rear: new THREE.AxesHelper(4)};
+    const sensors = Object.values(this.sensors);
+    world.add(this.force.group, this.estimate.group, ...sensors);
+    for (const part of [this.wall, this.target, this.force.group, this.estimate.group, ...sensors]) part.visible = false;
     if (this.newest) this.show(...this.newest);
   }
 
