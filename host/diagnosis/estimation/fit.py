@@ -30,6 +30,11 @@ class Term:
     candidate: Candidate
     parameters: tuple[Parameter, ...]
 
+    @property
+    def fitted(self) -> int:
+        """Return how many of its parameters are fitted: a middle or a range that the recordings give costs no evidence."""
+        return len(free(list(self.parameters)))
+
 
 @dataclass
 class Fit:
@@ -45,6 +50,11 @@ class Fit:
     def names(self) -> tuple[str, ...]:
         """Return the keys of the active candidates."""
         return tuple(term.candidate.key for term in self.terms)
+
+    @property
+    def fitted(self) -> int:
+        """Return how many parameters of its effects are fitted. The nominal ones are those of every structure."""
+        return sum(term.fitted for term in self.terms)
 
     def values_of(self, term: Term) -> Array:
         """Return the values of `term`, which is one of `terms` itself, not one equal to it."""

@@ -29,7 +29,7 @@ from host.diagnosis.estimation.fit import (
     tuned,
 )
 from host.diagnosis.model.dataset import one_clock
-from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Reading, same_place
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, same_place
 from host.diagnosis.model.model import scale_of
 
 Array = npt.NDArray[np.float64]
@@ -40,22 +40,31 @@ ABSORBED = 1e-10  # share of a response that the active parameters do not explai
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 
-def term_of(problem: Problem, candidate: Candidate, fit: Fit) -> Term:
-    """`candidate` with bounds and start values for these recordings."""
+def term_of(problem: Problem, candidate: Candidate, fit: Fit, sizes: dict[str, float] | None = None) -> Term:
+    """`candidate` with bounds and start values for these recordings. sizes: RMS needs of ports with this fit, kept."""
+    sizes = {} if sizes is None else sizes
+    if candidate.port.name not in sizes:
+        sizes[candidate.port.name] = _need(problem, candidate.port, fit)
+    rms = sizes[candidate.port.name]
+    scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
+    parameters = candidate.effect.parameters(scale, candidate.form)
+    if problem.model.either_sign and candidate.effect.slots is not None:
+        nominal = fit.values[: len(problem.model.parameters)]
+        own = {p.name: float(value) for p, value in zip(problem.model.parameters, nominal, strict=True)}
+        parameters = tuple(_either(p, own) if p.linear and p.low == 0.0 else p for p in parameters)
+    return Term(candidate, parameters)
+
+
+def _need(problem: Problem, port: Port, fit: Fit) -> float:
+    """RMS of what `port` would have to be moved by, over the samples to fit."""
     n = len(problem.model.parameters)
     needs = [
-        problem.model.needs(segment, candidate.port, fit.values[:n], residual)[segment.fit]
+        problem.model.needs(segment, port, fit.values[:n], residual)[segment.fit]
         for segment, residual in zip(problem.segments, fit.residuals, strict=True)
         if segment.fit.any()
     ]
     together = np.concatenate(needs)
-    rms = float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
-    scale = scale_of(problem.model, problem.segments, candidate.port, candidate, rms)
-    parameters = candidate.effect.parameters(scale, candidate.form)
-    if problem.model.either_sign and candidate.effect.slots is not None:
-        own = {p.name: float(value) for p, value in zip(problem.model.parameters, fit.values[:n], strict=True)}
-        parameters = tuple(_either(p, own) if p.linear and p.low == 0.0 else p for p in parameters)
-    return Term(candidate, parameters)
+    return float(np.sqrt(np.nanmean(together**2))) if np.isfinite(together).any() else 1.0
 
 
 def _either(p: Parameter, nominal: dict[str, float]) -> Parameter:
@@ -135,6 +144,7 @@ def screen(
     found = []
     bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
     few = _independent(problem, r)
+    sizes: dict[str, float] = {}
     slopes = _slopes(problem, fit)
     used = [
         np.where(segment.fit, r, np.nan)
@@ -159,7 +169,7 @@ def screen(
             Q = np.linalg.qr(J)[0] if J.shape[1] else J
             bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
         terms, values, base, Q, rest = bases[drop]
-        term = _seeded(problem, fit, term_of(problem, candidate, fit))
+        term = _seeded(problem, fit, term_of(problem, candidate, fit, sizes))
         quick = candidate.port.name in slopes
         if not term.parameters or (candidate.effect.joins and _absorbs(problem, (*terms, term), values, term, base, Q)):
             continue
@@ -172,7 +182,7 @@ def screen(
         reference = float(r @ r)
         left = max(float(rest @ rest) - points[0].taken, 1e-300)
         n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
-        promise = 0.5 * n_eff * np.log(reference / left) - len(term.parameters) - points[0].begun
+        promise = 0.5 * n_eff * np.log(reference / left) - term.fitted - points[0].begun
         nominal = [point.values for point in points[:2] if point.values is not None]
         begin = [point.begin for point in points[: len(nominal) or 3]]
         found.append(Screened(candidate, term, drop, float(promise), begin, nominal))
@@ -324,7 +334,7 @@ def _scan(
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
             columns.append(_fast(problem, terms, trial, slopes) if fast else base - _known(problem, terms, trial, base))
-        S = np.zeros((base.size, 0)) if fast else _begun(problem, terms, trial, Q)
+        S = _begun(problem, terms, trial, Q, slopes, columns[-1] if fast else None)
         if shifts:
             again = _absorbed(problem, terms, values, trial, base, S)
             if again is not None:
@@ -361,10 +371,13 @@ def _known(problem: Problem, terms: tuple[Term, ...], trial: Array, base: Array)
     return np.where(r >= FAR, base, r)
 
 
-def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) -> Array:
+def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array, slopes: Slopes, now: Array | None) -> Array:
     """What the state at a recording's first sample does of the last term's memory: orthonormal columns, one a recording.
 
-    They are orthogonal to `Q` too, so that they and the term share the residual.
+    They are orthogonal to `Q` too, so that they and the term share the residual. Without them an effect with a long memory
+    is taken for what it would be if the first samples had told its state.
+
+    now: the term's response with the states so far, where the model answers without a simulation.
     """
     candidate = terms[-1].candidate
     none = np.zeros((Q.shape[0], 0))
@@ -373,10 +386,14 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array) ->
     port, before = candidate.port.name, get_starts(problem)
     used = [segment for segment in problem.segments if segment.fit.any()]
     spread = float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
-    r = problem.stacked(terms, trial)
+
+    def response() -> Array:
+        return _fast(problem, terms, trial, slopes) if port in slopes else -problem.stacked(terms, trial)
+
+    change = -(response() if now is None else now)
     for segment in used:
         segment.start[port] = segment.start.get(port, 0.0) + START_STEP * spread
-    change = r - problem.stacked(terms, trial)
+    change += response()
     set_starts(problem, before)
     rows = len(problem.noise)
     edges = np.cumsum([0] + [rows * int(segment.fit.sum()) for segment in used])

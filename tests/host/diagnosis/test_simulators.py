@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 import typer
 from numba import njit
+from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import seldinger as sd
 from host.cli.diagnose import diagnose as diagnose_command
+from host.diagnosis.effects import candidates
 from host.diagnosis.model.effect import Array
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import prepare
+from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.selection.screening import screen
+from host.diagnosis.selection.search import fit_nominal
 from protocol.errors import InputError
 
 DT_S = 0.005
@@ -199,3 +203,42 @@ def test_code_that_others_may_write_is_refused(tmp_path: Path) -> None:
     assert trusted.exit_code == 0 and "with your rights" in trusted.stderr
     os.chmod(nominal.with_suffix(".py"), 0o644)
     assert CliRunner().invoke(app, arguments, catch_exceptions=False).exit_code == 0
+
+
+def bent(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+    """A tip that a knob bends and a roll turns: static, so that the answer to every input is known from one step of it."""
+    r = p["gain"] * np.sin(inputs["knob"])
+    return {"x": r * np.cos(inputs["roll"]), "y": r * np.sin(inputs["roll"])}
+
+
+def crept(number: int, slow_share: float) -> Table:
+    """Ten seconds cut from motion: a share of the knob's motion follows over 1.5 s (exact for a held input)."""
+    rng, dt_s, before = np.random.default_rng(number), 0.02, 1000
+    t = dt_s * (np.arange(before + 500) - before)
+    tones = rng.uniform(0.05, 0.6, 6), rng.uniform(0.0, 6.0, 6)
+    knob = 0.5 + 0.08 * np.sum(np.sin(2.0 * np.pi * np.multiply.outer(t, tones[0]) + tones[1]), axis=1)
+    roll = 0.8 * np.sin(2.0 * np.pi * 0.17 * t + rng.uniform(0.0, 6.0))
+    keep = np.exp(-dt_s / 1.5)
+    slow = lfilter([1.0 - keep], [1.0, -keep], knob, zi=[keep * knob[0]])[0]
+    moved = (1.0 - slow_share) * knob + slow_share * slow
+    tip = bent({"knob": moved, "roll": roll}, {"gain": 0.05}, t)
+    columns = {"t": t - t[before], "knob": knob, "roll": roll}
+    columns |= {name: row + 2e-4 * rng.standard_normal(t.size) for name, row in tip.items()}
+    return Table(f"r{number}", {name: column[before:] for name, column in columns.items()})
+
+
+def test_a_slow_share_is_screened_with_the_state_that_a_recording_begins_with() -> None:
+    """Cut from motion, the slow part begins anywhere: if the first samples tell it, friction promises more."""
+    content: dict[str, Any] = {
+        "name": "tip",
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {n: {"column": n, "unit": u} for n, u in (("knob", "rad"), ("roll", "rad"), ("x", "m"), ("y", "m"))},
+        "callable": {"function": bent, "inputs": ["knob", "roll"], "outputs": ["x", "y"], "subsystem": "tip"},
+        "parameters": {"gain": {"value": 0.05, "low": 0.01, "high": 0.2, "unit": "m"}},
+    }
+    _, problem, _ = prepare(nominal_of(content), [crept(k, 0.15) for k in range(3)])
+    nominal = fit_nominal(problem)
+    ranked = screen(problem, nominal, candidates(candidate_ports(problem), True), lambda *_: None)
+    assert ranked[0].candidate.key == "creep_relaxation@knob"
+    assert 0.5 < ranked[0].begin[0][1] < 4.0
