@@ -40,7 +40,7 @@ class SelectionRules:
     screening_log_likelihood: float = 3.0  # projected gain from which a candidate is fitted
     least_fits: int = 4  # candidates that are fitted for any promise, while the residual is above noise
     fits_per_step: int = 10
-    fits_per_port: int = 5
+    fits_per_port: int = 6  # different effects
     first_iterations: int = 5  # of a fit from each start
     further_iterations: int = 9  # from the best of these on
     most_effects: int = 5

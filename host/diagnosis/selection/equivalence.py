@@ -50,18 +50,18 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
             set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
-        crossed = unexcited(problem, less, found.best, len(term.parameters), noise_sd, gain)
+        crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
         gain = crossed or gain
         alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
         said = _better_said(problem, found, term.candidate, less, noise_sd)
-        alike += tuple(candidate for candidate, _ in said)
+        alike += tuple(candidate for candidate, _ in said if candidate.name != term.candidate.name)
+        paired = _pairs(problem, found, term.candidate, noise_sd)
+        alike += tuple(dict.fromkeys(part for part, _ in paired if part not in alike))
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
-        differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said))
-        alone = _rests_on(problem, less, found.best, noise_sd, len(term.parameters))
+        differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
+        alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
         share = _share(problem, found, less, noise_sd) if terms else np.inf
-        out.append(
-            Standing(term.candidate, gain, both, alike, differences, len(term.parameters), share, alone, crossed is not None)
-        )
+        out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 
 
@@ -79,7 +79,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
             (difference, k, rival)
             for k, one in enumerate(standing)
             for rival, difference in one.rivals
-            if not rival.effect.searched and difference < -problem.rules.equal_log_likelihood
+            if not rival.effect.searched and difference - _own(one) < -problem.rules.equal_log_likelihood
         ]
         if not behind or problem.budget.spent():
             return standing
@@ -97,6 +97,29 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         seen.append(other.names)
         standing = standings(problem, found, noise_sd)
     return standing
+
+
+def _pairs(problem: Problem, found: Found, candidate: Candidate, noise_sd: Array) -> list[tuple[Candidate, float]]:
+    """Effects of pairs that do as well as `candidate`, the only effect that is named: each with its coarsened difference.
+
+    A pair is one explanation: its two effects share its weight.
+    """
+    if len(found.best.terms) > 1:
+        return []
+    parts = []
+    for pair in found.pairs:
+        if candidate in [term.candidate for term in pair.terms]:
+            return []  # another effect was named when they were compared
+        ahead = compare(problem.segments, "both", pair.residuals, found.best.residuals, noise_sd)
+        if ahead.log_likelihood < problem.rules.equal_log_likelihood:
+            difference = coarse(ahead, found.best.fitted - pair.fitted, problem.rules) + float(np.log(len(pair.terms)))
+            parts += [(term.candidate, difference) for term in pair.terms]
+    return parts
+
+
+def _own(standing: Standing) -> float:
+    """Coarsened difference of the likeliest form of an effect's name: zero or less."""
+    return min([0.0, *(difference for rival, difference in standing.rivals if rival.name == standing.candidate.name)])
 
 
 def without_improbable(
@@ -128,7 +151,8 @@ def without_improbable(
 
 def probability_of(standing: Standing, left: float, rules: SelectionRules) -> Posterior:
     """Probabilities at the place of one effect. left: share of the mismatch that the best model leaves."""
-    return posterior(standing.both, standing.gain, standing.parameters, list(standing.rivals), left, rules, standing.share)
+    rivals, name = list(standing.rivals), standing.candidate.name
+    return posterior(standing.both, standing.gain, standing.parameters, rivals, left, rules, standing.share, name)
 
 
 def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial) -> Fit:
@@ -189,18 +213,17 @@ def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[
 def _better_said(
     problem: Problem, found: Found, candidate: Candidate, less: Fit, noise_sd: Array
 ) -> tuple[tuple[Candidate, float], ...]:
-    """An equation that does plainly better in the place of `candidate` and says something else: then `candidate` may be
-    the wrong name.
+    """An equation that does plainly better in the place of `candidate`: if it says something else, `candidate` may be the
+    wrong name; if it says the same, the form of `candidate` is not exact, and no rival's form has to be the better name.
     """
     if candidate.effect.searched:
         return ()
     for trial in equations_for(problem, less, candidate.port, noise_sd):
-        if trial.candidate.name == candidate.name:
-            continue
         behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
-            more = len(found.best.values) - len(trial.fit.values)
-            return ((trial.candidate, -coarse(behind, -more, problem.rules)),)
+            # its form was chosen among hundreds: it is no simpler than an effect with more parameters
+            more = max(trial.fit.fitted - found.best.fitted, 0)
+            return ((trial.candidate, -coarse(behind, more, problem.rules)),)
     return ()
 
 
@@ -228,12 +251,12 @@ def _equals(
         contained = candidate.effect.id in trial.candidate.effect.contains
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
             continue
-        if at_bound(other) and len(other.values) > len(best.values):
+        if at_bound(other) and other.fitted > best.fitted:
             continue  # its further parameter ended at a bound, so it says what the simpler one says
         ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
-        refitted.append((trial.candidate, coarse(ahead, len(best.values) - len(other.values), problem.rules)))
+        refitted.append((trial.candidate, coarse(ahead, best.fitted - other.fitted, problem.rules)))
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
@@ -274,7 +297,7 @@ def _collapsed(problem: Problem, best: Fit, other: Fit) -> bool:
                 left = np.where(used, a[row], np.nan)
                 power = float(np.nanmean(left**2)) * correlation_time(left)
                 lead += float(np.sum((a[row] - b[row])[used] ** 2)) / max(power, 1e-300)
-    return 0.5 * lead < problem.rules.parameter_penalty * max(len(other.values) - len(best.values), 1)
+    return 0.5 * lead < problem.rules.parameter_penalty * max(other.fitted - best.fitted, 1)
 
 
 def _indistinguishable(ahead: Gain, held: Gain, earned: Gain, rival: Gain, rules: SelectionRules) -> bool:

@@ -27,7 +27,7 @@ def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial], nois
         and not vanished(trial.fit, trial.fit.terms[-1], problem.rules)
     ]
     for trial in possible[: problem.rules.crossed_fits]:
-        more = max(len(trial.fit.values) - len(base.values), 0)
+        more = max(trial.fit.fitted - base.fitted, 0)
         trial.crossed = _where_called_for(problem, base, trial.fit, more, noise_sd, trial.starts)
     set_starts(problem, begun)
 

@@ -72,8 +72,9 @@ def best_pair(
 
 def pair_instead(
     problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array, restart: Restart
-) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
+) -> tuple[tuple[Fit, Gain, list[dict[str, float]]] | None, list[Fit]]:
     """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
+    Then the pairs that do as well: no data tell them from it.
 
     A loop with a dead band both rests after a reversal and is late. It outdoes play or a delay alone where both are there,
     and hides them: past it, neither earns much. Pairs of an effect that it contains and any unlike one at its port have to
@@ -84,7 +85,7 @@ def pair_instead(
     here = [t for t in _singles(trials, len(trials)) if t.candidate.port.name == term.candidate.port.name]
     parts = [t for t in here if t.candidate.effect.id in term.candidate.effect.contains]
     if len(_unlike(parts)) < 2 or problem.budget.spent():
-        return None
+        return None, []
     tried = [
         (a, b)
         for a, b in itertools.combinations(here, 2)
@@ -92,7 +93,7 @@ def pair_instead(
         and not (related(a.candidate, b.candidate) or related(b.candidate, a.candidate))
         and term.candidate.key not in (a.candidate.key, b.candidate.key)
     ]
-    begun, found = get_starts(problem), []
+    begun, found, equal = get_starts(problem), [], []
     for a, b in tried[: rules.split_fits]:
         starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
         set_starts(problem, starts)
@@ -102,15 +103,19 @@ def pair_instead(
         starts = get_starts(problem)
         passed = _passed(problem, nominal, fit, noise_sd)
         ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd)
-        more = len(fit.values) - len(one.values)
-        likelier = ahead.log_likelihood > rules.heldout_log_likelihood + rules.parameter_penalty * max(more, 0)
-        if likelier and passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
-            found.append((*passed, fit, starts))
+        more = fit.fitted - one.fitted
+        lead = ahead.log_likelihood - rules.parameter_penalty * max(more, 0)
+        if lead < -rules.equal_log_likelihood or passed is None:
+            continue
+        if all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
+            equal.append(fit)
+            if lead > rules.heldout_log_likelihood:
+                found.append((*passed, fit, starts))
     set_starts(problem, begun)
     if not found:
-        return None
+        return None, equal
     _, held, fit, starts = max(found, key=lambda item: item[0])
-    return fit, held, starts
+    return (fit, held, starts), []
 
 
 def _singles(trials: list[Trial], most: int) -> list[Trial]:
@@ -154,7 +159,7 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> boo
     """
     if any(bound_by(fit, term) for term in fit.terms):
         return False
-    more = len(fit.values) - len(alone.values)
+    more = fit.fitted - alone.fitted
     held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd)
     trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd)
@@ -170,7 +175,7 @@ def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
 
 def _passed(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> tuple[float, Gain] | None:
     """Score of a pair and its gain on held-out samples; None if it does not pass what a single effect has to."""
-    rules, more = problem.rules, len(fit.values) - len(nominal.values)
+    rules, more = problem.rules, fit.fitted - nominal.fitted
     held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
     both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)

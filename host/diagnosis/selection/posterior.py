@@ -12,7 +12,9 @@ which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
     w(other)  = prior_none / (1 - prior_none) * exact_share / share      only where further effects are named
 
-where `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
+An effect is a name, whatever the form: the weight of another form of it, an equation that says the same, is its own.
+
+Here `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
 rivals that are indistinguishable (`equivalence`) have at least the weight `prior_equal` together.
 The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
 independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
@@ -68,20 +70,22 @@ def posterior(
     left: float,
     rules: SelectionRules,
     share: float = np.inf,
+    name: str = "",
 ) -> Posterior:
     """Probabilities at the place of one effect.
 
     gain, heldout: of the effect on all and on held-out samples; parameters: their number; rivals: each with its coarsened
     difference; left: share of the mismatch that the extended model leaves; share: that this effect alone removes, infinite
-    where it is the only one.
+    where it is the only one; name: of the effect.
     """
-    weights = [(rival, _exp(-difference)) for rival, difference in rivals]
+    weights = [(rival, _exp(-difference)) for rival, difference in rivals if rival.name != name]
+    own = 1.0 + sum(_exp(-difference) for rival, difference in rivals if rival.name == name)
     nothing = max(_exp(-(gain.log_likelihood - rules.parameter_penalty * parameters)), min(heldout.p_value, 1.0))
     odds = rules.prior_none / (1.0 - rules.prior_none)
     none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
     none += odds * min(rules.exact_share / max(share, 1e-300), 1.0 / odds)
-    total = 1.0 + sum(weight for _, weight in weights) + nothing + none
-    raw = 1.0 / total
+    total = own + sum(weight for _, weight in weights) + nothing + none
+    raw = own / total
     stated = calibrated(raw, *rules.effect_curve)
     share = (1.0 - stated) / (1.0 - raw) if raw < 1.0 else 0.0  # of what is not the effect, every part alike
     others = tuple((rival, share * weight / total) for rival, weight in weights)

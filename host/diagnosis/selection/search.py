@@ -67,6 +67,7 @@ class Found:
     best: Fit
     steps: list[Step]
     forms: list[Form] = field(default_factory=list)
+    pairs: list[Fit] = field(default_factory=list)  # of two effects each, that do as well as the first one named
     nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
     best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 
@@ -143,7 +144,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
         heldout,
         trained,
         both,
-        both.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(base.values)),
+        both.log_likelihood - problem.rules.parameter_penalty * (fit.fitted - base.fitted),
         after,
         bool(item.drop),
         problem.segments[0].recording.dt_s,
@@ -265,7 +266,9 @@ def _grow(
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
         best = _parted(problem, _taken(problem, winner), candidate_effects)
-        two = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart) if len(best.terms) == 1 else None
+        two = None
+        if len(best.terms) == 1:
+            two, found.pairs = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart)
         if two is not None:
             best, gain = _joined(problem, two), two[1]
             steps += [Step("joint", term.candidate.key, gain, trials) for term in best.terms]
@@ -451,7 +454,7 @@ def _detour(
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
         _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
         ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd)
-        more = max(len(other.best.values) - len(best.best.values), 0)
+        more = max(other.best.fitted - best.best.fitted, 0)
         if (
             ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
             and len(other.best.terms) <= len(best.best.terms) + 1
@@ -468,7 +471,7 @@ def _detour(
 def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:
     """Likelihood on all samples that a structure has earned, less the price of its parameters."""
     gain = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
-    return gain.log_likelihood - problem.rules.parameter_penalty * (len(fit.values) - len(nominal.values))
+    return gain.log_likelihood - problem.rules.parameter_penalty * (fit.fitted - nominal.fitted)
 
 
 def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
@@ -483,7 +486,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
                 problem, minimize(problem, (*rest, new), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             )
             ahead = compare(problem.segments, "both", best.residuals, other.residuals, noise_sd)
-            more = len(other.values) - len(best.values)
+            more = other.fitted - best.fitted
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
             ) and not at_bound(other):
@@ -534,7 +537,7 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             other = _restart(problem, finish(problem, begun_again(problem, other)), simple.candidate)
             earned = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
             ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd)
-            more = len(found.best.values) - len(other.values)
+            more = found.best.fitted - other.fitted
             if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
                 found.steps.append(Step("reduce", key, ahead, [trial]))
                 found.best = other
@@ -552,11 +555,11 @@ def _simpler(found: Found, term: Term) -> list[Trial]:
             if (
                 trial.candidate.effect.id in term.candidate.effect.contains
                 and related(trial.candidate, term.candidate)
-                and len(own.parameters) < len(term.parameters)
+                and own.fitted < term.fitted
                 and trial.candidate.key not in active
             ):
                 kept.setdefault(trial.candidate.key, trial)
-    return sorted(kept.values(), key=lambda trial: len(trial.fit.terms[-1].parameters))
+    return sorted(kept.values(), key=lambda trial: trial.fit.terms[-1].fitted)
 
 
 def _frequencies(fit: Fit, term: Term) -> tuple[float, ...]:
@@ -590,9 +593,9 @@ def _in_place_of(
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
-    simpler = len(winner.fit.values) < len(found.best.values) and related(winner.candidate, term.candidate)
+    simpler = winner.fit.fitted < found.best.fitted and related(winner.candidate, term.candidate)
     ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd)
-    more = len(winner.fit.values) - len(found.best.values)
+    more = winner.fit.fitted - found.best.fitted
     if (
         simpler  # preferred by `rank`, which weighs what the finer shape takes more
         or ahead.log_likelihood
@@ -617,17 +620,23 @@ def _rivals(trials: list[Trial], best: Fit, candidate: Candidate) -> list[Trial]
 def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list[Screened]:
     """The most promising, few of one effect or port so that rivals of other kinds get their chance.
 
-    here: how many of one port; 0: `fits_per_port`.
+    The best form of each effect comes first, then further forms: three forms of two effects would fill the places of a
+    port, and an effect whose start values promise half as much may fit best.
+
+    here: how many effects of one port; 0: `fits_per_port`.
     """
     most_here = here or rules.fits_per_port
     kept: list[Screened] = []
-    for item in items:
-        same = sum(other.candidate.effect.id == item.candidate.effect.id for other in kept)
-        at_port = sum(other.candidate.port.name == item.candidate.port.name for other in kept)
-        if same < 3 and at_port < most_here:
-            kept.append(item)
-        if len(kept) == rules.fits_per_step:
-            break
+    for further in (False, True):
+        for item in items:
+            effect, port = item.candidate.effect.id, item.candidate.port.name
+            same = sum(other.candidate.effect.id == effect for other in kept)
+            at_port = {other.candidate.effect.id for other in kept if other.candidate.port.name == port}
+            known = effect in at_port
+            if known is further and same < 3 and (known or len(at_port) < most_here) and not any(item is k for k in kept):
+                kept.append(item)
+            if len(kept) == rules.fits_per_step:
+                return kept
     return kept
 
 
@@ -643,12 +652,11 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
             gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd)
             held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd)
             least = 0.5 * max(problem.rules.least_error_reduction, problem.rules.least_excess_reduction * gain.excess)
-            few = gain.log_likelihood < problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * len(
-                term.parameters
-            )
+            price = problem.rules.parameter_penalty * term.fitted
+            few = gain.log_likelihood < problem.rules.heldout_log_likelihood + price
             gone = vanished(best, term, problem.rules)
             if held.log_likelihood < 0.0:
-                held = unexcited(problem, less, best, len(term.parameters), noise_sd) or held
+                held = unexcited(problem, less, best, term.fitted, noise_sd) or held
             if gone or few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))

@@ -89,7 +89,7 @@ def rank(trials: list[Trial], base: Fit) -> None:
     most = np.max([trial.both.independent for trial in trials], axis=0)
     common = max(trials, key=lambda trial: float(most @ trial.both.log_ratio)).both.independent
     for trial in trials:
-        more = max(len(trial.fit.values) - len(base.values), 0)
+        more = max(trial.fit.fitted - base.fitted, 0)
         trial.score = 0.5 * float(common @ trial.both.log_ratio) - rules.parameter_penalty * more
     trials.sort(key=lambda trial: trial.score, reverse=True)
     top = trials[0]
@@ -100,16 +100,16 @@ def rank(trials: list[Trial], base: Fit) -> None:
         rules.heldout_log_likelihood, rules.refinement_tolerance * top.score, min(coarse, 0.3 * top.score)
     )
     # A form whose further parameters ended at zero is the form without them, which may have begun a fit less luckily.
-    same, much = len(top.fit.values) - _zeros(top.fit), (1.0 - rules.reduced_form_tolerance) * top.score
+    same, much = top.fit.fitted - _zeros(top.fit), (1.0 - rules.reduced_form_tolerance) * top.score
     simpler = [
         t
         for t in trials
-        if len(t.fit.values) < len(top.fit.values)
-        and (t.score > near or (len(t.fit.values) <= same and t.candidate.name == top.candidate.name and t.score > much))
+        if t.fit.fitted < top.fit.fitted
+        and (t.score > near or (t.fit.fitted <= same and t.candidate.name == top.candidate.name and t.score > much))
         and related(t.candidate, top.candidate)
     ]
     if simpler:
-        best = max(simpler, key=lambda t: (-len(t.fit.values), t.score))
+        best = max(simpler, key=lambda t: (-t.fit.fitted, t.score))
         trials.remove(best)
         trials.insert(0, best)
 
@@ -195,7 +195,7 @@ def good_enough(trial: Trial, base: Fit) -> bool:
 
 def called_for(trial: Trial, base: Fit) -> bool:
     """Whether the evidence of a trial is enough, wherever its parameters ended."""
-    more = max(len(trial.fit.values) - len(base.values), 0)
+    more = max(trial.fit.fitted - base.fitted, 0)
     if trial.crossed is not None and _across(trial, trial.crossed, more):
         return True
     return _alone(trial, more) or (trial.apart and _together(trial, more)) or _plainly(trial, more)

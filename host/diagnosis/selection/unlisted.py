@@ -194,7 +194,7 @@ def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, 
     begin = np.concatenate((best.values, winner.fit.values_of(term)))
     both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
     gain = compare(problem.segments, "heldout", winner.fit.residuals, both.residuals, noise_sd)
-    more = len(both.values) - len(winner.fit.values)
+    more = both.fitted - winner.fit.fitted
     return gain.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
 
 

@@ -214,7 +214,7 @@ def bent(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[s
 def crept(number: int, slow_share: float) -> Table:
     """Ten seconds cut from motion: a share of the knob's motion follows over 1.5 s (exact for a held input)."""
     rng, dt_s, before = np.random.default_rng(number), 0.02, 1000
-    t = dt_s * (np.arange(before + 500) - before)
+    t: Array = dt_s * (np.arange(before + 500) - float(before))
     tones = rng.uniform(0.05, 0.6, 6), rng.uniform(0.0, 6.0, 6)
     knob = 0.5 + 0.08 * np.sum(np.sin(2.0 * np.pi * np.multiply.outer(t, tones[0]) + tones[1]), axis=1)
     roll = 0.8 * np.sin(2.0 * np.pi * 0.17 * t + rng.uniform(0.0, 6.0))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from host.diagnosis.effects.quantization import MOST_STEPS, from_saw_tooth, step
 from host.diagnosis.estimation.evidence import Gain
 from host.diagnosis.estimation.fit import Fit, Term, finish
 from host.diagnosis.estimation.rules import RULES
-from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import candidate_ports, prepare
@@ -20,14 +22,15 @@ from host.diagnosis.report.verdict import at_bound, likelier
 from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
 from host.diagnosis.selection.posterior import calibrated, posterior
-from host.diagnosis.selection.screening import term_of
-from host.diagnosis.selection.search import Found, fit_nominal
+from host.diagnosis.selection.screening import Screened, term_of
+from host.diagnosis.selection.search import Found, _varied, fit_nominal
 from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
 from host.diagnosis.selection.unlisted import Remainder
-from host.diagnosis.symbolic.dictionary import Form, PredictedPart
+from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at
 from tests.host.diagnosis.test_export import COMMON, KINDS
 
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
+PORT = Port("cable", "motion+limit", "cable", ("angle",))
 NOTHING = Gain(0.0, 1.0, 0.0)
 
 
@@ -110,6 +113,96 @@ def test_a_calibrated_probability_takes_its_share_from_all_others() -> None:
         assert each.effect + each.rivals[0][1] + each.nothing + each.none == pytest.approx(1.0)
     assert calibrated(0.8, 0.5, 0.5, -0.3) == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * np.log(4.0) - 0.3))))
     assert calibrated(0.8, 0.2, 0.9, 0.1) == pytest.approx(1.0 / (1.0 + 0.8**-0.2 * 0.2**0.9 * np.exp(-0.1)))
+
+
+def test_an_effect_is_as_probable_as_all_forms_of_its_name() -> None:
+    """A limit with a knee outdoes a polynomial; an equation of a curve outdoes both. Curves together are likelier."""
+    curve, limit = (
+        next(c for c in candidates((PORT,), True) if c.effect.id == name) for name in ("static_nonlinearity", "saturation")
+    )
+    exact = equation_at(PORT, Form("tanh(angle)", lambda segment: np.tanh(segment.y[0]), 2, curve=True))
+    assert exact.name == curve.name != limit.name
+    gain = Gain(400.0, 1e-9, 0.9, independent=np.array([400.0]), log_ratio=np.array([2.0]), excesses=np.array([0.1]))
+    rules = replace(RULES, effect_a=1.0, effect_b=1.0, effect_c=0.0)
+    alone = posterior(gain, gain, 2, [(limit, -2.0)], 0.0, rules, name=curve.name)
+    found = posterior(gain, gain, 2, [(limit, -2.0), (exact, -5.0)], 0.0, rules, name=curve.name)
+    other = posterior(gain, gain, 3, [(curve, 2.0), (exact, -3.0)], 0.0, rules, name=limit.name)
+    assert alone.effect < 0.15 < 0.9 < found.effect
+    assert found.effect == pytest.approx(sum(p for _, p in other.rivals), abs=0.01)
+    assert [rival for rival, _ in found.rivals] == [limit]
+
+
+def test_an_equation_chosen_among_hundreds_is_no_simpler_than_an_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It outdoes a limit by what it leaves alone, not by the two parameters that the limit has more."""
+    limit = next(c for c in candidates((PORT,), True) if (c.effect.id, c.form) == ("saturation", "both"))
+    scale = Scale("rad", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True)
+    best = Fit((Term(limit, limit.effect.parameters(scale, "both")),), np.zeros(3))
+    equation = equation_at(PORT, Form("angle^2", lambda segment: segment.y[0] ** 2, 2))
+    found = replace(trial(0.0, 0.0), candidate=equation)
+    found.fit = Fit((Term(equation, equation.effect.parameters(scale, "")),), np.zeros(1))
+    ahead = Gain(6.0, 1e-3, 0.1, independent=np.array([60.0]))
+    monkeypatch.setattr(equivalence, "equations_for", lambda *_: [found])
+    monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
+    problem: Any = SimpleNamespace(rules=RULES, segments=[])
+    ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, np.ones(1))
+    assert rival is equation and difference == pytest.approx(-6.0 * RULES.coarsening / (60.0 + RULES.coarsening))
+
+
+def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
+    """Five forms of two effects promise most at one port; the third effect there is fitted all the same."""
+    every = candidates((PORT,), True)
+    promised = [
+        ("presliding_friction", "general"),
+        ("presliding_friction", "dahl"),
+        ("static_nonlinearity", ""),
+        ("static_nonlinearity", "fine"),
+        ("presliding_friction", "reversal"),
+        ("presliding_friction", "maxwell"),
+        ("creep_relaxation", ""),
+    ]
+    items = [
+        Screened(next(c for c in every if (c.effect.id, c.form) == key), Term(BACKLASH, ()), (), 90.0 - k, [])
+        for k, key in enumerate(promised)
+    ]
+    kept = [(item.candidate.effect.id, item.candidate.form) for item in _varied(items, RULES)]
+    assert kept[:3] == [promised[0], promised[2], promised[6]]
+    assert set(promised) - set(kept) == {("presliding_friction", "maxwell")}
+    assert [item.candidate.effect.id for item in _varied(items, RULES, here=1)] == ["presliding_friction"] * 3
+
+
+@pytest.mark.parametrize(("lead", "named"), [(0.5, True), (30.0, False)])
+def test_a_pair_that_does_as_well_shares_the_probability(lead: float, named: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loop with a dead band is as late as a delay and rests like a gap: data may not separate them."""
+    loop, gap, late = (
+        next(c for c in candidates((PORT,), True) if (c.effect.id, c.form) == key)
+        for key in (("dead_zone", "loop"), ("backlash", ""), ("latency", ""))
+    )
+    scale = Scale("rad", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True)
+    best, pair = (
+        Fit(tuple(Term(c, c.effect.parameters(scale, c.form)) for c in given), np.zeros(2))
+        for given in ((loop,), (gap, late))
+    )
+    ahead = Gain(lead, 0.2, 0.01, independent=np.array([60.0]))
+    monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
+    problem: Any = SimpleNamespace(rules=RULES, segments=[])
+    parts = equivalence._pairs(problem, Found(best, best, [], pairs=[pair]), loop, np.ones(1))
+    assert [part for part, _ in parts] == ([gap, late] if named else [])
+    if named:
+        gain = Gain(400.0, 1e-9, 0.9, independent=np.array([400.0]), log_ratio=np.array([2.0]), excesses=np.array([0.1]))
+        found = posterior(
+            gain, gain, 2, parts, 0.0, replace(RULES, effect_a=1.0, effect_b=1.0, effect_c=0.0), name=loop.name
+        )
+        assert 0.4 < found.effect < 0.6 and sum(p for _, p in found.rivals) == pytest.approx(1.0 - found.effect, abs=0.06)
+
+
+@pytest.mark.parametrize(("form", "fitted"), [("", 2), ("fine", 5)])
+def test_what_the_recordings_give_is_no_fitted_parameter(form: str, fitted: int) -> None:
+    """Middle and half range of a curve are those of the recorded motion: a limit with as many parameters is no simpler."""
+    scale = Scale("rad", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True)
+    curve = next(c for c in candidates((PORT,), True) if (c.effect.id, c.form) == ("static_nonlinearity", form))
+    term = Term(curve, curve.effect.parameters(scale, form))
+    assert len(term.parameters) == fitted + 2
+    assert Fit((term,), np.zeros(fitted + 3)).fitted == term.fitted == fitted
 
 
 @pytest.mark.parametrize(("step_m", "found"), [(5e-4, True), (1e-16, False)])
