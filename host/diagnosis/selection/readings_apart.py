@@ -3,6 +3,8 @@
 The other kinds of model are checked by their law (`model/findings.py`). A simulator has none that could be read, so its
 outputs are compared with what it simulates for its nominal parameters. The initial state of a recording is read off the
 same outputs; what it explains is taken off both, so that a reversed reading is not compared with its own reversed start.
+A simulator that is not linear can start from degrees called radians on another course altogether: if nothing alike comes
+out, it is started from the readings in other units as well.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from host.diagnosis.model.readings import Finding
 
 Array = npt.NDArray[np.float64]
 ALIKE = 0.95  # correlation with what is simulated, from which on a factor between the two is one of units
+MATCHED = 0.9  # and where the gain is near one as well
+UNLIKE = 0.8  # correlation below which a simulator with one output is started from its reading in other units
 
 
 def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[list[Recording], list[Finding]]:
@@ -58,6 +62,8 @@ def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[l
             findings.append(Finding("sign", columns[row], says))
             change[names[row]] = -1.0
         factor = factor_of(abs(gain), NEAR_FACTOR) if abs(correlation) > ALIKE else 0.0
+        if abs(correlation) < UNLIKE and len(names) == 1:
+            factor = _of_start(problem, theta)
         if factor:
             says = f"Column {columns[row]} is about {FACTORS[factor]} times what the nominal model says: the unit of it, or "
             says += "of an input, is probably another (channels.*.scale). The diagnosis continues with "
@@ -67,6 +73,26 @@ def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[l
     if not findings:
         return list(recordings), []
     return [_put_right(recording, names, order, change) for recording in recordings], findings
+
+
+def _of_start(problem: Problem, theta: Array) -> float:
+    """The factor of units by which the readings of the only output, and the start that they give, have to be divided; 0 if
+    there is none.
+    """
+    for factor in FACTORS:
+        scaled = []
+        for segment in problem.segments:
+            begin = segment.begin
+            if begin is None:
+                return 0.0
+            changed = replace(
+                begin, values=begin.values / factor, measured=begin.measured / factor, spread=begin.spread / factor
+            )
+            scaled.append(_freed(problem, replace(segment, y=segment.y / factor, begin=changed), theta))
+        correlation, gain = _likeness(scaled, 0, 0)
+        if correlation > MATCHED and abs(float(np.log(gain))) < NEAR_FACTOR:
+            return factor
+    return 0.0
 
 
 def _put_right(recording: Recording, names: list[str], order: list[int], change: dict[str, float]) -> Recording:

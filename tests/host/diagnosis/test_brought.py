@@ -89,6 +89,45 @@ def test_a_slow_axis_starts_anywhere_if_its_position_is_not_read() -> None:
     assert next(v["value"] for k, v in fitted.items() if k.startswith("mass")) == pytest.approx(1.0, rel=0.02)
 
 
+def swung(inputs: dict[str, Array], values: dict[str, float], time_s: Array, start: dict[str, float]) -> dict[str, Array]:
+    """A pendulum under a torque that is held between samples, by half-steps of speed and angle (Verlet)."""
+    angle, rate, h = start["angle"], start["angle_rate"], float(time_s[1] - time_s[0]) / 5.0
+    out = np.empty(time_s.size)
+    for k, torque in enumerate(inputs["torque"]):
+        out[k] = angle
+        for _ in range(5):
+            angle += 0.5 * h * rate
+            rate += h * (torque - values["damping"] * rate - values["gravity"] * np.sin(angle))
+            angle += 0.5 * h * rate
+    return {"angle": out}
+
+
+def test_degrees_that_also_start_a_simulator_are_found() -> None:
+    """A pendulum that starts at 20 degrees called radians turns over: nothing alike is simulated from there."""
+    t = np.arange(0.0, 11.0, 0.02)
+    recordings = []
+    for number in (1, 2):
+        rng = stream(40 + number)
+        torque = sweep(rng, t, 1.2, 4.0)
+        angle = swung({"torque": torque}, {"damping": 0.6, "gravity": 18.0}, t, {"angle": 0.0, "angle_rate": 0.0})["angle"]
+        degrees = np.rad2deg(angle + 0.005 * rng.standard_normal(t.size))
+        recordings.append({"t": t[150:], "u": torque[150:], "y": degrees[150:]})
+    pendulum = {
+        "name": "pendulum",
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {"torque": {"column": "u", "unit": "N m"}, "angle": {"column": "y", "unit": "rad"}},
+        "callable": {"function": swung, "inputs": ["torque"], "outputs": ["angle"], "subsystem": "pendulum"},
+        "parameters": {
+            "gravity": {"value": 16.5, "low": 1.0, "high": 100.0},
+            "damping": {"value": 0.7, "low": 0.01, "high": 10.0},
+        },
+    }
+    verdict = sd.diagnose(recordings, pendulum).as_dict()
+    assert "57.3" in next(f["says"] for f in verdict["data_findings"] if f["id"] == "unit")
+    assert verdict["verdict"] == "nothing_missing"
+
+
 def metered(factor: float) -> list[dict[str, Array]]:
     recordings = []
     for number in range(3):
