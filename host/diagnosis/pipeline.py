@@ -20,6 +20,7 @@ from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
+from host.diagnosis.estimation.spectral_line import common_line
 from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model import readings
@@ -246,6 +247,8 @@ def _diagnosed(
     )
     if not found.best.terms:
         result.findings += late_by_a_sample(problem, found)
+    if not found.best.terms:
+        result.findings += _lines(full, found)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best, noise_sd)
         result.findings += _too_slow(full, found, slow) or _above_guess(full, figures, problem.rules)
@@ -264,6 +267,29 @@ def _without_lone_samples(
         return recordings, []
     nominal = fit_nominal(problem)
     return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
+
+
+def _lines(full: Problem, found: Found) -> list[Finding]:
+    """Sentences on lines in the spectrum of the nominal residual that no effect explains."""
+    findings = []
+    periods = [segment.recording.dt_s for segment in full.segments]
+    read = {output.channel for output in full.model.outputs}
+    inputs = [
+        [u for name, u in segment.inputs.items() if name in segment.recording.channels and name not in read]
+        for segment in full.segments
+    ]
+    for row, output in enumerate(full.model.outputs):
+        line = common_line([r[row] for r in found.nominal_full.residuals], inputs, periods)
+        if line is None or not full.segments[0].recording.timed:
+            continue
+        column = full.columns.get(output.channel, output.channel)
+        says = f"The residual of column {column} has a sine of {line.frequency_Hz:.4g} Hz, amplitude {line.amplitude:.3g} "
+        says += (
+            f"{output.unit}, in every recording. No input has this frequency: it is a hum, a vibration or a rotating part, "
+        )
+        says += "of another phase in each recording, and not in the nominal model."
+        findings.append(Finding("line", column, says))
+    return findings
 
 
 def _too_slow(full: Problem, found: Found, rows: list[int]) -> list[Finding]:

@@ -18,7 +18,7 @@ from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
-UNDECIDED = ("slow_noise", "noise_unseen", "within_sample", "excitation")
+UNDECIDED = ("line", "slow_noise", "noise_unseen", "within_sample", "excitation")
 REMARKS = ("outliers", "quantized", "hold", *UNDECIDED)  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, dlsim
+from scipy.signal import cont2discrete, dlsim, lfilter
 
 import seldinger as sd
+from host.diagnosis.estimation.spectral_line import common_line
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import inspected
@@ -167,3 +168,40 @@ def test_random_stamps_are_no_missing_samples() -> None:
     assert "% of the steps" in next(f.says for f in findings if "not even" in f.says)
     half = [{**r, "y": np.where(np.arange(2000) % 2 == 0, r["y"], np.nan)} for r in recordings]
     assert "missing" in {f.id for f in inspected(spec, [Table(f"r{k}", r) for k, r in enumerate(half)]).findings}
+
+
+def hummed(phases: tuple[float, ...], amplitude: float) -> list[dict[str, Array]]:
+    recordings = []
+    for number, phase in enumerate(phases):
+        rng = stream(50 + number)
+        t = np.arange(0.0, 20.0, 1.0 / 60.0)
+        q = sweep(rng, t, 1.0, 1.0)
+        noise = 0.04 * rng.standard_normal(t.size)
+        recordings.append({"t": t, "q": q, "y": 2.0 * q + amplitude * np.sin(2.0 * np.pi * 7.3 * t + phase) + noise})
+    return recordings
+
+
+@pytest.mark.parametrize(("amplitude", "stated"), [(0.06, True), (0.0, False)])
+def test_a_hum_of_another_phase_in_each_recording_is_stated(amplitude: float, stated: bool) -> None:
+    verdict = sd.diagnose(hummed((0.3, 2.9), amplitude), transmission("V", value=2.0)).as_dict()
+    assert not verdict["effects"]
+    lines = [f["says"] for f in verdict["data_findings"] if f["id"] == "line"]
+    assert bool(lines) is stated
+    if stated:
+        assert "7.3 Hz" in lines[0] and verdict["next"] == lines[0]
+
+
+def test_a_broad_peak_and_a_tone_of_the_input_are_no_lines() -> None:
+    """Noise behind a damped mode has a peak of many bins; a harmonic error of a tone has the frequency of an input."""
+    rng = stream(60)
+    t = np.arange(0.0, 20.0, 0.01)
+    broad = [lfilter([1.0], [1.0, -1.8, 0.95], rng.standard_normal(t.size)) for _ in range(2)]
+    assert common_line(broad, [[], []], [0.01, 0.01]) is None
+    tone = [np.sin(2.0 * np.pi * 3.0 * t + phase) + 0.1 * rng.standard_normal(t.size) for phase in (0.0, 1.0)]
+    assert common_line(tone, [[np.sin(2.0 * np.pi * 3.0 * t)]] * 2, [0.01, 0.01]) is None
+    line = common_line(tone, [[], []], [0.01, 0.01])
+    assert (
+        line is not None
+        and line.frequency_Hz == pytest.approx(3.0, abs=1e-2)
+        and line.amplitude == pytest.approx(1.0, rel=0.02)
+    )
