@@ -1,8 +1,9 @@
 """The running rig's planar estimator: both tracked poses, projected by roll, with play in insertion and curvature.
 
 An error of 1 mm in the insertion would read as 0.1 N, so the errors of insertion and curvature are estimated along with
-the force and followed from pose to pose; the second sensor separates them from the force. The force out of the plane is
-not estimated: it is reported as zero with `out_of_plane_sd_N`.
+the force and followed from pose to pose; the second sensor separates them from the force. The poses show no force out of
+the plane: without a commanded contact it is reported as zero with `out_of_plane_sd_N`. With one it follows from the force in
+the plane, because the force then points along the commanded direction, within `tangential_sd_N`.
 """
 
 from __future__ import annotations
@@ -137,15 +138,16 @@ class PlanarRigEstimator:
         if converged:
             shown = _shown(known, axes)
             self.errors.learn(known, shown @ fit.parameters, shown @ fit.covariance @ shown.T)
-        force_N = -axes @ fit.parameters[:2]
+        whole, unseen_sd_N = self._whole_force(actuation, axes, normal)
+        force_N = -whole @ fit.parameters[:2]
         in_plane = fit.covariance[:2, :2]
         lasting_too = prior.of_lasting[:2, :2] - axes.T @ self.errors.information_of_one_pose(known.across) @ axes
         of_one_pose = np.linalg.inv(fit.information[:2, :2] - lasting_too)
         # A pose depends on force over stiffness, so a relative error of the stiffness is one of the force.
         stiffness = self._contact.stiffness_sd**2 * np.outer(force_N, force_N)
-        unseen = self._contact.out_of_plane_sd_N**2 * np.outer(normal, normal)
-        lasting = axes @ lasting_part(in_plane, of_one_pose) @ axes.T + stiffness + unseen
-        total = axes @ in_plane @ axes.T + stiffness + unseen
+        unseen = unseen_sd_N**2 * np.outer(normal, normal)
+        lasting = whole @ lasting_part(in_plane, of_one_pose) @ whole.T + stiffness + unseen
+        total = whole @ in_plane @ whole.T + stiffness + unseen
         return TipForce(
             force_N,
             0.5 * (total + total.T),
@@ -154,6 +156,22 @@ class PlanarRigEstimator:
             pose_tip.stamp_ns,
             0.5 * (lasting + lasting.T),
         )
+
+    def _whole_force(self, actuation: Actuation, axes: Array, normal: Array) -> tuple[Array, float]:
+        """Matrix (3, 2) that makes the whole force of its part in the plane, and the uncertainty (N) out of the plane.
+
+        The force is f d + t u + ...: along the commanded direction d = p e + o n, and along the wall, u = -o e + p n. Here
+        e is in the plane, n its normal, and t has the standard deviation `tangential_sd_N`. Both parts in the plane and out
+        of it share f, so that F_n = (o / p) F_e + t / p.
+        """
+        if actuation.force_direction is None:
+            return axes, self._contact.out_of_plane_sd_N
+        direction = np.asarray(actuation.force_direction, dtype=float)
+        along = axes.T @ direction
+        p = float(np.linalg.norm(along))
+        if p <= LEAST_IN_PLANE:
+            return axes, self._contact.force_sd_N
+        return axes + np.outer(normal, along) * (normal @ direction) / p**2, self._contact.tangential_sd_N / p
 
     @staticmethod
     def _along_wall(actuation: Actuation, axes: Array) -> Array:
@@ -180,7 +198,7 @@ class PlanarRigEstimator:
         lateral, across = float(tip.position_m @ y_axis), float(tip.position_m @ normal)
         seen = lateral * lateral / self._sensors.position_std_m**2
         held = 1.0 / self._roll_sd_rad**2
-        return actuation.roll_rad - math.atan2(across * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
+        return actuation.roll_rad + math.atan2(across * lateral, lateral * lateral + 1e-12) * seen / (seen + held)
 
     @staticmethod
     def _planar(reading: PoseReading, y_axis: Array, actuation: Actuation) -> Array:

@@ -270,3 +270,32 @@ def test_rig_estimator_without_shaft_sensor_and_with_bad_input() -> None:
             estimator.estimate(bad, None, Actuation(-0.07, 0.3, 18.0, 0))
     with pytest.raises(ValueError, match="insertion_m"):
         estimator.estimate(tip, None, Actuation(-0.2, 0.3, 18.0, 0))
+
+
+@pytest.mark.parametrize("wound_rad", [-0.5, 0.5])
+def test_rig_estimator_follows_the_plane_that_the_poses_show(wound_rad: float) -> None:
+    """A shaft that is wound up lies in another plane than the controller's roll says."""
+    rig = load_rig(SIMULATED_RIG)
+    estimator = PlanarRigEstimator.from_rig(rig)
+    arcs, force = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056), np.array([-0.1, 0.0])
+    tip, shaft = (
+        reading(arcs, force, back, 0.3 + wound_rad, np.zeros(3)) for back in (0.0, rig.tracker.shaft_sensor_offset_m)
+    )
+    found = estimator.estimate(tip, shaft, Actuation(-0.07, 0.3, 18.0, 0, np.array([0.0, 0.0, 1.0])))
+    assert found.converged and np.allclose(found.force_N, [0.0, 0.0, 0.1], atol=2e-3)
+
+
+def test_rig_estimator_takes_the_force_out_of_the_plane_from_the_commanded_direction() -> None:
+    """Of a force of 0.1 N, 30 degrees out of the plane, the plane holds 0.087 N; the commanded direction gives the other."""
+    estimator = PlanarRigEstimator.from_rig(load_rig(SIMULATED_RIG))
+    arcs, in_plane_N = pcar.arcs_of(BLAZER, -0.07, 18.0, 0.0056), 0.1 * math.cos(math.radians(30.0))
+    tip, shaft = (reading(arcs, np.array([-in_plane_N, 0.0]), back, 0.0, np.zeros(3)) for back in (0.0, 0.02))
+    into = np.array([-math.sin(math.radians(30.0)), 0.0, math.cos(math.radians(30.0))])
+    found = estimator.estimate(tip, shaft, Actuation(-0.07, 0.0, 18.0, 0, into, "contact"))
+    assert found.converged and np.allclose(found.force_N, 0.1 * into, atol=2e-3)
+    _, normal = bending_plane(0.0)
+    # Out of the plane: that of the force along the wall, 20 mN over cos 30 degrees, and more by the part in the plane.
+    assert normal @ found.covariance_N2 @ normal > (0.02 / math.cos(math.radians(30.0))) ** 2
+    straight_out = estimator.estimate(tip, shaft, Actuation(-0.07, 0.0, 18.0, 0, normal, "contact"))
+    assert abs(straight_out.force_N @ normal) < 1e-12  # nothing in the plane tells of it
+    assert normal @ straight_out.covariance_N2 @ normal >= 1.0  # and this is stated
