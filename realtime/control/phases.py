@@ -98,7 +98,7 @@ def _arm(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> Non
     hybrid.forget(state.hybrid)
     state.history.count = 0
     tip_offset.start(state.tip_offset)
-    wall_observer.forget(state.wall)
+    wall_observer.forget(params.wall, state.wall)
     predictive.stay(state.predictive, state.hybrid, state.predicted_joint)
     for i in range(3):
         state.hybrid.goal_m[i] = tip_m[i]

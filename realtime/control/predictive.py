@@ -23,7 +23,6 @@ from realtime.control.records import (
     PredictiveParams,
     PredictiveState,
     TargetState,
-    WallParams,
     WallState,
 )
 
@@ -198,7 +197,6 @@ def press(
     state: PredictiveState,
     hybrid: HybridState,
     kinematics: KinematicsParams,
-    wall_config: WallParams,
     wall_state: WallState,
     move: Move,
     contact: Contact,
@@ -210,8 +208,7 @@ def press(
         state: the law's state.
         hybrid: joint command and goal.
         kinematics: the unloaded catheter.
-        wall_config: compliance of the contact.
-        wall_state: the wall's motion; a lost wall is searched for by moving it.
+        wall_state: the wall's motion and the compliance; a lost wall is searched for by moving it.
         move: where the goal moves across the normal.
         contact: the contact in this tick.
     """
@@ -222,7 +219,7 @@ def press(
     state.away_s = state.away_s + move.period_s if contact.loose else 0.0
     if state.away_s > _AWAY_S:
         target_predictor.shift(wall, config.slide_speed_m_per_s * move.period_s)
-    compliance, sd_m = wall_config.compliance_m_per_N, _prediction_sd_m(wall)
+    compliance, sd_m = wall_state.compliance_m_per_N, _prediction_sd_m(wall)
     spring_m = compliance * _force_setpoint(config, state, contact, sd_m / compliance, move.period_s)
     stiffer = target_predictor.stiffer(wall)
     least_m = max(contact.depth_m, state.touch_depth_m) - _REACH_m

@@ -346,6 +346,7 @@ class RollWindupState:
     """By how much a force across turns the tip about the sheath's axis (`roll_windup`)."""
 
     windup_rad: float = real("rad", "roll of the tip minus that of the handle, scaled by the slope")
+    torque_Nm: float = real("N m", "torque of the contact force about the sheath's axis, averaged as the windup is")
     stamp_ns: int = whole("ns", "when the newest pose was measured")
 
 
@@ -365,6 +366,7 @@ class WallState:
 
     force: TargetState = part(TargetState, "the wall by its force")
     pose: TargetState = part(TargetState, "the wall by the tip's poses")
+    compliance_m_per_N: float = real("m/N", "compliance of catheter and tissue in series, in use")
     mean_depth_m: float = real("m", "mean depth of the free tip along the inward normal")
     stamp_ns: int = whole("ns", "time of measurement of the newest accepted force")
 

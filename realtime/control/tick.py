@@ -79,6 +79,7 @@ def _learn_windup(params: Params, state: State, inputs: Inputs, joint: Joint, to
     memory_s, before_m = params.tip_offset.contact_memory_s, _depth_m(params, state)
     if state.force.source == SOURCE_ESTIMATE:
         memory_s *= _SLOW_FACTOR
+    dt_s = min(max((inputs.tip.stamp_ns - state.windup.stamp_ns) * 1e-9, 0.0), 0.1)
     roll_rad = roll_windup.apply(
         params.kinematics, state.windup, joint[1], inputs.tip, state.tip_offset.touch_offset_m, touching, free, memory_s
     )
@@ -89,6 +90,11 @@ def _learn_windup(params: Params, state: State, inputs: Inputs, joint: Joint, to
         target_predictor.shift(state.wall.force, further_m)
         state.wall.mean_depth_m += further_m
         state.predictive.touch_depth_m += further_m
+    # With a sensor the compliance is learned from the force (`stiffer`); estimates are too coarse for it.
+    if touching and state.force.source == SOURCE_ESTIMATE:
+        roll_windup.take_force(state.windup, inputs.tip.position_m, state.force.force_N, dt_s, memory_s)
+        softer = roll_windup.softer_m_per_N(state.windup, inputs.tip.position_m, state.normal)
+        wall_observer.soften(state.wall, params.wall.compliance_m_per_N + softer, state.force.smooth_N)
     return joint[0], roll_rad, joint[2]
 
 
@@ -98,7 +104,8 @@ def _take_pose(params: Params, state: State, inputs: Inputs, touching: bool) -> 
     joint, flank = free_tip.joint_at(state.history, inputs.tip.stamp_ns)
     if flank == 0.0:
         return
-    witnesses.take_pose(params, state.witness, inputs, joint, state.normal, state.phase)
+    felt = state.force.smooth_N > params.hybrid.contact_force_N
+    witnesses.take_pose(params, state.witness, inputs, joint, state.normal, state.phase, felt)
     moving = state.phase == PHASE_POSITION or state.phase == PHASE_APPROACH or state.phase == PHASE_JOG
     free = (moving or state.phase == PHASE_HOLD) and state.force.smooth_N < params.hybrid.contact_force_N
     if params.law == LAW_PREDICTIVE:
@@ -151,7 +158,7 @@ def _watch_contact(params: Params, state: State, now_ns: int, force_N: float, ti
     if now_ns - hy.above_ns >= (_CONTACT_NS if approaching else _LOST_NS):
         phases.enter(params, state, PHASE_CONTACT if approaching else PHASE_APPROACH, tip_m)
         if approaching:
-            wall_observer.forget(state.wall)
+            wall_observer.forget(params.wall, state.wall)
             tip_offset.touch(state.tip_offset)
             predictive.touch(state.predictive, force_N, _depth_m(params, state))
 
@@ -220,7 +227,7 @@ def _control_predictive(params: Params, state: State, inputs: Inputs, force_N: f
             params.force_source == SOURCE_ESTIMATE,
             inputs.now_ns + params.setpoint_lead_ns,
         )
-        predictive.press(law, own, hy, params.kinematics, params.wall, state.wall, slide, contact)
+        predictive.press(law, own, hy, params.kinematics, state.wall, slide, contact)
     else:
         predictive.stay(own, hy, state.predicted_joint)
 
@@ -324,7 +331,7 @@ def _report(params: Params, state: State, inputs: Inputs, outputs: Outputs, forc
     outputs.wall_m = target_predictor.at(wall, inputs.now_ns + params.setpoint_lead_ns)
     outputs.wall_sd_m = math.sqrt(max(target_predictor.variance_ahead(wall) - wall.noise_m2, 0.0))
     outputs.heart_Hz, outputs.breath_Hz = target_predictor.rates_Hz(wall)
-    outputs.stiffness_N_per_m = (1.0 + target_predictor.stiffer(wall)) / params.wall.compliance_m_per_N
+    outputs.stiffness_N_per_m = (1.0 + target_predictor.stiffer(wall)) / state.wall.compliance_m_per_N
 
 
 @njit(cache=True)
@@ -355,7 +362,7 @@ def _compression_N(params: Params, state: State, now_ns: int, touching: bool) ->
         joint, flank = free_tip.joint_at(state.history, now_ns)
         if flank != 0.0:
             depth_m = -dot(free_tip.apply(params.kinematics, joint), state.normal)
-            return wall_observer.force_at(params.wall, state.wall, depth_m, now_ns)
+            return wall_observer.force_at(state.wall, depth_m, now_ns)
     return state.force.smooth_N
 
 

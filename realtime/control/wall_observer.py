@@ -30,9 +30,18 @@ _BACKLASH_S = 2.0
 
 
 @njit(cache=True)
-def forget(state: WallState) -> None:
+def forget(config: WallParams, state: WallState) -> None:
     """Reset the estimate of the wall: contact begins, or the loop is armed."""
     state.force.started = state.pose.started = 0
+    state.compliance_m_per_N = config.compliance_m_per_N
+
+
+@njit(cache=True)
+def soften(state: WallState, compliance_m_per_N: float, force_N: float) -> None:
+    """Use `compliance_m_per_N` from now on. The wall moves with it, because the force (N) does not."""
+    if state.force.started != 0:
+        target_predictor.shift(state.force, (state.compliance_m_per_N - compliance_m_per_N) * force_N)
+    state.compliance_m_per_N = compliance_m_per_N
 
 
 @njit(cache=True)
@@ -58,7 +67,7 @@ def take_force(
     variance of an estimate is limited to the recent prediction error.
 
     Args:
-        config: compliance, noise, parameters of the predictors.
+        config: noise, parameters of the predictors.
         kinematics: the unloaded catheter.
         state: what is learned.
         history: predicted joints of the last 0.2 s.
@@ -79,10 +88,10 @@ def take_force(
     loose = force.value_N < 0.5 * contact_force_N
     if loose and wall.started != 0 and target_predictor.at(wall, force.stamp_ns) > depth_m:
         return target_predictor.NOTHING_NEW, 0.0
-    noise_m2 = config.compliance_m_per_N**2 * force.spread_N2 + config.play_noise_m**2
+    noise_m2 = state.compliance_m_per_N**2 * force.spread_N2 + config.play_noise_m**2
     if wall.started == 0:
         state.mean_depth_m, state.stamp_ns = depth_m, force.stamp_ns
-    value_m, travel_m = depth_m - config.compliance_m_per_N * force.value_N, depth_m - state.mean_depth_m
+    value_m, travel_m = depth_m - state.compliance_m_per_N * force.value_N, depth_m - state.mean_depth_m
     if estimated and wall.started != 0:
         noise_m2 = min(noise_m2, target_predictor.least_score(wall))
     predictor = config.by_estimate if estimated else config.by_force
@@ -103,11 +112,11 @@ def correct_backlash(config: BacklashParams, gap: BacklashState, state: WallStat
 
 
 @njit(cache=True)
-def force_at(config: WallParams, state: WallState, depth_m: float, now_ns: int) -> float:
+def force_at(state: WallState, depth_m: float, now_ns: int) -> float:
     """Return the compression (N) that the wall makes at `now_ns` on a free tip `depth_m` (m) along the inward normal."""
     stiffer = target_predictor.stiffer(state.force)
     pressed_m = depth_m * (1.0 + stiffer) - stiffer * state.mean_depth_m
-    return max((pressed_m - target_predictor.at(state.force, now_ns)) / config.compliance_m_per_N, 0.0)
+    return max((pressed_m - target_predictor.at(state.force, now_ns)) / state.compliance_m_per_N, 0.0)
 
 
 @njit(cache=True)

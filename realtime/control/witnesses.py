@@ -7,7 +7,9 @@ wrong source can press unseen:
 - estimate: the model process' answer, by the stiffness of the catheter's file; for too much force also by the adapted
   one, whichever is greater,
 - geometry: the distance by which the measured tip stays behind the free tip of the kinematics, along the inward normal,
-  since the catheter was last free, over the compliance of the rig file. It needs neither of the others.
+  since the catheter was last free, over the compliance of the rig file. It needs neither of the others. While the loop's
+  force shows a contact, a turn about the sheath's axis is left out: there the shaft yields by its windup, which the
+  compliance does not describe.
 
 Sensor and estimate are compared at the estimate's time, so that a beating wall cancels. Geometry is too coarse to prove
 a small force (1 mm is 0.1 N); it says which of two that disagree is the wrong one, and it limits how far the free tip is
@@ -20,7 +22,7 @@ import math
 
 from numba import njit
 
-from realtime.control import free_tip
+from realtime.control import free_tip, inverse_kinematics
 from realtime.control.codes import PHASE_APPROACH, PHASE_HOLD, PHASE_POSITION, SOURCE_ESTIMATE, SOURCE_SENSOR
 from realtime.control.constraint_frame import dot
 from realtime.control.declare import ReadFloats
@@ -92,10 +94,16 @@ def take_forces(state: WitnessState, force: ForceSourceState, period_s: float) -
 
 @njit(cache=True)
 def take_pose(
-    params: Params, state: WitnessState, inputs: Inputs, joint: ReadFloats, normal: ReadFloats, phase: int
+    params: Params, state: WitnessState, inputs: Inputs, joint: ReadFloats, normal: ReadFloats, phase: int, felt: bool
 ) -> None:
-    """Process an accepted pose with the joints (3,) at its time: compute the distance from the free tip to the tip."""
-    free_m = free_tip.apply(params.kinematics, joint)
+    """Process an accepted pose with the joints (3,) at its time: compute the distance from the free tip to the tip.
+
+    felt: whether the loop's force shows a contact.
+    """
+    roll_rad = joint[1]
+    if felt:
+        roll_rad = inverse_kinematics.roll_of(params.kinematics, inputs.tip.position_m, roll_rad)
+    free_m = free_tip.apply(params.kinematics, (joint[0], roll_rad, joint[2]))
     behind_m = dot(inputs.tip.position_m, normal) - dot(free_m, normal)
     dt_s = min(max((inputs.tip.stamp_ns - state.pose_ns) * 1e-9, 0.0), 0.1)
     state.pose_ns = inputs.tip.stamp_ns

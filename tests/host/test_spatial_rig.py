@@ -325,3 +325,18 @@ def test_the_poses_of_one_frame_reach_the_estimator_together() -> None:
     world = World(rig, simulated_plant(rig, 1), forkable_board("native"), 1)
     Scenario(rig, world, lambda topic, message: None, estimator=asked).run(2.0)
     assert len(seen) > 5 and set(seen[1:]) == {0}
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "wound_rad", "share"), [(30.0, 0.0, 0.93), (30.0, 0.5, 0.97), (60.0, 0.0, 0.70), (60.0, 0.5, 0.90)]
+)
+def test_planar_force_on_a_tilted_wall(tilt_deg: float, wound_rad: float, share: float) -> None:
+    """The rod's poses under 0.2 N along a commanded direction out of the plane, the shaft wound up by it or not."""
+    tilt = math.radians(tilt_deg)
+    into = np.array([-math.sin(tilt), 0.0, math.cos(tilt)])
+    rig = load_rig(SIMULATED_RIG)
+    one = PlanarRigEstimator.from_rig(rig)
+    for k, force_N in enumerate([0.0] * 80 + [0.2] * 40):
+        tip, shaft = poses(-force_N * into, -0.0778, 27.0, wound_rad if force_N else 0.0)
+        found = one.estimate(tip, shaft, Actuation(-0.0778, 0.0, 27.0, 25_000_000 * k, into, "approach"))
+    assert found.converged and found.force_N @ into == pytest.approx(0.2 * share, rel=0.03)

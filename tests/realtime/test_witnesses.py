@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from protocol.rig_file import SIMULATED_RIG, load_rig
-from realtime.control import witnesses
-from realtime.control.codes import PHASE_APPROACH, PHASE_CONTACT, SOURCE_ESTIMATE, SOURCE_SENSOR
+from realtime.control import free_tip, witnesses
+from realtime.control.codes import PHASE_APPROACH, PHASE_CONTACT, PHASE_HOLD, SOURCE_ESTIMATE, SOURCE_SENSOR
 from realtime.control.configure import tick_parameters
 from realtime.control.records import INPUTS, STATE, new
 from realtime.core.telemetry import witness_text
@@ -137,3 +139,18 @@ def test_the_text_names_the_witness_that_is_wrong() -> None:
     assert witness_text(np.array([0.0, 0.21, 0.18])).endswith("the force sensor disagrees with both others")
     assert witness_text(np.array([0.2, 0.0, 0.22])).endswith("the estimate disagrees with both others")
     assert "disagrees" not in witness_text(np.array([0.2, 0.21, 0.1]))
+
+
+@pytest.mark.parametrize("felt", [False, True])
+def test_a_turn_about_the_axis_is_a_deflection_only_while_no_force_is_felt(felt: bool) -> None:
+    """A tip that a tilted wall turned by 0.7 rad about the axis stays 4 mm behind along the normal, by 0.4 N of bending."""
+    rig = Witnesses()
+    joint, normal = (-0.075, 0.2, 0.8), (0.5, 0.0, -math.sqrt(0.75))
+    turned_m = free_tip.apply(rig.params.kinematics, (joint[0], joint[1] + 0.7, joint[2]))
+    for phase, tip_m in ((PHASE_HOLD, free_tip.apply(rig.params.kinematics, joint)), (PHASE_APPROACH, turned_m)):
+        for _ in range(60):
+            rig.inputs.tip.stamp_ns += 25 * MS
+            rig.inputs.tip.position_m[:] = tip_m
+            witnesses.take_pose(rig.params, rig.state.witness, rig.inputs, joint, np.array(normal), phase, felt)
+    geometry_N = rig.state.witness.geometry_N
+    assert geometry_N < 0.02 if felt else geometry_N > 0.3
