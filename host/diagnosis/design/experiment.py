@@ -102,7 +102,9 @@ def against(
         ranked.append((float(r @ r), excitation, trial))
     ranked.sort(key=lambda item: -item[0])
     top: tuple[float, Excitation, Problem] | None = None
-    for _, excitation, trial in ranked[:FINALISTS]:
+    for size, excitation, trial in ranked[:FINALISTS]:
+        if top is not None and np.sqrt(size) <= top[0]:
+            break  # a rival that adapts takes a part of the difference: the rest of them cannot be further apart
         reached = separation(trial, rival, known)
         if top is None or reached > top[0]:
             top = (reached, excitation, trial)
