@@ -27,6 +27,8 @@ IRREGULAR = 0.2  # largest deviation of a period from the median one that counts
 OPPOSITE = -0.7  # correlation with what the model says, below which the sign is opposite
 EXPLAINED = 0.9  # share of the variance that a regression has to explain to say that columns are exchanged,
 BETTER = 0.1  # and largest ratio of what it leaves unexplained to what the labelled order does
+PASSIVE = 0.95  # agreement of the signs of all terms, weighted by their size, below which a law is not passive
+AS_STATED, NOT_AS_STATED = 3.0, 30.0  # factors within and beyond which a coefficient is the stated one, and is another
 WRONG_WAY = 3e-4  # share that the labelled order leaves at least: in a closed loop either order leaves only noise
 EXACT = 1e-7  # residual over span below which a channel is a copy of another
 NOISY = 1e-6  # noise over span, from which on two channels cannot be alike by chance
@@ -459,7 +461,8 @@ def _by_law(
         across = [regression(recording, path, exchanged=True) for recording in used]
         crossed = float(np.median([part[2] for part in across]))
         passive = abs(_agreement(across)) >= abs(_agreement(straight))
-        if passive and crossed > EXPLAINED and 1.0 - crossed < BETTER * (1.0 - explained):
+        better = 1.0 - crossed < BETTER * (1.0 - explained)
+        if passive and crossed > EXPLAINED and (better or (crossed > explained and _as_stated(path, straight, across))):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
             says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
             says += "The diagnosis continues with them exchanged."
@@ -472,6 +475,21 @@ def _by_law(
     leading = path.input if spec.impedance is not None else path.output
     recordings = _causal_by_law(recordings, path, leading, columns, findings)
     return _in_units(recordings, path, straight, explained, columns, findings)
+
+
+def _as_stated(path: Pair, straight: list[tuple[Array, Array, float]], across: list[tuple[Array, Array, float]]) -> bool:
+    """Whether the law of exchanged columns alone is passive and has the stated values, where it has several terms.
+
+    Uneven stamps and noise leave a part of either order, so that what is unexplained does not decide.
+    """
+    stated = np.abs(np.array(path.values))
+    if np.count_nonzero(stated) == 0 or len(path.law) < 2 or _agreement(across) < 1.0 or _agreement(straight) > PASSIVE:
+        return False
+    far = []
+    for fits in (straight, across):
+        found = np.median([np.abs(c) for c, _, _ in fits], axis=0)[stated > 0.0]
+        far.append(np.abs(np.log(np.maximum(found, 1e-300) / stated[stated > 0.0])))
+    return bool(np.max(far[1]) < np.log(AS_STATED) and np.min(far[0]) > np.log(NOT_AS_STATED))
 
 
 def _sign_by_law(

@@ -205,3 +205,27 @@ def test_a_broad_peak_and_a_tone_of_the_input_are_no_lines() -> None:
         and line.frequency_Hz == pytest.approx(3.0, abs=1e-2)
         and line.amplitude == pytest.approx(1.0, rel=0.02)
     )
+
+
+@pytest.mark.parametrize("swapped", [True, False])
+def test_exchanged_columns_are_found_by_stated_values_where_stamps_are_uneven(swapped: bool) -> None:
+    """Interpolated noise leaves 3e-4 and 9e-4 of the two orders: no ratio of ten, but a spring of 529 or of 0.002 N/m."""
+    recordings = []
+    for number in range(3):
+        rng = stream(70 + number)
+        t = np.sort(rng.uniform(0.0, 15.0, 1500))
+        hertz, phase = np.array([0.3, 1.1]), rng.uniform(0.0, 6.28, 2)
+        angle = 2.0 * np.pi * np.outer(t, hertz) + phase
+        place, speed = np.sin(angle) @ [0.02, 0.01], np.cos(angle) @ (2.0 * np.pi * hertz * [0.02, 0.01])
+        force = 530.0 * place + 15.0 * speed + 0.05 * rng.standard_normal(t.size)
+        recordings.append({"t": t, "x": force if swapped else place, "f": place if swapped else force})
+    nominal = {
+        "name": "mount",
+        "kind": "impedance",
+        "data": {"time": "t"},
+        "channels": {"motion": {"column": "x", "unit": "m"}, "force": {"column": "f", "unit": "N"}},
+        "impedance": {"subsystem": "mount", "input": "motion", "output": "force", "terms": ["stiffness", "damping"]},
+        "parameters": {"stiffness": 630.0},
+    }
+    findings = inspected(nominal_of(nominal), [Table(f"r{k}", r) for k, r in enumerate(recordings)]).findings
+    assert ("swapped" in {f.id for f in findings}) is swapped
