@@ -1,6 +1,8 @@
-"""Backlash: the output follows only after a gap is taken up; it remembers the last reversal."""
+"""Backlash: the output follows only after a gap is taken up; of a loaded joint, the gap that its load crosses near zero."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.model.operators import play
@@ -17,6 +19,23 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     return play(signal, 0.5 * p[0], c.start)
 
 
+def crossed(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Width of the gap, in the deflection's unit, and the load at which three quarters of each half of it are crossed."""
+    # a gap that closes over more of the range bends all of it: that is a curve of the spring, not a gap
+    loads = spread(5e-3 * s.motion_span, 0.1 * s.motion_span, 5)
+    return (
+        Parameter("width", s.unit, (s.need,), linear=True),
+        Parameter(
+            "load", s.motion_unit, loads, 1e-3 * s.motion_span, 0.15 * s.motion_span, log=True, shape=True, vanishes=True
+        ),
+    )
+
+
+def apply_crossed(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Deflection with half of the gap p[0] added on the side to which the load presses."""
+    return np.asarray(signal + 0.5 * p[0] * np.tanh(c.motion / p[1]))
+
+
 EFFECTS = (
     Effect(
         "backlash",
@@ -28,5 +47,15 @@ EFFECTS = (
         apply,
         family="dry",
         remembers=True,
+    ),
+    Effect(
+        "backlash",
+        "deflection",
+        10,
+        crossed,
+        "Where the load changes its side, the joint crosses a gap of {width}; the gap is closed by a load of about {load}.",
+        "y = x + width/2*tanh(F/load),  F the load behind friction",
+        apply_crossed,
+        side="output",
     ),
 )

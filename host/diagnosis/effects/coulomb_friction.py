@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
+from host.diagnosis.model.operators import play
 
 BRISTLES = 2e-3  # of the travel: friction that builds up over less is dry friction, over more presliding
 
@@ -34,6 +35,17 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Apply a lag of p[0] against the direction of motion."""
     return np.asarray(signal - p[0] * c.moving(c.motion))
+
+
+def held(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Load that friction takes up before anything deflects."""
+    low = max(s.tolerance, 1e-4 * s.span)
+    return (Parameter("friction", s.unit, spread(max(low, 4e-3 * s.span), 0.3 * s.span, 8), low, s.span, log=True),)
+
+
+def apply_held(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Load behind friction: within p[0] of the load before it, and at rest until it has to move."""
+    return play(signal, p[0], c.start)
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
@@ -70,6 +82,20 @@ EFFECTS = (
         "The output lags by {lost_motion}, against the motion, immediately after each reversal.",
         "y = x - lost_motion*sign(v)",
         apply,
+        family="dry",
+        remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "coulomb_friction",
+        "load",
+        44,
+        held,
+        "Dry friction takes up to {friction} of the load: after each reversal nothing deflects until the load has changed "
+        "by twice as much.",
+        "|F - x| <= friction,  F standing between",
+        apply_held,
+        forms=("held",),
         family="dry",
         remembers=True,
         dissipates=True,

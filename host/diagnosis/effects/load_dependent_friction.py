@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from host.diagnosis.effects.coulomb_friction import held
 from host.diagnosis.effects.presliding_friction import build_up, yielding
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
-from host.diagnosis.model.operators import capstan, dahl
+from host.diagnosis.model.operators import capstan, dahl, pressed
 
 
 def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -44,25 +45,37 @@ def apply_wrapped(signal: Array, c: Context, p: Array, form: str) -> Array:
     return capstan(signal, p[0], c.start)
 
 
+def in_mechanism(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Friction without load, and the friction coefficient of what the load presses together."""
+    return (*held(s, form), Parameter("coefficient", "", (0.05, 0.15, 0.4), 0.0, 0.95, step=0.05))
+
+
+def apply_in_mechanism(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Load behind friction that grows with it: p[0] + p[1] |load behind|."""
+    return pressed(signal, p[0], p[1], c.start)
+
+
 def slots(p: Array, form: str) -> dict[str, float]:
     """Coefficient and distance of the hysteretic force that follows the load."""
     return {"load_friction": p[0], "load_friction_distance": p[1]}
 
 
+_CAPSTAN = Effect(
+    "load_dependent_friction",
+    "motion",
+    47,
+    wrapped,
+    "Friction grows with the tension itself (capstan): coefficient times wrap angle is {exponent}.",
+    "x*exp(-exponent) <= y <= x*exp(exponent), y standing between",
+    apply_wrapped,
+    contains=("backlash", "coulomb_friction"),
+    family="dry",
+    remembers=True,
+    dissipates=True,
+)
 EFFECTS = (
-    Effect(
-        "load_dependent_friction",
-        "motion",
-        47,
-        wrapped,
-        "Friction grows with the tension itself (capstan): coefficient times wrap angle is {exponent}.",
-        "x*exp(-exponent) <= y <= x*exp(exponent), y standing between",
-        apply_wrapped,
-        contains=("backlash", "coulomb_friction"),
-        family="dry",
-        remembers=True,
-        dissipates=True,
-    ),
+    _CAPSTAN,
+    replace(_CAPSTAN, port="load"),
     Effect(
         "load_dependent_friction",
         "motion",
@@ -72,6 +85,21 @@ EFFECTS = (
         "y = x - coefficient*|load|*z,  dz = (1 - z*sign(dx))*dx/distance",
         apply,
         source="drag",
+        remembers=True,
+        dissipates=True,
+    ),
+    Effect(
+        "load_dependent_friction",
+        "load",
+        47,
+        in_mechanism,
+        "Dry friction takes {friction} of the load and {coefficient} of what is behind it: after each reversal nothing "
+        "deflects until the load has changed by twice as much.",
+        "|F - x| <= friction + coefficient*|F|,  F standing between",
+        apply_in_mechanism,
+        forms=("held",),
+        contains=("coulomb_friction",),
+        family="dry",
         remembers=True,
         dissipates=True,
     ),

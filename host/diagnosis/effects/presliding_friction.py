@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from host.diagnosis.effects.coulomb_friction import BRISTLES
@@ -82,7 +84,7 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"presliding": float(np.sum(each)), "presliding_distance": p[-1], "slip_ratio": RATIO[form], **elements}
 
 
-EFFECTS = (
+_LAGS = (
     Effect(
         "presliding_friction",
         "motion",
@@ -100,20 +102,6 @@ EFFECTS = (
     ),
     Effect(
         "presliding_friction",
-        "force",
-        11,
-        force,
-        "Friction of {force} builds up over {distance} after each reversal.",
-        "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
-        slots=slots,
-        forms=("dahl", "maxwell"),
-        contains=("coulomb_friction",),
-        family="dry",
-        remembers=True,
-        dissipates=True,
-    ),
-    Effect(
-        "presliding_friction",
         "motion",
         46,
         lost,
@@ -123,6 +111,24 @@ EFFECTS = (
         apply,
         forms=("general",),
         contains=("backlash", "coulomb_friction"),
+        family="dry",
+        remembers=True,
+        dissipates=True,
+    ),
+)
+EFFECTS = (
+    *_LAGS,
+    *(replace(effect, port="load") for effect in _LAGS),
+    Effect(
+        "presliding_friction",
+        "force",
+        11,
+        force,
+        "Friction of {force} builds up over {distance} after each reversal.",
+        "F = force*z,  dz = (1 - z*sign(dx))*dx/distance",
+        slots=slots,
+        forms=("dahl", "maxwell"),
+        contains=("coulomb_friction",),
         family="dry",
         remembers=True,
         dissipates=True,

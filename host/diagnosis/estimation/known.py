@@ -129,7 +129,9 @@ def chosen(model: Model, spec: EffectSpec, timed: bool) -> Candidate:
     at = [
         c
         for c in candidate_effects
-        if spec.id in (c.effect.id, *c.effect.spans) and spec.at in (c.port.name, c.port.subsystem)
+        if spec.id in (c.effect.id, *c.effect.spans)
+        and spec.at in (c.port.name, c.port.subsystem)
+        and f"{c.effect.id}:{c.form}@{c.port.name}" not in model.taken
     ]
     if not at:
         raise InputError(

@@ -54,10 +54,14 @@ def period_of(time_s: Array) -> float:
     return float(np.median(np.diff(time_s)))
 
 
-def affected(run: ExportedRun, signal: Array, port: str, side: str = "", moving: str = "") -> Array:
-    """`signal` (n,) after the effects at `port` (on one `side` of a gain). moving: channel whose resolution counts there."""
+def affected(
+    run: ExportedRun, signal: Array, port: str, side: str = "", moving: str = "", before_gain: Array | None = None
+) -> Array:
+    """`signal` (n,) after the effects at `port` (on one `side` of a gain). moving: channel whose resolution counts there.
+    before_gain: (n,) load that effects behind the gain read; theirs is `signal` without it.
+    """
     here = [effect for effect in run.effects if effect.port == port and side in ("", effect.side)]
-    motion = signal
+    motion = signal if before_gain is None else before_gain
     for effect in here:
         span = float(np.ptp(motion)) or 1.0
         values = run.inputs.get(moving)
@@ -76,7 +80,8 @@ def run_links(links: tuple[ExportedLink, ...], run: ExportedRun) -> dict[str, Ar
     found = {}
     for link in links:
         signal = affected(run, run.inputs[link.input], link.port, "input", link.input)
-        signal = link.gain * signal + link.offset
+        load = affected(run, signal, f"{link.port}_friction", "", link.input)
+        signal = affected(run, link.gain * load + link.offset, f"{link.port}_spring", before_gain=load)
         for constant_s in link.lags_s:
             signal = lag(signal, period_of(run.time_s), constant_s)
         signal = affected(run, signal, link.port, "output", link.input)

@@ -126,8 +126,8 @@ Corner = Callable[[Array], tuple[str, str]]
 class Effect:
     """One effect at one kind of port.
 
-    `port`: motion (a kinematic signal), turn (an angle), force (a force balance), timing, limit, drift and mix (a scalar
-    reading),
+    `port`: motion (a kinematic signal), turn (an angle), load (one that deflects the output), deflection (what it does),
+    force (a force balance), timing, limit, drift and mix (a scalar reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
     `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "other"
     (another channel). `order`: place among the effects of one port, small first. `side`: motion ports only, before or after
@@ -179,6 +179,7 @@ class Port:
     drags: tuple[str, ...] = ()
     offers: tuple[Effect, ...] = ()  # parameters of a simulator that compete as effects, of this port alone
     held: bool = False  # an input that is held between samples: a delay within one sample is how it was held
+    within: str = ""  # port of the link that this place along a loaded link belongs to: an equation acts there
     path: tuple[str, ...] = ()  # this port and those to which a linear time-invariant model alone leads
 
 

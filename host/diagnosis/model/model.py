@@ -197,15 +197,17 @@ def apply_effects(
     side: str | None,
     kind: str | None = None,
     finer: int = 1,
+    before_gain: Array | None = None,
 ) -> Array:
     """`signal` (n * finer,) after all active effects at `port` (on `side` of the nominal gain), in their order.
 
+    before_gain: (n,) motion or load that effects behind the nominal gain read; theirs is `signal` without it.
     finer: points of `signal` in one sample; it is then held within each of them, as are the other channels in each sample.
     """
     here = [effect for effect in active if effect[0].port.name == port and (side is None or effect[0].effect.side == side)]
     if not here:
         return signal
-    motion = signal
+    motion = signal if before_gain is None else before_gain
     span = float(np.ptp(motion)) or 1.0
     tolerance = segment.tolerances.get(port, 1e-3 * span)
     for candidate, values in sorted(here, key=lambda effect: effect[0].effect.order):

@@ -43,6 +43,23 @@ def capstan(x: Array, exponent: float, start: float) -> Array:
 
 
 @njit(cache=True)
+def pressed(x: Array, friction: float, coefficient: float, start: float) -> Array:
+    """Load F behind dry friction that it presses on: |F - x| <= friction + coefficient |F|, F at rest in between.
+
+    x: (n,) load before friction. coefficient: below 1, or the load would lock itself. start: first F minus x.
+    """
+    out = np.empty(x.size)
+    F = x[0] + start
+    for i in range(x.size):
+        above, below = x[i] + friction, x[i] - friction
+        most = above / (1.0 - coefficient) if above >= 0.0 else above / (1.0 + coefficient)
+        least = below / (1.0 + coefficient) if below >= 0.0 else below / (1.0 - coefficient)
+        F = min(max(F, least), most)
+        out[i] = F
+    return out
+
+
+@njit(cache=True)
 def jenkins(x: Array, distance: float, start: float) -> Array:
     """Elastic-plastic element in [-1, 1]: rises over `distance` after a reversal, then slides (Jenkin 1922)."""
     out = np.empty(x.size)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.effects import library
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Parameter, Port
+from host.diagnosis.model.effect import Effect, Parameter, Port, is_force
 from host.diagnosis.model.model import (
     ActiveEffect,
     Begin,
@@ -33,7 +34,6 @@ class TransmissionModel(Model):
     coarsest_s = 0.02
     screen_samples = 24000
     scan_points = 160
-    taken: frozenset[str] = frozenset()
 
     def __init__(self, spec: NominalSpec) -> None:
         self.links: list[LinkSpec] = spec.link
@@ -47,16 +47,24 @@ class TransmissionModel(Model):
         self.outputs = tuple(Output(link.output, self.units[link.output], link.subsystem) for link in self.links)
         ports: list[Port] = []
         parameters: list[Parameter] = []
+        taken: set[str] = set()
         for name, link in zip(names, self.links, strict=True):
             others = tuple(link.others)
             loads = tuple(link.load) or forces_among(others, self.units)
             turn = "motion+turn" if self.units[link.input] == "rad" else "motion"
             prefix = "" if len(self.links) == 1 else f"{name}_"
             held = not spec.start(f"{prefix}gain", 1.0)[1]  # a gain that is fitted would absorb an error of the scale
+            deflects = is_force(self.units[link.input]) and not is_force(self.units[link.output])
             ports += [
                 Port(name, turn, link.subsystem, (link.output,), loads, others),
                 Port(f"{name}_reading", "drift+scale" if held else "drift", link.subsystem, (link.output,)),
             ]
+            if deflects:
+                ports += [
+                    Port(f"{name}_friction", "load", link.subsystem, (link.output,), within=name),
+                    Port(f"{name}_spring", "deflection", link.subsystem, (link.output,), within=name),
+                ]
+                taken |= {f"{e.id}:{form}@{name}" for e in library() for form in e.forms if _of_motion(e, form)}
             ratio = (
                 ""
                 if self.units[link.input] == self.units[link.output]
@@ -70,7 +78,7 @@ class TransmissionModel(Model):
             for order in range(link.lag_order):
                 value, _ = spec.start(f"{prefix}time_constant_{order + 1}", 1.0)
                 parameters.append(Parameter(f"{prefix}time_constant_{order + 1}", "s", (value,), 1e-6, 1e6, log=True))
-        self.ports, self.parameters = tuple(ports), tuple(parameters)
+        self.ports, self.parameters, self.taken = tuple(ports), tuple(parameters), frozenset(taken)
         used = dict.fromkeys(name for link in self.links for name in (link.input, *link.load))
         self.travel = tuple((name.replace("_", " "), name, self.units[name]) for name in used)
         self.unlisted_at = tuple((name, name) for name in names)
@@ -94,7 +102,10 @@ class TransmissionModel(Model):
             motion = segment.inputs[link.input]
             segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
             units[name], units[f"output:{name}"] = self.units[link.input], self.units[link.output]
-            units[f"{name}_reading"] = self.units[link.output]
+            units[f"{name}_reading"] = units[f"{name}_spring"] = self.units[link.output]
+            units[f"{name}_friction"] = self.units[link.input]
+            segment.tolerances[f"{name}_friction"] = segment.tolerances[name]
+            units[f"motion:{name}_spring"] = self.units[link.input]
         segment.units = units
         if self.tared:
             spans = [float(np.nanmax(recording.channels[name]) - np.nanmin(recording.channels[name])) for name in self.tared]
@@ -138,7 +149,9 @@ class TransmissionModel(Model):
         tares = dict(zip(self.tared, segment.begin.values, strict=True)) if segment.begin is not None else {}
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
             signal = apply_effects(segment.inputs[link.input], active, name, segment, "input")
-            signal = theta[at] * signal + theta[at + 1]
+            load = apply_effects(signal, active, f"{name}_friction", segment, None)
+            signal = theta[at] * load + theta[at + 1]
+            signal = apply_effects(signal, active, f"{name}_spring", segment, None, before_gain=load)
             for constant in theta[at + 2 : at + 2 + link.lag_order]:
                 signal = lag(signal, segment.recording.dt_s, float(constant))
             at += 2 + link.lag_order
@@ -149,7 +162,7 @@ class TransmissionModel(Model):
     def motion(self, segment: Segment, port: Port) -> Array:
         """Nominal input of the link, or its measured output for the reading port."""
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
-            if port.name == name:
+            if port.name in (name, f"{name}_friction", f"{name}_spring"):
                 return segment.inputs[link.input]
             if port.name == f"{name}_reading":
                 return np.where(np.isfinite(segment.y[row]), segment.y[row], np.nanmedian(segment.y[row]))
@@ -159,12 +172,19 @@ class TransmissionModel(Model):
         """Return the residual (n,) at the input of a link, divided by its gain."""
         at = 0
         for row, (name, link) in enumerate(zip(self.names, self.links, strict=True)):
-            if port.name == name:
+            if port.name in (name, f"{name}_friction"):
                 return np.asarray(residual[row] / (theta[at] or 1.0))
-            if port.name == f"{name}_reading":
+            if port.name in (f"{name}_reading", f"{name}_spring"):
                 return np.asarray(residual[row])
             at += 2 + link.lag_order
         raise KeyError(port.name)
+
+
+def _of_motion(effect: Effect, form: str) -> bool:
+    """Whether an effect at an input stands for what only a motion does: dry friction and gaps between places (those of a
+    load have ports of their own), lost steps, and position loops.
+    """
+    return effect.port == "motion" and (effect.family == "dry" or effect.id == "missed_steps" or form == "loop")
 
 
 def _alone(link: LinkSpec, spec: NominalSpec) -> bool:

@@ -118,6 +118,41 @@ def pair_instead(
     return (fit, held, starts), []
 
 
+def pair_first(
+    problem: Problem, nominal: Fit, trials: list[Trial], noise_sd: Array, restart: Restart, progress: Progress
+) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
+    """The likeliest pair of unlike effects that were tried in the first step, one of them at a place along a loaded link;
+    None if no pair passes.
+
+    A gap behind friction is seen only together with it: another effect can be the best single one, and what is found past it
+    hides the pair. The arguments and what is returned are those of `pair_instead`.
+    """
+    tried = [
+        (a, b)
+        for a, b in itertools.combinations(trials, 2)
+        if (a.candidate.port.within or b.candidate.port.within)
+        and not (a.replaced or b.replaced or related(a.candidate, b.candidate) or related(b.candidate, a.candidate))
+    ]
+    tried = sorted(tried, key=lambda pair: -(pair[0].score + pair[1].score))[: problem.rules.first_pairs]
+    begun, found = get_starts(problem), []
+    for count, (a, b) in enumerate(tried):
+        if problem.budget.spent():
+            break
+        progress(f"fitting {a.candidate.key} and {b.candidate.key}", count / len(tried))
+        set_starts(problem, [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)])
+        fit = _fitted(problem, nominal, a, b)
+        for which in (a, b):
+            fit = restart(problem, fit, which.candidate)
+        passed = _passed(problem, nominal, fit, noise_sd)
+        if passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
+            found.append((*passed, fit, get_starts(problem)))
+    set_starts(problem, begun)
+    if not found:
+        return None
+    _, held, fit, starts = max(found, key=lambda item: item[0])
+    return fit, held, starts
+
+
 def _singles(trials: list[Trial], most: int) -> list[Trial]:
     """The likeliest trial of each effect and port."""
     kept: dict[str, Trial] = {}

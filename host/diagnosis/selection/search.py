@@ -27,7 +27,7 @@ from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.folds import unexcited, with_other_recordings
-from host.diagnosis.selection.joint import best_pair, pair_instead
+from host.diagnosis.selection.joint import best_pair, pair_first, pair_instead
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
 from host.diagnosis.selection.trial import (
@@ -453,19 +453,32 @@ def _detour(
             continue
         other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
         _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
-        ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd)
-        more = max(other.best.fitted - best.best.fitted, 0)
-        if (
-            ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
-            and len(other.best.terms) <= len(best.best.terms) + 1
-        ):
+        if _ahead(problem, other, best, noise_sd):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
+    if above_noise(problem, best.best, problem.rules.residual_over_noise):
+        pair = pair_first(problem, found.nominal, first.trials, noise_sd, _restart, progress)
+        if pair is not None:
+            base = _parted(problem, _joined(problem, pair), candidate_effects)
+            steps = [Step("joint", term.candidate.key, pair[1], first.trials) for term in base.terms]
+            other = Found(found.nominal, base, steps)
+            earned = compare(problem.segments, "both", found.nominal.residuals, base.residuals, noise_sd).log_likelihood
+            _grow(problem, other, candidate_effects, noise_sd, earned, progress)
+            if _ahead(problem, other, best, noise_sd):
+                best, begun, scale = other, get_starts(problem), problem.scale.copy()
     set_starts(problem, begun)
     problem.scale[:] = scale
     for segment in problem.segments:
         segment.weight = problem.scale
     start_again(problem, best.best)
     return best
+
+
+def _ahead(problem: Problem, other: Found, best: Found, noise_sd: Array) -> bool:
+    """Whether another beginning ends plainly likelier, with one effect more at most."""
+    ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd)
+    more = max(other.best.fitted - best.best.fitted, 0)
+    least = problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
+    return ahead.log_likelihood > least and len(other.best.terms) <= len(best.best.terms) + 1
 
 
 def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:

@@ -200,7 +200,8 @@ def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, 
 
 def equations_for(problem: Problem, less: Fit, port: Port, noise_sd: Array) -> list[Trial]:
     """The best forms of the library at `port`, or at the one whose reading it is, each refitted with `less`."""
-    target = next((b for a, b in problem.model.unlisted_at if port.name in (a, b)), None)
+    here = port.within or port.name
+    target = next((b for a, b in problem.model.unlisted_at if here in (a, b)), None)
     if target is None:
         return []
     ports = {p.name: p for p in problem.model.ports}
