@@ -51,7 +51,6 @@ STEADY_m, STEADY_per_m, STEADY_rad = 0.008, 6.0, 0.1
 FORCE_SD_N, LARGEST_FORCE_N = 1.0, 1.0
 # A contact of the body with the tip is preferred to one of the body alone where it explains so much more (chi square).
 SIMPLER_BY = 15.0
-STARTS = (0.35, 0.65)  # of the search for the place, shares of the exposed length
 WATCHED = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.CONTACT, Phase.JOG))
 REPORTS_KEPT = 64
 
@@ -182,7 +181,6 @@ class ContactWatch:
             PoseSensor(offset, pose[:3], pose[3:], *noise)
             for offset, pose in zip(window.frame.offsets, window.frame.poses, strict=True)
         ]
-        total = self._catheter.distal_length_m + insertion
         self._found = None
         for touching_tip in (False, True):
             try:
@@ -194,7 +192,6 @@ class ContactWatch:
                     roll_rad=roll,
                     actuation=window.prior,
                     touching_tip=touching_tip,
-                    places_m=total * np.array(STARTS),
                 )
             except (InputError, ArithmeticError):
                 continue

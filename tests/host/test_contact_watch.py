@@ -67,7 +67,7 @@ def test_a_third_pose_is_given_to_an_estimator_only_where_the_rig_has_one() -> N
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if case.offsets_m == THREE][:3])
 def test_three_sensors_of_the_running_rig_find_the_place_to_five_millimetres(case: ObstacleCase) -> None:
-    found = run(load_rig(SIMULATED_RIG), 7, case, 3.0)
+    found = run(load_rig(SIMULATED_RIG), 7, case, 6.0)
     before = [report for report in found.reports if report.stamp_ns < COMES_S * 1e9]
     assert len(before) > 20 and {report.place for report in before} == {"tip"}
     last = [report for report in found.reports if report.place != "tip"][-1]
