@@ -43,6 +43,7 @@ _JOINTS, _ALONG_WALL = slice(0, 4), slice(4, 7)
 # Of the force along the wall: its memory, and the share of its variance that is new in each pose. A smaller share makes
 # the filter surer of a tilted wall than it is (docs/mechanics.md).
 _WALL_MEMORY_S, _NEW_SHARE = 30.0, 0.1
+_LEAST_ACROSS = 0.1  # of a commanded direction that winds up the shaft; less of it changes the roll by less than its noise
 # Nothing is commanded to press on the wall in these, or the tip is still on its way to it.
 _APART = frozenset(phase.label for phase in (Phase.HOLD, Phase.POSITION, Phase.APPROACH, Phase.JOG))
 
@@ -181,6 +182,8 @@ class LastingErrors:
         moved[CURVATURE] = self._beyond(actuation.curvature_per_m, seconds)
         growth = np.square(self._known.by_travel) * np.abs(moved) + np.square(self._known.by_time) * seconds
         grown = self._covariance[_JOINTS, _JOINTS] + np.diag([*growth, self._known.flank_m**2 * seconds / _FLANK_MEMORY_S])
+        if _winds_up(actuation):
+            grown[ROLL, ROLL] += self._known.start[ROLL] ** 2
         start = np.array([*self._known.start, self._known.flank_m])
         shrink = np.minimum(1.0, start / np.maximum(np.sqrt(np.diag(grown)), 1e-12))
         pressed = actuation.force_direction is not None and actuation.mode not in _APART
@@ -203,6 +206,15 @@ class LastingErrors:
         """Follow the flank of the backlash: +1 pushed, -1 pulled, between them in proportion to the body's motion."""
         crossing_m = max(2.0 * abs(self._mean[FLANK]), _SHORTEST_CROSSING_m)
         self._side = min(max(self._side + 2.0 * moved_m / crossing_m, -1.0), 1.0)
+
+
+def _winds_up(actuation: Actuation) -> bool:
+    """Whether the commanded force has a part across the sheath's axis.
+
+    It winds up the shaft in proportion to itself, by 0.2 rad from one pose to the next, so the roll does not last.
+    """
+    across = actuation.force_direction
+    return across is not None and math.hypot(float(across[0]), float(across[1])) > _LEAST_ACROSS
 
 
 def lasting_part(total: Array, of_one_pose: Array) -> Array:

@@ -340,3 +340,19 @@ def test_planar_force_on_a_tilted_wall(tilt_deg: float, wound_rad: float, share:
         tip, shaft = poses(-force_N * into, -0.0778, 27.0, wound_rad if force_N else 0.0)
         found = one.estimate(tip, shaft, Actuation(-0.0778, 0.0, 27.0, 25_000_000 * k, into, "approach"))
     assert found.converged and found.force_N @ into == pytest.approx(0.2 * share, rel=0.03)
+
+
+@pytest.mark.parametrize(("tilt_deg", "jump_rad", "kept"), [(30.0, 0.2, False), (0.0, 0.0, True)])
+def test_the_roll_is_remembered_only_where_the_force_does_not_wind_up_the_shaft(
+    tilt_deg: float, jump_rad: float, kept: bool
+) -> None:
+    """On a tilted wall the shaft turned by 0.2 rad from one pose to the next: the poses were refused, the wall was lost."""
+    tilt = math.radians(tilt_deg)
+    into = np.array([-math.sin(tilt), 0.0, math.cos(tilt)])
+    one = SpatialRigEstimator.from_rig(load_rig(SIMULATED_RIG))
+    for k, roll_rad in enumerate([0.0] * 80 + [jump_rad]):
+        tip, shaft = poses(-0.2 * into, -0.0778, 27.0, roll_rad)
+        found = one.estimate(tip, shaft, Actuation(-0.0778, 0.0, 27.0, 25_000_000 * k, into, "contact"))
+    assert found.converged and found.force_N @ into == pytest.approx(0.2, rel=0.05)
+    one.errors.move_to(Actuation(-0.0778, 0.0, 27.0, 25_000_000 * 81, into, "contact"))
+    assert (math.sqrt(one.errors.covariance[2, 2]) < 0.05) == kept
