@@ -325,7 +325,7 @@ class _Problem:
         place_sd = float(np.sqrt(joint[PLACE, PLACE]))
         freedom = 6 * len(self._offsets) - (7 if touching_tip else 4)
         converged = bool(cost <= chi_square_limit(max(freedom, 1), ODD_DEVIATIONS))
-        notes = self._notes(x, joint, converged, cost, place_sd, touching_tip)
+        notes = self._notes(min(fits, key=lambda fit: fit.cost), joint, converged, place_sd, touching_tip)
         return ContactsEstimate(
             x[TIP].copy(),
             joint[TIP, TIP],
@@ -341,14 +341,15 @@ class _Problem:
             tuple(notes),
         )
 
-    def _notes(self, x: Array, joint: Array, converged: bool, cost: float, place_sd: float, touching_tip: bool) -> list[str]:
+    def _notes(self, best: _PlaceFit, joint: Array, converged: bool, place_sd: float, touching_tip: bool) -> list[str]:
         """Return the quantities that the poses do not determine, in words; empty if all are observable."""
         notes, body_sd = [], np.sqrt(np.linalg.eigvalsh(joint[BODY, BODY]))
-        size = float(np.linalg.norm(x[BODY]))
-        along = x[BODY] / max(size, 1e-12)
-        size_sd = float(np.sqrt(along @ joint[BODY, BODY] @ along))
+        # Whether there is a force on the body is asked of the best answer, given its place: without a force there is none.
+        size = float(np.linalg.norm(best.x[BODY]))
+        along = best.x[BODY] / max(size, 1e-12)
+        size_sd = float(np.sqrt(along @ best.covariance[BODY, BODY] @ along))
         if not converged:
-            notes.append(f"a force on the tip and one on the body do not explain these poses (chi square {cost:.3g})")
+            notes.append(f"a force on the tip and one on the body do not explain these poses (chi square {best.cost:.3g})")
         if size < LEAST_DEVIATIONS * size_sd:
             notes.append(f"not observable: the body's force is {1e3 * size:.0f} mN +- {1e3 * size_sd:.0f} mN, perhaps none")
         if place_sd > OBSERVABLE_m:
