@@ -279,15 +279,17 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         for segment in full.segments
     ]
     for row, output in enumerate(full.model.outputs):
-        line = common_line([r[row] for r in found.nominal_full.residuals], inputs, periods)
+        residuals = [r[row] for r in found.nominal_full.residuals]
+        simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
+        line = common_line(residuals, inputs, simulated, periods)
         if line is None or not full.segments[0].recording.timed:
             continue
         column = full.columns.get(output.channel, output.channel)
         says = f"The residual of column {column} has a sine of {line.frequency_Hz:.4g} Hz, amplitude {line.amplitude:.3g} "
         says += (
-            f"{output.unit}, in every recording. No input has this frequency: it is a hum, a vibration or a rotating part, "
+            f"{output.unit}, in every recording. No input has this frequency, and the simulated output hardly moves at it: "
         )
-        says += "of another phase in each recording, and not in the nominal model."
+        says += "a hum, a vibration or a rotating part is not in the nominal model."
         findings.append(Finding("line", column, says))
     return findings
 
@@ -336,7 +338,7 @@ def _jumps(full: Problem, found: Found) -> list[Finding]:
             )
         column = full.columns.get(output.channel, output.channel)
         says = f"The level of column {column} jumps past what the nominal model predicts: {'; '.join(places)}. "
-        says += "Jumps at other instants in other recordings are events, not a law; they are not corrected."
+        says += "A sensor was moved, or an axis lost steps: an event, not a law of the model. It is not corrected."
         findings.append(Finding("jump", column, says))
     return findings
 

@@ -2,7 +2,8 @@
 
 A sine over time with one phase for all recordings is a candidate effect. If each recording starts at another instant of
 the disturbance, no such sine fits, and an autoregression predicts a sine as it predicts noise. The line itself shows in
-every periodogram, against the level of the bins around it.
+every periodogram, against the level of the bins around it. A frequency at which the simulated output moves more says
+nothing: the residual rings there if a parameter or a start of the nominal model is a little off.
 """
 
 from __future__ import annotations
@@ -31,17 +32,25 @@ class Tone:
     amplitude: float
 
 
-def common_line(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], periods_s: Sequence[float]) -> Tone | None:
-    """The line at one frequency in all residuals (n_i,) that no input (n_i,) of its recording has; None if there is none."""
+def common_line(
+    residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], simulated: Sequence[Array], periods_s: Sequence[float]
+) -> Tone | None:
+    """The line at one frequency in all residuals (n_i,) that no input (n_i,) of its recording has; None if there is none.
+
+    simulated: output (n_i,) of each recording; it moves less than the residual at that frequency.
+    """
     if not residuals or min(int(np.isfinite(r).sum()) for r in residuals) < FEWEST:
         return None
     count = sum(r.size // 2 for r in residuals)
     found = []
-    for r, own, dt_s in zip(residuals, inputs, periods_s, strict=True):
+    for r, own, said, dt_s in zip(residuals, inputs, simulated, periods_s, strict=True):
         over = _over_level(fill(r))
         bin_ = int(np.argmax(over))
         limit = np.log(count / SIGNIFICANCE)
         if over[bin_] < limit or any(np.max(_over_level(fill(u))[max(bin_ - 1, 0) : bin_ + 2]) > limit for u in own):
+            return None
+        near = slice(max(bin_ - 2, 0), bin_ + 3)
+        if np.sum(_periodogram(fill(said))[near]) > np.sum(_periodogram(fill(r))[near]):
             return None
         found.append(_sine(fill(r), bin_, dt_s))
     hertz = np.array([each.frequency_Hz for each in found])
@@ -53,11 +62,15 @@ def common_line(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], p
 
 def _over_level(x: Array) -> Array:
     """Periodogram of `x` (n,) over the level around each bin: exponential of mean 1 for noise. Ends say nothing."""
-    power = np.abs(np.fft.rfft((x - np.mean(x)) * np.hanning(x.size))) ** 2
+    power = _periodogram(x)
     level = median_filter(power, AROUND, mode="nearest") / np.log(2.0)
     over = power / np.maximum(level, 1e-300)
     over[:3] = over[-2:] = 0.0
     return np.asarray(over)
+
+
+def _periodogram(x: Array) -> Array:
+    return np.asarray(np.abs(np.fft.rfft((x - np.mean(x)) * np.hanning(x.size))) ** 2)
 
 
 def _sine(x: Array, bin_: int, dt_s: float) -> Tone:

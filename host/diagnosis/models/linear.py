@@ -292,10 +292,11 @@ def sampled(A: Array, B: Array, dt_s: float, hold: str) -> tuple[Array, Array, A
     whole[:n, :n], whole[:n, n : n + m] = A * dt_s, B * dt_s
     whole[n : n + m, n + m :] = np.eye(m)
     grown = expm(whole)
-    held, ramp = grown[:n, n : n + m], grown[:n, n + m :]
+    # Copies: a compiled product of parts of a larger matrix is slower, and numba warns of it on the user's terminal.
+    step, held, ramp = (np.ascontiguousarray(part) for part in (grown[:n, :n], grown[:n, n : n + m], grown[:n, n + m :]))
     if hold == "zero":
-        return grown[:n, :n], held, np.zeros_like(held)
-    return grown[:n, :n], held - ramp, ramp
+        return step, held, np.zeros_like(held)
+    return step, held - ramp, ramp
 
 
 @njit(cache=True)
