@@ -282,6 +282,23 @@ def test_an_encoder_disk_off_its_centre_turns_unevenly() -> None:
     assert found["id"] == "whip" and found["parameters"]["amplitude_rad"]["value"] == pytest.approx(0.0139, rel=0.05)
 
 
+@pytest.mark.parametrize("shape", ["cubic", "sine"])
+def test_a_curve_and_a_turn_of_which_less_than_half_is_seen_are_both_listed(shape: str) -> None:
+    """Over 1.4 rad a sine once a turn bends as a polynomial does: no verdict may be sure of one of them."""
+    rng, t = np.random.default_rng(3), np.arange(0.0, 20.0, 0.02)
+    runs = []
+    for phase in (0.3, 1.9):
+        angle = 0.7 * (0.8 * np.sin(0.4 * t + phase) + 0.2 * np.sin(1.9 * t + phase))
+        turned = angle - 0.1 * angle**3 if shape == "cubic" else angle + 0.1 * np.sin(angle + 0.7)
+        runs.append({"t": t, "m": angle, "y": turned + 1.4e-3 * rng.normal(size=t.size)})
+    (found,) = diagnose(runs, GEAR).effects
+    assert {found["id"], *(other.split("@")[0] for other in found["indistinguishable_from"])} == {
+        "static_nonlinearity",
+        "whip",
+    }
+    assert found["probability"] < 0.8
+
+
 def test_a_universal_joint_turns_unevenly_twice_a_turn() -> None:
     rng, t = np.random.default_rng(12), np.arange(0.0, 20.0, 0.02)
     runs = []
