@@ -125,7 +125,8 @@ def pair_first(
     None if no pair passes.
 
     A gap behind friction is seen only together with it: another effect can be the best single one, and what is found past it
-    hides the pair. The arguments and what is returned are those of `pair_instead`.
+    hides the pair. Pairs of two places along the link are fitted first: the scores of single effects say little of them.
+    The arguments and what is returned are those of `pair_instead`.
     """
     tried = [
         (a, b)
@@ -133,7 +134,8 @@ def pair_first(
         if (a.candidate.port.within or b.candidate.port.within)
         and not (a.replaced or b.replaced or related(a.candidate, b.candidate) or related(b.candidate, a.candidate))
     ]
-    tried = sorted(tried, key=lambda pair: -(pair[0].score + pair[1].score))[: problem.rules.first_pairs]
+    tried.sort(key=lambda pair: (not all(t.candidate.port.within for t in pair), -sum(t.score for t in pair)))
+    tried = tried[: problem.rules.first_pairs]
     begun, found = get_starts(problem), []
     for count, (a, b) in enumerate(tried):
         if problem.budget.spent():

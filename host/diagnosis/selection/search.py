@@ -461,9 +461,10 @@ def _detour(
             base = _parted(problem, _joined(problem, pair), candidate_effects)
             steps = [Step("joint", term.candidate.key, pair[1], first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
+            likelier = _ahead(problem, other, best, noise_sd)
             earned = compare(problem.segments, "both", found.nominal.residuals, base.residuals, noise_sd).log_likelihood
             _grow(problem, other, candidate_effects, noise_sd, earned, progress)
-            if _ahead(problem, other, best, noise_sd):
+            if likelier or _ahead(problem, other, best, noise_sd):
                 best, begun, scale = other, get_starts(problem), problem.scale.copy()
     set_starts(problem, begun)
     problem.scale[:] = scale
@@ -536,6 +537,8 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
     for term in found.best.terms:
         if problem.budget.spent():
             return
+        if not any(term is other for other in found.best.terms):
+            continue  # it left with another of its name, which was reduced
         for trial in _simpler(found, term):
             rest, values = without(found.best, problem, (term.candidate.key,))
             simple = trial.fit.terms[-1]
