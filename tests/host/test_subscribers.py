@@ -72,8 +72,10 @@ def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
 
 def test_the_rates_are_those_of_the_table() -> None:
     rig, count = load_rig(RIG_FILE), Counter[str]()
+    tracker = rig.tracker.model_copy(update={"rear_handle": "0C", "rear_sensor_offset_m": 0.045})  # the table has its topic
+    rig = rig.model_copy(update={"tracker": tracker})
     with LibraryBoard() as board:
-        plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), 1)
+        plant = Plant(PlantConfig(tool_offsets_m=tracker.tool_offsets_m), 1)
         run = Scenario(rig, World(rig, plant, board, 1), lambda topic, message: count.update([topic]))
         assert run.arm()
         count.clear()
