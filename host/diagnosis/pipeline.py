@@ -246,9 +246,7 @@ def _diagnosed(
         else "nothing_missing"
     )
     if not found.best.terms:
-        result.findings += late_by_a_sample(problem, found)
-    if not found.best.terms:
-        result.findings += _lines(full, found)
+        result.findings += late_by_a_sample(problem, found) + _lines(full, found)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best, noise_sd)
         result.findings += _too_slow(full, found, slow) or _above_guess(full, figures, problem.rules)
@@ -271,6 +269,8 @@ def _without_lone_samples(
 
 def _lines(full: Problem, found: Found) -> list[Finding]:
     """Sentences on lines in the spectrum of the nominal residual that no effect explains."""
+    if not full.segments[0].recording.timed:
+        return []
     findings = []
     periods = [segment.recording.dt_s for segment in full.segments]
     read = {output.channel for output in full.model.outputs}
@@ -282,7 +282,7 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         residuals = [r[row] for r in found.nominal_full.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
         line = common_line(residuals, inputs, simulated, periods)
-        if line is None or not full.segments[0].recording.timed:
+        if line is None:
             continue
         column = full.columns.get(output.channel, output.channel)
         says = f"The residual of column {column} has a sine of {line.frequency_Hz:.4g} Hz, amplitude {line.amplitude:.3g} "

@@ -45,8 +45,8 @@ class TrackedSensors(NamedTuple):
     def from_rig(cls, rig: Rig) -> TrackedSensors:
         """Return the sensors and the noise of the rig file's tracker."""
         tracker = rig.tracker
-        rear_m = tracker.rear_sensor_offset_m if tracker.rear_handle else None
-        return cls(tracker.shaft_sensor_offset_m, tracker.position_noise_m, tracker.orientation_noise_rad, rear_m)
+        _, shaft_m, *rear_m = tracker.tool_offsets_m
+        return cls(shaft_m, tracker.position_noise_m, tracker.orientation_noise_rad, *rear_m)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import pytest
 from host.run.wall_clock import with_folder
 from host.security import keys
 from host.studies.bad_subscriber import KINDS, BadSubscriber, bad_subscriber
+from host.studies.benchmarks.body_contact import THREE, with_sensors
 from protocol.commander import CommandSender
 from protocol.local_paths import SERVICE_FOLDER, LocalPaths
 from protocol.rig_file import load_rig, parse_rig
@@ -23,9 +24,8 @@ from protocol.zenoh_access import Network
 from protocol.zenoh_session import Session
 from realtime.core.command_gate import CommandGate
 from sim.forked_board import LibraryBoard
-from sim.plant import Plant, PlantConfig
 from sim.scenario import Scenario
-from sim.world import World
+from sim.world import World, simulated_plant
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S, free_port, until
 
@@ -58,8 +58,7 @@ def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
         def publish(topic: str, message: Message) -> None:
             publishers[topic].put(message)
 
-        plant = Plant(PlantConfig(tool_offsets_m=(0.0, rig.tracker.shaft_sensor_offset_m)), 1)
-        run = Scenario(rig, World(rig, plant, board, 1), publish, pace=1.0)
+        run = Scenario(rig, World(rig, simulated_plant(rig, 1), board, 1), publish, pace=1.0)
         server = session.serve_requests(run.loop.request)
         with bad_subscriber(kind, rig.name, endpoint) as bad:
             assert run.arm() and run.command("target", "position", target_m=(0.0, -0.0107, 0.021)).accepted
@@ -71,12 +70,9 @@ def digest_beside(kind: str, move_s: float = 0.5) -> tuple[str, int]:
 
 
 def test_the_rates_are_those_of_the_table() -> None:
-    rig, count = load_rig(RIG_FILE), Counter[str]()
-    tracker = rig.tracker.model_copy(update={"rear_handle": "0C", "rear_sensor_offset_m": 0.045})  # the table has its topic
-    rig = rig.model_copy(update={"tracker": tracker})
+    rig, count = with_sensors(load_rig(RIG_FILE), THREE), Counter[str]()  # the table has the topic of a third sensor
     with LibraryBoard() as board:
-        plant = Plant(PlantConfig(tool_offsets_m=tracker.tool_offsets_m), 1)
-        run = Scenario(rig, World(rig, plant, board, 1), lambda topic, message: count.update([topic]))
+        run = Scenario(rig, World(rig, simulated_plant(rig, 1), board, 1), lambda topic, message: count.update([topic]))
         assert run.arm()
         count.clear()
         run.run(2.0)

@@ -44,15 +44,16 @@ def common_line(
     count = sum(r.size // 2 for r in residuals)
     found = []
     for r, own, said, dt_s in zip(residuals, inputs, simulated, periods_s, strict=True):
-        over = _over_level(fill(r))
+        x = fill(r)
+        over = _over_level(x)
         bin_ = int(np.argmax(over))
         limit = np.log(count / SIGNIFICANCE)
         if over[bin_] < limit or any(np.max(_over_level(fill(u))[max(bin_ - 1, 0) : bin_ + 2]) > limit for u in own):
             return None
         near = slice(max(bin_ - 2, 0), bin_ + 3)
-        if np.sum(_periodogram(fill(said))[near]) > np.sum(_periodogram(fill(r))[near]):
+        if np.sum(_periodogram(fill(said))[near]) > np.sum(_periodogram(x)[near]):
             return None
-        found.append(_sine(fill(r), bin_, dt_s))
+        found.append(_sine(x, bin_, dt_s))
     hertz = np.array([each.frequency_Hz for each in found])
     widest = max(1.0 / (r.size * dt_s) for r, dt_s in zip(residuals, periods_s, strict=True))
     amplitude = float(np.sqrt(np.mean([each.amplitude**2 for each in found])))

@@ -95,11 +95,7 @@ def pair_instead(
     ]
     begun, found, equal = get_starts(problem), [], []
     for a, b in tried[: rules.split_fits]:
-        starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
-        set_starts(problem, starts)
-        fit = _fitted(problem, nominal, a, b)
-        for which in (a, b):  # what the memory of each began with alone is not what it begins with past the other
-            fit = restart(problem, fit, which.candidate)
+        fit = _fitted_anew(problem, nominal, a, b, restart)
         starts = get_starts(problem)
         passed = _passed(problem, nominal, fit, noise_sd)
         ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd)
@@ -141,10 +137,7 @@ def pair_first(
         if problem.budget.spent():
             break
         progress(f"fitting {a.candidate.key} and {b.candidate.key}", count / len(tried))
-        set_starts(problem, [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)])
-        fit = _fitted(problem, nominal, a, b)
-        for which in (a, b):
-            fit = restart(problem, fit, which.candidate)
+        fit = _fitted_anew(problem, nominal, a, b, restart)
         passed = _passed(problem, nominal, fit, noise_sd)
         if passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
             found.append((*passed, fit, get_starts(problem)))
@@ -188,6 +181,15 @@ def _fitted(problem: Problem, nominal: Fit, a: Trial, b: Trial) -> Fit:
     fits = [minimize(problem, terms, begin, rounds=rules.first_iterations, tolerance=1e-4) for begin in begins]
     fit = min(fits, key=lambda f: f.cost)
     return finish(problem, minimize(problem, terms, fit.values, rounds=rules.further_iterations, tolerance=1e-4))
+
+
+def _fitted_anew(problem: Problem, nominal: Fit, a: Trial, b: Trial, restart: Restart) -> Fit:
+    """Both effects together, the memory of each started again: alone it began with something else than past the other."""
+    set_starts(problem, [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)])
+    fit = _fitted(problem, nominal, a, b)
+    for which in (a, b):
+        fit = restart(problem, fit, which.candidate)
+    return fit
 
 
 def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> bool:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from host.estimation.rig_estimator import make_estimator
 from host.estimation.service import EstimationService
+from host.studies.benchmarks.body_contact import with_sensors
 from protocol.enums import Phase
 from protocol.rig_file import SIMULATED_RIG, Rig, load_rig, parse_rig
 from protocol.topics import Message, Pose, RigState, Stage
@@ -150,8 +151,7 @@ def main() -> None:
     options = parser.parse_args()
     rig = load_rig(SIMULATED_RIG)
     if options.rear_mm:
-        third = {"rear_handle": "0C", "rear_sensor_offset_m": 1e-3 * options.rear_mm}
-        rig = parse_rig({**rig.effective(), "tracker": {**rig.effective()["tracker"], **third}})
+        rig = with_sensors(rig, (0.0, rig.tracker.shaft_sensor_offset_m, 1e-3 * options.rear_mm))
     runs = []
     for seed in options.seeds:
         runs.append(record(rig, seed, options.seconds, **({} if options.as_configured else drawn_world(rig, seed))))
