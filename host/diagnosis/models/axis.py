@@ -96,6 +96,7 @@ class AxisModel(Model):
         self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
         if "stiffness" not in self.spec.terms:
             self.taken |= {"softening:", "contact_nonlinear:"}
+        self.taken |= {f"softening:{term}" for term in ("mass", "damping") if term not in self.spec.terms}
         self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
         self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None else ()
         self.moves = {name: self.spec.output}
@@ -254,7 +255,8 @@ class AxisModel(Model):
             for candidate, values in active
             if candidate.effect.slots is not None
         ]
-        p = slot_array([*slots, {"stiffness": float(linear[2])}])
+        law = dict(zip(("mass", "damping", "stiffness"), map(float, linear), strict=False))
+        p = slot_array([*slots, law] if slots else [])
         load = np.zeros(segment.n)
         if spec.controller is not None:
             c = spec.controller
