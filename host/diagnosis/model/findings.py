@@ -457,12 +457,12 @@ def _by_law(
     straight = [regression(recording, path) for recording in used]
     explained = float(np.median([part[2] for part in straight]))
     force_column, motion_column = columns[path.input], columns[path.output]
-    if 1.0 - explained > WRONG_WAY:
+    if 1.0 - explained > WRONG_WAY or _elsewhere(path, straight):
         across = [regression(recording, path, exchanged=True) for recording in used]
         crossed = float(np.median([part[2] for part in across]))
         passive = abs(_agreement(across)) >= abs(_agreement(straight))
-        better = 1.0 - crossed < BETTER * (1.0 - explained)
-        if passive and crossed > EXPLAINED and (better or (crossed > explained and _as_stated(path, straight, across))):
+        better = 1.0 - explained > WRONG_WAY and 1.0 - crossed < BETTER * (1.0 - explained)
+        if passive and crossed > EXPLAINED and (better or _as_stated(path, straight, across)):
             says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
             says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
             says += "The diagnosis continues with them exchanged."
@@ -480,16 +480,25 @@ def _by_law(
 def _as_stated(path: Pair, straight: list[tuple[Array, Array, float]], across: list[tuple[Array, Array, float]]) -> bool:
     """Whether the law of exchanged columns alone is passive and has the stated values, where it has several terms.
 
-    Uneven stamps and noise leave a part of either order, so that what is unexplained does not decide.
+    Uneven stamps and noise leave a part of either order, and slow motion little of both, so that what is unexplained does
+    not decide.
     """
-    stated = np.abs(np.array(path.values))
-    if np.count_nonzero(stated) == 0 or len(path.law) < 2 or _agreement(across) < 1.0 or _agreement(straight) > PASSIVE:
+    if len(path.law) < 2 or _agreement(across) < 1.0 or _agreement(straight) > PASSIVE or not _elsewhere(path, straight):
         return False
-    far = []
-    for fits in (straight, across):
-        found = np.median([np.abs(c) for c, _, _ in fits], axis=0)[stated > 0.0]
-        far.append(np.abs(np.log(np.maximum(found, 1e-300) / stated[stated > 0.0])))
-    return bool(np.max(far[1]) < np.log(AS_STATED) and np.min(far[0]) > np.log(NOT_AS_STATED))
+    return bool(np.max(_from_stated(path, across)) < np.log(AS_STATED))
+
+
+def _elsewhere(path: Pair, fits: list[tuple[Array, Array, float]]) -> bool:
+    """Whether every coefficient whose value is stated has another one."""
+    away = _from_stated(path, fits)
+    return bool(away.size and np.min(away) > np.log(NOT_AS_STATED))
+
+
+def _from_stated(path: Pair, fits: list[tuple[Array, Array, float]]) -> Array:
+    """Magnitude of the logarithm of the ratio of each coefficient to its value, of those that are stated."""
+    stated = np.abs(np.array(path.values))
+    found = np.median([np.abs(c) for c, _, _ in fits], axis=0)[stated > 0.0]
+    return np.asarray(np.abs(np.log(np.maximum(found, 1e-300) / stated[stated > 0.0])))
 
 
 def _sign_by_law(
