@@ -61,7 +61,7 @@ def tilt(s: Scale, form: str) -> tuple[Parameter, ...]:
     )
 
 
-def _turned(turn: Array) -> Array:
+def turned(turn: Array) -> Array:
     """Rotations (3, 3, n) by small vectors `turn` (3, n)."""
     zero = np.zeros(turn.shape[1])
     K = np.array([[zero, -turn[2], turn[1]], [turn[2], zero, -turn[0]], [-turn[1], turn[0], zero]])
@@ -83,7 +83,7 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
     if form in ("beat", "rock"):
         phase = 2.0 * np.pi * p[-1] * t
         moved = {**state, "shift": state["shift"] + _waves(p[:6], phase)}
-        return moved if form == "beat" else {**moved, "turn": _turned(_waves(p[6:12], phase))}
+        return moved if form == "beat" else {**moved, "turn": turned(_waves(p[6:12], phase))}
     if form == "constant":
         when = np.ones(t.size)
     elif form == "shift":
@@ -92,7 +92,7 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
         when = np.clip((t - p[6]) / c.dt_s + 0.5, 0.0, 1.0)
     place = np.array([p[0], p[1], 0.0]) if form == "constant" else p[:3]
     turn = np.array([p[2], p[3], 0.0]) if form == "constant" else p[3:6]
-    return {**state, "shift": state["shift"] + np.outer(place, when), "turn": _turned(np.outer(turn, when))}
+    return {**state, "shift": state["shift"] + np.outer(place, when), "turn": turned(np.outer(turn, when))}
 
 
 SAYS = "The sheath's exit moves: all poses move with it."

@@ -15,7 +15,9 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.live.charts import Charts, ChartSettings, Usual
+from host.diagnosis.live.local_field import LOCAL_FIELD
 from host.diagnosis.live.twin import FrameCollector, Twin, TwinFit
+from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.screening import screen
 from protocol.rig_file import Rig
@@ -46,7 +48,7 @@ class LiveSettings:
     cause_s: float = 2.0
     lead_rows: int = 6
     suspects: int = 8
-    inflation: float = 80.0
+    inflation: float = 20.0
     charts: ChartSettings = field(default_factory=ChartSettings)
 
 
@@ -79,6 +81,13 @@ def probabilities(suspects: list[Suspect], samples: int, inflation: float) -> li
     return sorted(judged, key=lambda s: -s.probability)
 
 
+def _causes(twin: Twin) -> list[Candidate]:
+    """The vocabulary at every port but the wall; a distorted field in the form that seconds of motion can show."""
+    listed = candidates(twin.ports, True, twin.taken | {LOCAL_FIELD.id})
+    local = [Candidate(LOCAL_FIELD, port) for port in twin.ports if LOCAL_FIELD.port in port.kind.split("+")]
+    return [c for c in (*listed, *local) if c.port.name != "contact"]
+
+
 def is_armed(state: RigState) -> bool:
     """Return whether the rig follows commands in this state."""
     return state.mode not in ("disarmed", "homing", "stopped")
@@ -95,7 +104,7 @@ class Watch:
         self.settings, self._rest = settings or LiveSettings(), rest
         self.twin = Twin(rig)
         self.frames = FrameCollector(rig, max(self.settings.learn_s, 30.0))
-        self.candidate_effects = [c for c in candidates(self.twin.ports, True, self.twin.taken) if c.port.name != "contact"]
+        self.candidate_effects = _causes(self.twin)
         self.calibration: TwinFit | None = None
         self.charts: Charts | None = None
         self._armed_at_ns: int | None = None

@@ -53,6 +53,7 @@ def test_silent_where_nothing_is_missing() -> None:
             ),
         ),
         ("base_motion@base:rise_s=1", "base_motion"),
+        ("field_distortion@pose_sensor:amplitude_m=0.003", "field_distortion"),
     ],
 )
 def test_alarm_within_three_seconds_of_the_effect(planted: str, cause: str) -> None:
