@@ -463,8 +463,16 @@ def _by_law(
         passive = abs(_agreement(across)) >= abs(_agreement(straight))
         better = 1.0 - explained > WRONG_WAY and 1.0 - crossed < BETTER * (1.0 - explained)
         if passive and crossed > EXPLAINED and (better or _as_stated(path, straight, across)):
-            says = f"Columns {force_column} and {motion_column} are probably exchanged: as named the nominal law explains "
-            says += f"{max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
+            says = f"Columns {force_column} and {motion_column} are probably exchanged: "
+            if better:
+                says += (
+                    f"as named the nominal law explains {max(explained, 0.0):.0%} of the variance, exchanged {crossed:.0%}. "
+                )
+            else:
+                says += (
+                    "only exchanged do all terms of the nominal law have one sign, and the stated values within a factor of "
+                )
+                says += f"{AS_STATED:.0f}. "
             says += "The diagnosis continues with them exchanged."
             findings.append(Finding("swapped", force_column, says))
             recordings = [_exchanged(recording, path.input, path.output) for recording in recordings]

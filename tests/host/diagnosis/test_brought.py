@@ -234,7 +234,8 @@ def test_exchanged_columns_are_found_by_stated_values_where_stamps_are_uneven(sw
         "parameters": {"stiffness": 630.0},
     }
     findings = inspected(nominal_of(nominal), [Table(f"r{k}", r) for k, r in enumerate(recordings)]).findings
-    assert ("swapped" in {f.id for f in findings}) is swapped
+    said = [f.says for f in findings if f.id == "swapped"]
+    assert len(said) == swapped and all("stated values" in says for says in said)
 
 
 def test_a_residual_that_rings_where_the_model_does_is_no_line() -> None:
