@@ -459,8 +459,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--board", default="native")
     parser.add_argument("--out", type=Path, help="folder of recorded runs, to go on with")
     parser.add_argument("--recorded", action="store_true", help="judge the runs in --out; make no further ones")
-    parser.add_argument("--docs", type=Path, help="page whose text is to be written")
+    parser.add_argument("--docs", type=Path, help="page whose text of all jobs is to be written")
     given = parser.parse_args(arguments)
+    if given.docs is not None and set(given.jobs) != set(JOBS):  # the text is replaced as a whole
+        parser.error(f"argument --docs: found --jobs {' '.join(given.jobs)}, wanted --jobs {' '.join(JOBS)}")
     book = Book(given.out, given.board, given.recorded)
     parts = []
     for title, jobs in (("In lock step", (PRESS, ROUND)), ("By hand", (HAND,))):

@@ -119,3 +119,21 @@ def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:
     page.write_text("no marks")
     with pytest.raises(ValueError, match="marks"):
         live_study.write_docs(page, "new")
+
+
+def test_a_page_gets_the_text_of_all_jobs_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fake(task: Task, board: str) -> Frames:
+        return Frames(5, np.array([10, 20]), np.array([15, 25]), np.ones((2, 20)))
+
+    monkeypatch.setattr(live_study, "record", fake)
+    monkeypatch.setattr(live_study, "judge", lambda task, frames: LiveRow(task, 120.0, (), 0.5, 1.0))
+    page = tmp_path / "p.md"
+    page.write_text(f"{BEGIN}\nold\n{END}\n")
+    with pytest.raises(SystemExit):
+        live_study.main(["--jobs", "hand", "--docs", str(page)])
+    assert "old" in page.read_text()
+    live_study.main(["--jobs", *live_study.JOBS, "--docs", str(page)])
+    text = page.read_text()
+    assert "old" not in text and text.index("**In lock step.**") < text.index("**By hand.**")
+    for job in live_study.JOBS:
+        assert f"{job} 0 alarms in 0.03 hours (1 runs)" in text
