@@ -70,7 +70,8 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
 
     An effect enters by what it gains on held-out samples. Among effects of one step these gains can be alike while all
     samples speak for another one; the verdict would then state a probability near zero for its own name. The rival takes
-    the place if the effect would be distinguishable from it, were the rival named. Changes `found.best`.
+    the place if the effect would be distinguishable from it, were the rival named. A rival with fewer parameters takes it
+    where it is likelier at all: a gain of more parameters below their cost is chance. Changes `found.best`.
     """
     seen = [found.best.names]
     standing = standings(problem, found, noise_sd)
@@ -79,7 +80,8 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
             (difference, k, rival)
             for k, one in enumerate(standing)
             for rival, difference in one.rivals
-            if not rival.effect.searched and difference - _own(one) < -problem.rules.equal_log_likelihood
+            if not rival.effect.searched
+            and difference - _own(one) < (0.0 if _simpler(found, rival, one) else -problem.rules.equal_log_likelihood)
         ]
         if not behind or problem.budget.spent():
             return standing
@@ -89,7 +91,8 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         trial = next(t for t in step.trials if t.candidate.key == rival.key)
         other = _with_rival(problem, found.best, standing[k].candidate, trial)
         ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd)
-        if other.names in seen or ahead.log_likelihood <= 0.0 or at_bound(other):
+        likelier = coarse(ahead, other.fitted - before.fitted, problem.rules) > 0.0
+        if other.names in seen or not likelier or at_bound(other):
             set_starts(problem, begun)
             return standing
         found.best = other
@@ -97,6 +100,12 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         seen.append(other.names)
         standing = standings(problem, found, noise_sd)
     return standing
+
+
+def _simpler(found: Found, rival: Candidate, standing: Standing) -> bool:
+    """Whether `rival` has fewer parameters than the effect of `standing`."""
+    tried = (trial for step in found.steps for trial in step.trials if trial.candidate.key == rival.key)
+    return any(trial.fit.terms[-1].fitted < standing.parameters for trial in tried)
 
 
 def _pairs(problem: Problem, found: Found, candidate: Candidate, noise_sd: Array) -> list[tuple[Candidate, float]]:

@@ -110,10 +110,6 @@ def heated(seed: int, loss_W: float, offset_K: float = 0.0, drift_K_per_s: float
     return {"t": t, "u": u, "y": y + offset_K + drift_K_per_s * t + 0.1 * rng.standard_normal(t.size)}
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="named static_nonlinearity (0.32), with sensor_bias as indistinguishable and more probable (0.57)",
-)
 def test_an_offset_of_the_input_of_a_plant_that_settles_is_one_of_its_reading() -> None:
     """The initial state of the plant takes over the first seconds, so the two are one effect."""
     (found,) = sd.diagnose([heated(k, 8.0) for k in (1, 2, 3)], HEATER).effects
