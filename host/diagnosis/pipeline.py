@@ -33,9 +33,11 @@ from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
+from host.diagnosis.selection.between_recordings import unlike_recordings
 from host.diagnosis.selection.equivalence import (
     Standing,
     most_probable,
+    probability_of,
     standings,
     with_unlisted_rival,
     without_improbable,
@@ -159,6 +161,16 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
         # single wild samples would raise the noise by which they are found
         tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
         found = noise_module.estimate(tame, still, repeats)
+        seldom = [readings.repeated(p.y[row]) for p in segments]
+        for segment, places in zip(segments, seldom, strict=True):
+            if places is not None:
+                segment.repeats[row] = places
+        if any(places is not None for places in seldom):  # the noise of readings, not of their repetitions
+            kept = [slice(None) if places is None else np.unique(places) for places in seldom]
+            alone = noise_module.estimate(
+                [y[k] for y, k in zip(tame, kept, strict=True)], [m[k] for m, k in zip(still, kept, strict=True)]
+            )
+            found = replace(found, sigma=max(found.sigma, alone.sigma))
         own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
         if own:
             found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
@@ -225,13 +237,26 @@ def _diagnosed(
         standing = standings(problem, found, noise_sd)
     while fewer := without_improbable(problem, found, standing, remainder, noise_sd):
         standing, remainder = fewer
+    probable = max((probability_of(one, remainder.share, problem.rules).effect for one in standing), default=0.0)
+    unlike = probable < problem.rules.further_probability and not budget.spent()
+    between = unlike_recordings(problem, found.nominal, noise_sd) if unlike else []
+    if between and found.best.terms:
+        found.best, standing = fit_nominal(problem), []
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
     located, figures = _locate(full, found, problem), _figures(full, found)
     result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
     result.remainder = remainder
-    result.findings = [*data.findings, *apart, *lone, *held, *uncertain(problem, found.best, spans)]
+    result.findings = [
+        *data.findings,
+        *apart,
+        *lone,
+        *held,
+        *_repeated(full),
+        *between,
+        *uncertain(problem, found.best, spans),
+    ]
     if not found.best.terms and remainder.sure:
         result.findings += _jumps(full, found)
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
@@ -242,7 +267,7 @@ def _diagnosed(
         "missing_physics"
         if named
         else "mismatch_not_identified"
-        if remainder.sure or found.best.terms
+        if remainder.sure or found.best.terms or between
         else "nothing_missing"
     )
     if not found.best.terms:
@@ -265,6 +290,25 @@ def _without_lone_samples(
         return recordings, []
     nominal = fit_nominal(problem)
     return outliers_of_residual(full, at_full_rate(full, nominal, problem), recordings)
+
+
+def _repeated(full: Problem) -> list[Finding]:
+    """Sentences on sensors that are read more seldom than they are logged."""
+    findings = []
+    for row, output in enumerate(full.model.outputs):
+        segment = next((segment for segment in full.segments if row in segment.repeats), None)
+        if segment is None:
+            continue
+        column = full.columns.get(output.channel, output.channel)
+        samples = int(np.median(np.diff(np.unique(segment.repeats[row]))))
+        period = samples * segment.recording.dt_s
+        timed = f", every {period:.4g} s" if segment.recording.timed else ""
+        says = (
+            f"Column {column} repeats each reading for {samples} samples{timed}: its sensor is read more seldom than it is "
+        )
+        says += "logged. The simulated readings are repeated likewise. A delay up to this period may be the sensor's."
+        findings.append(Finding("repeated", column, says))
+    return findings
 
 
 def _lines(full: Problem, found: Found) -> list[Finding]:

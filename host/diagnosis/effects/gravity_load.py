@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -20,14 +20,21 @@ def apply(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def on_an_angle(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Moments of the weight at angles of a quarter turn and of zero; only where the motion is an angle."""
+    """Moments of the weight at angles of a quarter turn and of zero; only where the motion is an angle.
+
+    Form `constant`: the force itself, as of a weight on a slope.
+    """
+    if form == "constant":
+        return (Parameter("force", s.unit, (s.need,), linear=True),)
     if s.motion_unit != "rad":
         return ()
     return tuple(Parameter(f"moment_{part}", s.unit, (s.need,), linear=True) for part in ("sine", "cosine"))
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Moment of a weight that turns with the angle."""
+    """Moment of a weight that turns with the angle; form `constant`: a force that does not change."""
+    if form == "constant":
+        return {"constant": p[0]}
     return {"moment_sine": p[0], "moment_cosine": p[1]}
 
 
@@ -81,6 +88,15 @@ def payload_torques(moved: Array, c: Context | None, p: Array, form: str) -> Arr
     return np.asarray(np.cumsum(at[::-1], axis=0)[::-1])
 
 
+_TURNING = Effect(
+    "gravity_load",
+    "force",
+    15,
+    on_an_angle,
+    "A weight on an arm exerts a moment of {moment_sine} at a quarter turn and {moment_cosine} at zero.",
+    "M = moment_sine*sin(x) + moment_cosine*cos(x)",
+    slots=slots,
+)
 EFFECTS = (
     Effect(
         "gravity_load",
@@ -91,13 +107,11 @@ EFFECTS = (
         "dF/ds = weight,  F_tip = weight*tip_length",
         apply,
     ),
-    Effect(
-        "gravity_load",
-        "force",
-        15,
-        on_an_angle,
-        "A weight on an arm exerts a moment of {moment_sine} at a quarter turn and {moment_cosine} at zero.",
-        "M = moment_sine*sin(x) + moment_cosine*cos(x)",
-        slots=slots,
+    _TURNING,
+    in_form(
+        _TURNING,
+        "constant",
+        "A constant force of {force} acts against the positive direction, as of a weight or an offset of the input.",
+        "F = force",
     ),
 )

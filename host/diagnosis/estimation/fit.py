@@ -91,9 +91,18 @@ class Problem:
         return self.simulate_all([segment], terms, values)[0]
 
     def simulate_all(self, segments: list[Segment], terms: tuple[Term, ...], values: Array) -> list[Array]:
-        """Outputs (outputs, n) of several recordings; a simulation that ran away is far from every recording."""
-        found = self.model.simulate_all(segments, *self.parted(terms, values))
-        return [np.where(np.abs(out) < 1e150, out, 1e150) for out in found]
+        """Outputs (outputs, n) of several recordings; a simulation that ran away is far from every recording.
+
+        Where a sensor is read more seldom than it is logged, its simulated readings are repeated as the recorded ones are.
+        """
+        found = [
+            np.where(np.abs(out) < 1e150, out, 1e150)
+            for out in self.model.simulate_all(segments, *self.parted(terms, values))
+        ]
+        for segment, out in zip(segments, found, strict=True):
+            for row, places in segment.repeats.items():
+                out[row] = out[row, places]
+        return found
 
     def parted(self, terms: tuple[Term, ...], values: Array) -> tuple[Array, list[ActiveEffect]]:
         """Nominal parameters, and every effect with its own."""

@@ -56,6 +56,7 @@ SLOTS = (
     "mass_rate",
     "damping",
     "damping_rate",
+    "constant",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
 (
@@ -105,6 +106,7 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     MASS_RATE,
     DAMPING,
     DAMPING_RATE,
+    CONSTANT,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
 LEAST_MASS = 0.02  # share of its value that a mass keeps however long it falls
@@ -118,7 +120,8 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
     Maxwell branch.
     """
     force = p[VISCOUS] * v + p[DRAG] * v * abs(v) + p[ASYMMETRY] * abs(v) + p[QUADRATIC] * x * x + p[CUBIC] * x * x * x
-    force += p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x + p[DAMPING_RATE] * t * p[DAMPING] * v
+    force += p[CONSTANT] + p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x
+    force += p[DAMPING_RATE] * t * p[DAMPING] * v
     force -= p[STIFFNESS] * min(max(x, -p[GAP]), p[GAP])
     if p[PITCH] > 0.0:
         force += p[SINE] * math.sin(TWO_PI * x / p[PITCH]) + p[COSINE] * math.cos(TWO_PI * x / p[PITCH])
@@ -449,7 +452,7 @@ def run_axis(
         if p[DRIVE_LIMIT] > 0.0:
             drive = min(max(drive, -p[DRIVE_LIMIT]), p[DRIVE_LIMIT])
         for j in range(substeps):
-            more = offset - held
+            more = offset - held - (p[CONSTANT] if short else 0.0)
             push = (
                 (drive + more, drive + more, drive + more)
                 if control.size

@@ -15,6 +15,7 @@ from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+Places = npt.NDArray[np.int64]
 ActiveEffect = tuple[Candidate, Array]
 
 
@@ -58,6 +59,7 @@ class Segment:
     weight: Array | None = None  # (outputs,) scale of each output's residual
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
     fed_back: list[Array | None] = field(default_factory=list)  # of each output, later input that holds its noise
+    repeats: dict[int, Places] = field(default_factory=dict)  # output -> (n,) sample whose reading each sample repeats
 
     @property
     def n(self) -> int:

@@ -12,6 +12,7 @@ from host.diagnosis.model.operators import constant_speed, fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+Places = npt.NDArray[np.int64]
 
 ALONE = 12.0  # noise standard deviations from the median of the neighbours, and
 LOCAL = 8.0  # local spreads, from which a sample stands alone
@@ -19,13 +20,16 @@ MOVES = 5.0  # deviations of the other samples over noise, from which a channel 
 CODES = 3  # returns to the same value, from which that is a code for a lost reading
 LONGEST_CODE = 50  # samples in a row of such a code
 COARSEST = 1000.0  # steps in the range of a channel, below which its resolution is said
+FEWEST_READINGS = 20  # of a channel that repeats them, below which nothing is said
+REGULAR = 0.9  # share of its readings that last equally long, to a sample or a multiple, from which on it repeats them
+FINE_STEPS = 4.0  # smallest changes between two readings, below which what stays the same is a coarse reading
 FEW_LEVELS = 20  # levels up to which a channel may be a switched signal
 
 
 @dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped,
-    saturated, outliers, quantized, hold or jump; `channel`: the column's name in the recordings.
+    saturated, outliers, quantized, repeated, session, hold or jump; `channel`: the column's name in the recordings.
     """
 
     id: str
@@ -130,6 +134,25 @@ def resolution(values: Array, switched: bool) -> float:
     smallest = float(np.min(steps))
     even = np.abs(steps / smallest - np.round(steps / smallest)) < 1e-3
     return smallest if bool(even.all()) and not constant_speed(values, smallest) else 0.0
+
+
+def repeated(values: Array) -> Places | None:
+    """Sample (n,) whose reading each sample of `values` (n,) repeats, where a sensor is read more seldom than it is logged.
+
+    None where readings do not last equally long: a coarse reading stays the same for as long as the motion is slow.
+    """
+    new = np.concatenate(([0], np.flatnonzero(np.diff(values) != 0.0) + 1))
+    lasts = np.diff(new)
+    if lasts.size < FEWEST_READINGS:
+        return None
+    period = int(np.median(lasts))
+    if period < 2:
+        return None
+    regular = np.abs(lasts - period * np.maximum(np.round(lasts / period), 1)) <= 1
+    steps = np.abs(np.diff(values[new]))
+    if np.mean(regular) < REGULAR or float(np.nanmedian(steps)) < FINE_STEPS * float(np.nanmin(steps)):
+        return None
+    return np.asarray(new[np.searchsorted(new, np.arange(values.size), side="right") - 1])
 
 
 def coarse(

@@ -28,6 +28,7 @@ from host.diagnosis.model.operators import calm, fill, smooth_derivatives, white
 from host.diagnosis.models import balance
 
 Array = npt.NDArray[np.float64]
+READ = ("position", "velocity", "acceleration")
 SMOOTHING_S = 0.02
 UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
 FINER = 8  # points in each sub-step at which a held input is computed that an effect delays
@@ -64,6 +65,7 @@ class AxisModel(Model):
         self.holds = balance.HOLDS if spec.axis.controller is None else ()
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
+        place = integral_unit(motion, READ.index(self.spec.reads))
         self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
         outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
         if self.spec.controller is not None or not self.free_run:
@@ -81,9 +83,9 @@ class AxisModel(Model):
             Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
         )
         defaults = {
-            "mass": (1.0, f"{force} s2/{motion}"),
-            "damping": (1.0, f"{force} s/{motion}"),
-            "stiffness": (1.0, f"{force}/{motion}"),
+            "mass": (1.0, f"{force} s2/{place}"),
+            "damping": (1.0, f"{force} s/{place}"),
+            "stiffness": (1.0, f"{force}/{place}"),
             "offset": (0.0, force),
         }
         parameters = []
@@ -97,7 +99,9 @@ class AxisModel(Model):
         if "stiffness" not in self.spec.terms:
             self.taken |= {"softening:", "contact_nonlinear:"}
         self.taken |= {f"softening:{term}" for term in ("mass", "damping") if term not in self.spec.terms}
-        self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", motion),)
+        if "stiffness" in self.spec.terms or "offset" in self.spec.terms:  # it is an offset of the reading, or nominal
+            self.taken |= {"gravity_load:constant"}
+        self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", place),)
         self.unlisted_at = ((name, f"{name}_drive"),) if self.spec.controller is None else ()
         self.moves = {name: self.spec.output}
         self.quiet_inputs = (self.spec.input,)
@@ -114,33 +118,30 @@ class AxisModel(Model):
         window = max(7, round(SMOOTHING_S / recording.dt_s) | 1)
         x, v, _a = smooth_derivatives(motion, recording.dt_s, window)
         name = spec.subsystem
-        reads = {
-            "position": (x, v),
-            "velocity": (np.cumsum(x) * recording.dt_s, x),
-            "acceleration": (np.zeros_like(x), np.zeros_like(x)),
-        }
-        segment.inputs[f"motion:{name}"] = reads[spec.reads][0]
-        begin = reads[spec.reads][0][0] if spec.reads == "position" else 0.0, reads[spec.reads][1][0]
+        once = _integrated(x, recording.dt_s, 1)
+        twice = _integrated(once, recording.dt_s, 2)
+        place = {"position": x, "velocity": np.cumsum(x) * recording.dt_s, "acceleration": twice}[spec.reads]
+        segment.inputs[f"motion:{name}"] = place
+        begin = {"position": (x[0], v[0]), "velocity": (0.0, x[0]), "acceleration": (0.0, 0.0)}[spec.reads]
         # Position and speed at the first sample are estimated: one is a derivative of noise, and its error rings on.
         again = self.free_run and spec.controller is None
         spread = _begin_spread(motion, x, recording.dt_s, window)
         # What is not read is found from the recording; it begins about as large as the integral of the reading gets.
         largest = float(np.max(np.abs(x)))
-        once = _integrated(x, recording.dt_s, 1)
         if spec.reads == "velocity":
             spread = np.array([max(largest * UNSEEN_S, float(np.std(once))), spread[0]])
         elif spec.reads == "acceleration":
-            twice = _integrated(once, recording.dt_s, 2)
             spread = np.array(
                 [max(largest * UNSEEN_S**2, float(np.std(twice))), max(largest * UNSEEN_S, float(np.std(once)))]
             )
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
-        segment.tolerances[name] = tolerance_of(motion, float(np.ptp(motion)))
+        along = motion if spec.reads == "position" else place
+        segment.tolerances[name] = tolerance_of(along, float(np.ptp(along)))
         segment.units = {
             **self.units,
             name: self.units[spec.input],
-            f"motion:{name}": self.units[spec.output],
+            f"motion:{name}": integral_unit(self.units[spec.output], READ.index(spec.reads)),
             f"{name}_drive": self.units[spec.input],
             f"{name}_reading": self.units[spec.output],
         }
@@ -183,7 +184,7 @@ class AxisModel(Model):
             U, Y = np.fft.rfft(window * (u - u.mean())), np.fft.rfft(window * (y - y.mean()))
             s = 2j * np.pi * np.fft.rfftfreq(u.size, segment.recording.dt_s)
             keep = (np.abs(s) > 0) & (np.abs(U) > 0.02 * np.max(np.abs(U)))
-            X = Y[keep] / s[keep] ** ("position", "velocity", "acceleration").index(self.spec.reads)
+            X = Y[keep] / s[keep] ** READ.index(self.spec.reads)
             columns = {"mass": s[keep] ** 2 * X, "damping": s[keep] * X, "stiffness": X, "offset": np.zeros_like(X)}
             rows.append(np.array([columns[term] for term in self.spec.terms]).T)
             sides.append(U[keep])
@@ -288,7 +289,7 @@ class AxisModel(Model):
             segment.start.get(spec.subsystem, 0.0),
             float(segment.recording.time_s[0]),
         )
-        motion = run[("position", "velocity", "acceleration").index(spec.reads)]
+        motion = run[READ.index(spec.reads)]
         motion = apply_effects(motion, active, f"{spec.subsystem}_reading", segment, None)
         return np.vstack([motion, run[3]]) if spec.controller is not None else motion[None, :]
 
@@ -307,7 +308,9 @@ class AxisModel(Model):
         assert isinstance(segment, AxisSegment)
         if port.name == f"{self.spec.subsystem}_drive":
             return segment.inputs[self.spec.input]
-        return segment.inputs[f"motion:{self.spec.subsystem}"] if self.spec.reads == "position" else segment.x
+        return (
+            segment.x if port.name == f"{self.spec.subsystem}_reading" else segment.inputs[f"motion:{self.spec.subsystem}"]
+        )
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Force residual where a force is compared; else the motion residual times what a unit of the reading takes.
@@ -330,6 +333,18 @@ class AxisModel(Model):
         rate = float(np.std(np.diff(free_of_noise))) / segment.recording.dt_s / moved
         size = mass if self.spec.reads == "acceleration" else law.get("damping", 0.0) + mass * rate
         return np.asarray(residual[0] * size)
+
+
+def integral_unit(unit: str, order: int) -> str:
+    """Unit of what has `unit`, integrated over time `order` times: m/s2 becomes m."""
+    for _ in range(order):
+        for rate, whole in (("/s2", "/s"), ("/s^2", "/s"), ("/s", "")):
+            if unit.endswith(rate):
+                unit = unit.removesuffix(rate) + whole
+                break
+        else:
+            unit = f"{unit} s"
+    return unit
 
 
 def _integrated(x: Array, dt_s: float, order: int) -> Array:

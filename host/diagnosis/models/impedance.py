@@ -75,7 +75,8 @@ class ImpedanceModel(Model):
                 self.terms.append((term, source))
         self.parameters = tuple(parameters)
         have = {"damping": "viscous_friction:", "mass": "added_mass"}
-        self.taken = frozenset(have[term] for term in self.spec.terms if term in have)
+        # A constant force is an offset of the reading of force.
+        self.taken = frozenset(("gravity_load:constant", *(have[term] for term in self.spec.terms if term in have)))
         if "stiffness" not in self.spec.terms:
             self.taken |= {"contact_nonlinear:", "softening:"}
         self.taken |= {f"softening:{term}" for term in ("mass", "damping") if term not in self.spec.terms}

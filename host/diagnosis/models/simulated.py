@@ -112,6 +112,7 @@ class SimulatedModel(Model):
     scan_points = 24
     simulates = True
     either_sign = True
+    taken = frozenset({"gravity_load:constant"})  # a constant force along a motion is an offset of the reading of force
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
 
     def __init__(self, spec: NominalSpec, section: SimulatorSpec, offers: list[OfferSpec]) -> None:

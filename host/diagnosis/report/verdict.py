@@ -12,6 +12,8 @@ from host.diagnosis.design.experiment import lines as experiment_lines
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere
 from host.diagnosis.model.findings import Finding
+from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.models import channels_of
 from host.diagnosis.pipeline import Diagnosis, Location, rms
 from host.diagnosis.selection.equivalence import Standing, probability_of
 from host.diagnosis.selection.locate import joined
@@ -19,7 +21,7 @@ from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
 UNDECIDED = ("line", "slow_noise", "noise_unseen", "within_sample", "excitation")
-REMARKS = ("outliers", "quantized", "hold", *UNDECIDED)  # findings that ask for no change of the data
+REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
 PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
@@ -99,13 +101,8 @@ def next_step(result: Diagnosis) -> str:
             f"Measure a further signal at {one.port.subsystem}, or choose by what is known of the hardware: no motion that "
             f"was tried separates {one.name} from {other.name}, so their predictions hardly differ."
         )
-    if result.verdict == "mismatch_not_identified" and result.model.simulates:
-        return (
-            "Offer the simulator's parameters that are nominally off ([[offer]]), or record slower and faster motions with "
-            "rests, and diagnose again: no known effect at its inputs and outputs fits."
-        )
-    if result.verdict == "mismatch_not_identified":
-        return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
+    if unexplained := _unexplained(result):
+        return unexplained
     if unsure and (places := placeless(result)):
         return f"Record a signal between {' and '.join(places)} as well: it alone can tell the place of the effect."
     if unsure:
@@ -118,6 +115,33 @@ def next_step(result: Diagnosis) -> str:
         return undecided[0].says
     with_values = f" with {moved}" if (moved := refitted(result)) else ""
     return f"Nothing: the nominal model explains these recordings{with_values}."
+
+
+def _unexplained(result: Diagnosis) -> str:
+    """What to do about a residual that no effect explains; empty where there is none."""
+    if any(f.id == "session" for f in result.findings):
+        return "Find what was changed between the recordings, or diagnose those that agree with each other apart."
+    if result.verdict == "mismatch_not_identified" and result.model.simulates:
+        return (
+            "Offer the simulator's parameters that are nominally off ([[offer]]), or record slower and faster motions with "
+            "rests, and diagnose again: no known effect at its inputs and outputs fits."
+        )
+    above = result.verdict == "mismatch_not_identified" or any(f.id == "noise_unseen" for f in result.findings)
+    if above and not effects(result) and (beside := unused(result.spec)):
+        return (
+            f"Name the channels that may play a part under `others` of the {result.spec.kind} and diagnose again: no known "
+            f"effect explains the residual, and the nominal model does not use {', '.join(beside)}."
+        )
+    if result.verdict == "mismatch_not_identified":
+        return "Record slower and faster motions of single axes, with rests, and diagnose again: no known effect fits."
+    return ""
+
+
+def unused(spec: NominalSpec) -> list[str]:
+    """Channels that a transmission or an impedance declares and does not read: no effect can depend on them."""
+    if spec.kind not in ("transmission", "impedance"):
+        return []
+    return [name for name in spec.channels if name not in channels_of(spec)[0]]
 
 
 def refitted(result: Diagnosis) -> str:
