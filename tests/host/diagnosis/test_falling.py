@@ -34,7 +34,7 @@ Law = Callable[[Array, Array, Array, Array], Array]
 def pressed(seed: int, law: Law, noise_N: float = 0.02) -> dict[str, Array]:
     """Force of a press along a motion with the exact speed and acceleration, of 20 s."""
     rng = np.random.default_rng(seed)
-    t: Array = np.arange(4000, dtype=np.float64) * 0.005
+    t: Array = np.arange(4000) * 0.005
     x: Array = np.zeros(t.size)
     v: Array = np.zeros(t.size)
     a: Array = np.zeros(t.size)
