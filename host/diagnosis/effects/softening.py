@@ -1,10 +1,10 @@
-"""Softening: gain or stiffness changes with time or with the distance travelled; likewise the mass or damping of a law."""
+"""Softening: gain or stiffness changes with time or with the distance travelled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -37,8 +37,8 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Relative change of stiffness, mass or damping per second."""
-    return {{"": "softening", "mass": "mass_rate", "damping": "damping_rate"}[form]: p[0]}
+    """Relative change of stiffness per second."""
+    return {"softening": p[0]}
 
 
 def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
@@ -47,7 +47,7 @@ def apply_shape(state: dict, c: Context, p: Array, form: str) -> dict:
 
 
 def fixed(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Return the parameter `rate`, relative change per second: small steps, since a plant's response is not linear in it."""
+    """Return the parameter `rate`, relative change per second."""
     return (Parameter("rate", "1/s", (0.1 / s.duration_s,), -10.0 / s.duration_s, 10.0 / s.duration_s, linear=True),)
 
 
@@ -56,16 +56,6 @@ def apply_contact(law: dict, c: Context, p: Array, form: str) -> dict:
     return {**law, "stiffness": law["stiffness"] * np.maximum(1.0 + p[0] * c.time_s, 0.02)}
 
 
-_FORCE = Effect(
-    "softening",
-    "force",
-    22,
-    fixed,
-    "The stiffness changes over time, by {rate} of its value.",
-    "F = stiffness*rate*t*x",
-    slots=slots,
-    timed=True,
-)
 EFFECTS = (
     Effect(
         "softening",
@@ -118,7 +108,14 @@ EFFECTS = (
         timed=True,
         forms=("run_in",),
     ),
-    _FORCE,
-    in_form(_FORCE, "mass", "The mass changes over time, by {rate} of its value.", "F = mass*rate*t*a"),
-    in_form(_FORCE, "damping", "The damping changes over time, by {rate} of its value.", "F = damping*rate*t*v"),
+    Effect(
+        "softening",
+        "force",
+        22,
+        parameters,
+        "The stiffness changes over time, by {rate} of its value.",
+        "F = stiffness*rate*t*x",
+        slots=slots,
+        timed=True,
+    ),
 )

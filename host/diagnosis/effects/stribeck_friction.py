@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, spread
 from host.diagnosis.model.operators import dahl
 
 
@@ -14,19 +12,20 @@ def lost(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Extra lost motion at rest, and the speed at which it has gone."""
     return (
         Parameter("kinetic", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
-        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True, further=True),
+        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
         Parameter("speed", f"{s.unit}/s", spread(0.1 * s.speed, 1.5 * s.speed, 3), 0.01 * s.speed, 10 * s.speed, log=True),
     )
 
 
 def force(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Kinetic force, excess of the static force, the Stribeck speed, and the distance over which the bristles yield; second
-    form: in its place the far lower speed below which friction rises, as that of a lubricated or simulated contact.
-    """
-    builds_up = (
-        Parameter("rise_speed", f"{s.motion_unit}/s", (0.02 * s.speed,), 2e-3 * s.speed, s.speed, log=True, vanishes=True)
-        if form == "smooth"
-        else Parameter(
+    """Kinetic force, excess of the static force, the Stribeck speed, and the distance over which the bristles yield."""
+    return (
+        Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
+        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True),
+        Parameter(
+            "speed", f"{s.motion_unit}/s", spread(0.05 * s.speed, 1.0 * s.speed, 4), 0.005 * s.speed, 10 * s.speed, log=True
+        ),
+        Parameter(
             "distance",
             s.motion_unit,
             spread(2e-3 * s.motion_span, 0.05 * s.motion_span, 3),
@@ -34,15 +33,7 @@ def force(s: Scale, form: str) -> tuple[Parameter, ...]:
             s.motion_span,
             log=True,
             vanishes=True,
-        )
-    )
-    return (
-        Parameter("kinetic_force", s.unit, (0.7 * s.need,), 0.0, np.inf, linear=True),
-        Parameter("static_excess", s.unit, (s.need,), 0.0, np.inf, linear=True, further=True),
-        Parameter(
-            "speed", f"{s.motion_unit}/s", spread(0.05 * s.speed, 1.0 * s.speed, 4), 0.005 * s.speed, 10 * s.speed, log=True
         ),
-        builds_up,
     )
 
 
@@ -53,33 +44,10 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 def slots(p: Array, form: str) -> dict[str, float]:
-    """Kinetic level, static excess, Stribeck speed, and the bristles' distance or the speed at which friction has risen."""
-    if form == "smooth":
-        return {"smooth": p[0], "smooth_excess": p[1], "stribeck_speed": p[2], "smooth_speed": p[3]}
+    """Kinetic level, static excess, Stribeck speed, and the bristles' distance."""
     return {"coulomb": p[0], "static_excess": p[1], "stribeck_speed": p[2], "stribeck_distance": p[3]}
 
 
-_FORCE = Effect(
-    "stribeck_friction",
-    "force",
-    13,
-    force,
-    "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and {static_excess} more at rest.",
-    "F = (kinetic + static_excess*exp(-(v/speed)^2))*z,  dz = (1 - z*sign(dx))*dx/distance",
-    slots=slots,
-    timed=True,
-    contains=("coulomb_friction", "presliding_friction"),
-    family="dry",
-    remembers=True,
-    dissipates=True,
-)
-_RISING = in_form(
-    _FORCE,
-    "smooth",
-    "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and {static_excess} more near rest; below "
-    "{rise_speed} it is smaller.",
-    "F = (kinetic + static_excess*exp(-(v/speed)^2))*tanh(v/rise_speed)",
-)
 EFFECTS = (
     Effect(
         "stribeck_friction",
@@ -95,6 +63,18 @@ EFFECTS = (
         remembers=True,
         dissipates=True,
     ),
-    _FORCE,
-    replace(_RISING, contains=("coulomb_friction",), remembers=False),
+    Effect(
+        "stribeck_friction",
+        "force",
+        13,
+        force,
+        "Friction falls with speed: it is {kinetic_force} above a speed of {speed}, and {static_excess} more at rest.",
+        "F = (kinetic + static_excess*exp(-(v/speed)^2))*z,  dz = (1 - z*sign(dx))*dx/distance",
+        slots=slots,
+        timed=True,
+        contains=("coulomb_friction", "presliding_friction"),
+        family="dry",
+        remembers=True,
+        dissipates=True,
+    ),
 )

@@ -69,8 +69,6 @@ class SelectionRules:
     equal_significance: float = 0.01  # or p-value above which
     equal_error: float = 0.1  # or difference of errors below which, since formulas are idealized,
     equal_mismatch: float = 0.05  # or part of the mismatch
-    further_share: float = 0.5  # of the effect's size: what a rival that contains it and ended as it is held to have more,
-    absorbed_fits: int = 6  # fitted from so many starts
     equal_likelihood_ratio: float = 0.25  # while the difference is below this part of the effect's own gain
 
     # None of these: what known effects leave.

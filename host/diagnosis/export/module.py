@@ -131,7 +131,7 @@ def _axis(model: AxisModel, theta: Array, active: list[ActiveEffect], gathered: 
     given = dict(zip(spec.terms, map(float, theta), strict=True))
     linear = [given.get("mass", 1.0), given.get("damping", 0.0), given.get("stiffness", 0.0), given.get("offset", 0.0)]
     slots = [c.effect.slots(values, c.form) for c, values in active if c.effect.slots is not None]
-    p = slot_array([*slots, dict(zip(("mass", "damping", "stiffness"), linear, strict=False))])
+    p = slot_array([*slots, {"stiffness": linear[2]}])
     names = {"input": spec.input, "output": spec.output, "subsystem": spec.subsystem, "reads": spec.reads}
     substeps = 2 if "stiffness" not in spec.terms else 3
     return (

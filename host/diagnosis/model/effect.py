@@ -36,7 +36,6 @@ class Parameter:
     dead_time: bool = False  # the output's first so many seconds come from what was before the recording
     follows: str = ""  # nominal parameter whose sign it has: a branch of a spring counts as the spring does
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
-    further: bool = False  # an amount at whose zero the effect is the simpler one that it contains
 
     @property
     def key(self) -> str:

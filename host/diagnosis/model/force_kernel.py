@@ -51,11 +51,6 @@ SLOTS = (
     "drive_limit",
     "smooth",
     "smooth_speed",
-    "smooth_excess",
-    "mass",
-    "mass_rate",
-    "damping",
-    "damping_rate",
     "constant",
 )
 PLACE = {name: index for index, name in enumerate(SLOTS)}
@@ -101,15 +96,9 @@ PLACE = {name: index for index, name in enumerate(SLOTS)}
     DRIVE_LIMIT,
     SMOOTH,
     SMOOTH_SPEED,
-    SMOOTH_EXCESS,
-    MASS,
-    MASS_RATE,
-    DAMPING,
-    DAMPING_RATE,
     CONSTANT,
 ) = range(len(SLOTS))
 TWO_PI = 2.0 * math.pi
-LEAST_MASS = 0.02  # share of its value that a mass keeps however long it falls
 SHARP = 0.1  # bend of a motion at its reversal, over the tolerance, from which its samples place the reversal
 FOOT = 1.0 / (math.sqrt(10.0) - 1.0)  # of a parabola before its height is 0.1, in the time it takes from there to 1
 
@@ -121,7 +110,6 @@ def smooth_force(x: float, v: float, t: float, slow: float, p: Array) -> float:
     """
     force = p[VISCOUS] * v + p[DRAG] * v * abs(v) + p[ASYMMETRY] * abs(v) + p[QUADRATIC] * x * x + p[CUBIC] * x * x * x
     force += p[CONSTANT] + p[MAXWELL_K] * (x - slow) + p[SOFTENING] * t * p[STIFFNESS] * x
-    force += p[DAMPING_RATE] * t * p[DAMPING] * v
     force -= p[STIFFNESS] * min(max(x, -p[GAP]), p[GAP])
     if p[PITCH] > 0.0:
         force += p[SINE] * math.sin(TWO_PI * x / p[PITCH]) + p[COSINE] * math.cos(TWO_PI * x / p[PITCH])
@@ -142,21 +130,9 @@ def level_at(v: float, p: Array) -> float:
 
 
 @njit(cache=True)
-def _risen(v: float, p: Array) -> float:
-    """Level at speed v of the law that rises with speed, once it has risen: what it has more near rest falls again."""
-    return p[SMOOTH] + (p[SMOOTH_EXCESS] * math.exp(-((v / p[STRIBECK]) ** 2)) if p[STRIBECK] > 0.0 else 0.0)
-
-
-@njit(cache=True)
 def _rising(v: float, p: Array) -> float:
     """Friction at speed v of the law that rises with speed; nothing where there is none."""
-    return _risen(v, p) * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
-
-
-@njit(cache=True)
-def mass_at(t: float, mass: float, p: Array) -> float:
-    """Mass at time t, which changes in proportion to time. What leaves it does so at the speed of the rest."""
-    return mass * max(1.0 + p[MASS_RATE] * t, LEAST_MASS)
+    return p[SMOOTH] * math.tanh(v / p[SMOOTH_SPEED]) if p[SMOOTH_SPEED] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -291,7 +267,7 @@ def along(
         dx = x[i] - x[i - 1] if i > 0 else 0.0
         slow = x[i] + (slow - x[i]) * decay
         out[i] = smooth_force(x[i], v[i], t[i], slow, p) + hysteresis(z, dx, v[i], load[i], p)
-        out[i] += _rising(v[i], p) + p[MASS_RATE] * t[i] * p[MASS] * a[i]
+        out[i] += _rising(v[i], p)
         if dry and p[STRIBECK_D] <= 0.0:
             out[i] += level_at(v[i], p) * (side[i] if side[i] != 0.0 else rest)
         if p[MASS2] > 0.0:
@@ -313,7 +289,7 @@ def _accelerations(
     if p[MASS2] > 0.0:
         pull = p[OMEGA2] * p[OMEGA2] * (x - x2) + 2.0 * p[DAMPING2] * p[OMEGA2] * (v - v2)
         force -= p[MASS2] * linear[0] * pull
-    return force / mass_at(t, linear[0], p), pull
+    return force / linear[0], pull
 
 
 @njit(cache=True)
@@ -350,8 +326,6 @@ def polynomial(p: Array) -> bool:
     return (
         p[MAXWELL_K] == 0.0
         and p[SOFTENING] == 0.0
-        and p[MASS_RATE] == 0.0
-        and p[DAMPING_RATE] == 0.0
         and p[GAP] == 0.0
         and p[PITCH] <= 0.0
         and p[FREQUENCY] <= 0.0
@@ -425,7 +399,7 @@ def run_axis(
     """
     n = load.size
     out = np.empty((4, n))
-    offset, h = linear[3], dt_s / substeps
+    m, offset, h = linear[0], linear[3], dt_s / substeps
     s = (begin[0], begin[1], begin[0], begin[1])
     z = np.zeros(6)
     start_state(z, start, load[0], p)
@@ -433,11 +407,9 @@ def run_axis(
     decay = math.exp(-h / p[MAXWELL_T]) if p[MAXWELL_T] > 0.0 else 0.0
     previous, drive = begin[0], 0.0
     short = polynomial(p)
-    m = linear[0]
     q = ((linear[1] + p[VISCOUS]) / m, p[DRAG] / m, p[ASYMMETRY] / m, linear[2] / m, p[QUADRATIC] / m, p[CUBIC] / m)
     remembers = p[PRESLIDING] != 0.0 or p[LOAD] != 0.0 or p[STRIBECK_D] > 0.0
     for i in range(n):
-        m = mass_at(begin_s + i * dt_s, linear[0], p)
         if control.size:
             drive = (
                 control[2] * control[1] * (control[0] * (reference[0, i] - s[0]) - (s[0] - previous) / dt_s)
@@ -459,7 +431,7 @@ def run_axis(
                 else (u[i, j, 0] + more, u[i, j, 1] + more, u[i, j, 2] + more)
             )
             # Half the impulse of friction that rises with speed before the step, half after it (Strang 1968).
-            s = (s[0], _slowed(s[1], 0.5 * h / m * _risen(s[1], p), p[SMOOTH_SPEED]), s[2], s[3])
+            s = (s[0], _slowed(s[1], 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED]), s[2], s[3])
             x_old, v_old = s[0], s[1]
             dry = level_at(v_old, p) if p[STRIBECK_D] <= 0.0 else 0.0
             if short:
@@ -474,7 +446,7 @@ def run_axis(
                 v_dry, stuck = _dry(v_old, v, a, dry, h, m)
                 x = x_old if stuck else x + 0.5 * h * (v_dry - v)
                 v = v_dry
-            v = _slowed(v, 0.5 * h / m * _risen(v, p), p[SMOOTH_SPEED])
+            v = _slowed(v, 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED])
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay
             if remembers:

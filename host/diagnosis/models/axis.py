@@ -98,7 +98,6 @@ class AxisModel(Model):
         self.taken = frozenset(["viscous_friction:"] if "damping" in self.spec.terms else [])
         if "stiffness" not in self.spec.terms:
             self.taken |= {"softening:", "contact_nonlinear:"}
-        self.taken |= {f"softening:{term}" for term in ("mass", "damping") if term not in self.spec.terms}
         if "stiffness" in self.spec.terms or "offset" in self.spec.terms:  # it is an offset of the reading, or nominal
             self.taken |= {"gravity_load:constant"}
         self.travel = ((self.spec.output.replace("_", " "), f"motion:{name}", place),)
@@ -256,8 +255,7 @@ class AxisModel(Model):
             for candidate, values in active
             if candidate.effect.slots is not None
         ]
-        law = dict(zip(("mass", "damping", "stiffness"), map(float, linear), strict=False))
-        p = slot_array([*slots, law] if slots else [])
+        p = slot_array([*slots, {"stiffness": float(linear[2])}])
         load = np.zeros(segment.n)
         if spec.controller is not None:
             c = spec.controller

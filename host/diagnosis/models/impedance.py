@@ -79,7 +79,6 @@ class ImpedanceModel(Model):
         self.taken = frozenset(("gravity_load:constant", *(have[term] for term in self.spec.terms if term in have)))
         if "stiffness" not in self.spec.terms:
             self.taken |= {"contact_nonlinear:", "softening:"}
-        self.taken |= {f"softening:{term}" for term in ("mass", "damping") if term not in self.spec.terms}
         self.travel = tuple((n.replace("_", " "), n, self.units[n]) for n in (self.spec.input, *loads))
         self.unlisted_at = ((name, f"{name}_reading"),)
         self.moves = {name: self.spec.input}
@@ -112,16 +111,13 @@ class ImpedanceModel(Model):
         force = np.zeros(segment.n)
         moved = segment.moved
         given = {"mass": moved.a, "damping": moved.v, "stiffness": moved.x, "offset": 1.0}
+        stiffness = 0.0
         for (term, source), value in zip(self.terms, theta, strict=True):
             force = force + value * (segment.inputs[source] if term == "load" else given[term])
-        law = {
-            term: float(value)
-            for (term, _), value in zip(self.terms, theta, strict=True)
-            if term in given and term != "offset"
-        }
+            stiffness = value if term == "stiffness" else stiffness
         port = self.spec.subsystem
         here = [effect for effect in active if effect[0].port.name == port]
-        force = force + force_along(segment.moved, here, segment, port, law)
+        force = force + force_along(segment.moved, here, segment, port, float(stiffness))
         return np.asarray(apply_effects(force, active, f"{self.spec.subsystem}_reading", segment, None))[None, :]
 
     def motion(self, segment: Segment, port: Port) -> Array:

@@ -49,16 +49,14 @@ class Moved:
         return cls(motion if clean else x, v, a, tolerance)
 
 
-def force_along(moved: Moved, here: list[ActiveEffect], segment: Segment, port: str, law: dict[str, float]) -> Array:
-    """Force (n,) of the effects `here`, all of them at `port`, along its motion. law: the nominal model's mass, damping and
-    stiffness, as far as it has them.
-    """
+def force_along(moved: Moved, here: list[ActiveEffect], segment: Segment, port: str, stiffness: float = 0.0) -> Array:
+    """Force (n,) of the effects `here`, all of them at `port`, along its motion. stiffness: of the nominal model."""
     force = np.zeros(segment.n)
     terms = [(candidate, values) for candidate, values in here if candidate.effect.slots is not None]
     for source in dict.fromkeys(candidate.source for candidate, _ in terms):
         filled = [c.effect.slots(values, c.form) for c, values in terms if c.source == source and c.effect.slots is not None]
         load = segment.inputs[source] if source else np.zeros(segment.n)
-        p = slot_array([*filled, law])
+        p = slot_array([*filled, {"stiffness": stiffness}])
         time_s, dt_s = segment.recording.time_s, segment.recording.dt_s
         start = segment.start.get(port, 0.0)
         force = force + along(moved.x, moved.v, moved.a, load, time_s, dt_s, moved.tolerance, start, p)

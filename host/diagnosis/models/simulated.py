@@ -123,7 +123,6 @@ class SimulatedModel(Model):
         self.forced, self.chain = self._forced(), self._chain()
         self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
         self.ports = (*self._signal_ports(), *self._offered_ports(offers))
-        self.taken = frozenset({"softening:mass", "softening:damping"})  # the simulator has no law of which they are a part
         parameters = []
         for key, declared in spec.parameters.items():
             low, high = declared.bounds() if declared.free else (declared.value, declared.value)
@@ -291,7 +290,7 @@ class SimulatedModel(Model):
         for name, (force, motion) in self.forced.items():
             here = [effect for effect in active if effect[0].port.name == name]
             if force == output and here:
-                total = total + force_along(self._moved_of(segment, motion), here, segment, name, {})
+                total = total + force_along(self._moved_of(segment, motion), here, segment, name)
         return total
 
     def _payload(self, segment: Segment, active: list[ActiveEffect]) -> Array | float:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import Gain, compare, correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, grid_points, minimize, set_starts, starts
+from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
@@ -259,10 +259,6 @@ def _equals(
         set_starts(problem, begun)
         contained = candidate.effect.id in trial.candidate.effect.contains
         if contained and (at_bound(other) or _collapsed(problem, best, other)):
-            absorbed = _absorbed(problem, best, less, candidate, trial, noise_sd)
-            if absorbed is not None:
-                refitted.append((trial.candidate, absorbed))
-                kept += [trial.candidate] if len(kept) < problem.rules.most_equals else []
             continue
         if at_bound(other) and other.fitted > best.fitted:
             continue  # its further parameter ended at a bound, so it says what the simpler one says
@@ -273,38 +269,6 @@ def _equals(
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
-
-
-def _absorbed(problem: Problem, best: Fit, less: Fit, candidate: Candidate, trial: Trial, noise_sd: Array) -> float | None:
-    """Coarsened difference of a rival that contains `candidate` and ended as it, if the data allow the rival all the same.
-
-    What the rival has more (`Parameter.further`) is held at a part of the size of `candidate`. If the model is then as
-    likely, and only because nominal parameters took it over, the data cannot exclude it: friction that falls with speed is
-    dry friction with less damping. If nominal parameters stay where they are, what it has more changes nothing: None.
-    """
-    rules, begun = problem.rules, get_starts(problem)
-    term, own = term_of(problem, trial.candidate, less), next(t for t in best.terms if t.candidate.key == candidate.key)
-    size = sum(float(v) for p, v in zip(own.parameters, best.values_of(own), strict=True) if p.linear)
-    held = tuple(
-        replace(p, low=rules.further_share * size, high=rules.further_share * size) if p.further else p
-        for p in term.parameters
-    )
-    if size == 0.0 or held == term.parameters:
-        return None
-    term, n = replace(term, parameters=held), len(problem.model.parameters)
-    amounts = {p.name: (rules.further_share if p.further else 1.0 - rules.further_share) * size for p in held if p.linear}
-    allowed = []
-    for point in grid_points(held, rules.absorbed_fits):
-        begin = np.concatenate((less.values, starts(term, amounts, point)))
-        other = minimize(problem, (*less.terms, term), begin, rounds=rules.further_iterations, tolerance=1e-4)
-        other = finish(problem, begun_again(problem, other))
-        ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
-        moved = finish(problem, replace(best, values=np.concatenate((other.values[:n], best.values[n:]))))
-        taken_over = compare(problem.segments, "both", moved.residuals, best.residuals, noise_sd)
-        set_starts(problem, begun)
-        if ahead.log_likelihood < rules.equal_log_likelihood < taken_over.log_likelihood:
-            allowed.append(coarse(ahead, best.fitted - other.fitted - 1, rules))
-    return min(allowed, default=None)
 
 
 def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:

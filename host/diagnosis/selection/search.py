@@ -320,11 +320,10 @@ def _promising(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Scre
 
 
 def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Screened], noise_sd: Array) -> list[Trial]:
-    """`trials`, and the simpler shapes and other forms of the first that were screened but not fitted; ranked again.
+    """`trials`, and the simpler shapes of the first that were screened but not fitted; ranked again.
 
     A richer shape can promise more than each of the simpler ones it contains, and several rich ones fill the places of a
-    port. Which of them the data call for shows only where all are fitted. The same holds of the first one's other forms
-    with no more parameters: what changes over time, a mass or a spring, hardly differs to first order.
+    port. Which of them the data call for shows only where all are fitted.
     """
     if not trials or problem.budget.spent():
         return trials
@@ -333,11 +332,9 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
         item
         for item in ranked
         if item.candidate.key not in fitted
+        and item.candidate.effect.id in top.effect.contains
         and related(item.candidate, top)
-        and (
-            (item.candidate.effect.id in top.effect.contains and item.promise > problem.rules.screening_log_likelihood)
-            or (item.candidate.effect.id == top.effect.id and item.term.fitted <= trials[0].fit.terms[-1].fitted)
-        )
+        and item.promise > problem.rules.screening_log_likelihood
     ]
     if not missing:
         return trials
