@@ -57,6 +57,9 @@ _SETTINGS: dict[str, Any] = {
         }
     ],
 }
+# What ends a publisher waits so long between its looks at whether another thread is still in a call of it.
+_IN_USE_S = 0.0005
+_ENDED = "found a publisher or subscriber that is ended, wanted one that is declared"
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
 
 
@@ -99,6 +102,47 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
+class _Shared:
+    """A publisher or subscriber of zenoh's for several threads: a call while another thread ends it raises ZError.
+
+    zenoh 1.x lends its Python object to each call, so that ending one that is in use, and using one that is ended in
+    the same moment, raises RuntimeError.
+    """
+
+    def __init__(self, declared: zenoh.Publisher | zenoh.Subscriber[Any]) -> None:
+        self._declared: Any = declared
+        self._ended = False
+
+    def put(self, payload: bytes) -> None:
+        """Publish `payload`. Raises ZError once it is ended."""
+        if self._ended:
+            raise zenoh.ZError(_ENDED)
+        try:
+            self._declared.put(payload)
+        except RuntimeError:
+            raise zenoh.ZError(_ENDED) from None
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """Return the oldest sample that waits, None if none does. Raises ZError once it is ended."""
+        if self._ended:
+            raise zenoh.ZError(_ENDED)
+        try:
+            sample: zenoh.Sample | None = self._declared.try_recv()
+        except RuntimeError:
+            raise zenoh.ZError(_ENDED) from None
+        return sample
+
+    def undeclare(self) -> None:
+        """End it, after the calls that are in it; later calls raise ZError."""
+        self._ended = True
+        while True:
+            try:
+                self._declared.undeclare()
+                return
+            except RuntimeError:
+                time.sleep(_IN_USE_S)
+
+
 class Publisher:
     """Publishes one topic, numbered. `put` never blocks: a message that a reader does not read in time is dropped.
 
@@ -110,8 +154,8 @@ class Publisher:
         self.sequence = 0
         self.refused = 0
         self.complaint = ""
-        self._publisher = session.declare_publisher(
-            key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False
+        self._publisher = _Shared(
+            session.declare_publisher(key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False)
         )
 
     def put(self, message: Message) -> None:
@@ -143,7 +187,7 @@ class Latest:
         self.topic = TOPICS[topic]
         self.malformed = 0
         self.complaint = ""
-        self._subscriber = session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(1))
+        self._subscriber = _Shared(session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(1)))
 
     def take(self) -> Message | None:
         """Return the newest message since the last call, None if there is none or it is malformed."""
@@ -166,7 +210,7 @@ class RecentSamples:
     """The newest `depth` messages of one topic, as zenoh's samples."""
 
     def __init__(self, session: zenoh.Session, rig: str, topic: str, depth: int) -> None:
-        self._subscriber = session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(depth))
+        self._subscriber = _Shared(session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(depth)))
 
     def try_recv(self) -> zenoh.Sample | None:
         """Return the oldest sample that waits, None if none does."""
@@ -185,7 +229,9 @@ class Everything:
         self.complaint = ""
         self._depth = depth
         names = [name for name, topic in TOPICS.items() if topic.kind != "query"]
-        self._subscribers = [session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth)) for name in names]
+        self._subscribers = [
+            _Shared(session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth))) for name in names
+        ]
 
     def take(self) -> list[tuple[str, Message, bytes]]:
         """Return (topic, message, payload) of all messages since the last call, topic by topic."""
