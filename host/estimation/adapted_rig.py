@@ -71,9 +71,12 @@ class AdaptedRigEstimator:
     ) -> TipForce:
         """The force by the adapted stiffness, with that by the file's as `nominal`. Raises: InputError (bad input)."""
         nominal = self._nominal.estimate(pose_tip, pose_shaft, actuation, pose_rear)
+        before_per_m = self._tracker.adapted_curvature(actuation.curvature_per_m)
         state, why = self._learn(pose_tip, pose_shaft, actuation)
         self._use(state)
         bent = actuation._replace(curvature_per_m=self._tracker.adapted_curvature(actuation.curvature_per_m))
+        # `adapted` follows the curvature's error by the same poses: what the tracker takes over must not count twice.
+        self._user.restate_curvature(bent.curvature_per_m - before_per_m)
         try:
             answer = self._adapted.estimate(pose_tip, pose_shaft, bent, pose_rear)
         except (InputError, ArithmeticError):

@@ -89,3 +89,10 @@ class StiffnessUser(Protocol):
     def use_stiffness(self, catheter: Catheter, relative_sd: float) -> None:
         """Use the stiffness of `catheter` from now on, known to `relative_sd`."""
         ...
+
+    def restate_curvature(self, by_per_m: float) -> None:
+        """Expect every curvature from now on larger by this (1/m) at the same place of the knob.
+
+        What was learned of the curvature's error becomes smaller by as much.
+        """
+        ...

@@ -195,6 +195,11 @@ class LastingErrors:
         self._covariance[_ALONG_WALL, _ALONG_WALL] += (1.0 - kept**2) * self._wall_N2 * np.eye(3)
         self._mean[_ALONG_WALL] *= kept
 
+    def restate_curvature(self, by_per_m: float) -> None:
+        """Expect every curvature from now on larger by this (1/m) where the knob did not move: the shaft did not either."""
+        self._mean[CURVATURE] -= by_per_m
+        self._visited = (self._visited[0] + by_per_m, self._visited[1] + by_per_m)
+
     def _beyond(self, curvature_per_m: float, seconds: float) -> float:
         """Return how far the curvature is outside those visited lately, and take it among them."""
         kept = math.exp(-seconds / _VISIT_MEMORY_S)

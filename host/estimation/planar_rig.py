@@ -107,6 +107,10 @@ class PlanarRigEstimator:
         self._catheter = catheter
         self._contact = replace(self._contact, stiffness_sd=relative_sd)
 
+    def restate_curvature(self, by_per_m: float) -> None:
+        """Expect every curvature from now on larger by this (1/m), and what was learned of its error smaller by as much."""
+        self.errors.restate_curvature(by_per_m)
+
     def estimate(
         self,
         pose_tip: PoseReading,
