@@ -70,5 +70,17 @@ EFFECTS = (
         apply,
         at_rest=True,
         invariant=True,
+        affine=True,
+    ),
+    # Not invariant: behind a plant that integrates it is a ramp.
+    Effect(
+        "sensor_bias",
+        "shift",
+        27,
+        scalar,
+        "What acts is the recorded input with a constant offset of {offset}.",
+        "u = x + offset",
+        apply,
+        at_rest=True,
     ),
 )

@@ -55,5 +55,6 @@ EFFECTS = (
         "y = x*(1 + gain_error)",
         apply,
         invariant=True,
+        affine=True,
     ),
 )

@@ -164,6 +164,7 @@ class Effect:
     shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
     joins: tuple[tuple[str, str], ...] = ()  # effects (id, form) of one parameter each that it is the sum of, in their order
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
+    affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ signals cause.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,6 +63,9 @@ class LinearModel(SimulatedModel):
         self.hold, self.hold_stated = self.spec.hold, "hold" in self.spec.model_fields_set
         self.holds = HOLDS if self.spec.period_s is None and self.spec.feedback is None else ()
         self.offs = {offer.parameter: offer.off for offer in spec.offer}
+        if self.spec.feedback is not None or not self._integrates():
+            # A constant offset of the input does what one of the reading does: the initial state takes the difference.
+            self.ports = tuple(replace(port, kind=port.kind.replace("+shift", "")) for port in self.ports)
         if self.spec.feedback is not None:
             output, channels = self.spec.feedback.output, tuple(self.spec.outputs)
             self.inside_units = {actuation: self.units.get(self.spec.feedback.actuation, ""), fed_back: self.units[output]}
@@ -69,6 +73,12 @@ class LinearModel(SimulatedModel):
                 Port(actuation, "motion", name, channels, held=True),
                 Port(fed_back, "drift+timing+limit", self.subsystem_of(output), channels),
             )
+
+    def _integrates(self) -> bool:
+        """Whether a constant input moves the nominal plant for ever."""
+        A = self.matrices({**self.offs, **{p.name: p.grid[0] for p in self.parameters}})[0]
+        at_rest = A - np.eye(A.shape[0]) if self.spec.period_s is not None else A
+        return A.size > 0 and bool(np.linalg.matrix_rank(at_rest) < A.shape[0])
 
     def _check(self, spec: NominalSpec) -> None:
         section = self.spec
