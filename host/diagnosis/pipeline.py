@@ -439,7 +439,10 @@ def _figures(full: Problem, found: Found) -> Figures:
     ratio = np.where(after > 0, before / np.maximum(after, 1e-300), 1.0)
     used = np.isfinite(before) & (before > 0)
     primary = int(np.argmax(np.where(used, ratio, 0.0)))
-    return Figures(before, after, np.array([n.sigma for n in full.noise]), white_b, white_a, primary)
+    # The residual is noise and perhaps more: an estimate above it, of parts taken for rest, is too high.
+    left = np.array([rms([r[row] for r in best.residuals]) for row in rows])
+    noise_sd = np.fmin([noise.sigma for noise in full.noise], np.where(left > 0.0, left, np.nan))
+    return Figures(before, after, noise_sd, white_b, white_a, primary)
 
 
 def rms(parts: list[Array]) -> float:

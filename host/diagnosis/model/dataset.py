@@ -176,7 +176,7 @@ def _one(
         raise InputError("data.time", f"more than half of the stamps of {name} repeat", "seconds that increase")
     jitter = float(np.max(np.abs(np.diff(time_s) - dt_s))) / dt_s
     if timed and jitter > 0.2:
-        time_s, channels = _even(time_s, dt_s, channels)
+        time_s, channels = _even(time_s, dt_s, channels, spec.held_inputs)
     nothing = np.zeros(time_s.size, dtype=bool)
     units = {key: channel.unit for key, channel in needed.items()}
     return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter, infinite=infinite)
@@ -210,8 +210,12 @@ def _grid(time_s: Array, dt_s: float) -> Array:
     return np.concatenate(parts)
 
 
-def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Even grid; a grid point further than one and a half periods from any sample stays missing."""
+def _even(time_s: Array, dt_s: float, channels: dict[str, Array], held: tuple[str, ...]) -> tuple[Array, dict[str, Array]]:
+    """Even grid; a grid point further than one and a half periods from any sample stays missing.
+
+    held: channels that keep their value from each stamp to the next. Their grid has the mean over each period, so that what
+    integrates them goes as far as it went; a line between two samples would begin a step before its stamp.
+    """
     grid = _grid(time_s, dt_s)
     after = np.clip(np.searchsorted(time_s, grid), 1, time_s.size - 1)
     hole = (time_s[after] - time_s[after - 1]) > 3.0 * dt_s
@@ -221,10 +225,19 @@ def _even(time_s: Array, dt_s: float, channels: dict[str, Array]) -> tuple[Array
         if np.count_nonzero(good) < 2:
             even[key] = np.full(grid.size, np.nan)
             continue
-        line = np.interp(grid, time_s[good], values[good])
+        on_grid = _mean_of_held if key in held else np.interp
+        line = on_grid(grid, time_s[good], values[good])
         missing = np.interp(grid, time_s, (~good).astype(float)) > 0.49
         even[key] = np.where(missing | hole, np.nan, line)
     return grid, even
+
+
+def _mean_of_held(grid: Array, time_s: Array, values: Array) -> Array:
+    """Mean over the period after each point of `grid` (n,) of a signal that keeps each value until the next stamp."""
+    ends = np.append(grid[1:], 2.0 * grid[-1] - grid[-2])
+    stamps = np.concatenate(([min(time_s[0], grid[0])], time_s[1:], [max(time_s[-1], ends[-1]) + 1.0]))
+    sums = np.concatenate(([0.0], np.cumsum(values * np.diff(stamps))))
+    return np.asarray((np.interp(ends, stamps, sums) - np.interp(grid, stamps, sums)) / (ends - grid))
 
 
 def _cut(whole: Recording, name: str, first: int, last: int, lead: int) -> Recording:

@@ -376,6 +376,15 @@ class NominalSpec(Request):
         return sections.get(self.kind)
 
     @property
+    def held_inputs(self) -> tuple[str, ...]:
+        """Channels that the model takes for constant between samples."""
+        if self.axis is not None:
+            return (self.axis.input,) if self.axis.hold == "zero" else ()
+        if self.linear is not None:
+            return tuple(self.linear.inputs) if self.linear.hold == "zero" else ()
+        return () if self.mujoco is None else tuple(self.mujoco.inputs)
+
+    @property
     def folder(self) -> str:
         """Return the folder of the TOML file, in which its function is searched."""
         return self._folder

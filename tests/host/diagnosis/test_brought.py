@@ -258,3 +258,39 @@ def test_a_closed_loop_is_simulated_without_a_warning(recwarn: pytest.WarningsRe
     y, _ = closed_loop(loop, controller, 0, np.ones(600), np.zeros((2, 600)), np.zeros(2))
     assert y[0, -1] == pytest.approx(1.0, abs=1e-3)
     assert not [w for w in recwarn if "contiguous" in str(w.message)]
+
+
+def test_torque_steps_at_uneven_stamps_are_no_missing_physics() -> None:
+    """A line between two stamps begins a step before it does: its error in speed was named creep, in another draw drift."""
+    rng = np.random.default_rng(4)
+    inertia, damping, drag, rate, size = 0.0767, 0.0506, 0.39, 150.0, 6.0
+    recordings = []
+    for _ in range(3):
+        t = np.concatenate(([0.0], np.cumsum(1.0 + rng.uniform(-0.5, 0.5, 2999)))) / rate
+        changes, levels = np.cumsum(rng.uniform(0.5, 2.5, 60)), rng.uniform(-1.0, 1.0, 61)
+        torque = size * (0.3 + levels[np.searchsorted(changes, t)])
+        speed, now = np.zeros(t.size), 0.0
+        for k in range(1, t.size):
+            left = np.exp(-damping / inertia * (t[k] - t[k - 1]))
+            now = now * left + (torque[k - 1] - drag) / damping * (1.0 - left)
+            speed[k] = now
+        recordings.append({"t": t, "u": torque, "v": speed + 0.1 * rng.standard_normal(t.size)})
+    nominal = {
+        "name": "rotor",
+        "kind": "axis",
+        "data": {"time": "t"},
+        "channels": {"torque": {"column": "u", "unit": "N m"}, "speed": {"column": "v", "unit": "rad/s"}},
+        "axis": {
+            "subsystem": "rotor",
+            "input": "torque",
+            "output": "speed",
+            "terms": ["mass", "damping", "offset"],
+            "reads": "velocity",
+            "hold": "zero",
+        },
+        "parameters": {"mass": 0.08, "damping": 0.045},
+    }
+    verdict = sd.diagnose(recordings, nominal).as_dict()
+    assert verdict["verdict"] == "nothing_missing"
+    assert verdict["fit"]["rmse_before"] < 0.09  # 0.0996 where a line joins two stamps
+    assert verdict["fit"]["noise_floor"] < 0.1  # 1.5 by the parts in which the torque rests and the speed does not
