@@ -113,6 +113,7 @@ class LastingErrors:
         known = self._known
         self._mean = np.array([0.0, 0.0, 0.0, known.flank_mean_m, 0.0, 0.0, 0.0])
         self._covariance = np.diag([*np.square([*known.start, known.flank_m]), *3 * [self._wall_N2]])
+        self._by_first = np.eye(7)[CURVATURE]  # sensitivity of the states to the curvature's error expected at the start
         self._last: Actuation | None = None
         self._side = 0.0
         self._visited = (0.0, 0.0)  # lowest and highest curvature (1/m), from the first actuation on
@@ -147,6 +148,8 @@ class LastingErrors:
         cross = self._covariance @ self._now(prior.across, prior.which).T
         gain = np.linalg.solve(prior.covariance, cross.T).T
         self._mean = self._mean + gain @ (np.asarray(mean) - prior.mean)
+        expected = self._now(prior.across, prior.which) @ self._by_first
+        self._by_first = self._by_first + gain @ (covariance @ np.linalg.solve(prior.covariance, expected) - expected)
         after = self._covariance - gain @ (prior.covariance - covariance) @ gain.T
         self._covariance = 0.5 * (after + after.T)
 
@@ -194,9 +197,15 @@ class LastingErrors:
         self._covariance[_ALONG_WALL, _ALONG_WALL] *= kept**2
         self._covariance[_ALONG_WALL, _ALONG_WALL] += (1.0 - kept**2) * self._wall_N2 * np.eye(3)
         self._mean[_ALONG_WALL] *= kept
+        self._by_first[_ALONG_WALL] *= kept
 
     def restate_curvature(self, by_per_m: float) -> None:
-        """Expect every curvature from now on larger by this (1/m) where the knob did not move: the shaft did not either."""
+        """Expect every curvature from now on larger by this (1/m) where the knob did not move: the shaft did not either.
+
+        At the start no error was expected of the curvature that was given then; now none is expected of the new one. What
+        the states still have of this expectation moves along.
+        """
+        self._mean += self._by_first * by_per_m
         self._mean[CURVATURE] -= by_per_m
         self._visited = (self._visited[0] + by_per_m, self._visited[1] + by_per_m)
 

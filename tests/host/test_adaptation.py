@@ -96,9 +96,9 @@ def test_the_curvature_that_the_adaptation_takes_over_does_not_count_twice(model
         answers.append(estimator.estimate(tip, shaft, actuation(i * 25_000_000, False)))
     assert isinstance(estimator, AdaptedRigEstimator)
     assert len({round(report.scale, 2) for _, report in estimator.reports() if isinstance(report, Stiffness)}) > 1
-    nominal = [answer.nominal for answer in answers if answer.nominal is not None]
-    # The filter of the lasting errors follows the curvature's error from the first pose on; the adaptation from the 26th.
-    assert abs(mean_N(answers[26:]) - mean_N(nominal[26:])) < 0.005
+    # The filter of the lasting errors follows the curvature's error from the first pose on, the adaptation from the 26th.
+    # Taken over twice the mean of the free poses is 45 mN; with what the filter expected at the start kept, 3 to 5 mN.
+    assert abs(mean_N(answers[26:])) < 0.0025
 
 
 def test_the_nominal_answer_is_bit_by_bit_that_without_adaptation() -> None:

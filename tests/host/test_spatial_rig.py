@@ -272,6 +272,27 @@ def test_a_knob_that_turns_to_and_fro_adds_no_uncertainty_and_one_that_goes_furt
     assert errors.covariance[1, 1] > by_time + UNSURE.by_travel[1] ** 2 * 0.9
 
 
+def test_a_curvature_that_is_restated_leaves_the_errors_as_if_it_had_been_given_from_the_start() -> None:
+    """The error of the curvature is 3 1/m, six standard deviations, of which some poses leave a part."""
+    into, seen = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0.3, -0.1, 200.0, 1.0, 0.4]])
+    states = []
+    for restated in (True, False):
+        errors, given_per_m = LastingErrors(UNSURE, 0.02), 18.0 if restated else 21.0
+        for k in range(12):
+            errors.move_to(Actuation(-0.07 + 2e-4 * k, 0.0, given_per_m - 0.3 * k, k * 25_000_000, into[0], "contact"))
+            known = errors.prior(into, ALL_JOINTS)
+            # A reading of force along the wall and joints, with a variance of 1; it shows the curvature's error.
+            gain = known.covariance @ seen.T / (1.0 + seen @ known.covariance @ seen.T)
+            reading = 0.02 * k + (21.0 - given_per_m) * seen[0, 3]
+            mean = known.mean + gain[:, 0] * (reading - seen[0] @ known.mean)
+            errors.learn(known, mean, known.covariance - gain @ seen @ known.covariance)
+        if restated:
+            assert 0.3 < errors.mean[1] < 2.7
+            errors.restate_curvature(3.0)
+        states.append(np.concatenate([errors.mean, errors.prior(into, ()).mean]))
+    assert np.allclose(*states, atol=1e-9)
+
+
 def test_the_lasting_part_is_what_exceeds_the_scatter_of_a_pose_alone() -> None:
     one = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]])
     more = np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])
