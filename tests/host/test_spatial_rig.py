@@ -293,6 +293,21 @@ def test_a_curvature_that_is_restated_leaves_the_errors_as_if_it_had_been_given_
     assert np.allclose(*states, atol=1e-9)
 
 
+def test_a_press_of_three_seconds_in_hold_makes_the_next_force_a_quarter_too_small_at_most() -> None:
+    """A limit of the filter: in hold no force is expected, so a press that lasts counts as an error of the curvature."""
+    into, found = np.array([0.0, 0.0, 1.0]), {}
+    for pressed_N in (0.0, 0.1):
+        rng, one, forces = np.random.default_rng(1), SpatialRigEstimator.from_rig(load_rig(SIMULATED_RIG)), []
+        phases = [("position", None, 0.0)] * 60 + [("hold", None, pressed_N)] * 120 + [("contact", into, 0.2)] * 60
+        for k, (phase, commanded, force_N) in enumerate(phases):
+            tip, shaft = poses(-force_N * into, -0.082, 25.0, 0.0, rng)
+            answer = one.estimate(tip, shaft, Actuation(-0.082, 0.0, 25.0, 25_000_000 * k, commanded, phase))
+            forces.append(float(answer.force_N @ into))
+        found[pressed_N] = float(np.mean(forces[-50:]))
+    assert found[0.0] == pytest.approx(0.2, abs=0.015)
+    assert 0.15 < found[0.1] < 0.2
+
+
 def test_the_lasting_part_is_what_exceeds_the_scatter_of_a_pose_alone() -> None:
     one = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]])
     more = np.outer([1.0, 2.0, -1.0], [1.0, 2.0, -1.0])
