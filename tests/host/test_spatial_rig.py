@@ -290,11 +290,11 @@ def test_a_curvature_that_is_restated_leaves_the_errors_as_if_it_had_been_given_
             assert 0.3 < errors.mean[1] < 2.7
             errors.restate_curvature(3.0)
         states.append(np.concatenate([errors.mean, errors.prior(into, ()).mean]))
-    assert np.allclose(*states, atol=1e-9)
+    assert np.allclose(states[0], states[1], atol=1e-9)
 
 
 def test_a_press_of_three_seconds_in_hold_makes_the_next_force_a_quarter_too_small_at_most() -> None:
-    """A limit of the filter: in hold no force is expected, so a press that lasts counts as an error of the curvature."""
+    """A limit of the filter: without a wall no force is expected, so a lasting press counts as an error of the curvature."""
     into, found = np.array([0.0, 0.0, 1.0]), {}
     for pressed_N in (0.0, 0.1):
         rng, one, forces = np.random.default_rng(1), SpatialRigEstimator.from_rig(load_rig(SIMULATED_RIG)), []
