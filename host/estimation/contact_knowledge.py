@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from host.estimation.interface import Actuation
+from protocol.enums import Phase
 from protocol.rig_file import Rig
 
 
@@ -34,5 +35,6 @@ class ContactKnowledge:
         )
 
     def force_sd(self, actuation: Actuation) -> float:
-        """Standard deviation of the force, N: whether a contact is commanded decides."""
-        return self.free_sd_N if actuation.force_direction is None else self.force_sd_N
+        """Standard deviation of the force, N: whether a contact is commanded decides; a tip that is held may be pressed."""
+        free = actuation.force_direction is None and actuation.mode != Phase.HOLD.label
+        return self.free_sd_N if free else self.force_sd_N
