@@ -57,7 +57,7 @@ _SETTINGS: dict[str, Any] = {
         }
     ],
 }
-# What ends a publisher waits so long between its looks at whether another thread is still in a call of it.
+# Wait before the next attempt to end a publisher or subscriber that another thread is in a call of.
 _IN_USE_S = 0.0005
 _ENDED = "found a publisher or subscriber that is ended, wanted one that is declared"
 _TCP = re.compile(r"tcp/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})")
@@ -102,48 +102,38 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-class _Shared:
-    """A publisher or subscriber of zenoh's for several threads: a call while another thread ends it raises ZError.
+class _Entity:
+    """A publisher or subscriber of zenoh's, for several threads: a call while another thread ends it raises ZError.
 
     zenoh 1.x lends its Python object to each call, so that ending one that is in use, and using one that is ended in
     the same moment, raises RuntimeError.
     """
 
-    def __init__(self, declared: zenoh.Publisher | zenoh.Subscriber[Any]) -> None:
-        self._declared: Any = declared
+    def __init__(self, entity: zenoh.Publisher | zenoh.Subscriber[Any]) -> None:
+        self._entity: Any = entity
         self._ended = False
 
-    def put(self, payload: bytes) -> None:
-        """Publish `payload`. Raises ZError once it is ended."""
+    def _call(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a method of the entity. Raises ZError once it is ended."""
         if self._ended:
             raise zenoh.ZError(_ENDED)
         try:
-            self._declared.put(payload)
+            return call(*arguments)
         except RuntimeError:
             raise zenoh.ZError(_ENDED) from None
-
-    def try_recv(self) -> zenoh.Sample | None:
-        """Return the oldest sample that waits, None if none does. Raises ZError once it is ended."""
-        if self._ended:
-            raise zenoh.ZError(_ENDED)
-        try:
-            sample: zenoh.Sample | None = self._declared.try_recv()
-        except RuntimeError:
-            raise zenoh.ZError(_ENDED) from None
-        return sample
 
     def undeclare(self) -> None:
-        """End it, after the calls that are in it; later calls raise ZError."""
+        """End it, after the calls that are in it; later calls raise ZError, and nothing arrives."""
         self._ended = True
         while True:
             try:
-                self._declared.undeclare()
+                self._entity.undeclare()
                 return
             except RuntimeError:
                 time.sleep(_IN_USE_S)
 
 
-class Publisher:
+class Publisher(_Entity):
     """Publishes one topic, numbered. `put` never blocks: a message that a reader does not read in time is dropped.
 
     refused, complaint: how many messages were not sent because a field was out of bounds, and the newest reason.
@@ -154,7 +144,7 @@ class Publisher:
         self.sequence = 0
         self.refused = 0
         self.complaint = ""
-        self._publisher = _Shared(
+        super().__init__(
             session.declare_publisher(key(rig, topic), congestion_control=zenoh.CongestionControl.DROP, express=False)
         )
 
@@ -172,26 +162,34 @@ class Publisher:
             self.refused += 1
             self.complaint = str(error)
             return
-        self._publisher.put(payload)
+        self._call(self._entity.put, payload)
         self.sequence += 1
 
-    def undeclare(self) -> None:
-        """End the publishing; `put` raises ZError after it."""
-        self._publisher.undeclare()
+
+class RecentSamples(_Entity):
+    """The newest `depth` messages of one topic, as zenoh's samples."""
+
+    def __init__(self, session: zenoh.Session, rig: str, topic: str, depth: int) -> None:
+        super().__init__(session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(depth)))
+
+    def try_recv(self) -> zenoh.Sample | None:
+        """Return the oldest sample that waits, None if none does."""
+        sample: zenoh.Sample | None = self._call(self._entity.try_recv)
+        return sample
 
 
-class Latest:
+class Latest(RecentSamples):
     """The newest value of one topic. Older ones are dropped; malformed ones are counted and not returned."""
 
     def __init__(self, session: zenoh.Session, rig: str, topic: str) -> None:
         self.topic = TOPICS[topic]
         self.malformed = 0
         self.complaint = ""
-        self._subscriber = _Shared(session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(1)))
+        super().__init__(session, rig, topic, 1)
 
     def take(self) -> Message | None:
         """Return the newest message since the last call, None if there is none or it is malformed."""
-        sample = self._subscriber.try_recv()
+        sample = self.try_recv()
         if sample is None:
             return None
         try:
@@ -200,25 +198,6 @@ class Latest:
             self.malformed += 1
             self.complaint = str(error)
             return None
-
-    def undeclare(self) -> None:
-        """End the subscription; nothing arrives after it."""
-        self._subscriber.undeclare()
-
-
-class RecentSamples:
-    """The newest `depth` messages of one topic, as zenoh's samples."""
-
-    def __init__(self, session: zenoh.Session, rig: str, topic: str, depth: int) -> None:
-        self._subscriber = _Shared(session.declare_subscriber(key(rig, topic), zenoh.handlers.RingChannel(depth)))
-
-    def try_recv(self) -> zenoh.Sample | None:
-        """Return the oldest sample that waits, None if none does."""
-        return self._subscriber.try_recv()
-
-    def undeclare(self) -> None:
-        """End the subscription; nothing arrives after it."""
-        self._subscriber.undeclare()
 
 
 class Everything:
@@ -229,9 +208,7 @@ class Everything:
         self.complaint = ""
         self._depth = depth
         names = [name for name, topic in TOPICS.items() if topic.kind != "query"]
-        self._subscribers = [
-            _Shared(session.declare_subscriber(key(rig, name), zenoh.handlers.RingChannel(depth))) for name in names
-        ]
+        self._subscribers = [RecentSamples(session, rig, name, depth) for name in names]
 
     def take(self) -> list[tuple[str, Message, bytes]]:
         """Return (topic, message, payload) of all messages since the last call, topic by topic."""
