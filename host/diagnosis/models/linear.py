@@ -12,7 +12,6 @@ signals cause.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,13 +58,13 @@ class LinearModel(SimulatedModel):
         name = self.spec.subsystem
         actuation, fed_back = f"{name}_actuation", f"{name}_feedback"
         self.inside = (actuation, fed_back) if self.spec.feedback else ()
+        self.offs = {offer.parameter: offer.off for offer in spec.offer}
+        self._nominal_A = self.matrices({**self.offs, **{key: p.value for key, p in spec.parameters.items()}})[0]
+        # Where the plant settles, the initial state takes what an offset of the input does more than one of the reading.
+        self.shifted = self.spec.feedback is None and self._integrates()
         super().__init__(spec, self.spec, spec.offer)
         self.hold, self.hold_stated = self.spec.hold, "hold" in self.spec.model_fields_set
         self.holds = HOLDS if self.spec.period_s is None and self.spec.feedback is None else ()
-        self.offs = {offer.parameter: offer.off for offer in spec.offer}
-        if self.spec.feedback is not None or not self._integrates():
-            # A constant offset of the input does what one of the reading does: the initial state takes the difference.
-            self.ports = tuple(replace(port, kind=port.kind.replace("+shift", "")) for port in self.ports)
         if self.spec.feedback is not None:
             output, channels = self.spec.feedback.output, tuple(self.spec.outputs)
             self.inside_units = {actuation: self.units.get(self.spec.feedback.actuation, ""), fed_back: self.units[output]}
@@ -76,7 +75,7 @@ class LinearModel(SimulatedModel):
 
     def _integrates(self) -> bool:
         """Whether a constant input moves the nominal plant for ever."""
-        A = self.matrices({**self.offs, **{p.name: p.grid[0] for p in self.parameters}})[0]
+        A = self._nominal_A
         at_rest = A - np.eye(A.shape[0]) if self.spec.period_s is not None else A
         return A.size > 0 and bool(np.linalg.matrix_rank(at_rest) < A.shape[0])
 
@@ -147,7 +146,7 @@ class LinearModel(SimulatedModel):
 
         These say the same for all parameters; the state itself depends on how the model is written.
         """
-        order = self.matrices({**self.offs, **{p.name: p.grid[0] for p in self.parameters}})[0].shape[0]
+        order = self._nominal_A.shape[0]
         names: list[str] = []
         means: list[float] = []
         sds: list[float] = []

@@ -114,6 +114,7 @@ class SimulatedModel(Model):
     either_sign = True
     taken = frozenset({"gravity_load:constant"})  # a constant force along a motion is an offset of the reading of force
     inside: tuple[str, ...] = ()  # ports inside the simulator, whose effects `run_many` finds in a run
+    shifted: bool = True  # whether a constant offset of an input is another one than that of a reading
 
     def __init__(self, spec: NominalSpec, section: SimulatorSpec, offers: list[OfferSpec]) -> None:
         self.section, self.specified = section, spec
@@ -155,7 +156,8 @@ class SimulatedModel(Model):
         found = []
         for channel in section.inputs:
             # The simulator may have no gain and no zero at an input: errors of them are candidates, too.
-            kind = "motion+turn+scale+shift" if self.units[channel] == "rad" else "motion+scale+shift"
+            kind = "motion+turn+scale" if self.units[channel] == "rad" else "motion+scale"
+            kind += "+shift" if self.shifted else ""
             others = tuple(other for other in section.inputs if other != channel)
             found.append(Port(channel, kind, self.subsystem_of(channel), tuple(section.outputs), loads, others))
         for channel in section.outputs:
@@ -335,25 +337,21 @@ class SimulatedModel(Model):
         initial = {
             name: value - begin.get(f"offset:{name}", 0.0) for name, value in begin.items() if not name.startswith("offset:")
         }
-        self._undo(initial, active)
+        self._undo(segment, initial, active)
         within = [effect for effect in active if effect[0].port.name in self.inside]
         inside = (segment, within) if within else None
         return SimulatorRun(given, values, segment.recording.time_s, initial, inside, self.rate_of(segment))
 
-    def _undo(self, initial: dict[str, float], active: list[ActiveEffect]) -> None:
+    def _undo(self, segment: Segment, initial: dict[str, float], active: list[ActiveEffect]) -> None:
         """Let each output and its rate begin where the effects on its reading, if affine, have what was read."""
-        for name in self.section.outputs:
-            here = [effect for effect in active if effect[0].effect.affine and effect[0].port.name == f"{name}_reading"]
-            if not here or name not in initial:
-                continue
-            read = np.array([0.0, 1.0])
-            for candidate, values in sorted(here, key=lambda effect: effect[0].effect.order):
-                if candidate.effect.apply is not None:
-                    read = candidate.effect.apply(read, UNUSED, values, candidate.form)
-            gain = float(read[1] - read[0])
-            initial[name] = (initial[name] - float(read[0])) / gain
-            if f"{name}_rate" in initial:
-                initial[f"{name}_rate"] /= gain
+        affine = [effect for effect in active if effect[0].effect.affine]
+        for name in self.section.outputs if affine else ():
+            if name in initial:
+                at_zero, at_one = apply_effects(np.array([0.0, 1.0]), affine, f"{name}_reading", segment, None)
+                gain = float(at_one - at_zero)
+                initial[name] = (initial[name] - float(at_zero)) / gain
+                if f"{name}_rate" in initial:
+                    initial[f"{name}_rate"] /= gain
 
     def rate_of(self, segment: Segment) -> float:
         """Scale of time (1/s) of the derivatives among the initial state."""
@@ -488,7 +486,6 @@ class SimulatedModel(Model):
         )
 
 
-UNUSED = Context(np.zeros(2), 1.0, np.zeros(2), 0.0)  # an affine effect reads no other signal
 UNSCALED = Scale("", 1.0, 0.0, 1.0, 1.0, 1e-3, 1.0, 1e-2, 10.0, True)
 
 
