@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from host.diagnosis.design.experiment import Design, design
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation import noise as noise_module
 from host.diagnosis.estimation.coloured import independent_samples
-from host.diagnosis.estimation.evidence import whiteness
+from host.diagnosis.estimation.evidence import compare, whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
@@ -25,10 +27,10 @@ from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording, load, read_tables, thin
-from host.diagnosis.model.effect import Port
+from host.diagnosis.model.effect import Candidate, Port
 from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
-from host.diagnosis.model.nominal import NominalSpec
+from host.diagnosis.model.nominal import EffectSpec, NominalSpec
 from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
@@ -47,12 +49,14 @@ from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, fit_nominal, search
+from host.diagnosis.selection.trial import WITHIN, Trial, within_sample
 from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
 
 @dataclass
@@ -196,8 +200,22 @@ def diagnose(
         InputError: the recordings do not fit the nominal model's file.
         NothingToCompare: a channel that the comparison needs says nothing.
     """
+    _keep_freed_memory()
     with threadpool_limits(1, "blas"):  # products of a few columns: threads that wait for each other took 4 times the work
         return _diagnosed(spec, sources, progress, left_out, rules, Budget(time_budget_s))
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep up to 256 MiB of freed memory, where it is the C library.
+
+    A fit frees and allocates the same arrays again and again. Pages that are returned to the system each time and cleared
+    again took two fifths of the processor time of some diagnoses of axes.
+    """
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        if mallopt is not None:
+            mallopt(M_TRIM_THRESHOLD, 256 << 20)
+            mallopt(M_MMAP_THRESHOLD, 32 << 20)
 
 
 def _diagnosed(
@@ -227,7 +245,8 @@ def _diagnosed(
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
         overall.part(0.02, 0.03)(cost, 0.0)
-    found = search(problem, candidate_effects, overall.part(0.03, 0.7))
+    done = _searched(spec, _Searched(model, problem, full, findings=held), tame, candidate_effects, overall)
+    model, problem, full, found = done.model, done.problem, done.full, done.found
     noise_sd = np.array([n.sigma for n in problem.noise])
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
     standing = most_probable(problem, found, noise_sd)
@@ -252,7 +271,7 @@ def _diagnosed(
         *data.findings,
         *apart,
         *lone,
-        *held,
+        *done.findings,
         *_repeated(full),
         *between,
         *uncertain(problem, found.best, spans),
@@ -271,7 +290,7 @@ def _diagnosed(
         else "nothing_missing"
     )
     if not found.best.terms:
-        result.findings += late_by_a_sample(problem, found) + _lines(full, found)
+        result.findings += _lines(full, found)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best, noise_sd)
         result.findings += _too_slow(full, found, slow) or _above_guess(full, figures, problem.rules)
@@ -279,6 +298,80 @@ def _diagnosed(
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
     return result
+
+
+@dataclass
+class _Searched:
+    """What was searched, and what was found in it."""
+
+    model: Model
+    problem: Problem
+    full: Problem
+    found: Found = field(default_factory=lambda: Found(Fit((), np.zeros(0)), Fit((), np.zeros(0)), []))
+    findings: list[Finding] = field(default_factory=list)
+
+
+def _searched(
+    spec: NominalSpec,
+    begun: _Searched,
+    recordings: list[Recording],
+    candidate_effects: Sequence[Candidate],
+    overall: Overall,
+) -> _Searched:
+    """The search, and once more with a delay within one sample among the nominal parameters where the data call for one.
+
+    Such a delay is not named, because it may be a matter of the recording. It still hides what is missing beside it.
+    """
+    problem = begun.problem
+    begun.found = search(problem, [*candidate_effects], overall.part(0.03, 0.6))
+    late = within_sample(begun.found.last_trials, begun.found.best)
+    if late is None:
+        return begun
+    if not problem.budget.spent():
+        past = _past_delay(spec, late, begun, recordings, candidate_effects, overall.part(0.6, 0.7))
+        if past is not None:
+            return past
+    if not begun.found.best.terms:
+        begun.findings = [*begun.findings, *late_by_a_sample(problem, late)]
+    return begun
+
+
+def _past_delay(
+    spec: NominalSpec,
+    late: Trial,
+    begun: _Searched,
+    recordings: list[Recording],
+    candidate_effects: Sequence[Candidate],
+    progress: Progress,
+) -> _Searched | None:
+    """The search with the delay of `late` among the nominal parameters; None if that names nothing better.
+
+    What is named may be no shape of the delay: its gain has to be that of a further effect, it is no linear effect at the
+    place of the delay, and the delay stays within the sample.
+    """
+    candidate, term, problem = late.candidate, late.fit.terms[-1], begun.problem
+    values = {p.key: float(value) for p, value in zip(term.parameters, late.fit.values_of(term), strict=True)}
+    known = EffectSpec(
+        id=candidate.effect.id, at=candidate.port.name, values=values, source=candidate.source, form=candidate.form
+    )
+    model, again, full = problems(spec.model_copy(update={"effect": [*spec.effect, known]}), recordings, problem.rules)
+    again.budget, again.joint_states = problem.budget, problem.joint_states
+    for each in (again, full):
+        model.hold_as(each.segments, problem.model.hold)
+    others = [c for c in candidate_effects if not (c.effect.shifts and c.port.held)]
+    found = search(again, others, progress, late.both.log_likelihood)
+    place = {*candidate.port.path, candidate.port.name}
+    own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
+    delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
+    if not own or float(np.sum(np.abs(delay_s))) > WITHIN * problem.segments[0].recording.dt_s:
+        return None
+    noise_sd = np.array([n.sigma for n in problem.noise])
+    before, rules = late.fit.residuals, problem.rules
+    ahead = compare(problem.segments, "both", before, found.best.residuals, noise_sd).log_likelihood
+    earned = compare(problem.segments, "both", begun.found.nominal.residuals, before, noise_sd).log_likelihood
+    if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
+        return None
+    return _Searched(model, again, full, found, [*begun.findings, *late_by_a_sample(again, late, past=True)])
 
 
 def _without_lone_samples(

@@ -243,7 +243,7 @@ class AxisModel(Model):
             linear[0] = 1.0
         recorded, place = segment.inputs[spec.input], f"{spec.subsystem}_drive"
         drive = [effect for effect in active if effect[0].port.name == place]
-        late = self.hold == "zero" and bool(drive) and all(candidate.effect.shifts == "time" for candidate, _ in drive)
+        late = self.hold == "zero" and any(candidate.effect.shifts == "time" for candidate, _ in drive)
         finer = FINER * segment.substeps if late else 1  # a held input that is late by a part of a sample jumps within it
         noise = segment.force_noise if drive else None  # what reads the force is no part of the drive: no effect smooths it
         true = recorded if noise is None else recorded - noise

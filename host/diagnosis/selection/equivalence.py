@@ -266,6 +266,8 @@ def _equals(
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
         refitted.append((trial.candidate, coarse(ahead, best.fitted - other.fitted, problem.rules)))
+        if trial.candidate.name == candidate.name:
+            continue  # another form of the same answer
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
@@ -274,18 +276,23 @@ def _equals(
 def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:
     """Trials of other names, tried when `candidate` was or after, that earned much of what the best of its step did.
 
-    A simpler shape of `candidate` is a rival whatever it earned alone: past the other effects it may do as well.
+    A simpler shape of `candidate` is a rival whatever it earned alone: past the other effects it may do as well. So is a
+    form of its own name with fewer parameters: a rival that is as simple has to outdo that form.
     """
     active = {term.candidate.key for term in found.best.terms}
-    names = {candidate.name, *(term.candidate.name for term in found.best.terms)}
+    others = {term.candidate.name for term in found.best.terms} - {candidate.name}
+    own = next(term for term in found.best.terms if term.candidate == candidate)
     kept: dict[str, Trial] = {}
     for step in (s for s in found.steps if any(trial.candidate.key == candidate.key for trial in s.trials)):
         most = max(trial.score for trial in step.trials)
         for trial in step.trials:
             simpler = trial.candidate.effect.id in candidate.effect.contains and related(trial.candidate, candidate)
+            same = trial.candidate.name == candidate.name
+            if same and trial.fit.terms[-1].fitted >= own.fitted:
+                continue
             if (
                 trial.candidate.key not in active
-                and trial.candidate.name not in names
+                and trial.candidate.name not in others
                 and (simpler or trial.score > rules.equals_score * most)
             ):
                 kept.setdefault(trial.candidate.name, trial)

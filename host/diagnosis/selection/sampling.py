@@ -11,8 +11,8 @@ from host.diagnosis.estimation.fit import Fit, Problem
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.readings import Finding
 from host.diagnosis.selection.screening import screen
-from host.diagnosis.selection.search import Found, fit_nominal, try_fit
-from host.diagnosis.selection.trial import within_sample
+from host.diagnosis.selection.search import fit_nominal, try_fit
+from host.diagnosis.selection.trial import Trial
 
 WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
 
@@ -75,14 +75,15 @@ def _late(problem: Problem, hold: str, candidates: Sequence[Candidate]) -> Fit:
     return min([nominal, *fits], key=lambda fit: fit.cost)
 
 
-def late_by_a_sample(problem: Problem, found: Found) -> list[Finding]:
-    """Say that a delay within one sample explains a mismatch that has no other name, if the data call for one."""
-    best, period_s = within_sample(found.last_trials, found.best), problem.segments[0].recording.dt_s
-    if best is None:
-        return []
-    port = best.candidate.port
-    says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {best.both.share:.0%} "
+def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[Finding]:
+    """Say that a delay within one sample explains a mismatch and is not named. past: it was searched on with it."""
+    period_s, port = problem.segments[0].recording.dt_s, late.candidate.port
+    says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
     says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "
-    says += "from an input that is recorded one sample early or late. Record at a higher rate, or shift that column by one "
-    says += "sample."
+    says += "from an input that is recorded one sample early or late. "
+    says += (
+        "The diagnosis continues with this delay."
+        if past
+        else "Record at a higher rate, or shift that column by one sample."
+    )
     return [Finding("within_sample", problem.columns.get(port.channels[0], port.channels[0]), says)]

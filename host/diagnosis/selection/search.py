@@ -210,13 +210,16 @@ def _best_start(problem: Problem, fit: Fit, segment: Segment, port: str, reach: 
     segment.start[port] = best if tried[best] < 0.9999 * tried[old] else old
 
 
-def search(problem: Problem, candidate_effects: list[Candidate], progress: Progress) -> Found:
-    """Nominal refit, then moves until none is earned; then detours by other first effects, where two may do better."""
+def search(problem: Problem, candidate_effects: list[Candidate], progress: Progress, earned: float = 0.0) -> Found:
+    """Nominal refit, then moves until none is earned; then detours by other first effects, where two may do better.
+
+    earned: likelihood by which the nominal model was extended before; each effect is then a further one.
+    """
     progress("refitting the nominal model", 0.0)
     nominal = fit_nominal(problem)
     noise_sd = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
-    _grow(problem, found, candidate_effects, noise_sd, 0.0, progress)
+    _grow(problem, found, candidate_effects, noise_sd, earned, progress)
     _join(problem, found, candidate_effects, noise_sd, progress)
     found = _detour(problem, found, candidate_effects, noise_sd, progress)
     _exchange(problem, found, candidate_effects, noise_sd, progress)

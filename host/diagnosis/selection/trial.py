@@ -12,6 +12,8 @@ from host.diagnosis.estimation.fit import Fit, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
+WITHIN = 1.05  # samples: a delay up to this may be a matter of how the input was recorded
+
 
 @dataclass
 class Trial:
@@ -144,13 +146,13 @@ def of_sampling(trial: Trial) -> bool:
     term = trial.fit.terms[-1]
     own = zip(term.parameters, trial.fit.values_of(term), strict=True)
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
-    return late_s < 1.05 * trial.period_s
+    return late_s < WITHIN * trial.period_s
 
 
 def within_sample(trials: list[Trial], base: Fit) -> Trial | None:
-    """The likeliest delay or lag within one sample that the data call for, where `base` names no effect."""
-    late = [] if base.terms else [trial for trial in trials if of_sampling(trial) and called_for(trial, base)]
-    return max(late, key=lambda trial: trial.score, default=None)
+    """The likeliest of the simplest delays and lags within one sample that the data call for beyond `base`."""
+    late = [trial for trial in trials if of_sampling(trial) and called_for(trial, base)]
+    return max(late, key=lambda trial: (-trial.fit.fitted, trial.score), default=None)
 
 
 def only_sampling(trial: Trial, trials: list[Trial]) -> bool:

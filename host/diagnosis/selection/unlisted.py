@@ -17,7 +17,7 @@ from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
-from host.diagnosis.selection.trial import Trial, rank, within_sample
+from host.diagnosis.selection.trial import WITHIN, Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
 
@@ -106,7 +106,7 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
     ports = {port.name: port for port in problem.model.ports}
     pairs = {a: (ports[a], ports[b]) for a, b in problem.model.unlisted_at}
     progress("testing whether the residual is predictable", 0.0)
-    late = within_sample(found.last_trials, found.best)
+    late = None if found.best.terms else within_sample(found.last_trials, found.best)
     if late is not None:
         past = _past(problem, found, late, noise_sd)
         if not past.sure:
@@ -230,7 +230,7 @@ def _earned(trial: Trial) -> bool:
 def _only_sampling(problem: Problem, trial: Trial) -> bool:
     """Whether an equation shifts its port's own input by no more than a sample: how the input was held, not physics."""
     own = problem.columns.get(problem.model.moves.get(trial.candidate.port.name, ""), "")
-    return trial.candidate.effect.equation == f"rate({own})" and abs(trial.fit.values[-1]) < 1.05 * trial.period_s
+    return trial.candidate.effect.equation == f"rate({own})" and abs(trial.fit.values[-1]) < WITHIN * trial.period_s
 
 
 def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: Form, size: float) -> Trial:

@@ -338,3 +338,25 @@ def test_jumps_of_dry_friction_do_not_count_as_noise() -> None:
     speed = np.cos(2.0 * np.pi * 0.4 * t) + np.cos(2.0 * np.pi * 1.1 * t + 1.0)
     force = speed + 2.2 * np.sign(speed) + 0.05 * rng.standard_normal(t.size)
     assert estimate([force], [np.zeros(t.size, dtype=bool)]).sigma == pytest.approx(0.05, rel=0.15)
+
+
+@pytest.mark.slow
+def test_what_a_delay_within_a_sample_hides_is_named_with_its_true_size() -> None:
+    """A force of +-1 N that lags by 4 ms, four fifths of a sample, and reaches 0.8 N only."""
+    runs = []
+    for seed in (41, 42):
+        rng, n, step = np.random.default_rng(seed), 500, 1e-4
+        force = np.repeat(rng.uniform(-1.0, 1.0, n // 12 + 1), 12)[:n]
+        lagged = place = speed = 0.0
+        x = np.empty(n)
+        for k, f in enumerate(np.repeat(np.clip(force, -0.8, 0.8), 50)):
+            if k % 50 == 0:
+                x[k // 50] = place
+            lagged += (f - lagged) * (1.0 - np.exp(-step / 0.004))
+            speed += step * (lagged - 4.0 * speed - 250.0 * place) / 0.3
+            place += step * speed
+        runs.append({"t": 0.005 * np.arange(n), "f": force, "x": x + 1e-5 * rng.standard_normal(n)})
+    held = {**SPRUNG, "axis": {**SPRUNG["axis"], "hold": "zero", "reads": "position"}}
+    content = diagnose(runs, held).as_dict()
+    assert [effect["id"] for effect in content["effects"]] == ["saturation"] and "within_sample" in ids(content)
+    assert content["effects"][0]["parameters"]["limit_N"]["value"] == pytest.approx(0.8, abs=0.004)

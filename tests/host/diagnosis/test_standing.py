@@ -23,7 +23,7 @@ from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
 from host.diagnosis.selection.posterior import calibrated, posterior
 from host.diagnosis.selection.screening import Screened, term_of
-from host.diagnosis.selection.search import Found, _varied, fit_nominal
+from host.diagnosis.selection.search import Found, Step, _varied, fit_nominal
 from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
 from host.diagnosis.selection.unlisted import Remainder
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at
@@ -146,6 +146,23 @@ def test_an_equation_chosen_among_hundreds_is_no_simpler_than_an_effect(monkeypa
     problem: Any = SimpleNamespace(rules=RULES, segments=[])
     ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, np.ones(1))
     assert rival is equation and difference == pytest.approx(-6.0 * RULES.coarsening / (60.0 + RULES.coarsening))
+
+
+def test_a_rival_with_few_parameters_has_to_outdo_the_form_with_few_parameters() -> None:
+    """The simple form of the effect that is named is fitted beside its rivals; a form with as many parameters is not."""
+    every = candidates((Port("pad", "force", "pad", ("force",)),), True)
+    scale = Scale("N", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True, motion_unit="m")
+
+    def tried(effect: str, form: str, score: float) -> Trial:
+        candidate = next(c for c in every if (c.effect.id, c.form) == (effect, form))
+        term = Term(candidate, candidate.effect.parameters(scale, form))
+        return Trial(candidate, Fit((term,), np.zeros(len(term.parameters))), NOTHING, NOTHING, NOTHING, score)
+
+    smooth, plain = tried("coulomb_friction", "smooth", 148.0), tried("coulomb_friction", "", 135.0)
+    bristles, drag = tried("coulomb_friction", "bristles", 127.0), tried("viscous_friction", "quadratic", 86.0)
+    assert plain.fit.fitted < smooth.fit.fitted == bristles.fit.fitted
+    found = Found(Fit((), np.zeros(0)), smooth.fit, [Step("forward", "", NOTHING, [smooth, bristles, plain, drag])])
+    assert equivalence._rivals(found, smooth.candidate, RULES) == [plain, drag]
 
 
 def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
