@@ -320,7 +320,7 @@ def _searched(
 ) -> _Searched:
     """The search, and once more with a delay within one sample among the nominal parameters where the data call for one.
 
-    Such a delay is not named, because it may be a matter of the recording. It still hides what is missing beside it.
+    Such a delay is not named, because it may be a matter of the recording. It still hides what else is missing.
     """
     problem = begun.problem
     begun.found = search(problem, [*candidate_effects], overall.part(0.03, 0.6))
