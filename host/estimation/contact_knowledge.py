@@ -8,6 +8,8 @@ from host.estimation.interface import Actuation
 from protocol.enums import Phase
 from protocol.rig_file import Rig
 
+UNKNOWN_N = 30.0  # standard deviation of a force that nothing is assumed of
+
 
 @dataclass(frozen=True)
 class ContactKnowledge:
@@ -36,5 +38,15 @@ class ContactKnowledge:
 
     def force_sd(self, actuation: Actuation) -> float:
         """Standard deviation of the force, N: whether a contact is commanded decides; a tip that is held may be pressed."""
-        free = actuation.force_direction is None and actuation.mode != Phase.HOLD.label
-        return self.free_sd_N if free else self.force_sd_N
+        return self.free_sd_N if _free(actuation) else self.force_sd_N
+
+    def learned_sd(self, actuation: Actuation) -> float:
+        """Return the standard deviation (N) of the force for what is learned of lasting errors.
+
+        A force that presses lasts. Expected to be zero in each of many poses, it would count as an error of the joints.
+        """
+        return self.free_sd_N if _free(actuation) else UNKNOWN_N
+
+
+def _free(actuation: Actuation) -> bool:
+    return actuation.force_direction is None and actuation.mode != Phase.HOLD.label

@@ -138,10 +138,9 @@ class PlanarRigEstimator:
         if not fit.ended and self._branch.any():
             fit = self._fit(poses, actuation, prior, np.zeros(2))
         converged = fit.ended and fit.chi_square <= CHI_SQUARE_PER_FREEDOM * 3 * len(poses)
-        self._branch = fit.parameters[:2] if converged else np.zeros(2)
         if converged:
-            shown = _shown(known, axes)
-            self.errors.learn(known, shown @ fit.parameters, shown @ fit.covariance @ shown.T)
+            self._learn(poses, actuation, known, _shown(known, axes), fit.parameters)
+        self._branch = fit.parameters[:2] if converged else np.zeros(2)
         whole, unseen_sd_N = self._whole_force(actuation, axes, normal)
         force_N = -whole @ fit.parameters[:2]
         in_plane = fit.covariance[:2, :2]
@@ -160,6 +159,26 @@ class PlanarRigEstimator:
             pose_tip.stamp_ns,
             0.5 * (lasting + lasting.T),
         )
+
+    def _learn(self, poses: dict[float, Array], actuation: Actuation, known: Prior, shown: Array, parameters: Array) -> None:
+        """Take over what the poses told of the lasting errors: `parameters` of the fit, corrected by one step.
+
+        Its sensitivities are those at the last force, which the noise of these poses did not reach
+        (`spatial_rig_kernels.refit`).
+        """
+        here = self._linearize(poses, actuation, parameters)
+        last = self._linearize(poses, actuation, np.array([*self._branch, *known.mean[len(known.across) :]]))
+        if here is None or last is None:
+            return
+        held, loose = shown.T @ np.linalg.inv(known.covariance), np.eye(2) / self._contact.learned_sd(actuation) ** 2
+        information, gradient = held @ shown, held @ (known.mean - shown @ parameters)
+        information[:2, :2] += loose
+        gradient[:2] -= loose @ parameters[:2]
+        for (error, _), (_, jacobian) in zip(here, last, strict=True):
+            information += jacobian.T @ self._weight @ jacobian
+            gradient += jacobian.T @ self._weight @ error
+        covariance = _capped(information)
+        self.errors.learn(known, shown @ (parameters + covariance @ gradient), shown @ covariance @ shown.T)
 
     def _whole_force(self, actuation: Actuation, axes: Array, normal: Array) -> tuple[Array, float]:
         """Matrix (3, 2) that makes the whole force of its part in the plane, and the uncertainty (N) out of the plane.

@@ -19,7 +19,7 @@ from host.estimation.lasting_errors import ALL_JOINTS, NOWHERE, ActuationKnowled
 from host.estimation.reach import check_reach
 from host.estimation.sensor_noise import TrackedSensors, chi_square_limit
 from host.estimation.spatial import start_grid
-from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows, new_fit
+from host.estimation.spatial_rig_kernels import FrameFit, TrackedFrame, fit, known_rows, new_fit, refit
 from host.mechanics.rod import finite, rod_record
 from protocol.catheter import Catheter, load_catheter
 from protocol.rig_file import Rig
@@ -101,6 +101,8 @@ class SpatialRigEstimator:
         )
         settled, cost, found = self._search(frame, known)
         converged = settled and cost <= chi_square_limit(6 * len(offsets), ODD_DEVIATIONS)
+        if converged:
+            self._learn(frame._replace(known=known_rows(known, self._contact.learned_sd(actuation))[0]), known, found)
         return self._answer(frame, known, found, converged, pose_tip.stamp_ns)
 
     def _search(self, frame: TrackedFrame, known: Prior) -> tuple[bool, float, FrameFit]:
@@ -136,8 +138,6 @@ class SpatialRigEstimator:
         residual = _residual(frame, found)
         if converged:
             self._force, self._unexplained = found.x[:3].copy(), 0
-            shown = np.vstack([known.across @ found.by_x, np.eye(3, 6, 3)])
-            self.errors.learn(known, np.array([*known.across @ found.force_N, *found.x[3:]]), shown @ covariance @ shown.T)
         else:
             self._force = np.zeros(3)
             self._unexplained += 1
@@ -145,6 +145,15 @@ class SpatialRigEstimator:
                 self.errors.forget()
                 self._unexplained = 0
         return TipForce(force_N, 0.5 * (total + total.T), converged, residual, stamp_ns, 0.5 * (lasting + lasting.T))
+
+    def _learn(self, frame: TrackedFrame, known: Prior, found: FrameFit) -> None:
+        """Take over what the poses told of the lasting errors, with sensitivities at the last force."""
+        at = new_fit(len(frame.offsets))
+        at.x[:3], at.x[3:] = self._force, known.mean[len(known.across) :]
+        refit(frame, found, at)
+        shown = np.vstack([known.across @ at.by_x, np.eye(3, 6, 3)])
+        covariance = np.linalg.inv(at.information)
+        self.errors.learn(known, np.array([*known.across @ at.force_N, *at.x[3:]]), shown @ covariance @ shown.T)
 
     def _of_one_pose(self, frame: TrackedFrame, known: Prior, found: FrameFit) -> Array:
         """Covariance (3, 3) of the force from this pose alone, with the joints' errors held at their estimate."""

@@ -235,3 +235,27 @@ def fit(f: TrackedFrame, largest_N: float, found: FrameFit) -> tuple[bool, float
     model(f, x, rows, work, found, A)
     cost = _normal_equations(f, found, x, A, found.information, g)
     return settled, cost
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def refit(f: TrackedFrame, found: FrameFit, at: FrameFit) -> None:
+    """Correct the answer `found` of `fit` by one step whose sensitivities are those at the unknowns at.x.
+
+    At the answer itself the sensitivities contain the noise of the poses, and their product with the residuals has a mean
+    other than zero. At a point that the noise of this frame did not reach it is zero.
+
+    Args:
+        f: the frame; what is known before may be less than in `fit`.
+        found: the answer of `fit`.
+        at: on entry at.x is the point; on return all parts but the residual are those of the corrected answer.
+    """
+    k = f.offsets.shape[0]
+    rows, work, A, g = np.zeros((k + 1, ROW)), np.zeros(WORK), np.zeros((k, ROWS_OF_POSE, UNKNOWNS)), np.zeros(UNKNOWNS)
+    model(f, at.x, rows, work, at, A)
+    at.residual[:], at.force_N[:], at.x[:] = found.residual, found.force_N, found.x
+    _normal_equations(f, at, at.x, A, at.information, g)
+    step = np.linalg.solve(at.information, g)
+    for j in range(UNKNOWNS):
+        at.x[j] += step[j]
+        for i in range(3):
+            at.force_N[i] += at.by_x[i, j] * step[j]
