@@ -149,7 +149,7 @@ def test_an_equation_chosen_among_hundreds_is_no_simpler_than_an_effect(monkeypa
 
 
 def test_a_rival_with_few_parameters_has_to_outdo_the_form_with_few_parameters() -> None:
-    """The simple form of the effect that is named is fitted together with its rivals; a form with as many parameters is not."""
+    """The simple form of the named effect is fitted together with its rivals; a form with as many parameters is not."""
     every = candidates((Port("pad", "force", "pad", ("force",)),), True)
     scale = Scale("N", 2.0, -1.0, 1.0, 1.0, 1e-6, 0.1, 0.01, 10.0, True, motion_unit="m")
 
