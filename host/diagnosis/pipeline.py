@@ -245,7 +245,9 @@ def _diagnosed(
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:
         overall.part(0.02, 0.03)(cost, 0.0)
-    done = _searched(spec, _Searched(model, problem, full, findings=held), tame, candidate_effects, overall)
+    found = search(problem, candidate_effects, overall.part(0.03, 0.6))
+    begun = _Searched(model, problem, full, found, held)
+    done = _past_sampling(spec, begun, tame, candidate_effects, overall.part(0.6, 0.7))
     model, problem, full, found = done.model, done.problem, done.full, done.found
     noise_sd = np.array([n.sigma for n in problem.noise])
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
@@ -300,40 +302,38 @@ def _diagnosed(
     return result
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Searched:
     """What was searched, and what was found in it."""
 
     model: Model
     problem: Problem
     full: Problem
-    found: Found = field(default_factory=lambda: Found(Fit((), np.zeros(0)), Fit((), np.zeros(0)), []))
-    findings: list[Finding] = field(default_factory=list)
+    found: Found
+    findings: list[Finding]
 
 
-def _searched(
+def _past_sampling(
     spec: NominalSpec,
     begun: _Searched,
     recordings: list[Recording],
     candidate_effects: Sequence[Candidate],
-    overall: Overall,
+    progress: Progress,
 ) -> _Searched:
-    """The search, and once more with a delay within one sample among the nominal parameters where the data call for one.
+    """What a second search finds, with a delay within one sample among the nominal parameters, where the data call for one.
 
     Such a delay is not named, because it may be a matter of the recording. It still hides what else is missing.
     """
-    problem = begun.problem
-    begun.found = search(problem, [*candidate_effects], overall.part(0.03, 0.6))
     late = within_sample(begun.found.last_trials, begun.found.best)
     if late is None:
         return begun
-    if not problem.budget.spent():
-        past = _past_delay(spec, late, begun, recordings, candidate_effects, overall.part(0.6, 0.7))
+    if not begun.problem.budget.spent():
+        past = _past_delay(spec, late, begun, recordings, candidate_effects, progress)
         if past is not None:
             return past
-    if not begun.found.best.terms:
-        begun.findings = [*begun.findings, *late_by_a_sample(problem, late)]
-    return begun
+    if begun.found.best.terms:
+        return begun
+    return replace(begun, findings=[*begun.findings, *late_by_a_sample(begun.problem, late)])
 
 
 def _past_delay(
