@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+WORDS = "seldinger: compiling kernels, which can take some minutes; `seldinger warm` compiles all of them once, on all cores"
+
 _callback: Callable[[], None] | None = None
 
 

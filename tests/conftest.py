@@ -1,6 +1,9 @@
 """Settings of the whole suite: the same examples in every run, and no deadline on the wall clock."""
 
+import fcntl
+import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,3 +54,12 @@ def signal_handlers() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(scope="module")
+def rig_alone() -> Iterator[None]:
+    """One whole rig on the wall clock at a time: it takes 1.3 cores, and two of them start and end too slowly."""
+    with open(Path(tempfile.gettempdir()) / f"seldinger-tests-{os.getuid()}.lock", "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+        fcntl.flock(lock, fcntl.LOCK_UN)  # a forked process that is still there has the file open as well

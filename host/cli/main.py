@@ -98,11 +98,6 @@ NEGATIVE_VALUES = ("jog", "goto", "touch", "force")
 # What typer raises for an option or argument that a command does not take; its click is a copy of its own, or the package.
 Refused = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
-COMPILES = (
-    "seldinger: compiling kernels, which can take some minutes; `seldinger warm` compiles all of them once, on all cores"
-)
-
-
 ENDED = "seldinger: interrupted before the end"
 # Exit status after Ctrl-C or SIGTERM.
 INTERRUPTED = 130
@@ -361,7 +356,7 @@ def main(starting: Callable[[int, FrameType | None], object] | None = None) -> N
         _take_signals(starting)
         _open_standard_streams()
         warnings.showwarning = _show_warning
-        compile_notice.on_first(lambda: print(COMPILES, file=sys.stderr, flush=True))
+        compile_notice.on_first(lambda: print(compile_notice.WORDS, file=sys.stderr, flush=True))
         status = _run(argv)
         sys.stdout.flush()
         sys.exit(status)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from host.estimation.interface import Actuation, Estimator, PoseReading, Reporting, TipForce
+from protocol.catheter import load_catheter
 from protocol.errors import InputError
 from protocol.rig_file import Rig
 from protocol.topics import ForceEstimate, Message, Pose, RigState, Stage
@@ -17,7 +19,10 @@ from protocol.topics import ForceEstimate, Message, Pose, RigState, Stage
 DEFAULT_ESTIMATOR = "host.estimation.rig_estimator:make_estimator"
 HISTORY_NS = 500_000_000
 PAIRED_WITHIN_NS = 5_000_000
-SHAFT, REAR = "pose/shaft", "pose/rear"
+TIP, SHAFT, REAR = "pose/tip", "pose/shaft", "pose/rear"
+# Of a rehearsal: the angle by which the catheter is bent, its frames, those before it is pressed, those before it looks odd.
+REHEARSED_TURN_rad = 0.8
+REHEARSED_FRAMES, REHEARSED_FREE, REHEARSED_PRESSED, REHEARSED_EVERY_NS = 22, 12, 14, 25_000_000
 
 
 def load_estimator(name: str, rig: Rig) -> Estimator:
@@ -28,6 +33,52 @@ def load_estimator(name: str, rig: Rig) -> Estimator:
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"estimator: found {name!r} ({error}), wanted module:function") from None
     return make(rig)
+
+
+def rehearse(estimator: Estimator, rig: Rig) -> None:
+    """Let `estimator` answer made-up poses, so that its code is compiled before real ones come; it is of no use afterwards.
+
+    The poses are those of a free catheter, then of one that is pressed, then poses that no force on the tip explains:
+    what looks for a contact of the body runs as well.
+    """
+    catheter = load_catheter(rig.catheter.name)
+    curvature_per_m = REHEARSED_TURN_rad / catheter.distal_length_m
+    service = EstimationService(estimator)
+    for frame in range(REHEARSED_FRAMES):
+        stamp_ns = (frame + 1) * REHEARSED_EVERY_NS
+        pressed, odd = frame >= REHEARSED_FREE, frame >= REHEARSED_PRESSED
+        service.receive(
+            "stage",
+            Stage(
+                stamp_ns=stamp_ns,
+                command_insertion_m=0.0,
+                command_roll_rad=0.0,
+                command_knob_rad=0.0,
+                joint_insertion_m=0.0,
+                joint_roll_rad=0.0,
+                joint_curvature_per_m=curvature_per_m,
+            ),
+        )
+        mode, direction = ("contact", (0.0, 0.0, 1.0)) if pressed and not odd else ("position", None)
+        service.receive("state", RigState(stamp_ns=stamp_ns, mode=mode, safety_action="none", force_direction=direction))
+        for number, (topic, offset_m) in enumerate(zip((TIP, SHAFT, REAR), rig.tracker.tool_offsets_m, strict=False)):
+            bent_per_m = curvature_per_m * (1.0 + (0.5 if odd and number == 0 else 0.0))
+            service.receive(topic, _on_arc(bent_per_m, max(catheter.distal_length_m - offset_m, 0.0), stamp_ns))
+        service.answer(stamp_ns)
+        service.reports()
+
+
+def _on_arc(curvature_per_m: float, station_m: float, stamp_ns: int) -> Pose:
+    """Return the pose at `station_m` of an arc that begins at the sheath's exit, bent at roll 0."""
+    angle = curvature_per_m * station_m
+    return Pose(
+        stamp_ns=stamp_ns,
+        arrival_ns=stamp_ns,
+        frame=0,
+        missing=False,
+        position_m=(0.0, (math.cos(angle) - 1.0) / curvature_per_m, math.sin(angle) / curvature_per_m),
+        quaternion_wxyz=(math.cos(0.5 * angle), math.sin(0.5 * angle), 0.0, 0.0),
+    )
 
 
 def _reading(pose: Pose) -> PoseReading:
@@ -70,7 +121,7 @@ class EstimationService:
             self._mode = message.mode
         elif isinstance(message, Pose) and topic in (SHAFT, REAR):
             self._behind[topic] = message
-        elif isinstance(message, Pose) and topic == "pose/tip" and not message.missing:
+        elif isinstance(message, Pose) and topic == TIP and not message.missing:
             self._waiting = message
 
     def answer(self, now_ns: int) -> ForceEstimate | None:
@@ -97,7 +148,7 @@ class EstimationService:
         rear: Message | None = None,
     ) -> ForceEstimate | None:
         """Return the estimate for one pose at once, for lock step; the caller sets `published_ns`."""
-        for topic, message in (("stage", stage), ("state", state), (SHAFT, shaft), (REAR, rear), ("pose/tip", tip)):
+        for topic, message in (("stage", stage), ("state", state), (SHAFT, shaft), (REAR, rear), (TIP, tip)):
             if message is not None:
                 self.receive(topic, message)
         return self.answer(tip.stamp_ns)

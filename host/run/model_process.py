@@ -11,9 +11,10 @@ import warnings
 from pathlib import Path
 
 from host.estimation.interface import Estimator
-from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator
+from host.estimation.service import DEFAULT_ESTIMATOR, EstimationService, load_estimator, rehearse
 from host.recordings.header import header_of
 from host.recordings.writer import RecordingWriter
+from protocol import compile_notice
 from protocol.end_signals import EndSignals
 from protocol.rig_file import load_rig
 from protocol.topics import Log
@@ -108,11 +109,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int)
     options = parser.parse_args(arguments)
     ends = EndSignals()
+    compile_notice.on_first(lambda: print(json.dumps({"compiling": True}), flush=True))
     session: Session | None = None
     warnings.simplefilter("ignore", UnusualValue)  # the realtime process reports them
     try:
         rig = load_rig(options.rig)
         with ends.interrupting():
+            # Compiled now: at the first pose it would keep this process from its watchdog, and from an end in order.
+            rehearse(load_estimator(options.estimator, rig), rig)
             estimator = load_estimator(options.estimator, rig)
             session = Session.hub(rig)
     except (ValueError, OSError) as error:

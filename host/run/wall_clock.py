@@ -20,6 +20,7 @@ import numpy as np
 from host.recordings.writer import new_recording_path
 from host.run.commander import Commander
 from host.run.demo import DemoRun, DemoSettings, Progress
+from protocol import compile_notice
 from protocol.local_paths import LocalPaths, listens
 from protocol.rig_file import load_rig
 from protocol.text_files import read_text
@@ -31,7 +32,8 @@ from sim.scenario import TARGET_M, ContactJob, Outcome
 _BEFORE_S = 6.0  # to come before the tissue
 _TOUCH_TIMEOUT_S = 60.0  # for all attempts to touch it
 _START_TIMEOUT_S = 120.0  # a first start compiles the loop, on a machine that may be busy
-_STOP_TIMEOUT_S = 20.0  # for all to end of themselves; a recorder that is killed leaves a truncated recording
+# For each to end of itself, on a machine that may be busy. A recorder that is killed leaves a truncated recording.
+_STOP_TIMEOUT_S = {"realtime": 20.0, "host": 60.0, "rig": 20.0}
 
 
 class Fleet:
@@ -136,6 +138,9 @@ class Fleet:
         self.processes[name] = process
         assert process.stdout is not None
         line = process.stdout.readline() if answers else ""
+        if answers and "compiling" in line:
+            print(compile_notice.WORDS, file=sys.stderr, flush=True)
+            line = process.stdout.readline()
         if answers and not line:
             process.wait()
             raise OSError(f"{name}: found that it ended at its start, wanted it to run: {self.last_log_line(name)}")
@@ -174,15 +179,14 @@ class Fleet:
         self._folder.cleanup()
 
     def _end_processes(self) -> None:
-        deadline = time.monotonic() + _STOP_TIMEOUT_S
-        for name in ("realtime", "host", "rig"):
+        for name, timeout_s in _STOP_TIMEOUT_S.items():
             process = self.processes.get(name)
             if process is None:
                 continue
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
             try:
-                out, _ = process.communicate(timeout=max(deadline - time.monotonic(), 0.2))
+                out, _ = process.communicate(timeout=timeout_s)
             except subprocess.TimeoutExpired:
                 process.kill()
                 out, _ = process.communicate()

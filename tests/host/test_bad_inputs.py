@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from host.cli import main as command_line
+from protocol import compile_notice
 from protocol.catheter import CATHETER_FOLDER
 from protocol.rig_file import SIMULATED_RIG
 
@@ -689,7 +690,7 @@ def test_a_bad_input_is_one_line(
     status = answer(tuple(word.replace("{port in use}", port_in_use) for word in words), monkeypatch)
     said = capfd.readouterr()
     # Kernels may be compiled, and a slow machine draws a line of progress; `rig check` prints a line for each mistake.
-    lines = [line for line in said.err.splitlines() if not line.startswith("[") and line != command_line.COMPILES]
+    lines = [line for line in said.err.splitlines() if not line.startswith("[") and line != compile_notice.WORDS]
     if words[:2] == ("rig", "check"):
         lines = [line for line in lines if named in line][:1]
     assert status == 2, said.err

@@ -64,8 +64,9 @@ def test_the_realtime_process_while_it_waits_for_the_boards_port(
     assert compiling.began and not compiling.ended
 
 
-def test_the_model_process(compiling: Compiling, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model_process, "load_estimator", compiling)
+@pytest.mark.parametrize("part", ["load_estimator", "rehearse"])
+def test_the_model_process(part: str, compiling: Compiling, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model_process, part, compiling)
     monkeypatch.setattr(model_process, "Session", SimpleNamespace(hub=lambda rig: pytest.fail("a session was opened")))
     assert model_process.main([str(SIMULATED_RIG)]) == 0
     assert compiling.began and not compiling.ended

@@ -20,6 +20,8 @@ from tests.host.test_drive_commands import VirtualRig, rig, virtual  # noqa: F40
 from tests.host.test_drive_commands import called as driven
 from tests.waiting import free_port, until
 
+pytestmark = pytest.mark.usefixtures("rig_alone")
+
 PATIENCE_S = 300.0
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "first-day.md").read_text(encoding="utf-8")

@@ -20,6 +20,8 @@ from tests.host.supervisor import ServiceSettings, Supervisor
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.usefixtures("rig_alone")
+
 MOST_EXPOSED = 2.0
 
 

@@ -32,6 +32,8 @@ from realtime.core.process import RealtimeProcess
 from sim.scenario import TARGET_M, ContactJob
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.usefixtures("rig_alone")
+
 ATTEMPTS = 20
 
 

@@ -29,6 +29,8 @@ from sim.world import World
 from tests.realtime.conftest import RIG_FILE
 from tests.waiting import until
 
+pytestmark = pytest.mark.usefixtures("rig_alone")
+
 TARGET_M = (0.0, -0.0107, 0.025)
 
 

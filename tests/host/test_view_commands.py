@@ -18,6 +18,8 @@ from tests.host.test_foxglove import recording  # noqa: F401 - a fixture
 from tests.host.test_view import free_port
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.usefixtures("rig_alone")
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -15,7 +15,7 @@ from host.run.demo import DemoSettings
 from host.run.wall_clock import Fleet, Operator
 from sim.scenario import TARGET_M, ContactJob
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("rig_alone")]
 
 JOB = ContactJob(TARGET_M, force_N=0.15, approach_s=120.0)
 PATIENCE_S = 300.0
