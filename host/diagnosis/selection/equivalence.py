@@ -13,7 +13,7 @@ from host.diagnosis.estimation.initial_state import begun_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
-from host.diagnosis.selection.posterior import Posterior, coarse, posterior
+from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
 from host.diagnosis.selection.search import Found, Step, refined
 from host.diagnosis.selection.trial import Trial, at_bound, related
@@ -265,7 +265,7 @@ def _equals(
         ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
-        refitted.append((trial.candidate, coarse(ahead, best.fitted - other.fitted, problem.rules)))
+        refitted.append((trial.candidate, ahead_of_rival(ahead, best.fitted - other.fitted, problem.rules)))
         if trial.candidate.name == candidate.name:
             continue  # another form of the same answer
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):

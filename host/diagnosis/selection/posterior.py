@@ -12,6 +12,9 @@ which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
     w(other)  = prior_none / (1 - prior_none) * exact_share / share      only where further effects are named
 
+Where dl is more than c dk > 0, and more of the error than an idealized formula leaves, the cost is coarsened with the
+likelihood, w(rival) = exp(-r (dl - c dk)): the further parameters of the effect have earned it (`ahead_of_rival`).
+
 An effect is a name, whatever the form: the weight of another form of it, an equation that says the same, is its own.
 
 Here `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
@@ -28,7 +31,7 @@ that judge (host.studies.proof.calibrate). The probabilities before that are kep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,6 +63,18 @@ def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
     n = float(np.sum(ahead.independent))
     power = rules.coarsening / (n + rules.coarsening)
     return power * ahead.log_likelihood - rules.parameter_penalty * parameters_more
+
+
+def ahead_of_rival(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
+    """Coarsened difference of a named effect from its rival, where further parameters that have earned their cost are free.
+
+    They have earned it where all samples gain more than the cost, and more of the error than an idealized formula leaves.
+    The full cost against the coarsened likelihood would let a rival with fewer parameters win on every long recording.
+    """
+    cost = rules.parameter_penalty * parameters_more
+    if 0.0 < cost < ahead.log_likelihood and ahead.share > rules.equal_error:
+        return coarse(replace(ahead, log_likelihood=ahead.log_likelihood - cost), 0, rules)
+    return coarse(ahead, parameters_more, rules)
 
 
 def posterior(

@@ -21,7 +21,7 @@ from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.report.verdict import at_bound, likelier
 from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
-from host.diagnosis.selection.posterior import calibrated, posterior
+from host.diagnosis.selection.posterior import ahead_of_rival, calibrated, posterior
 from host.diagnosis.selection.screening import Screened, term_of
 from host.diagnosis.selection.search import Found, Step, _varied, fit_nominal
 from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
@@ -163,6 +163,23 @@ def test_a_rival_with_few_parameters_has_to_outdo_the_form_with_few_parameters()
     assert plain.fit.fitted < smooth.fit.fitted == bristles.fit.fitted
     found = Found(Fit((), np.zeros(0)), smooth.fit, [Step("forward", "", NOTHING, [smooth, bristles, plain, drag])])
     assert equivalence._rivals(found, smooth.candidate, RULES) == [plain, drag]
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "share", "stays"),
+    [
+        (765.0, 0.15, True),  # the base moved at one time; a constant offset has four parameters fewer
+        (765.0, 0.02, False),  # no more than an idealized formula leaves
+        (7.0, 0.15, False),  # less than four parameters cost
+    ],
+)
+def test_parameters_that_have_earned_their_cost_are_no_case_for_a_simpler_rival(
+    likelihood: float, share: float, stays: bool
+) -> None:
+    """Each cost its full penalty against a likelihood that is coarsened to a thousandth."""
+    ahead = Gain(likelihood, 1e-9, share, independent=np.array([40000.0]))
+    assert (ahead_of_rival(ahead, 4, RULES) > 0.0) is stays
+    assert ahead_of_rival(ahead, -4, RULES) > 4 * RULES.parameter_penalty
 
 
 def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
