@@ -78,6 +78,11 @@ class OperatorCommands:
         self._reach = TargetReach(rig)
         record.normal[:] = (0.0, 0.0, -1.0)
 
+    def prepare(self) -> None:
+        """Compile what judges a target."""
+        low, high = self._rig.safety.workspace_min_m, self._rig.safety.workspace_max_m
+        self._reach.problem(tuple(0.5 * (least + most) for least, most in zip(low, high, strict=True)))
+
     @property
     def armed(self) -> bool:
         """Return whether the loop is to be armed."""

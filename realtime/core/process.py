@@ -97,6 +97,7 @@ class RealtimeProcess:
         self._requests = self._session.serve_requests(self.request, self._seal.prove)
         self.log("info", "starting: the loop is being compiled")
         self.loop.prepare()
+        self.core.prepare()
         self.loop.start()
         if self.loop.granted.warning:
             self.log("warning", self.loop.granted.warning)

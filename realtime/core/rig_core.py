@@ -21,6 +21,7 @@ from protocol.rig_file import AXES, Rig
 from protocol.topics import Command, ForceEstimate, Log, LoopTiming, Message, Reply
 from realtime.control import safety
 from realtime.control.configure import tick_parameters
+from realtime.control.inverse_kinematics import curvature_of_knob
 from realtime.control.records import POSE, new
 from realtime.core import telemetry
 from realtime.core.board_intake import axis_limits, board_message, take_status
@@ -157,6 +158,12 @@ class RigCore:
         self._causes = CauseWatch()
         # Axes that were homed since the board was connected or reset.
         self._homed: set[str] = set()
+
+    def prepare(self) -> None:
+        """Compile what a step calls now and then: the readings would wait a second for it at the first such command."""
+        safety.action_of(0)
+        curvature_of_knob(self.params[0].kinematics, 0.0)
+        self.commands.prepare()
 
     def step(self, now_ns: int, arrived: Arrived) -> Leaving:
         """Process the data that has arrived by `now_ns` (the rig's clock, ns) and return the data to be sent.

@@ -1,4 +1,4 @@
-"""The rehearsal of the model process: whatever the rig does later, no more code is compiled or loaded for it."""
+"""What the processes of a rig compile at their start: whatever the rig does later, no more is compiled or loaded for it."""
 
 from __future__ import annotations
 
@@ -61,6 +61,26 @@ def loaded() -> dict[str, int]:
     return {f"{item.py_func.__module__}.{item.py_func.__name__}": len(item.overloads) for item in found if item.overloads}
 
 
+def realtime_process() -> None:
+    """In a process of its own: prepare the core, then press on the wall; print what of it was compiled after that."""
+    from protocol.enums import Phase
+    from protocol.rig_file import SIMULATED_RIG, load_rig
+    from sim.forked_board import forkable_board
+    from sim.scenario import TARGET_M, ContactJob, Scenario
+    from sim.world import World, simulated_plant
+
+    rig = load_rig(SIMULATED_RIG)
+    run = Scenario(rig, World(rig, simulated_plant(rig, 1), forkable_board("native"), 1), lambda topic, message: None)
+    run.run(0.1)
+    run.loop.core.prepare()
+    before, job = loaded(), ContactJob(TARGET_M)
+    run.arm()
+    run.command("target", "contact", target_m=job.target_m, normal=job.into, force_N=job.force_N)
+    run.run(5.0)
+    more = {name for name, forms in loaded().items() if before.get(name) != forms and name.startswith("realtime.")}
+    print(json.dumps({"phase": Phase(run.phase).label, "more": sorted(more)}))
+
+
 def main(model: str) -> None:
     """In a process of its own: rehearse, then answer the frames of standard input; print what was compiled for them."""
     from host.estimation.interface import Actuation, PoseReading
@@ -97,5 +117,17 @@ def test_nothing_is_compiled_after_it(model: str) -> None:
     assert json.loads(said.stdout) == {"touched": True, "more": []}
 
 
+def test_no_command_waits_for_a_compilation() -> None:
+    """The first target after a first start kept the readings from the loop for a second."""
+    said = subprocess.run(
+        [sys.executable, "-m", "tests.host.test_rehearsal"], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert said.returncode == 0, said.stderr
+    assert json.loads(said.stdout) == {"phase": "contact", "more": []}
+
+
 if __name__ == "__main__":
-    main(sys.argv[1])
+    if len(sys.argv) > 1:
+        main(sys.argv[1])
+    else:
+        realtime_process()
