@@ -41,31 +41,27 @@ def rehearse(estimator: Estimator, rig: Rig) -> None:
     The poses are those of a free catheter, then of one that is pressed, then poses that no force on the tip explains:
     what looks for a contact of the body runs as well.
     """
-    catheter = load_catheter(rig.catheter.name)
-    curvature_per_m = REHEARSED_TURN_rad / catheter.distal_length_m
+    distal_m = load_catheter(rig.catheter.name).distal_length_m
+    curvature_per_m = REHEARSED_TURN_rad / distal_m
     service = EstimationService(estimator)
     for frame in range(REHEARSED_FRAMES):
         stamp_ns = (frame + 1) * REHEARSED_EVERY_NS
-        pressed, odd = frame >= REHEARSED_FREE, frame >= REHEARSED_PRESSED
-        service.receive(
-            "stage",
-            Stage(
-                stamp_ns=stamp_ns,
-                command_insertion_m=0.0,
-                command_roll_rad=0.0,
-                command_knob_rad=0.0,
-                joint_insertion_m=0.0,
-                joint_roll_rad=0.0,
-                joint_curvature_per_m=curvature_per_m,
-            ),
+        pressed, odd = REHEARSED_FREE <= frame < REHEARSED_PRESSED, frame >= REHEARSED_PRESSED
+        stage = Stage(
+            stamp_ns=stamp_ns,
+            command_insertion_m=0.0,
+            command_roll_rad=0.0,
+            command_knob_rad=0.0,
+            joint_insertion_m=0.0,
+            joint_roll_rad=0.0,
+            joint_curvature_per_m=curvature_per_m,
         )
-        mode, direction = ("contact", (0.0, 0.0, 1.0)) if pressed and not odd else ("position", None)
-        service.receive("state", RigState(stamp_ns=stamp_ns, mode=mode, safety_action="none", force_direction=direction))
-        for number, (topic, offset_m) in enumerate(zip((TIP, SHAFT, REAR), rig.tracker.tool_offsets_m, strict=False)):
-            bent_per_m = curvature_per_m * (1.0 + (0.5 if odd and number == 0 else 0.0))
-            service.receive(topic, _on_arc(bent_per_m, max(catheter.distal_length_m - offset_m, 0.0), stamp_ns))
-        service.answer(stamp_ns)
-        service.reports()
+        mode, direction = ("contact", (0.0, 0.0, 1.0)) if pressed else ("position", None)
+        state = RigState(stamp_ns=stamp_ns, mode=mode, safety_action="none", force_direction=direction)
+        tip = _on_arc(1.5 * curvature_per_m if odd else curvature_per_m, distal_m, stamp_ns)
+        behind = [_on_arc(curvature_per_m, max(distal_m - at_m, 0.0), stamp_ns) for at_m in rig.tracker.tool_offsets_m[1:]]
+        shaft, rear = (*behind, None, None)[:2]
+        service(tip, shaft, stage, state, rear)
 
 
 def _on_arc(curvature_per_m: float, station_m: float, stamp_ns: int) -> Pose:

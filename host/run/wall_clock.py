@@ -138,7 +138,7 @@ class Fleet:
         self.processes[name] = process
         assert process.stdout is not None
         line = process.stdout.readline() if answers else ""
-        if answers and "compiling" in line:
+        if line and "compiling" in json.loads(line):
             print(compile_notice.WORDS, file=sys.stderr, flush=True)
             line = process.stdout.readline()
         if answers and not line:

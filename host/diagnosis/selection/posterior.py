@@ -66,7 +66,7 @@ def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
 
 
 def ahead_of_rival(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
-    """Coarsened difference of a named effect from its rival, where further parameters that have earned their cost are free.
+    """Coarsened difference of a named effect from its rival; the cost of parameters that have earned it is coarsened too.
 
     They have earned it where all samples gain more than the cost, and more of the error than an idealized formula leaves.
     The full cost against the coarsened likelihood would let a rival with fewer parameters win on every long recording.
