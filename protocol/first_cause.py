@@ -115,15 +115,22 @@ RULES: dict[str, Rule] = {
         "Check the force sensor.",
         ("force_rejected", "force_stale", "force_lost"),
     ),
+    "body_contact": Rule(
+        "The catheter's body touches something away from the tip.",
+        "Move the catheter away from the place on the page (topic contact); do not use the estimated force until then.",
+        ("steps_lost", "tracker_moved", "pose_rejected"),
+    ),
     "force_disagrees": Rule(
         "Force sensor, estimate and tip deflection disagree.",
-        "Zero the force sensor in free space; if they still disagree, check its mounting and the catheter's stiffness.",
-        ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
+        "Check whether the catheter's body touches something; zero the force sensor in free space; if they still disagree, "
+        "check its mounting and the catheter's stiffness.",
+        ("force_rejected", "force_stale", "steps_lost", "tracker_moved", "body_contact"),
     ),
     "force_undecided": Rule(
         "Force sensor, estimate and tip deflection began to disagree.",
-        "Wait; if they still disagree, the catheter retracts. Zero the force sensor in free space.",
-        ("force_rejected", "force_stale", "steps_lost", "tracker_moved"),
+        "Wait; if they still disagree, the catheter retracts. Check whether the catheter's body touches something, and zero "
+        "the force sensor in free space.",
+        ("force_rejected", "force_stale", "steps_lost", "tracker_moved", "body_contact"),
     ),
     "host_silent": Rule(
         "The model process does not answer.",
@@ -141,10 +148,6 @@ RULES: dict[str, Rule] = {
     "force_unreached": Rule(
         "The requested force is not reached, because the catheter bends too far.",
         "Request less force, or insert the catheter less far.",
-    ),
-    "body_contact": Rule(
-        "The catheter's body touches something away from the tip.",
-        "Move the catheter away from the place on the page (topic contact); do not use the estimated force until then.",
     ),
     "still_pressed": Rule(
         "A force remains on the tip after the retraction.",

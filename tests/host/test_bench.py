@@ -125,3 +125,11 @@ def test_the_tick_as_plain_python_is_the_compiled_tick(monkeypatch: pytest.Monke
     monkeypatch.setattr(control, "READINGS", 1)
     row = control.control_tick(3, lambda line: None)[0]
     assert row["joint_difference"] == 0.0
+
+
+def test_the_rigs_estimators_answer_every_pose_of_one_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    from host.studies.benchmarks import rig_estimators
+
+    monkeypatch.setattr(rig_estimators, "CONTACT_S", 0.5)
+    (row,) = rig_estimators.estimate_rig(1, lambda line: None)
+    assert row["cases"] > 50 and row["median"] > 0.0 and row["peer_median"] > 0.0

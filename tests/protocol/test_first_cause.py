@@ -24,6 +24,8 @@ TABLE = [
     ({"force_stale": 0, "force_lost": 100, "force_handover": 100}, "force_stale"),
     ({"steps_lost": 0, "over_force": 40}, "steps_lost"),
     ({"pose_rejected": 0, "tracker_moved": 25, "force_disagrees": 400}, "tracker_moved"),
+    ({"force_undecided": 0, "force_disagrees": 300, "body_contact": 270}, "body_contact"),  # averaged over a quarter second
+    ({"tracker_moved": 0, "body_contact": 250, "force_disagrees": 300}, "tracker_moved"),
     ({"pose_rejected": 0, "tracker_moved": 9_000}, "pose_rejected"),
     ({"over_force": 0, "operator_stop": 900}, "over_force"),
     ({"operator_stop": 0, "board_fault": 20}, "operator_stop"),

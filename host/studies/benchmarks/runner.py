@@ -32,6 +32,7 @@ BENCHMARKS: dict[str, str] = {
     "estimate_case_5": "host.studies.benchmarks.estimation:case_5",
     "estimate_case_6": "host.studies.benchmarks.estimation:case_6",
     "estimate_batch": "host.studies.benchmarks.estimation:batch",
+    "estimate_rig": "host.studies.benchmarks.rig_estimators:estimate_rig",
     "public_solve": "host.studies.benchmarks.public_face:public_solve",
     "public_estimate": "host.studies.benchmarks.public_face:public_estimate",
     "import_and_solve": "host.studies.benchmarks.start_up:import_and_solve",
