@@ -17,6 +17,7 @@ from host.studies.proof.worlds.nominal_arm import torques
 
 Array = np.ndarray
 STEP_S = 1e-3
+HUNG_kg = 1000.0  # of a load that hangs on the hinge: the heavier, the shorter the arm of the same moment
 _HEAD = f'<option timestep="{STEP_S}" gravity="{{gravity}}" integrator="implicitfast"/>'
 Control = Callable[[int, Any], None]  # (step, data): sets the controls
 
@@ -176,8 +177,8 @@ class Gear(ode.Link):
         if hang or _only(planted, "unlisted"):
             stiffness = stiffness or self._stiffness(setup)
             weight = hang.get("share", 0.0) * gain * c.motion * stiffness / 9.81
-        if soft and not mode:  # keep the load's own mode out of the recording
-            inertia = min(inertia, stiffness * (0.05 * c.slow_s) ** 2)
+        if stiffness and not mode:  # keep the load's own mode out of the recording
+            inertia = min(inertia, stiffness * ((0.05 if soft else 0.02) * c.slow_s) ** 2)
         if gap:
             friction, inertia = 4.0 * c.force + 20.0 * inertia * c.motion / c.slow_s**2, inertia
         damping = 2.0 * 0.15 * (stiffness * inertia) ** 0.5
@@ -196,12 +197,12 @@ class Gear(ode.Link):
             f'<tendon><fixed name="belt" {limit} stiffness="{stiffness}" damping="{damping}" springlength="0">'
             f'<joint joint="load" coef="1"/><joint joint="motor" coef="{-gain}"/></fixed></tendon>'
         )
-        # the weight hangs on the load's hinge, whose axis is level
+        # the weight hangs on the load's hinge, whose axis is level, on an arm so short that it adds hardly any inertia
         return f"""<mujoco>{_HEAD.format(gravity="0 0 -9.81" if hang else "0 0 0")}
 <worldbody>
 <body><joint name="motor" type="hinge" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body>
 <body><joint name="load" type="hinge" axis="0 1 0" damping="{1e-6}" frictionloss="{friction}"/>
-<inertial pos="0 0 {-weight / 1.0}" mass="1" diaginertia="{inertia} {inertia} {inertia}"/></body>
+<inertial pos="0 0 {-weight / HUNG_kg}" mass="{HUNG_kg}" diaginertia="{inertia} {inertia} {inertia}"/></body>
 </worldbody>
 {joined if gap or stiffness else rigid}
 <actuator><position joint="motor" kp="400" kv="8"/><motor joint="load"/></actuator></mujoco>"""
