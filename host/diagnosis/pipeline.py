@@ -22,7 +22,6 @@ from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.known import Known
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
-from host.diagnosis.estimation.spectral_line import common_line
 from host.diagnosis.estimation.uncertainty import intervals, uncertain
 from host.diagnosis.live.recorded_rig import RecordedRig
 from host.diagnosis.model import readings
@@ -32,6 +31,7 @@ from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import EffectSpec, NominalSpec
 from host.diagnosis.model.progress import Overall
+from host.diagnosis.model.spectral_line import common_line, distorted
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
@@ -418,7 +418,8 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
     for row, output in enumerate(full.model.outputs):
         residuals = [r[row] for r in found.nominal_full.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
-        line = common_line(residuals, inputs, simulated, periods)
+        known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
+        line = common_line(residuals, known, simulated, periods)
         if line is None:
             continue
         column = full.columns.get(output.channel, output.channel)

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from host.diagnosis.effects.latency import rows
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale
+from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 from host.diagnosis.model.operators import shift
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-    """Rate of one clock against the other."""
+    """Rate of one clock against the other; form `set`: and the time at which both agree, at first a recording's middle."""
     size = s.dt_s / s.duration_s
     rates = tuple(sign * times * size for times in (0.04, 0.2, 1.0, 5.0) for sign in (-1.0, 1.0))
-    return (Parameter("rate", "s/s", rates, -0.05, 0.05, step=size),)
+    rate = Parameter("rate", "s/s", rates, -0.05, 0.05, step=size)
+    if form == "set":
+        agree = Parameter("agree", "s", (0.5 * s.duration_s,), -s.duration_s, 2.0 * s.duration_s, step=0.1 * s.duration_s)
+        return rate, agree
+    return (rate,)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Delay the signal (n,) by p[0] t."""
-    return shift(signal, c.dt_s, p[0] * c.time_s)
+    """Delay the signal (n,) by p[0] t, or by p[0] (t - p[1])."""
+    return shift(signal, c.dt_s, p[0] * (c.time_s - p[1] if form == "set" else c.time_s))
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -30,12 +34,16 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 
 SAYS = "One clock runs faster: the delay grows by {rate}."
-EFFECTS = tuple(
+_DRIFTS = tuple(
     Effect(
         "clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate", invariant=True
     )
     for port in ("motion", "timing")
-) + (
+)
+_SET = "One clock runs faster: the delay grows by {rate}; both agree at {agree}."
+EFFECTS = (
+    *_DRIFTS,
+    *(in_form(each, "set", _SET, "y(t) = x(t - rate*(t - agree))") for each in _DRIFTS),
     Effect(
         "clock_drift",
         "pose",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, lines, spread
+from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parameter, Scale, lines, spread
+from host.diagnosis.model.spectral_line import common_line, distorted, stands_out
 
 LEAST_PERIODS = 1.0  # in a recording: less of a sine cannot be separated from an offset, a ramp and a bend (Rayleigh)
 PERIODS = 0.8  # pitch against the span beyond which a bend is no period: it has to come back once
@@ -50,6 +53,44 @@ def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
 def slots(p: Array, form: str) -> dict[str, float]:
     """A sine over time or over place, as a force."""
     return {"sine": p[0], "cosine": p[1], ("pitch" if form == "place" else "frequency"): p[2]}
+
+
+def of_a_line(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """The frequency; amplitude and phase are those of each recording."""
+    return (Parameter("frequency", "Hz", (LEAST_PERIODS / s.duration_s,), LEAST_PERIODS / s.duration_s, 0.5 / s.dt_s),)
+
+
+def on_the_line(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
+    """The frequency of a line that stands out of the residual of every recording; no parameter where none does, or where
+    what was simulated has it too, or a law that distorts it would.
+    """
+    count = len(evidence.need)
+    periods = [float(np.median(np.diff(time_s))) if time_s.size > 1 else 1.0 for time_s in evidence.time_s]
+    laid = [_on_grid(t, x, dt) for t, x, dt in zip(evidence.time_s, evidence.need, periods, strict=True)]
+    line = common_line(laid, [()] * count, [np.zeros(x.size) for x in laid], periods)
+    outputs = len(evidence.readings) // max(count, 1)
+    if line is not None and any(
+        stands_out(form, line.frequency_Hz, periods[k // outputs])
+        for k, one in enumerate(evidence.readings)
+        for form in distorted(one.course)
+    ):
+        line = None
+    (p,) = parameters
+    return () if line is None else (replace(p, grid=(min(max(line.frequency_Hz, p.low), p.high),)),)
+
+
+def _on_grid(time_s: Array, values: Array, dt_s: float) -> Array:
+    """`values` (n,) at even steps, NaN in the gaps."""
+    place = np.round((time_s - time_s[0]) / dt_s).astype(int)
+    out = np.full(place[-1] + 1, np.nan)
+    out[place] = values
+    return out
+
+
+def apply_line(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Adds a sine over time, of the recording's own amplitudes of cosine and sine."""
+    phase = 2.0 * np.pi * p[0] * (c.time_s - c.time_s[0])
+    return np.asarray(signal + c.starts[0] * np.cos(phase) + c.starts[1] * np.sin(phase))
 
 
 SAYS = "A periodic disturbance is added to the signal."
@@ -192,5 +233,21 @@ EFFECTS = (
         timed=True,
         at_rest=True,
         several=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "drift",
+        76,
+        of_a_line,
+        "The reading contains an oscillation at {frequency} that no motion causes, with another phase in each recording.",
+        "y = x + a*cos(2 pi f t) + b*sin(2 pi f t),  a and b of each recording",
+        apply_line,
+        forms=("phases",),
+        seeds=on_the_line,
+        timed=True,
+        at_rest=True,
+        several=True,
+        remembers=True,
+        memories=("cosine", "sine"),
     ),
 )

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
-from host.diagnosis.model.operators import lag, lagged_rows
+from host.diagnosis.model.operators import digital_lag, lag, lagged_rows
+
+FASTEST = 2.0  # samples: a digital filter with a shorter time constant delays by a part of a sample, and little else
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Return the time constant of the low pass (s)."""
+    if form == "digital":
+        least = FASTEST * s.dt_s
+        times = spread(2.0 * least, max(0.05 * s.duration_s, 4.0 * least), 5)
+        return (Parameter("time_constant", "s", times, least, max(0.3 * s.duration_s, 8.0 * least), log=True),)
     times = (0.1 * s.dt_s, *spread(0.5 * s.dt_s, 0.05 * s.duration_s, 6))
     return (Parameter("time_constant", "s", times, 0.02 * s.dt_s, 0.3 * s.duration_s, log=True),)
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
     """Pass the signal (n,) through a first-order low pass of time constant p[0] (s)."""
-    return lag(signal, c.dt_s, p[0], c.start)
+    return (digital_lag if form == "digital" else lag)(signal, c.dt_s, p[0], c.start)
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -45,7 +51,7 @@ _TRACKER = Effect(
     timed=True,
     shifts="time",
 )
-EFFECTS = tuple(
+_LAGS = tuple(
     Effect(
         "rate_lag",
         port,
@@ -60,7 +66,14 @@ EFFECTS = tuple(
         invariant=True,
     )
     for port in ("motion", "timing")
-) + (
+)
+_DIGITAL = "y[k] = y[k-1] + (1 - exp(-period/time_constant))*(x[k] - y[k-1])"
+EFFECTS = (
+    *_LAGS,
+    *(
+        in_form(each, "digital", "The samples pass a digital low pass of first order, {time_constant}.", _DIGITAL)
+        for each in _LAGS
+    ),
     _TRACKER,
     in_form(
         _TRACKER,

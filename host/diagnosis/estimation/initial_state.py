@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.fit import Fit, Problem, Term, free, jacobian, minimize, moved, robust, size_of
-from host.diagnosis.model.effect import rate_key
+from host.diagnosis.model.effect import memory_keys, rate_key
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
 Array = npt.NDArray[np.float64]
@@ -80,21 +80,32 @@ class _State:
             self.segment.begin.values[self.index] = value
 
 
-def _states(problem: Problem, segment: Segment, terms: tuple[Term, ...]) -> list[_State]:
-    """Every number that `segment` begins with, where it is not known."""
+def _states(problem: Problem, segment: Segment, fit: Fit) -> list[_State]:
+    """Every unknown number that `segment` begins with: of its model's state, and of memories that fade with time."""
     found, begin = [], segment.begin
     if begin is not None and begin.estimated:
         for k in np.flatnonzero(begin.spread > 0.0):
             found.append(_State(segment, float(begin.measured[k]), float(begin.spread[k]), int(k)))
-    for term in terms:
+    for term in fit.terms:
         candidate = term.candidate
-        if candidate.effect.remembers and candidate.effect.invariant:
-            port, dt_s = candidate.port.name, segment.recording.dt_s
-            motion = problem.model.motion(segment, candidate.port)
-            found.append(_State(segment, 0.0, float(np.ptp(motion)) or 1.0, key=port))
+        if candidate.effect.remembers and (candidate.effect.invariant or candidate.effect.timed):
+            port, motion = candidate.port.name, problem.model.motion(segment, candidate.port)
+            span = _memory_span(segment, term, fit, motion)
+            found += [_State(segment, 0.0, span, key=key) for key in memory_keys(candidate)]
             if candidate.effect.begins_with_speed:
-                found.append(_State(segment, 0.0, float(np.ptp(np.gradient(motion, dt_s))) or 1.0, key=rate_key(port)))
+                hurry = float(np.ptp(np.gradient(motion, segment.recording.dt_s))) / (float(np.ptp(motion)) or 1.0)
+                found.append(_State(segment, 0.0, span * hurry or 1.0, key=rate_key(port)))
     return found
+
+
+def _memory_span(segment: Segment, term: Term, fit: Fit, motion: Array) -> float:
+    """How far from its rest a memory can begin: as far as its input (n,) moves, times its share."""
+    if term.candidate.effect.memories:
+        return max(float(np.nanmax(row) - np.nanmin(row)) for row in segment.y if np.isfinite(row).any())
+    moved_by = segment.inputs[term.candidate.source] if term.candidate.source else motion
+    pairs = zip(term.parameters, fit.values_of(term), strict=True)
+    share = max((abs(float(value)) for p, value in pairs if p.linear), default=1.0)
+    return share * float(np.ptp(moved_by)) or 1.0
 
 
 def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask) -> tuple[Array, Array, list[_State]]:
@@ -104,7 +115,7 @@ def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: 
         r = problem.left(segment, fit.terms, values)[:, mask] / problem.scale[:, None]
         return np.nan_to_num(r, nan=0.0, posinf=0.0, neginf=0.0).ravel()
 
-    states = _states(problem, segment, fit.terms)
+    states = _states(problem, segment, fit)
     r, columns = left(), []
     for state in states:
         now = state.value

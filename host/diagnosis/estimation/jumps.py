@@ -44,8 +44,8 @@ def _jumps(r: Array, number: int) -> list[Jump]:
     shift, abrupt = _shift(r, SIDE), _shift(r, NEAR)
     level = 1.4826 * float(np.median(np.abs(shift - np.median(shift)))) + 1e-300
     found: list[Jump] = []
-    left = np.abs(shift)
-    while left.size and np.max(left) > LEAST * level and len(found) <= MOST:
+    left = np.where(np.abs(shift) > LEAST * np.maximum(level, _scatter(r)), np.abs(shift), 0.0)
+    while left.size and np.max(left) > 0.0 and len(found) <= MOST:
         place = int(np.argmax(left))
         at = place + SIDE  # first sample after it
         near = np.arange(max(at - SIDE // 2, NEAR), min(at + SIDE // 2, r.size - NEAR) + 1)  # medians are flat about it
@@ -56,6 +56,13 @@ def _jumps(r: Array, number: int) -> list[Jump]:
             found.append(Jump(number, int(near[np.argmax(steps)]), float(shift[place])))
         left[max(place - SIDE, 0) : place + SIDE + 1] = 0.0
     return sorted(found, key=lambda jump: jump.sample)
+
+
+def _scatter(r: Array) -> Array:
+    """Standard deviation of `_shift` if the samples around are white: noise can grow with the motion."""
+    steps = np.lib.stride_tricks.sliding_window_view(np.abs(np.diff(r)), 2 * SIDE - 1)
+    one = 1.4826 / np.sqrt(2.0) * np.median(steps, axis=1)
+    return np.asarray(one * np.sqrt(np.pi / SIDE))  # a median of n samples scatters by sqrt(pi / 2n) of one sample
 
 
 def _shift(r: Array, side: int) -> Array:

@@ -59,7 +59,9 @@ def module_of(result: Diagnosis) -> str:
         name = gathered.add(candidate.effect.apply)
         numbers = tuple(float(value) for value in values)
         form, source, side = candidate.form, candidate.source, candidate.effect.side
-        effects.append(f"    ExportedEffect({candidate.port.name!r}, {name}, {numbers!r}, {form!r}, {source!r}, {side!r}),")
+        last = f", {candidate.effect.memories!r}" if candidate.effect.memories else ""
+        listed = f"{candidate.port.name!r}, {name}, {numbers!r}, {form!r}, {source!r}, {side!r}{last}"
+        effects.append(f"    ExportedEffect({listed}),")
     gathered.imports.setdefault("import numpy as np")
     text = gathered.text().replace("from numba import njit\n", NUMBA)
     named = ", ".join(candidate.key for candidate, _ in active) or "none"

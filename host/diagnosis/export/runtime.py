@@ -27,10 +27,14 @@ class ExportedEffect(NamedTuple):
     form: str
     source: str
     side: str
+    memories: tuple[str, ...] = ()
 
 
 class ExportedRun(NamedTuple):
-    """What one simulation has. inputs: channels (n,). start: port -> displacement of a memory at the first sample."""
+    """What one simulation has.
+
+    inputs: channels (n,). start: port, or port/memory -> value of a memory at the first sample.
+    """
 
     inputs: dict[str, Array]
     time_s: Array
@@ -71,6 +75,7 @@ def affected(
         begun = run.start.get(port, 0.0)
         context = Context(run.time_s, period_of(run.time_s), base, tolerance, begun, source)
         context.start_rate = run.start.get(rate_key(port), 0.0)
+        context.starts = tuple(run.start.get(f"{port}/{name}", 0.0) for name in effect.memories)
         signal = effect.apply(signal, context, np.array(effect.values), effect.form)
     return signal
 

@@ -78,6 +78,7 @@ class Context:
     source: Array | None = None
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
     start_rate: float = 0.0  # speed at the first sample beyond that of the motion: start of memory of second order
+    starts: tuple[float, ...] = ()  # of an effect with `memories`: each of them, in this recording
     _cache: dict[str, Array] = field(default_factory=dict)
 
     def moving(self, signal: Array) -> Array:
@@ -108,12 +109,16 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Reading:
-    """One output in one recording, samples to fit alone: what was simulated, the residual, and the weight of both."""
+    """One output in one recording, samples to fit alone: what was simulated, the residual, and the weight of both.
+
+    course: what was simulated, at every sample of the recording.
+    """
 
     unit: str
     simulated: Array
     residual: Array
     scale: float
+    course: Array = field(default_factory=lambda: np.zeros(0))
 
 
 Apply = Callable[[Any, Context, Array, str], Any]
@@ -157,6 +162,7 @@ class Effect:
     family: str = ""  # of one family only one acts at a port: the second takes the place of the first
     remembers: bool = False  # its state at a recording's first sample is not known: it is estimated
     begins_with_speed: bool = False  # so is its speed there
+    memories: tuple[str, ...] = ()  # what each recording begins with, instead of a displacement: an amplitude, for one
     natural_bounds: bool = False  # a parameter may end at its bound: the bound is physics
     at_rest: bool = False  # seen without any motion of its port
     several: bool = False  # more than one may act at a port
@@ -221,6 +227,12 @@ def alike_everywhere(a: Candidate, b: Candidate) -> bool:
 def rate_key(port: str) -> str:
     """Key of the speed with which memory at `port` begins, among the starts of a recording."""
     return f"{port}/rate"
+
+
+def memory_keys(candidate: Candidate) -> tuple[str, ...]:
+    """Keys of what the memory of `candidate` begins with, among the starts of a recording; its speed is not among them."""
+    port = candidate.port.name
+    return tuple(f"{port}/{name}" for name in candidate.effect.memories) or (port,)
 
 
 def cornered(candidate: Candidate, values: Array) -> Candidate:

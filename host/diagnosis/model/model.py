@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, is_force, rate_key
+from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, is_force, memory_keys, rate_key
 from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
@@ -230,6 +230,7 @@ def apply_effects(
             source,
             segment.equations if finer == 1 else {k: np.repeat(v, finer) for k, v in segment.equations.items()},
             segment.start.get(rate_key(port), 0.0),
+            tuple(segment.start.get(key, 0.0) for key in memory_keys(candidate)),
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal

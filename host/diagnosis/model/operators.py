@@ -118,6 +118,19 @@ def lag(x: Array, dt_s: float, time_constant_s: float, start: float = 0.0) -> Ar
     return out
 
 
+@njit(cache=True)
+def digital_lag(x: Array, dt_s: float, time_constant_s: float, start: float = 0.0) -> Array:
+    """First-order low pass of samples, each output moved towards the newest input. `start`: first output minus input."""
+    out = np.empty(x.size)
+    share = 1.0 - math.exp(-dt_s / time_constant_s)
+    y = x[0] + start
+    out[0] = y
+    for i in range(1, x.size):
+        y += share * (x[i] - y)
+        out[i] = y
+    return out
+
+
 def lagged_rows(values: Array, dt_s: float, time_constant_s: float) -> Array:
     """First-order low pass of every row of `values` (..., n), begun as in a steady motion."""
     flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))

@@ -3,7 +3,8 @@
 A sine over time with one phase for all recordings is a candidate effect. If each recording starts at another instant of
 the disturbance, no such sine fits, and an autoregression predicts a sine as it predicts noise. The line itself shows in
 every periodogram, against the level of the bins around it. A frequency at which the simulated output moves more says
-nothing: the residual rings there if a parameter or a start of the nominal model is a little off.
+nothing: the residual rings there if a parameter or a start of the nominal model is a little off. Where a square, a
+cube or a magnitude of it has a line too, a nonlinear law may have made the one from the other.
 """
 
 from __future__ import annotations
@@ -59,6 +60,20 @@ def common_line(
     amplitude = float(np.sqrt(np.mean([each.amplitude**2 for each in found])))
     share = 0.5 * amplitude**2 / float(np.nanvar(np.concatenate(residuals)))
     return Tone(float(np.mean(hertz)), amplitude) if np.ptp(hertz) < widest and share > LEAST_SHARE else None
+
+
+def stands_out(x: Array, frequency_Hz: float, dt_s: float) -> bool:
+    """Whether the spectrum of `x` (n,) has a line at `frequency_Hz`."""
+    bin_ = round(frequency_Hz * x.size * dt_s)
+    near = _over_level(x)[max(bin_ - 1, 0) : bin_ + 2]
+    return x.size >= FEWEST and near.size > 0 and float(np.max(near)) > float(np.log(x.size / 2 / SIGNIFICANCE))
+
+
+def distorted(x: Array) -> list[Array]:
+    """Forms of a signal (n,), itself among them, whose lines a nonlinear law makes of those of the signal."""
+    centred = fill(x) - np.mean(fill(x))
+    speed = np.gradient(centred)
+    return [centred, centred**2, centred**3, np.abs(centred), np.sign(speed), speed * np.abs(speed)]
 
 
 def _over_level(x: Array) -> Array:

@@ -121,6 +121,15 @@ def _unexplained(result: Diagnosis) -> str:
     """What to do about a residual that no effect explains; empty where there is none."""
     if any(f.id == "session" for f in result.findings):
         return "Find what was changed between the recordings, or diagnose those that agree with each other apart."
+    if (
+        result.verdict == "mismatch_not_identified"
+        and result.spec.linear is not None
+        and result.spec.linear.feedback is None
+    ):
+        return (
+            "Describe a mass on a spring or damper as kind axis and diagnose again: a linear model has candidates at its "
+            "inputs and readings alone, and a force inside it, as of friction or a hardening spring, is none of them."
+        )
     if result.verdict == "mismatch_not_identified" and result.model.simulates:
         return (
             "Offer the simulator's parameters that are nominally off ([[offer]]), or record slower and faster motions with "

@@ -60,7 +60,9 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
         alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
-        share = _share(problem, found, less, noise_sd) if terms else np.inf
+        # No inexact formula of another effect leaves a line that no motion has.
+        doubtful = terms and not term.candidate.effect.memories
+        share = _share(problem, found, less, noise_sd) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 

@@ -29,8 +29,9 @@ from host.diagnosis.estimation.fit import (
     tuned,
 )
 from host.diagnosis.model.dataset import one_clock
-from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, same_place
+from host.diagnosis.model.effect import Candidate, Evidence, Parameter, Port, Reading, memory_keys, same_place
 from host.diagnosis.model.model import scale_of
+from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -294,8 +295,9 @@ def _seeded(problem: Problem, fit: Fit, term: Term) -> Term:
     for segment, residual in used:
         for row, output in enumerate(problem.model.outputs):
             good = segment.fit & np.isfinite(residual[row])
-            simulated = (segment.y[row] - residual[row])[good]
-            readings.append(Reading(output.unit, simulated, residual[row][good], float(problem.scale[row])))
+            course = segment.y[row] - residual[row]
+            left, scale = residual[row][good], float(problem.scale[row])
+            readings.append(Reading(output.unit, course[good], left, scale, fill(course)))
     needs = [problem.model.needs(segment, term.candidate.port, fit.values[:n], r)[segment.fit] for segment, r in used]
     times = [segment.recording.time_s[segment.fit] for segment, _ in used]
     shared = len(used) == 1 or one_clock([segment.recording for segment, _ in used])
@@ -342,6 +344,10 @@ def _scan(
                 taken = float(rest @ rest - left @ left)
                 points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1]))
             continue
+        if term.candidate.effect.memories:  # it is nothing but what each recording begins with
+            left = rest - S @ (S.T @ rest)
+            points.append(Point(float(rest @ rest - left @ left), starts(term, {}, point), left, None, S.shape[1]))
+            continue
         D = np.array(columns)
         D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
         B = D @ Q
@@ -383,26 +389,31 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array, sl
     none = np.zeros((Q.shape[0], 0))
     if not candidate.effect.remembers or not candidate.effect.timed:
         return none  # a memory of places, not of times, is soon overwritten
-    port, before = candidate.port.name, get_starts(problem)
+    port, before, keys = candidate.port.name, get_starts(problem), memory_keys(candidate)
     used = [segment for segment in problem.segments if segment.fit.any()]
-    spread = float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
+    spread = (
+        float(np.std(np.concatenate([problem.model.motion(segment, candidate.port)[segment.fit] for segment in used])))
+        or 1.0
+    )
 
     def response() -> Array:
         return _fast(problem, terms, trial, slopes) if port in slopes else -problem.stacked(terms, trial)
 
-    change = -(response() if now is None else now)
-    for segment in used:
-        segment.start[port] = segment.start.get(port, 0.0) + START_STEP * spread
-    change += response()
-    set_starts(problem, before)
+    now = response() if now is None else now
     rows = len(problem.noise)
     edges = np.cumsum([0] + [rows * int(segment.fit.sum()) for segment in used])
-    columns = np.zeros((change.size, len(used)))
-    for index, (first, last) in enumerate(itertools.pairwise(edges)):
-        columns[first:last, index] = change[first:last]
+    columns = np.zeros((now.size, len(keys) * len(used)))
+    for number, key in enumerate(keys):
+        for segment in used:
+            segment.start[key] = segment.start.get(key, 0.0) + START_STEP * spread
+        change = response() - now
+        set_starts(problem, before)
+        for index, (first, last) in enumerate(itertools.pairwise(edges)):
+            columns[first:last, number * len(used) + index] = change[first:last]
+    most = float(np.max(np.sum(columns**2, axis=0), initial=0.0)) ** 0.5
     columns -= Q @ (Q.T @ columns)
     size = np.sqrt(np.sum(columns**2, axis=0))
-    seen = np.flatnonzero(size > 1e-9 * max(float(np.sqrt(change @ change)), 1e-300))
+    seen = np.flatnonzero(size > 1e-9 * max(most, 1e-300))
     return np.asarray(np.linalg.qr(columns[:, seen])[0]) if seen.size else none
 
 

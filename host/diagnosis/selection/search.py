@@ -22,7 +22,7 @@ from host.diagnosis.estimation.fit import (
     robust,
     set_starts,
 )
-from host.diagnosis.estimation.initial_state import begun_again, start_again
+from host.diagnosis.estimation.initial_state import STATE_STEPS, begun_again, fit_with_states, start_again
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
@@ -158,7 +158,7 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
     if not candidate.effect.remembers:
         return fit
     port = candidate.port.name
-    for _ in range(2):
+    for _ in range(0 if candidate.effect.memories else 2):
         before = get_starts(problem)
         reach = 2.0 * max(max(abs(start.get(port, 0.0)) for start in before), _need_rms(problem, fit, candidate))
         for segment in problem.segments:
@@ -176,6 +176,20 @@ def _restart(problem: Problem, fit: Fit, candidate: Candidate) -> Fit:
         fit = finish(problem, trial)
         if not better:
             break
+    return _memory_and_values(problem, fit) if candidate.effect.timed and not problem.joint_states else fit
+
+
+def _memory_and_values(problem: Problem, fit: Fit) -> Fit:
+    """`fit` with its parameters and the starts of its memories moved together, if that lowers its cost.
+
+    In turn they hardly move where a memory fades slowly: the start holds what the parameters leave, and they follow it.
+    """
+    before = get_starts(problem)
+    trial = fit_with_states(problem, fit, STATE_STEPS)
+    trial = minimize(problem, trial.terms, trial.values, rounds=6, tolerance=1e-4)
+    if trial.cost < fit.cost:
+        return finish(problem, trial)
+    set_starts(problem, before)
     return fit
 
 

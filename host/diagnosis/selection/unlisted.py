@@ -78,8 +78,12 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
     levels = noise_sd.copy()
     for row, noise in enumerate(problem.noise):
         if noise.source not in MEASURED and _power(problem, fit.residuals, row) > levels[row] ** 2:
-            inputs = [[segment.inputs[name] for name in problem.model.quiet_inputs] for segment in problem.segments]
-            if only_coloured([r[row] for r in fit.residuals], inputs):
+            # What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
+            known = [
+                [*(segment.inputs[name] for name in problem.model.quiet_inputs), segment.y[row] - r[row]]
+                for segment, r in zip(problem.segments, fit.residuals, strict=True)
+            ]
+            if only_coloured([r[row] for r in fit.residuals], known):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
 

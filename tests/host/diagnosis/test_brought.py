@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import cont2discrete, dlsim, lfilter
 
 import seldinger as sd
-from host.diagnosis.estimation.spectral_line import common_line
 from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.spectral_line import common_line
 from host.diagnosis.model.tables import Table
 from host.diagnosis.models.linear import StateSpace, closed_loop, sampled
 from host.diagnosis.pipeline import inspected

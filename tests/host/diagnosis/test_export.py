@@ -76,6 +76,7 @@ EFFECTS = {
         ("compliance@cable(w)", "latency@cable"),
         ("creep_relaxation@cable",),
         ("rate_lag@cable", "sensor_drift@cable_reading"),
+        ("rate_lag@cable(digital)", "periodic_disturbance@cable_reading(phases)"),
     ],
     "axis": [
         ("coulomb_friction@axis", "nonlinear_stiffness@axis"),
@@ -93,6 +94,7 @@ def test_a_module_equals_the_simulation(tmp_path: Path, kind: str, keys: tuple[s
     result = case(tmp_path, kind, keys)
     segment = result.problem.segments[0]
     segment.start = {port.name: 0.02 for port in result.model.ports}
+    segment.start |= {f"{port.name}/{name}": 0.03 for port in result.model.ports for name in ("cosine", "sine")}
     if segment.begin is not None:
         segment.begin.values = np.zeros(segment.begin.values.size)
     target = tmp_path / "extended.py"

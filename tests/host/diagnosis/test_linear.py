@@ -215,3 +215,54 @@ def test_a_section_that_cannot_be_is_bad_input(change: dict[str, Any], wanted: s
 def test_coefficients_are_arithmetic_of_parameters() -> None:
     assert names_in("-k / m + sqrt(c)", "A") == {"k", "m", "c"}
     assert value_of("-(k / m) ** 2", {"k": 6.0, "m": 2.0}) == -9.0 and np.isnan(value_of("1 / m", {"m": 0.0}))
+
+
+def oscillator(seed: int, force: Any, n: int = 2000, steps: int = 8) -> dict[str, Array]:
+    """y'' + 4 y' + 25 y + 25 force(y, y') = 32.5 u by Runge-Kutta, u straight between samples, noise 2 mm."""
+    rng, t = np.random.default_rng(seed), np.arange(n + 300) * DT_S
+    hertz = np.geomspace(0.1, 3.0, 8) * rng.uniform(0.9, 1.1, 8)
+    u = 0.5 * np.sum(np.sin(2 * np.pi * np.outer(t, hertz) + rng.uniform(0, 6.28, 8)), axis=1)
+    y, state = np.empty(u.size), np.zeros(2)
+
+    def rate(x: Array, push: float) -> Array:
+        return np.array([x[1], 25.0 * (1.3 * push - x[0] - 0.16 * x[1] - force(x[0], x[1]))])
+
+    for i in range(u.size):
+        y[i] = state[0]
+        after = u[min(i + 1, u.size - 1)]
+        for j in range(steps):
+            h, (p, q, r) = DT_S / steps, (u[i] + (after - u[i]) * (j + c) / steps for c in (0.0, 0.5, 1.0))
+            a = rate(state, p)
+            b = rate(state + 0.5 * h * a, q)
+            c = rate(state + 0.5 * h * b, q)
+            state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(state + h * c, r))
+    y += 2e-3 * np.random.default_rng(seed + 50).standard_normal(u.size)
+    return {"t": np.arange(n) * DT_S, "u": u[300:], "y": y[300:]}
+
+
+SECOND: dict[str, Any] = {
+    **THIRD,
+    "linear": {
+        **THIRD["linear"],
+        "numerator": ["k * w**2"],
+        "denominator": [1.0, "2 * d * w", "w**2"],
+        "hold": "linear",
+    },
+    "parameters": {name: THIRD["parameters"][name] for name in ("k", "w", "d")},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("force", "verdict"),
+    [
+        (lambda y, v: 0.0, "nothing_missing"),
+        (lambda y, v: 0.06 * y**3, "mismatch_not_identified"),
+    ],
+    ids=["nothing", "hardening"],
+)
+def test_a_force_inside_the_plant_is_no_noise(force: Any, verdict: str) -> None:
+    """It is as coloured as noise and follows no form of the input, but it follows the plant's own motion."""
+    found = sd.diagnose([oscillator(301, force), oscillator(302, force)], SECOND).as_dict()
+    assert found["verdict"] == verdict
+    assert verdict == "nothing_missing" or "kind axis" in found["next"]
