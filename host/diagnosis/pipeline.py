@@ -274,6 +274,7 @@ def _diagnosed(
         *apart,
         *lone,
         *done.findings,
+        *_fed_back(problem),
         *_repeated(full),
         *between,
         *uncertain(problem, found.best, spans),
@@ -430,6 +431,17 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         says += "a hum, a vibration or a rotating part is not in the nominal model."
         findings.append(Finding("line", column, says))
     return findings
+
+
+def _fed_back(problem: Problem) -> list[Finding]:
+    """A sentence where effects were not tried because a controller fed the noise of the motion back into the input."""
+    if not problem.noise_fed:
+        return []
+    names = [problem.columns.get(name, name) for name in problem.model.quiet_inputs]
+    says = f"A controller computes column {names[0]} from the recorded motion, whose noise is most of the residual. No "
+    says += "delay, lag, resonance or second mass was tried: a law with memory can cancel this noise, so these recordings "
+    says += "cannot show one. Record in open loop, or read the motion with less noise."
+    return [Finding("noise_fed_back", names[0], says)]
 
 
 def _too_slow(full: Problem, found: Found, rows: list[int]) -> list[Finding]:

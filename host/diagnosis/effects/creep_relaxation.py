@@ -141,6 +141,7 @@ EFFECTS = (
         "Part of the stiffness, {stiffness}, relaxes with a time constant of {time_constant}.",
         "F = stiffness*(x - lag(x, time_constant))",
         slots=slots,
+        filters=True,
         timed=True,
         remembers=True,
         several=True,

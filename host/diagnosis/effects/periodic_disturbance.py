@@ -62,17 +62,22 @@ def of_a_line(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 def on_the_line(evidence: Evidence, parameters: tuple[Parameter, ...], form: str) -> tuple[Parameter, ...]:
     """The frequency of a line that stands out of the residual of every recording; no parameter where none does, or where
-    what was simulated has it too, or a law that distorts it would.
+    another signal has it too, recorded or simulated, or a law that distorts one would.
     """
     count = len(evidence.need)
     periods = [float(np.median(np.diff(time_s))) if time_s.size > 1 else 1.0 for time_s in evidence.time_s]
     laid = [_on_grid(t, x, dt) for t, x, dt in zip(evidence.time_s, evidence.need, periods, strict=True)]
     line = common_line(laid, [()] * count, [np.zeros(x.size) for x in laid], periods)
     outputs = len(evidence.readings) // max(count, 1)
+    known = [
+        [*others, *(one.course for one in evidence.readings[k * outputs : (k + 1) * outputs])]
+        for k, others in enumerate(evidence.others)
+    ]
     if line is not None and any(
-        stands_out(form, line.frequency_Hz, periods[k // outputs])
-        for k, one in enumerate(evidence.readings)
-        for form in distorted(one.course)
+        stands_out(form, line.frequency_Hz, dt_s)
+        for signals, dt_s in zip(known, periods, strict=True)
+        for signal in signals
+        for form in distorted(signal)
     ):
         line = None
     (p,) = parameters

@@ -131,6 +131,7 @@ EFFECTS = (
         "A part of the mass is attached by a spring and oscillates at {frequency}.",
         "m2 x2'' = k2 (x - x2) + c2 (x' - x2')",
         slots=slots,
+        filters=True,
         timed=True,
     ),
 )

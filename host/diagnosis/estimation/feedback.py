@@ -9,6 +9,9 @@ Here the part of the residual that later input predicts is taken off before two 
 A controller that computes the input of a row from the reading of the same row sends its noise into that row. A direct path
 through the plant would look alike, but such a path passes all of the input alike, and noise is in its new part alone:
 the residual then follows the new part and not the other one. Noise of the input's own reading has the same signature.
+
+Where both sides of a law are compared behind a test function, the noise of a sample is in the residual before and after it.
+Earlier new input then holds noise as well, and a filter of the input could take it away.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
 LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
 COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
 OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the other part
+LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
 
 
@@ -45,11 +49,15 @@ def unpredicted(x: Array) -> Array:
     return np.concatenate((np.zeros(ORDER), new))
 
 
-def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> None:
+def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> bool:
     """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs` or at once.
 
     residuals: (outputs, n) of each segment. `fed_back[row]` is an orthonormal basis (n, lags), or None.
+
+    Returns whether a law is compared behind a test function, and its residual is mostly noise that a controller fed back:
+    a linear law with memory can then take that noise away, and nothing tells it from one that does not.
     """
+    noisy = False
     new = [_new_input(segment, inputs) for segment in segments]
     for segment, u in zip(segments, new, strict=True):
         segment.fed_back = [_later(u) for _ in range(segment.y.shape[0])]
@@ -59,9 +67,15 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         if later < LEAST_SHARE or later < OVER_PAST * earlier:
             for segment in segments:
                 segment.fed_back[row] = None
+        if _said_by_motion(segments, inputs) > LEAST_SAID:
+            around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
+            noisy = noisy or _share(around, residuals, row) > LEAST_SAID
+            for segment, basis in zip(segments, around, strict=True):
+                segment.fed_back[row] = basis
         at_once = [part for name in inputs for part in _at_once(segments, residuals, row, name, earlier)]
         for index, column in at_once:
             segments[index].fed_back[row] = _with(segments[index].fed_back[row], column)
+    return noisy
 
 
 def _at_once(
@@ -113,6 +127,39 @@ def _new_input(segment: Segment, inputs: tuple[str, ...]) -> list[Array]:
 
 def _later(new: list[Array]) -> Array | None:
     return _basis(new, lambda u, k: np.concatenate((u[k + 1 :], np.zeros(k + 1))))
+
+
+def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...]) -> float:
+    """Share of the variance of the new input that the measured motion, up to the same row, says (Granger 1969).
+
+    A motion follows its input. It says something of a later one only through a controller. 0 where no law is compared
+    behind a test function.
+    """
+    alone = together = 0.0
+    for segment in segments:
+        if segment.spread == 0 or segment.read_motion is None or not ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES:
+            continue
+        x = fill(segment.read_motion)
+        for name in inputs:
+            u = fill(segment.inputs[name])
+            new = unpredicted(u)[ORDER:]
+            past = [u[ORDER - k - 1 : u.size - k - 1] for k in range(ORDER)]
+            known = np.column_stack([*past, *(x[ORDER - k : x.size - k] for k in range(ORDER)), np.ones(new.size)])
+            left = new - known @ np.linalg.lstsq(known, new, rcond=1e-12)[0]
+            scale = float(np.mean(new**2)) + 1e-300
+            alone, together = alone + float(new @ new) / scale, together + float(left @ left) / scale
+    return 1.0 - together / alone if alone > 0.0 else 0.0
+
+
+def _around(new: list[Array], spread: int) -> Array | None:
+    """The new input from `spread` samples before to LAGS more after: a test function spreads a sample's noise so far, and a
+    controller hands it on later.
+    """
+    if not new:
+        return None
+    most = max(1, new[0].size // SAMPLES_PER_LAG // len(new))
+    before, after = min(spread, most // 3), min(spread + LAGS, most - most // 3)
+    return np.linalg.qr(np.column_stack([np.roll(u, k) for u in new for k in range(-after, before + 1)]))[0]
 
 
 def _earlier(new: list[Array]) -> Array | None:

@@ -75,6 +75,7 @@ class Problem:
     rules: SelectionRules = RULES
     budget: Budget = field(default_factory=Budget)
     joint_states: bool = False  # whether parameters and initial states are fitted together: the model is a linear path
+    noise_fed: bool = False  # the residual is mostly noise that a controller fed back (`find_feedback`)
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
 
     @property

@@ -19,6 +19,8 @@ SAME = 2e-3  # deviation of two inputs over their own, below which the one repea
 ALIKE = 0.8  # correlation of a channel with itself, from which a period is looked for
 FEWEST_REPEATED = 200  # samples
 REPEATS = "differences between repeats"
+# A slow plant is on its way while its input rests: what remains of a straight line is smooth and far above white noise.
+UNDER_WAY, ABOVE = 0.8, 3.0  # correlation of neighbours, and ratio to the noise that the spectrum suggests
 HELD = 0.05  # share of third differences that are zero, from which on readings repeat and their median says nothing
 QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
@@ -146,9 +148,7 @@ def estimate(outputs: list[Array], still: list[Mask], repeats: Sequence[tuple[in
         segments = [d[part] - np.mean(d[part]) for d in differences for part in runs(np.isfinite(d), FEWEST_REPEATED)]
         source = REPEATS
     if not segments:
-        return Noise(
-            max(_high_frequency(outputs), noise_sd, 1e-300), np.zeros(0), "quietest part of the spectrum (no quiescent part)"
-        )
+        return _of_spectrum(outputs, noise_sd)
     table = []
     for segment in segments:
         spread = 1.4826 * np.median(np.abs(segment - np.median(segment))) + 1e-300
@@ -156,9 +156,17 @@ def estimate(outputs: list[Array], still: list[Mask], repeats: Sequence[tuple[in
         table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
     lags = _typical(np.array(table), np.array([segment.size for segment in segments]))
     sigma = float(np.sqrt(max(lags[0], 0.0)))
+    if source != REPEATS and lags[1] > UNDER_WAY * lags[0] and sigma > ABOVE * _high_frequency(outputs):
+        return _of_spectrum(outputs, noise_sd)
     if sigma <= noise_sd:
         return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")
     return Noise(sigma, autoregression(lags), source)
+
+
+def _of_spectrum(outputs: list[Array], resolution: float) -> Noise:
+    """Noise of which no sample was seen alone."""
+    level = max(_high_frequency(outputs), resolution, 1e-300)
+    return Noise(level, np.zeros(0), "quietest part of the spectrum (no quiescent part)")
 
 
 def _settled(stretches: list[Array]) -> list[Array]:

@@ -105,6 +105,7 @@ class Evidence:
     need: tuple[Array, ...]  # displacement or force that the port would need, NaN where nothing was measured
     readings: tuple[Reading, ...]
     one_clock: bool  # the recordings lie one after the other on one clock
+    others: tuple[tuple[Array, ...], ...] = ()  # what else than the outputs was recorded, at every sample (n,)
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,7 @@ class Effect:
     hides: bool = False  # the nominal parameters cannot be fitted without it
     shifts: str = ""  # its parameter is a delay: "time", or "rate" of one that grows
     joins: tuple[tuple[str, str], ...] = ()  # effects (id, form) of one parameter each that it is the sum of, in their order
+    filters: bool = False  # a linear law of its motion with memory: it can take noise out of a motion
     invariant: bool = False  # linear and time-invariant: before or behind a linear plant it does the same
     affine: bool = False  # a reading times a constant plus a constant: a state that is read begins elsewhere with it
 

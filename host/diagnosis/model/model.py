@@ -58,6 +58,8 @@ class Segment:
     resolution: Array | None = None  # (outputs,) standard deviation that the steps of each reading make
     weight: Array | None = None  # (outputs,) scale of each output's residual
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
+    spread: int = 0  # samples by which a test function spreads noise to either side
+    read_motion: Array | None = None  # (n,) as it was recorded, where a law is compared behind a test function
     fed_back: list[Array | None] = field(default_factory=list)  # of each output, later input that holds its noise
     repeats: dict[int, Places] = field(default_factory=dict)  # output -> (n,) sample whose reading each sample repeats
 

@@ -152,6 +152,7 @@ class AxisModel(Model):
             recorded = segment.inputs[spec.input]
             segment.force_noise = recorded - calm(recorded, white_level(recorded), 1.0)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
+            segment.spread, segment.read_motion = segment.balance.bump.size // 2, recording.channels[spec.output]
         return segment
 
     def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:

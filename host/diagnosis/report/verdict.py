@@ -10,7 +10,7 @@ import numpy as np
 
 from host.diagnosis.design.experiment import lines as experiment_lines
 from host.diagnosis.estimation.rules import RULES
-from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere
+from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere, memory_keys
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.models import channels_of
@@ -20,7 +20,7 @@ from host.diagnosis.selection.locate import joined
 from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 
 # Findings on what these data cannot decide, the most important one first.
-UNDECIDED = ("line", "slow_noise", "noise_unseen", "within_sample", "excitation")
+UNDECIDED = ("line", "noise_fed_back", "slow_noise", "noise_unseen", "within_sample", "excitation")
 REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  # findings that ask for no change of the data
 NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
 WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
@@ -333,6 +333,7 @@ def _effect(
         if p.high > p.low
     }
     says = sentence(candidate, parameters, values)
+    says += _amplitudes(result, candidate)
     says += elsewhere(result, candidate)
     if standing.rests_on and len(result.problem.segments) > 1:
         says += f" The evidence rests on one recording, {standing.rests_on}."
@@ -355,6 +356,18 @@ def _effect(
         "experiment_to_tell_apart": experiment_lines(result.designs, candidate),
         "experiment_separates": any(design.separates for design in result.designs if design.candidate == candidate),
     }
+
+
+def _amplitudes(result: Diagnosis, candidate: Candidate) -> str:
+    """Return a sentence with the amplitude in each recording, of an effect that has its own in each; else empty."""
+    if not candidate.effect.memories:
+        return ""
+    keys, found = memory_keys(candidate), []
+    for segment in result.problem.segments:
+        size = float(np.linalg.norm([segment.start.get(key, 0.0) for key in keys]))
+        unit = segment.units.get(candidate.port.name, "")
+        found.append(f"{size:.3g} {unit}".strip() + f" in {segment.recording.name}")
+    return f" Its amplitude is {', '.join(found)}."
 
 
 def elsewhere(result: Diagnosis, candidate: Candidate) -> str:

@@ -11,7 +11,7 @@ from host.diagnosis.estimation.evidence import Gain, compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, set_starts
 from host.diagnosis.estimation.initial_state import begun_again, start_again
 from host.diagnosis.model.model import Segment
-from host.diagnosis.selection.trial import Trial, at_bound, called_for, of_sampling, vanished
+from host.diagnosis.selection.trial import Trial, at_bound, called_for, of_sampling, refuted, vanished
 
 Array = npt.NDArray[np.float64]
 MOST_FOLDS = 4  # of the recordings to fit
@@ -24,6 +24,7 @@ def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial], nois
         trial
         for trial in trials
         if not (at_bound(trial.fit) or of_sampling(trial) or called_for(trial, base))
+        and not refuted(trial.heldout, problem.rules)
         and not vanished(trial.fit, trial.fit.terms[-1], problem.rules)
     ]
     for trial in possible[: problem.rules.crossed_fits]:
@@ -39,6 +40,8 @@ def unexcited(problem: Problem, base: Fit, fit: Fit, more: int, noise_sd: Array,
     """
     rules = problem.rules
     if heldout is not None and (heldout.log_likelihood > rules.weak_log_likelihood or heldout.p_value < rules.significance):
+        return None
+    if heldout is not None and refuted(heldout, rules):
         return None
     return _where_called_for(problem, base, fit, more, noise_sd, get_starts(problem))
 

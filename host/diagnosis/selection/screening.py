@@ -156,6 +156,8 @@ def screen(
     resting = _resting(problem)
     for count, candidate in enumerate(candidate_effects):
         progress("screening", count / len(candidate_effects))
+        if problem.noise_fed and (candidate.effect.invariant or candidate.effect.filters):
+            continue
         drop = replaced_by(fit, candidate)
         if drop is None or (candidate.port.name in resting and not candidate.effect.at_rest and not candidate.source):
             continue
@@ -301,7 +303,12 @@ def _seeded(problem: Problem, fit: Fit, term: Term) -> Term:
     needs = [problem.model.needs(segment, term.candidate.port, fit.values[:n], r)[segment.fit] for segment, r in used]
     times = [segment.recording.time_s[segment.fit] for segment, _ in used]
     shared = len(used) == 1 or one_clock([segment.recording for segment, _ in used])
-    evidence = Evidence(tuple(times), tuple(needs), tuple(readings), shared)
+    read = {output.channel for output in problem.model.outputs}
+    others = tuple(
+        tuple(fill(x) for name, x in segment.recording.channels.items() if name not in read and np.isfinite(x).any())
+        for segment, _ in used
+    )
+    evidence = Evidence(tuple(times), tuple(needs), tuple(readings), shared, others)
     return replace(term, parameters=seeds(evidence, term.parameters, term.candidate.form))
 
 

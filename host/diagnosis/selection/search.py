@@ -24,6 +24,7 @@ from host.diagnosis.estimation.fit import (
 )
 from host.diagnosis.estimation.initial_state import STATE_STEPS, begun_again, fit_with_states, start_again
 from host.diagnosis.estimation.rules import SelectionRules
+from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.folds import unexcited, with_other_recordings
@@ -108,8 +109,19 @@ def fit_nominal(problem: Problem) -> Fit:
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values, states=True)
     fit = settled(problem, begun_again(problem, fit))
-    find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
+    fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
+    problem.noise_fed = fed and _at_noise(problem, fit)
     return fit
+
+
+def _at_noise(problem: Problem, fit: Fit) -> bool:
+    """Whether a fit leaves no more than noise of the model's own differences can be, in all recordings together."""
+    ratios = []
+    for segment, residual in zip(problem.segments, fit.residuals, strict=True):
+        noise = problem.model.noise_of(segment)
+        if noise is not None:
+            ratios.append(float(np.nanmean(residual**2)) / noise.sigma**2)
+    return bool(ratios) and float(np.mean(ratios)) < problem.rules.residual_over_noise_nominal**2
 
 
 def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Trial:
@@ -241,7 +253,31 @@ def search(problem: Problem, candidate_effects: list[Candidate], progress: Progr
         _reduce(problem, found, noise_sd)
     if found.best.terms:
         found.best = refined(problem, found.best)
+    drop_unsure(problem, found)
     return found
+
+
+def drop_unsure(problem: Problem, found: Found) -> None:
+    """Drops effects of one amplitude whose interval contains zero.
+
+    The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
+    few, the jackknife of its interval shows that they do not agree on it.
+    """
+    while unsure := [term for term in _amplitudes(found.best) if _contains_zero(problem, found.best, term)]:
+        terms, values = without(found.best, problem, (unsure[-1].candidate.key,))
+        found.steps.append(Step("remove", unsure[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
+        found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
+
+
+def _amplitudes(fit: Fit) -> list[Term]:
+    return [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
+
+
+def _contains_zero(problem: Problem, fit: Fit, term: Term) -> bool:
+    place = next(index for index, other in enumerate(fit.terms) if other is term)
+    at = len(fit.values) - sum(len(other.parameters) for other in fit.terms[place:])
+    low, high = intervals(problem, fit)[at]
+    return low <= 0.0 <= high
 
 
 def _grow(
@@ -689,7 +725,7 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
             few = gain.log_likelihood < problem.rules.heldout_log_likelihood + price
             gone = vanished(best, term, problem.rules)
             if held.log_likelihood < 0.0:
-                held = unexcited(problem, less, best, term.fitted, noise_sd) or held
+                held = unexcited(problem, less, best, term.fitted, noise_sd, held) or held
             if gone or few or gain.share < least or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))

@@ -197,10 +197,21 @@ def good_enough(trial: Trial, base: Fit) -> bool:
 
 def called_for(trial: Trial, base: Fit) -> bool:
     """Whether the evidence of a trial is enough, wherever its parameters ended."""
+    if refuted(trial.heldout, trial.rules):
+        return False
     more = max(trial.fit.fitted - base.fitted, 0)
     if trial.crossed is not None and _across(trial, trial.crossed, more):
         return True
     return _alone(trial, more) or (trial.apart and _together(trial, more)) or _plainly(trial, more)
+
+
+def refuted(heldout: Gain, rules: SelectionRules) -> bool:
+    """Whether the error on held-out samples grows by as much as an effect has to take: not if they just do not excite it.
+
+    The likelihood is that of the error without what a controller fed back (`compare`). An effect that lowers it can raise
+    the whole error: it explains the remainder, which may be small, by what it spoils of the rest.
+    """
+    return heldout.share < -rules.least_error_reduction
 
 
 def _across(trial: Trial, crossed: Gain, more: int) -> bool:

@@ -64,6 +64,62 @@ def test_only_noise_that_comes_back_is_taken_off(through: float, share: float) -
     assert left == pytest.approx(share, abs=0.05)
 
 
+def looped(number: int, coulomb_N: float = 0.0, noise_m: float = 2e-4, load_kg: float = 0.0) -> dict[str, Any]:
+    """A mass of 0.5 kg and a damper of 3 N s/m under a controller that reads the recorded place, held for 10 ms.
+
+    load_kg: a second mass on a spring of 400 N/m.
+    """
+    rng = np.random.default_rng([78, number])
+    t, h = np.arange(2000) / 100.0, 0.01 / 40.0
+    wanted = 0.02 * np.sin(2.0 * np.pi * np.outer(t, np.geomspace(0.1, 1.0, 7)) + rng.uniform(0.0, 6.28, 7)).sum(axis=1)
+    x = v = far = far_v = before = 0.0
+    force, place = np.empty(t.size), np.empty(t.size)
+    for i in range(t.size):
+        place[i] = x + noise_m * rng.standard_normal()
+        force[i] = 300.0 * (wanted[i] - place[i]) - 3.0 * (place[i] - before) / 0.01
+        before = place[i]
+        for _ in range(40):
+            pull = 400.0 * (x - far) + (v - far_v) if load_kg else 0.0
+            a = (force[i] - 3.0 * v - coulomb_N * np.tanh(v / 2e-3) - pull) / 0.5
+            x, v = x + h * v + 0.5 * h * h * a, v + h * a
+            if load_kg:
+                far, far_v = far + h * far_v + 0.5 * h * h * pull / load_kg, far_v + h * pull / load_kg
+    return {"t": t[:1800], "f": force[200:], "x": place[200:]}
+
+
+FREE = {
+    "name": "slide",
+    "kind": "axis",
+    "data": {"time": "t"},
+    "channels": {"f": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
+    "axis": {
+        "subsystem": "slide",
+        "input": "f",
+        "output": "x",
+        "terms": ["mass", "damping", "offset"],
+        "hold": "zero",
+        "reads": "position",
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("more", "found", "said"),
+    [
+        ({}, [], True),
+        ({"noise_m": 5e-5}, [], True),
+        ({"coulomb_N": 0.6}, ["coulomb_friction"], False),
+        ({"load_kg": 0.3, "noise_m": 2e-7}, ["resonance"], False),
+    ],
+    ids=["nothing", "nothing, less noise", "friction", "a second mass read well"],
+)
+def test_noise_in_a_loop_around_a_free_mass_is_no_resonance(more: dict[str, float], found: list[str], said: bool) -> None:
+    """A second mass cancelled the noise that the controller had fed back, and was named with 0.92."""
+    verdict = diagnose([looped(k, **more) for k in (1, 2, 3)], FREE).as_dict()
+    assert [effect["id"] for effect in verdict["effects"]] == found
+    assert said == ("noise_fed_back" in [finding["id"] for finding in verdict["data_findings"]])
+
+
 def test_windows_of_a_recording_shorter_than_their_average() -> None:
     t = np.arange(2000) * 1e-5
     mismatch = np.where(t > 0.01, 1.0, 0.0)

@@ -9,7 +9,15 @@ import pytest
 from scipy.signal import lfilter
 
 from host.diagnosis import diagnose
+from host.diagnosis.effects import candidates
+from host.diagnosis.estimation.fit import minimize
 from host.diagnosis.estimation.jumps import jumps_of
+from host.diagnosis.estimation.noise import estimate
+from host.diagnosis.model.nominal import nominal_of
+from host.diagnosis.model.tables import Table
+from host.diagnosis.pipeline import prepare
+from host.diagnosis.selection.screening import term_of
+from host.diagnosis.selection.search import Found, drop_unsure, fit_nominal, refined
 from tests.host.proof import everyday as make
 
 Columns = dict[str, np.ndarray]
@@ -96,6 +104,29 @@ def test_noise_that_grows_with_the_motion_does_not_jump() -> None:
         noise = make.stream(900 + number).standard_normal(columns["t"].size)
         recordings.append({**columns, "load": 0.4 * columns["motor"] * (1.0 + 0.01 * noise)})
     assert diagnose(recordings, make.gear_nominal()).as_dict()["verdict"] == "nothing_missing"
+
+
+def test_a_slow_plant_is_on_its_way_while_its_input_rests() -> None:
+    """The noise of such stretches is that of the spectrum; a wander of the output itself is noise."""
+    rng, n = np.random.default_rng(7), 600
+    held = np.repeat(rng.uniform(0.0, 1.0, n // 40), 40)
+    slow = lfilter([0.02], [1.0, -0.98], held)
+    still = [np.tile(np.arange(40) >= 5, n // 40)]
+    sure = estimate([slow + 2e-4 * rng.standard_normal(n)], still)
+    assert "quiescent" not in sure.source.split(" (")[0] and sure.sigma == pytest.approx(2e-4, rel=0.3)
+    wander = 2e-4 * lfilter([1.0], [1.0, -0.6], rng.standard_normal(n))
+    assert estimate([wander], still).source == "quiescent parts"
+
+
+def test_an_amplitude_whose_interval_contains_zero_is_dropped() -> None:
+    recordings = [make.gear(k) for k in (31, 32)]
+    model, problem, _ = prepare(nominal_of(make.gear_nominal()), [Table(f"r{k}", r) for k, r in enumerate(recordings)])
+    drift = next(c for c in candidates(model.ports, True) if c.key == "sensor_drift@gear_reading")
+    found = Found(fit_nominal(problem), fit_nominal(problem), [])
+    term = term_of(problem, drift, found.nominal)
+    found.best = refined(problem, minimize(problem, (term,), np.append(found.nominal.values, 1e-4)))
+    drop_unsure(problem, found)
+    assert found.best.terms == () and found.steps[-1].key == drift.key
 
 
 def test_a_jump_above_the_noise_around_it_is_found() -> None:
