@@ -164,7 +164,7 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str])
     for row in range(len(model.outputs)):
         # single wild samples would raise the noise by which they are found
         tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
-        found = noise_module.estimate(tame, still, repeats)
+        found = noise_module.estimate(tame, still, repeats, model.simulates)
         seldom = [readings.repeated(p.y[row]) for p in segments]
         for segment, places in zip(segments, seldom, strict=True):
             if places is not None:

@@ -126,10 +126,16 @@ def _same(x: Array, y: Array) -> bool:
     return float(np.std(x - y)) <= SAME * float(np.std(x)) and float(np.std(x)) > 0.0
 
 
-def estimate(outputs: list[Array], still: list[Mask], repeats: Sequence[tuple[int, slice, int, slice]] = ()) -> Noise:
+def estimate(
+    outputs: list[Array],
+    still: list[Mask],
+    repeats: Sequence[tuple[int, slice, int, slice]] = (),
+    simulated: bool = False,
+) -> Noise:
     """Noise of one channel from several recordings: of its quiescent parts, else of what does not repeat.
 
     outputs: (n_i,) of each recording; still: its quiescent samples; repeats: stretches that repeat others (`repeated`).
+    simulated: whether the output is that of a simulator, which may be slow.
     """
     stretches = [
         values[part]
@@ -156,7 +162,7 @@ def estimate(outputs: list[Array], still: list[Mask], repeats: Sequence[tuple[in
         table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
     lags = _typical(np.array(table), np.array([segment.size for segment in segments]))
     sigma = float(np.sqrt(max(lags[0], 0.0)))
-    if source != REPEATS and lags[1] > UNDER_WAY * lags[0] and sigma > ABOVE * _high_frequency(outputs):
+    if simulated and source != REPEATS and lags[1] > UNDER_WAY * lags[0] and sigma > ABOVE * _high_frequency(outputs):
         return _of_spectrum(outputs, noise_sd)
     if sigma <= noise_sd:
         return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")

@@ -112,10 +112,10 @@ def test_a_slow_plant_is_on_its_way_while_its_input_rests() -> None:
     held = np.repeat(rng.uniform(0.0, 1.0, n // 40), 40)
     slow = lfilter([0.02], [1.0, -0.98], held)
     still = [np.tile(np.arange(40) >= 5, n // 40)]
-    sure = estimate([slow + 2e-4 * rng.standard_normal(n)], still)
+    sure = estimate([slow + 2e-4 * rng.standard_normal(n)], still, simulated=True)
     assert "quiescent" not in sure.source.split(" (")[0] and sure.sigma == pytest.approx(2e-4, rel=0.3)
     wander = 2e-4 * lfilter([1.0], [1.0, -0.6], rng.standard_normal(n))
-    assert estimate([wander], still).source == "quiescent parts"
+    assert estimate([wander], still, simulated=True).source == "quiescent parts"
 
 
 def test_an_amplitude_whose_interval_contains_zero_is_dropped() -> None:
