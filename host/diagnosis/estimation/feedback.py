@@ -32,8 +32,8 @@ MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
 LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
 COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
 OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the other part
-LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
+LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 
 
 def innovations(x: Array) -> Array:
@@ -59,6 +59,9 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     """
     noisy = False
     new = [_new_input(segment, inputs) for segment in segments]
+    around: list[Array | None] = []
+    if _said_by_motion(segments, inputs) > LEAST_SAID:
+        around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
     for segment, u in zip(segments, new, strict=True):
         segment.fed_back = [_later(u) for _ in range(segment.y.shape[0])]
     for row in range(segments[0].y.shape[0]):
@@ -67,8 +70,7 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
         if later < LEAST_SHARE or later < OVER_PAST * earlier:
             for segment in segments:
                 segment.fed_back[row] = None
-        if _said_by_motion(segments, inputs) > LEAST_SAID:
-            around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
+        if around:
             noisy = noisy or _share(around, residuals, row) > LEAST_SAID
             for segment, basis in zip(segments, around, strict=True):
                 segment.fed_back[row] = basis

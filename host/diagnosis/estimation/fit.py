@@ -58,9 +58,13 @@ class Fit:
 
     def values_of(self, term: Term) -> Array:
         """Return the values of `term`, which is one of `terms` itself, not one equal to it."""
-        place = next(index for index, other in enumerate(self.terms) if other is term)
-        first = len(self.values) - sum(len(other.parameters) for other in self.terms[place:])
+        first = self.first_of(term)
         return self.values[first : first + len(term.parameters)]
+
+    def first_of(self, term: Term) -> int:
+        """Return the index of the first of these values among all."""
+        place = next(index for index, other in enumerate(self.terms) if other is term)
+        return len(self.values) - sum(len(other.parameters) for other in self.terms[place:])
 
 
 @dataclass

@@ -263,21 +263,19 @@ def drop_unsure(problem: Problem, found: Found) -> None:
     The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
     few, the jackknife of its interval shows that they do not agree on it.
     """
-    while unsure := [term for term in _amplitudes(found.best) if _contains_zero(problem, found.best, term)]:
+    while unsure := _unsure(problem, found.best):
         terms, values = without(found.best, problem, (unsure[-1].candidate.key,))
         found.steps.append(Step("remove", unsure[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
         found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
 
 
-def _amplitudes(fit: Fit) -> list[Term]:
-    return [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
-
-
-def _contains_zero(problem: Problem, fit: Fit, term: Term) -> bool:
-    place = next(index for index, other in enumerate(fit.terms) if other is term)
-    at = len(fit.values) - sum(len(other.parameters) for other in fit.terms[place:])
-    low, high = intervals(problem, fit)[at]
-    return low <= 0.0 <= high
+def _unsure(problem: Problem, fit: Fit) -> list[Term]:
+    """Terms of one amplitude whose interval contains zero."""
+    amplitudes = [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
+    if not amplitudes:
+        return []
+    spans = intervals(problem, fit)
+    return [term for term in amplitudes if spans[fit.first_of(term)][0] <= 0.0 <= spans[fit.first_of(term)][1]]
 
 
 def _grow(

@@ -12,6 +12,7 @@ from host.diagnosis.estimation.feedback import find_feedback, freed
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.locate import windows
+from tests.host.proof.everyday import free_nominal
 
 RATE_HZ = 400.0
 STIFFNESS, DAMPING = 150.0, 2.0
@@ -87,22 +88,6 @@ def looped(number: int, coulomb_N: float = 0.0, noise_m: float = 2e-4, load_kg: 
     return {"t": t[:1800], "f": force[200:], "x": place[200:]}
 
 
-FREE = {
-    "name": "slide",
-    "kind": "axis",
-    "data": {"time": "t"},
-    "channels": {"f": {"column": "f", "unit": "N"}, "x": {"column": "x", "unit": "m"}},
-    "axis": {
-        "subsystem": "slide",
-        "input": "f",
-        "output": "x",
-        "terms": ["mass", "damping", "offset"],
-        "hold": "zero",
-        "reads": "position",
-    },
-}
-
-
 @pytest.mark.parametrize(
     ("more", "found", "said"),
     [
@@ -115,7 +100,7 @@ FREE = {
 )
 def test_noise_in_a_loop_around_a_free_mass_is_no_resonance(more: dict[str, float], found: list[str], said: bool) -> None:
     """A second mass cancelled the noise that the controller had fed back, and was named with 0.92."""
-    verdict = diagnose([looped(k, **more) for k in (1, 2, 3)], FREE).as_dict()
+    verdict = diagnose([looped(k, **more) for k in (1, 2, 3)], free_nominal("zero")).as_dict()
     assert [effect["id"] for effect in verdict["effects"]] == found
     assert said == ("noise_fed_back" in [finding["id"] for finding in verdict["data_findings"]])
 
