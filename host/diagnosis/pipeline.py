@@ -36,6 +36,7 @@ from host.diagnosis.model.tables import Table
 from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.between_recordings import unlike_recordings
+from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
 from host.diagnosis.selection.equivalence import (
     Standing,
     most_probable,
@@ -48,7 +49,7 @@ from host.diagnosis.selection.locate import Condition, condition, inside, joined
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
-from host.diagnosis.selection.search import Found, fit_nominal, search
+from host.diagnosis.selection.search import Found, concluded, fit_nominal, forward, search
 from host.diagnosis.selection.trial import WITHIN, Trial, within_sample
 from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
@@ -228,26 +229,16 @@ def _diagnosed(
 ) -> Diagnosis:
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
-    data = inspected(spec, sources)
-    model, problem, full = problems(spec, data.recordings, rules)
-    right, apart = readings_apart(problem, data.recordings)
-    if apart:
-        model, problem, full = problems(spec, right, rules)
-    tame, lone = _without_lone_samples(problem, full, right)
-    if lone:
-        model, problem, full = problems(spec, tame, rules)
-    problem.budget = budget
-    ports = candidate_ports(problem)
-    problem.joint_states = any(port.path for port in ports)
-    candidate_effects = candidates(ports, problem.segments[0].recording.timed, model.taken | left_out)
-    candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
-    held = hold_between_samples(problem, [full] if full is not problem else [], candidate_effects)
-    cost = model.announce(problem.segments, model.guess(problem.segments))
-    if cost:
-        overall.part(0.02, 0.03)(cost, 0.0)
-    found = search(problem, candidate_effects, overall.part(0.03, 0.6))
-    begun = _Searched(model, problem, full, found, held)
-    done = _past_sampling(spec, begun, tame, candidate_effects, overall.part(0.6, 0.7))
+    data, done = inspected(spec, sources), None
+    axis = spec.axis
+    if axis is not None and axis.runs_away and axis.compare is None:
+        by_motion = spec.model_copy(update={"axis": axis.model_copy(update={"compare": "motion"})})
+        done = _searched(by_motion, data, left_out, rules, _third(budget), overall, (0.02, 0.3), to_noise=True)
+        if done is not None:
+            spec = by_motion
+            done.problem.budget = budget
+    done = done or _searched(spec, data, left_out, rules, budget, overall, (0.3 if axis is not None else 0.02, 0.7))
+    assert done is not None
     model, problem, full, found = done.model, done.problem, done.full, done.found
     noise_sd = np.array([n.sigma for n in problem.noise])
     overall.part(0.7, 0.75)("comparing rivals in the place of each effect", 0.0)
@@ -271,8 +262,6 @@ def _diagnosed(
     result.remainder = remainder
     result.findings = [
         *data.findings,
-        *apart,
-        *lone,
         *done.findings,
         *_fed_back(problem),
         *_repeated(full),
@@ -296,11 +285,60 @@ def _diagnosed(
         result.findings += _lines(full, found)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best, noise_sd)
-        result.findings += _too_slow(full, found, slow) or _above_guess(full, figures, problem.rules)
+        late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
+        result.findings += _too_slow(full, found, slow) or ([] if late else _above_guess(full, figures, problem.rules))
     if not located and remainder.sure and remainder.predicted is not None:
         result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
     overall.end()
     return result
+
+
+def _third(budget: Budget) -> Budget:
+    return replace(budget, seconds=None if budget.seconds is None else budget.seconds / 3.0)
+
+
+def _searched(
+    spec: NominalSpec,
+    data: Inspected,
+    left_out: frozenset[str],
+    rules: SelectionRules,
+    budget: Budget,
+    overall: Overall,
+    share: tuple[float, float],
+    to_noise: bool = False,
+) -> _Searched | None:
+    """Search in all recordings, between two shares of the whole work; `left_out`: effect ids that are not considered.
+
+    to_noise: None unless single effects explain the outputs down to white noise.
+    """
+    low, high = share
+    begin, later = low + 0.02 * (high - low), low + 0.85 * (high - low)
+    model, problem, full = problems(spec, data.recordings, rules)
+    recordings, apart = readings_apart(problem, data.recordings)
+    if apart:
+        model, problem, full = problems(spec, recordings, rules)
+    recordings, lone = _without_lone_samples(problem, full, recordings)
+    if lone:
+        model, problem, full = problems(spec, recordings, rules)
+    problem.budget = budget
+    ports = candidate_ports(problem)
+    problem.joint_states = any(port.path for port in ports)
+    candidate_effects = candidates(ports, problem.segments[0].recording.timed, model.taken | left_out)
+    candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
+    held = hold_between_samples(problem, [full] if full is not problem else [], candidate_effects)
+    cost = model.announce(problem.segments, model.guess(problem.segments))
+    if cost:
+        overall.part(low, begin)(cost, 0.0)
+    progress = overall.part(begin, later)
+    if to_noise and ran_away(problem, fit_nominal(problem)):
+        return None
+    found = forward(problem, candidate_effects, progress)
+    late = within_sample(found.last_trials, found.best)
+    if to_noise and not at_white_noise(problem, found.best if late is None else late.fit):
+        return None
+    found = concluded(problem, found, candidate_effects, progress)
+    begun = _Searched(model, problem, full, found, [*apart, *lone, *held])
+    return _past_sampling(spec, begun, recordings, candidate_effects, overall.part(later, high))
 
 
 @dataclass(frozen=True)
@@ -311,7 +349,7 @@ class _Searched:
     problem: Problem
     full: Problem
     found: Found
-    findings: list[Finding]
+    findings: list[Finding]  # what was found about the data on the way
 
 
 def _past_sampling(

@@ -33,6 +33,7 @@ LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, be
 COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
 OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the other part
 OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
+PASSES = 3  # of a prediction that leaves out the rows of steps
 LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 
 
@@ -47,6 +48,25 @@ def unpredicted(x: Array) -> Array:
     past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
     new = x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=None)[0]
     return np.concatenate((np.zeros(ORDER), new))
+
+
+def common_part(x: Array) -> tuple[Array, Array]:
+    """The new part of `x` (n,) without steps of a set-point, and the rows (n,) of a step: both are 0 or False at the begin.
+
+    Steps exceed all other new parts together. The prediction is fitted without their rows, and they are 0 in the result.
+    """
+    past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
+    usual = np.ones(x.size - ORDER, dtype=bool)
+    new = x[ORDER:]
+    for _ in range(PASSES):
+        weights = np.linalg.lstsq(past[usual], x[ORDER:][usual], rcond=None)[0]
+        new = x[ORDER:] - past @ weights
+        usual = np.abs(new) <= COMMON * 1.4826 * float(np.median(np.abs(new)))
+    if np.count_nonzero(usual) < ORDER * SAMPLES_PER_LAG // 2:
+        return np.zeros_like(x), np.concatenate((np.zeros(ORDER, dtype=bool), ~usual))
+    return np.concatenate((np.zeros(ORDER), np.where(usual, new, 0.0))), np.concatenate(
+        (np.zeros(ORDER, dtype=bool), ~usual)
+    )
 
 
 def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> bool:
@@ -124,7 +144,8 @@ def _new_input(segment: Segment, inputs: tuple[str, ...]) -> list[Array]:
     if not ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES:
         return []
     moving = [fill(segment.inputs[name]) for name in inputs if name in segment.inputs and np.ptp(segment.inputs[name]) > 0.0]
-    return [innovations(x) for x in moving]
+    new = [common_part(x)[0] for x in moving]
+    return [u / np.std(u) for u in new if np.any(u)]
 
 
 def _later(new: list[Array]) -> Array | None:
@@ -144,9 +165,13 @@ def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...]) -> float:
         x = fill(segment.read_motion)
         for name in inputs:
             u = fill(segment.inputs[name])
-            new = unpredicted(u)[ORDER:]
+            new, steps = common_part(u)
+            new, usual = new[ORDER:], np.logical_not(steps[ORDER:])
+            if not np.any(new):
+                continue
             past = [u[ORDER - k - 1 : u.size - k - 1] for k in range(ORDER)]
             known = np.column_stack([*past, *(x[ORDER - k : x.size - k] for k in range(ORDER)), np.ones(new.size)])
+            new, known = new[usual], known[usual]
             left = new - known @ np.linalg.lstsq(known, new, rcond=1e-12)[0]
             scale = float(np.mean(new**2)) + 1e-300
             alone, together = alone + float(new @ new) / scale, together + float(left @ left) / scale

@@ -76,6 +76,12 @@ class SelectionRules:
     residual_over_noise: float = 2.0  # residual beyond which an extended model is not adequate,
     residual_over_noise_nominal: float = 3.0  # a nominal one,
     residual_over_guessed_noise: float = 8.0  # where noise was never seen alone
+    # A free mass is compared by its simulated motion where that agrees down to the noise of single readings.
+    simulated_over_noise_nominal: float = 1.2  # residual of a nominal model over white noise, which is known to some 5 %,
+    simulated_whiteness: float = 1e-3  # and least p-value of the test that it is white
+    simulated_over_noise: float = 4.0  # of a model with effects: the shape of friction at rest is an approximation
+    ran_away_over_noise: float = 2000.0  # nominal residual above which no effect is tried; friction leaves 20 to 1500,
+    # and noise of the recorded force 700 to 300000 (worlds `ode` and `mujoco`)
     partial_share: float = 0.15  # share of the mismatch that one effect may leave; several leave less
     partial_effects: int = 2  # effects that are named where they leave more
     predictable_log_likelihood: float = 8.0  # gain of simple forms from which a residual counts as structure

@@ -360,15 +360,22 @@ def _short_step(
 
 
 @njit(cache=True)
-def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: float) -> tuple[float, bool]:
-    """Speed after Coulomb friction `dry` has acted over a step, and whether the axis holds."""
+def _dry(v_old: float, v_free: float, a_free: float, dry: float, h: float, m: float) -> tuple[float, float, bool]:
+    """Speed and place, beyond that without friction, after Coulomb friction `dry` has acted over a step; whether it holds.
+
+    The axis stops within the step where its speed passes zero, and slides back if the other forces exceed friction. With the
+    friction of one direction over the whole step, each reversal has an error of the first order in h.
+    """
     if v_old == 0.0 and abs(a_free) * m <= dry:
-        return 0.0, True
-    dv = dry * h / m
-    side = v_old if v_old != 0.0 else v_free
-    if side > 0.0:
-        return (v_free - dv if v_free > dv else min(0.0, v_free + dv)), False
-    return (v_free + dv if v_free < -dv else max(0.0, v_free - dv)), False
+        return 0.0, 0.0, True
+    a, least = (v_free - v_old) / h, dry / m
+    side = 1.0 if (v_old if v_old != 0.0 else v_free) > 0.0 else -1.0
+    v = v_free - side * least * h
+    if side * v >= 0.0:
+        return v, 0.5 * h * (v - v_free), False
+    first = abs(v_old) / abs(a - side * least)  # time until it stops
+    v = (a + side * least) * (h - first) if abs(a) > least else 0.0
+    return v, 0.5 * (v_old * first + v * (h - first)) - 0.5 * h * (v_old + v_free), False
 
 
 @njit(cache=True)
@@ -443,9 +450,8 @@ def run_axis(
                 out[2, i] = a - (dry / m if v_old > 0.0 else (-dry / m if v_old < 0.0 else min(max(a, -dry / m), dry / m)))
                 out[2, i] -= _rising(v_old, p) / m
             if dry > 0.0:
-                v_dry, stuck = _dry(v_old, v, a, dry, h, m)
-                x = x_old if stuck else x + 0.5 * h * (v_dry - v)
-                v = v_dry
+                v, further, stuck = _dry(v_old, v, a, dry, h, m)
+                x = x_old if stuck else x + further
             v = _slowed(v, 0.5 * h / m * p[SMOOTH], p[SMOOTH_SPEED])
             s = (x, v, x2, v2)
             slow = x + (slow - x) * decay

@@ -165,6 +165,8 @@ class AxisSpec(Request):
     """Force in, motion out: mass * a + damping * v + stiffness * x = force + offset.
 
     `hold`: the force between samples; left out, a free mass takes what fits its recordings best, others `linear`.
+    `compare`: of a free mass whose position is read, the simulated motion or the force that the measured motion needs; left
+    out, the motion if all recordings can be simulated down to their white noise, else the force.
     """
 
     subsystem: str = "axis"
@@ -173,7 +175,13 @@ class AxisSpec(Request):
     terms: Terms[Literal["mass", "damping", "stiffness", "offset"]] = ["mass", "damping", "offset"]
     reads: Literal["position", "velocity", "acceleration"] = "position"
     hold: Literal["zero", "linear", "band_limited"] | None = None
+    compare: Literal["motion", "force"] | None = None
     controller: ControllerSpec | None = None
+
+    @property
+    def runs_away(self) -> bool:
+        """Whether small errors of the force add up in a simulation: a free mass, of which only the position is read."""
+        return self.controller is None and "stiffness" not in self.terms and self.reads == "position"
 
 
 class ImpedanceSpec(Request):

@@ -11,6 +11,9 @@ from numba import njit
 Array = npt.NDArray[np.float64]
 FIRST_SAMPLES = 10  # that show the speed with which a recording begins
 STEADY_SHARE = 0.9  # of all changes of a reading that repeat the one before, from which on the motion has equal steps
+RANGE = 6.0  # standard deviations between the extremes of noise in some hundred samples
+STEPPED = 0.7  # of the level of the spectrum, below which the usual second difference shows that steps make it
+WIDE_STEPS = 8  # from which on they show whether all are multiples of the smallest
 LEAST_INERTIA = 1e-9  # in sample periods: below this a lag is of first order, or none
 
 
@@ -412,6 +415,18 @@ def smooth_derivatives(x: Array, dt_s: float, window: int, degree: int = 3) -> t
     return smooth[0], smooth[1], smooth[2]
 
 
+def wander_at_rest(x: Array, smooth: Array, window: int, degree: int = 3) -> float:
+    """Range of the noise that a local polynomial leaves in a motion `x` (n,) at rest; `smooth` (n,) is its result.
+
+    Movements below it are no movements. The noise is taken from the median difference of both, which steps do not change.
+    """
+    from scipy.signal import savgol_coeffs
+
+    passed = float(np.sum(savgol_coeffs(window, degree) ** 2))
+    noise = 1.4826 * float(np.median(np.abs(x - smooth))) / math.sqrt(max(1.0 - passed, 1e-3))
+    return RANGE * noise * math.sqrt(passed)
+
+
 @njit(cache=True)
 def calm(x: Array, sigma: float, correlation: float, from_zero: bool = False) -> Array:
     """`x` (n,) without noise `sigma` of that correlation time (samples): at every sample the longest mean about it that
@@ -449,11 +464,24 @@ def white_level(x: Array) -> float:
     return float(np.sqrt(np.median(power[power.size // 2 :]) / np.log(2.0) / np.sum(window**2)))
 
 
+def reading_noise(x: Array) -> float:
+    """`white_level` of a signal (n,) that may also be held and jump: steps are no noise, but fill its spectrum.
+
+    Most second differences of such a signal are of noise alone. Those of a signal in fine steps may be zero, and its
+    resolution counts as noise.
+    """
+    level = white_level(x)
+    usual = 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / math.sqrt(6.0)
+    held = max(usual, quantum(x) / math.sqrt(12.0))
+    return held if held < STEPPED * level else level
+
+
 def quantum(values: Array) -> float:
     """Resolution of a channel: its smallest step that is not rounding dust; 0 if it is not visibly quantized.
 
     Steps of a twentieth of the range and more are a signal that switches between levels, no resolution. So are the steps of
-    a motion of constant speed, such as a triangle wave: each is as long as the one before.
+    a motion of constant speed, such as a triangle wave: each is as long as the one before. A command that is held between
+    steps of any size has few levels too, but the steps between them are no multiples of the smallest.
     """
     good = values[np.isfinite(values)]
     levels = np.unique(good)
@@ -462,6 +490,9 @@ def quantum(values: Array) -> float:
     steps = np.diff(levels)
     dust = 1e-9 * (levels[-1] - levels[0])
     smallest = float(np.min(steps[steps > dust], initial=np.inf))
+    wide = steps[steps > 1.5 * smallest] / smallest
+    if wide.size >= WIDE_STEPS and np.mean(np.abs(wide - np.round(wide)) < 0.1) < 0.6:
+        return 0.0
     return smallest if smallest < 0.05 * (levels[-1] - levels[0]) and not constant_speed(values, smallest) else 0.0
 
 

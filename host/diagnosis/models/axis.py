@@ -24,7 +24,7 @@ from host.diagnosis.model.model import (
     tolerance_of,
 )
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.model.operators import calm, fill, smooth_derivatives, white_level
+from host.diagnosis.model.operators import calm, fill, reading_noise, smooth_derivatives, wander_at_rest
 from host.diagnosis.models import balance
 
 Array = npt.NDArray[np.float64]
@@ -44,14 +44,15 @@ class AxisSegment(Segment):
     stages: Array | None = None  # (n, substeps, 3) recorded input at the stages of Runge-Kutta
     balance: balance.Balance | None = None
     force_noise: Array | None = None  # (n,) of the recorded force, where it is what is compared
+    rests: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))  # (n,) where the axis is at rest
 
 
 class AxisModel(Model):
     """Nominal model of kind `axis`.
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
-    without a spring, the axis would run away from any recording: then the force that its measured motion needs is
-    compared with the input instead (`balance.py`).
+    without a spring, small forces that were not recorded let the simulated axis run away from a recording. The force that
+    its measured motion needs is then compared with the input instead (`balance.py`), unless `compare` says "motion".
     """
 
     kind = "axis"
@@ -66,7 +67,7 @@ class AxisModel(Model):
         self.units = {name: channel.unit for name, channel in spec.channels.items()}
         force, motion, name = self.units[self.spec.input], self.units[self.spec.output], self.spec.subsystem
         place = integral_unit(motion, READ.index(self.spec.reads))
-        self.free_run = self.spec.controller is not None or "stiffness" in self.spec.terms or self.spec.reads != "position"
+        self.free_run = not self.spec.runs_away or self.spec.compare == "motion"
         outputs = [Output(self.spec.output, motion, name)] if self.free_run else []
         if self.spec.controller is not None or not self.free_run:
             outputs.append(Output(self.spec.input, force, name))
@@ -137,6 +138,8 @@ class AxisModel(Model):
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         along = motion if spec.reads == "position" else place
         segment.tolerances[name] = tolerance_of(along, float(np.ptp(along)))
+        if spec.reads == "position":
+            segment.tolerances[name] = max(segment.tolerances[name], wander_at_rest(motion, x, window))
         segment.units = {
             **self.units,
             name: self.units[spec.input],
@@ -150,8 +153,9 @@ class AxisModel(Model):
             segment.y = np.zeros_like(y)
             seen = np.isfinite(recording.channels[spec.output]) & np.isfinite(recording.channels[spec.input])
             recorded = segment.inputs[spec.input]
-            segment.force_noise = recorded - calm(recorded, white_level(recorded), 1.0)
+            segment.force_noise = recorded - calm(recorded, reading_noise(recorded), 1.0)
             segment.balance = balance.prepare(segment, spec.input, motion, seen, SMOOTHING_S, self.hold)
+            segment.rests = balance.at_rest(x, segment.tolerances[name], segment.balance.bump.size // 2)
             segment.spread, segment.read_motion = segment.balance.bump.size // 2, recording.channels[spec.output]
         return segment
 
@@ -266,7 +270,12 @@ class AxisModel(Model):
             control, reference = np.zeros(0), load[None, :]
         if segment.balance is not None:
             measured = balance.Motion(
-                segment.x, segment.v, segment.tolerances[spec.subsystem], segment.start.get(spec.subsystem, 0.0)
+                segment.x,
+                segment.v,
+                segment.tolerances[spec.subsystem],
+                segment.start.get(spec.subsystem, 0.0),
+                segment.rests,
+                recorded if segment.force_noise is None else recorded - segment.force_noise,
             )
             return balance.error(segment.balance, segment, measured, linear, force, p)
         if segment.stages is not None and not drive:

@@ -16,9 +16,19 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
-from host.diagnosis.model.force_kernel import DAMPING2, MASS2, MAXWELL_K, MAXWELL_T, OMEGA2, along
+from host.diagnosis.model.force_kernel import (
+    COULOMB,
+    DAMPING2,
+    EXCESS,
+    MASS2,
+    MAXWELL_K,
+    MAXWELL_T,
+    OMEGA2,
+    STRIBECK_D,
+    along,
+)
 from host.diagnosis.model.model import Segment
-from host.diagnosis.model.operators import signal_band, white_level
+from host.diagnosis.model.operators import reading_noise, signal_band, white_level
 
 Array = npt.NDArray[np.float64]
 POWER = 4  # of the bump: its second derivative is smooth at the ends
@@ -46,12 +56,17 @@ class Balance:
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed motion and speed (n,), the movement below which nothing has moved, and the friction held at first."""
+    """Smoothed motion and speed (n,), the movement below which nothing has moved, and the friction held at first.
+
+    At rest (n,) friction is what holds the axis against the input `pushed` (n,), freed of noise.
+    """
 
     x: Array
     v: Array
     tolerance: float
     start: float
+    rests: npt.NDArray[np.bool_]
+    pushed: Array
 
 
 def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bool_], least_s: float, hold: str) -> Balance:
@@ -82,7 +97,7 @@ def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bo
     segment.y[:, ~whole] = np.nan
     sigma_motion = white_level(motion)
     held, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
-    sigma_force = white_level(segment.inputs[force])
+    sigma_force = reading_noise(segment.inputs[force])
     return Balance(force, bump, held, rows, noise, kernels, s, length, sigma_motion, sigma_force)
 
 
@@ -104,7 +119,7 @@ def _held_force(
     kept = slice(half, recorded.size - half)
     columns = np.vstack([rows, np.ones(recorded.size)])[:, kept].T
     found: Array = np.asarray(np.linalg.lstsq(columns, _along_record(recorded, held)[kept], rcond=1e-12)[0])
-    return held, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, white_level(recorded), kernels, held)
+    return held, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, reading_noise(recorded), kernels, held)
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
@@ -153,6 +168,7 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     lags = np.zeros(ORDER + 1)
     for kernel in (of_motion, of_force):
         lags += [kernel[k:] @ kernel[: kernel.size - k] for k in range(ORDER + 1)]
+    lags[0] = lags[0] * (1.0 + 1e-9) or 1e-300  # neither has noise in an experiment that is only planned
     return Noise(
         max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), "spectra of motion and force above the motion's band"
     )
@@ -178,6 +194,29 @@ def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:
     return float(np.sqrt((2.0 * power.sum() - power[0] - power[-1]) / size)) / balance.noise.sigma
 
 
+def at_rest(x: Array, tolerance: float, half: int) -> npt.NDArray[np.bool_]:
+    """Samples (n,) about which the motion `x` (n,) moves by less than `tolerance` within `half` samples to either side."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    return np.asarray(maximum_filter1d(x, 2 * half + 1) - minimum_filter1d(x, 2 * half + 1) < tolerance)
+
+
+def _forces(segment: Segment, motion: Motion, p: Array) -> Array:
+    """Forces (n,) of the effects along the motion."""
+    recording = segment.recording
+    return along(
+        motion.x,
+        motion.v,
+        np.gradient(motion.v, recording.dt_s),
+        np.zeros(segment.n),
+        recording.time_s,
+        recording.dt_s,
+        motion.tolerance,
+        motion.start,
+        p,
+    )
+
+
 def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, force: Array, p: Array) -> Array:
     """Force (1, n) that the motion needs beyond the input. linear: m, c, k, offset; p: slots of the force kernel.
 
@@ -190,17 +229,14 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
     a, v, x = balance.rows
     need = linear[0] * a + linear[1] * v + linear[2] * x - linear[3]
     if np.any(p):
-        dry = along(
-            motion.x,
-            motion.v,
-            np.gradient(motion.v, recording.dt_s),
-            np.zeros(segment.n),
-            recording.time_s,
-            recording.dt_s,
-            motion.tolerance,
-            motion.start,
-            p,
-        )
+        dry = _forces(segment, motion, p)
+        most = p[COULOMB] + max(p[EXCESS], 0.0)
+        if p[COULOMB] > 0.0 and p[STRIBECK_D] <= 0.0 and motion.rests.any():
+            smooth = p.copy()
+            smooth[COULOMB] = smooth[EXCESS] = 0.0
+            other = _forces(segment, motion, smooth)
+            holds = np.clip(motion.pushed + linear[3] - linear[2] * motion.x - other, -most, most)
+            dry = np.where(motion.rests, other + holds, dry)
         need = need + _along_record(dry, balance.bump)
     size = float(np.std(force)) / max(float(np.std(segment.inputs[balance.input])), 1e-300)
     finer = force.size // segment.n

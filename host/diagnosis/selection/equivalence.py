@@ -252,6 +252,10 @@ def _equals(
             break
         if replaced_by(less, trial.candidate) != ():
             continue  # it stands for another active effect too: both together would say one thing twice
+        if _elsewhere(trial.candidate, candidate):
+            refitted.append((trial.candidate, 0.0))
+            kept.append(trial.candidate)
+            continue
         term = term_of(problem, trial.candidate, less)
         start = trial.fit.values[-len(term.parameters) :]
         begin = np.concatenate((less.values, start))
@@ -273,6 +277,15 @@ def _equals(
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):
             kept.append(trial.candidate)
     return tuple(kept), refitted
+
+
+def _elsewhere(rival: Candidate, candidate: Candidate) -> bool:
+    """Whether `rival` is the effect of `candidate`, in any form, at another place of one linear path: both say the same.
+
+    The form that was tried there, or the last steps of its fit, would pass for evidence of a place.
+    """
+    same = rival.effect.id == candidate.effect.id and rival.name != candidate.name
+    return same and candidate.effect.invariant and rival.port.name in candidate.port.path
 
 
 def _rivals(found: Found, candidate: Candidate, rules: SelectionRules) -> list[Trial]:

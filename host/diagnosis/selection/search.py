@@ -241,11 +241,22 @@ def search(problem: Problem, candidate_effects: list[Candidate], progress: Progr
 
     earned: likelihood by which the nominal model was extended before; each effect is then a further one.
     """
+    return concluded(problem, forward(problem, candidate_effects, progress, earned), candidate_effects, progress)
+
+
+def forward(problem: Problem, candidate_effects: list[Candidate], progress: Progress, earned: float = 0.0) -> Found:
+    """Nominal refit, then single effects until none is earned: the first part of `search`."""
     progress("refitting the nominal model", 0.0)
     nominal = fit_nominal(problem)
     noise_sd = np.array([noise.sigma for noise in problem.noise])
     found = Found(nominal, nominal, [])
     _grow(problem, found, candidate_effects, noise_sd, earned, progress)
+    return found
+
+
+def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate], progress: Progress) -> Found:
+    """Pairs, detours, exchanges and removals after `forward`: the second part of `search`."""
+    noise_sd = np.array([noise.sigma for noise in problem.noise])
     _join(problem, found, candidate_effects, noise_sd, progress)
     found = _detour(problem, found, candidate_effects, noise_sd, progress)
     _exchange(problem, found, candidate_effects, noise_sd, progress)
