@@ -125,7 +125,8 @@ class Problem:
     def unseen(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
         """First samples (number) that a dead time makes of what was before the recording: nothing can predict them."""
         late_s = max(self.late_s(terms, values), self.waits_s)
-        return min(math.ceil(late_s / segment.recording.dt_s - 1e-9), segment.n // 2) if late_s > 0.0 else 0
+        late = math.ceil(late_s / segment.recording.dt_s - 1e-9) + segment.spread  # a test function reaches so far back
+        return min(late, segment.n // 2) if late_s > 0.0 else 0
 
     def left(self, segment: Segment, terms: tuple[Term, ...], values: Array, out: Array | None = None) -> Array:
         """Measured minus simulated (outputs, n), NaN where nothing was measured or nothing can be predicted.

@@ -31,6 +31,7 @@ Array = npt.NDArray[np.float64]
 READ = ("position", "velocity", "acceleration")
 SMOOTHING_S = 0.02
 UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
+UNKNOWN = np.array([0.01, 0.05])  # of the range of position and speed, that an input before the recording can have made
 FINER = 8  # points in each sub-step at which a held input is computed that an effect delays
 
 
@@ -134,6 +135,10 @@ class AxisModel(Model):
             spread = np.array(
                 [max(largest * UNSEEN_S**2, float(np.std(twice))), max(largest * UNSEEN_S, float(np.std(once)))]
             )
+        elif (
+            spec.compare == "motion"
+        ):  # the input before the recording is unknown, and a delay puts it into its first moments
+            spread = np.maximum(spread, UNKNOWN * np.array([np.ptp(x), np.ptp(v)]))
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         along = motion if spec.reads == "position" else place

@@ -137,7 +137,9 @@ def over_time(result: Diagnosis) -> ReportFigure:
         legend_above(top, 2 if narrow else 3)
 
     unused = "" if segment.fit.any() else ", not used to fit"
-    caption = f"Recording {segment.recording.name}{unused}. Below: recording minus model; the grey band is the noise."
+    name = segment.recording.name
+    named = name.capitalize() if name.startswith("recording ") else f"Recording {name}"
+    caption = f"{named}{unused}. Below: recording minus model; the grey band is the noise."
     return report_figure(
         draw,
         4.3,

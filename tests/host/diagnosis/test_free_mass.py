@@ -97,3 +97,23 @@ def test_noise_at_rest_is_no_movement() -> None:
     rests = at_rest(smooth, tolerance, 15)
     assert np.ptp(smooth[:780]) < 1.4 * tolerance
     assert np.mean(rests[20:760]) > 0.9 and not rests[820:1180].any()
+
+
+@pytest.mark.parametrize(("late", "noise_m"), [(5, 2e-4), (5, 1e-5), (2, 2e-4)])
+def test_a_delay_of_the_force_is_found_in_recordings_cut_from_motion(late: int, noise_m: float) -> None:
+    """A speed that was held to four standard deviations of the first readings could not take up the input before them."""
+    runs = []
+    for number in (1, 2, 3):
+        rng = np.random.default_rng([80, number])
+        t, x, v = np.arange(2000) / 100.0, 0.0, 0.0
+        force = 1.5 * np.sin(2.0 * np.pi * np.outer(t, np.geomspace(0.1, 1.5, 7)) + rng.uniform(0.0, 6.28, 7)).sum(axis=1)
+        place, keep = np.empty(t.size), np.exp(-DAMPING / MASS_KG * 0.01)
+        for i in range(t.size):
+            place[i], steady = x, force[max(i - late, 0)] / DAMPING
+            x += steady * 0.01 + (v - steady) * (1.0 - keep) * MASS_KG / DAMPING
+            v = steady + (v - steady) * keep
+        place += noise_m * rng.standard_normal(t.size)
+        runs.append({"t": t[:1700], "f": force[300:], "x": place[300:]})
+    (found,) = diagnose(runs, free_nominal("zero")).effects
+    assert found["id"] == "latency"
+    assert found["parameters"]["delay_s"]["value"] == pytest.approx(0.01 * late, rel=0.01)
