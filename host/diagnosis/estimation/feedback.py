@@ -37,15 +37,9 @@ PASSES = 3  # of a prediction that leaves out the rows of steps
 LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 
 
-def innovations(x: Array) -> Array:
-    """Return what `x` (n,) does beyond its best linear prediction from the last ORDER samples, zero at its begin."""
-    new = unpredicted(x)
-    return new / (np.std(new[ORDER:]) + 1e-300)
-
-
 def unpredicted(x: Array) -> Array:
-    """As `innovations`, in the unit of `x` (n,)."""
-    past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
+    """Return what `x` (n,) does beyond its best linear prediction from the last ORDER samples, zero at its begin."""
+    past = _past(x)
     new = x[ORDER:] - past @ np.linalg.lstsq(past, x[ORDER:], rcond=None)[0]
     return np.concatenate((np.zeros(ORDER), new))
 
@@ -55,18 +49,22 @@ def common_part(x: Array) -> tuple[Array, Array]:
 
     Steps exceed all other new parts together. The prediction is fitted without their rows, and they are 0 in the result.
     """
-    past = np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
+    past = _past(x)
     usual = np.ones(x.size - ORDER, dtype=bool)
     new = x[ORDER:]
     for _ in range(PASSES):
         weights = np.linalg.lstsq(past[usual], x[ORDER:][usual], rcond=None)[0]
         new = x[ORDER:] - past @ weights
         usual = np.abs(new) <= COMMON * 1.4826 * float(np.median(np.abs(new)))
+    steps = np.concatenate((np.zeros(ORDER, dtype=bool), ~usual))
     if np.count_nonzero(usual) < ORDER * SAMPLES_PER_LAG // 2:
-        return np.zeros_like(x), np.concatenate((np.zeros(ORDER, dtype=bool), ~usual))
-    return np.concatenate((np.zeros(ORDER), np.where(usual, new, 0.0))), np.concatenate(
-        (np.zeros(ORDER, dtype=bool), ~usual)
-    )
+        return np.zeros_like(x), steps
+    return np.concatenate((np.zeros(ORDER), np.where(usual, new, 0.0))), steps
+
+
+def _past(x: Array) -> Array:
+    """The last ORDER samples before each sample of `x` (n,) from ORDER on, and a constant: (n - ORDER, ORDER + 1)."""
+    return np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
 
 
 def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> bool:
