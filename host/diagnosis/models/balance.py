@@ -36,6 +36,8 @@ HALF_GAIN = 0.62  # half length times the frequency at which the bump's gain is 
 FEWEST = 5  # samples in half a bump
 HOLDS = ("linear", "zero", "band_limited")
 FINE = 32  # points a sample, to integrate a held force
+PARTS = 8  # of a recording, in each of which the share of the input that is applied is looked at
+AT_REST = 0.05  # of the largest spread of a part: below it the input rests
 
 
 @dataclass(frozen=True)
@@ -238,8 +240,21 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
             holds = np.clip(motion.pushed + linear[3] - linear[2] * motion.x - other, -most, most)
             dry = np.where(motion.rests, other + holds, dry)
         need = need + _along_record(dry, balance.bump)
-    size = float(np.std(force)) / max(float(np.std(segment.inputs[balance.input])), 1e-300)
     finer = force.size // segment.n
     applied = _along_record(force, balance.held if finer == 1 else _finely(balance, recording.dt_s, finer))[::finer]
+    size = _passed(applied, _along_record(segment.inputs[balance.input], balance.held), np.isfinite(segment.y[0]))
     size *= min(quieted(balance, linear, p, recording.dt_s), 1.0)
     return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)
+
+
+def _passed(applied: Array, recorded: Array, compared: npt.NDArray[np.bool_]) -> float:
+    """Share of the recorded input that is applied: the median over parts of the recording of the ratio of their spreads.
+
+    One ratio for the whole recording is no measure. A limit that lets a single peak pass leaves no error anywhere else.
+
+    applied, recorded: (n,), under the test function; compared: (n,).
+    """
+    parts = [np.std(part, axis=1) for part in np.array_split(np.array([applied, recorded])[:, compared], PARTS, axis=1)]
+    moved = [(a, r) for a, r in parts if r > 0.0]
+    least = AT_REST * max((r for _, r in moved), default=0.0)
+    return float(np.median([a / r for a, r in moved if r > least])) if moved else 1.0

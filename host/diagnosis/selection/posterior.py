@@ -15,7 +15,8 @@ which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
 Where dl is more than c dk > 0, and more of the error than an idealized formula leaves, the cost is coarsened with the
 likelihood, w(rival) = exp(-r (dl - c dk)): the further parameters of the effect have earned it (`ahead_of_rival`).
 
-An effect is a name, whatever the form: the weight of another form of it, an equation that says the same, is its own.
+An effect is a name, whatever the form: the weight of another form of it, an equation that says the same, is its own. Where
+another form or a rival weighs more than what was fitted, w(none) and w(other) are multiplied by its weight.
 
 Here `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
 rivals that are indistinguishable (`equivalence`) have at least the weight `prior_equal` together.
@@ -94,11 +95,13 @@ def posterior(
     where it is the only one; name: of the effect.
     """
     weights = [(rival, _exp(-difference)) for rival, difference in rivals if rival.name != name]
-    own = 1.0 + sum(_exp(-difference) for rival, difference in rivals if rival.name == name)
+    forms = [1.0, *(_exp(-difference) for rival, difference in rivals if rival.name == name)]
+    own = sum(forms)
     nothing = max(_exp(-(gain.log_likelihood - rules.parameter_penalty * parameters)), min(heldout.p_value, 1.0))
     odds = rules.prior_none / (1.0 - rules.prior_none)
     none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
     none += odds * min(rules.exact_share / max(share, 1e-300), 1.0 / odds)
+    none *= max([*forms, *(weight for _, weight in weights)])  # its prior odds are those against the best that was fitted
     total = own + sum(weight for _, weight in weights) + nothing + none
     raw = own / total
     stated = calibrated(raw, *rules.effect_curve)
