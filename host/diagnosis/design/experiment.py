@@ -104,7 +104,7 @@ def against(
     top: tuple[float, Excitation, Problem] | None = None
     for size, excitation, trial in ranked[:FINALISTS]:
         if top is not None and np.sqrt(size) <= top[0]:
-            break  # a rival that adapts takes a part of the difference: the rest of them cannot be further apart
+            break  # a rival that adapts takes a part of the difference: the others cannot be further apart
         reached = separation(trial, rival, known)
         if top is None or reached > top[0]:
             top = (reached, excitation, trial)

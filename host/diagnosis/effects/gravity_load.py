@@ -38,6 +38,16 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"moment_sine": p[0], "moment_cosine": p[1]}
 
 
+def added(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Return the parameter `force`, in the direction of one recorded component."""
+    return (Parameter("force", s.unit, (s.need,), linear=True),)
+
+
+def add_constant(signal: Array, c: Context, p: Array, form: str) -> Array:
+    """Return one component (n,) of a force with the constant p[0] added."""
+    return np.asarray(signal + p[0])
+
+
 LENGTHS_M = (0.1, 0.4)  # of links, tried first: those of arms on a bench
 SHORTEST_M, LONGEST_M = 5e-3, 5.0
 GRAVITY_M_PER_S2 = 9.81
@@ -65,6 +75,31 @@ def payload(links: int) -> Effect:
         "An additional mass of {mass} is at the last link; its weight and inertia add to every joint's torque.",
         "torque_j = d/dt(dT/dq_j') - dT/dq_j + dV/dq_j of a point mass at the last link's end",
         payload_torques,
+    )
+
+
+def constant_load(loads: dict[str, str]) -> Effect:
+    """Return the effect of a force that acts in addition to recorded ones and does not change: `COMPONENT` at each of them.
+
+    loads: channel of each component -> its unit.
+    """
+
+    def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
+        units = {name: unit.replace(" ", "_") for name, unit in loads.items()}
+        stems = {name: name.removesuffix(f"_{unit}") for name, unit in units.items()}
+        return tuple(Parameter(f"added_{stems[name]}", unit, (s.need,), linear=True) for name, unit in loads.items())
+
+    stems = [name.removesuffix("_" + unit.replace(" ", "_")) for name, unit in loads.items()]
+    vector = ", ".join(f"{{added_{stem}}}" for stem in stems)
+    return Effect(
+        "gravity_load",
+        "weight",
+        26,
+        parameters,
+        f"A constant force of ({vector}) acts in addition to the recorded one, as of a weight. "
+        "An offset of the force sensor does the same.",
+        "F = recorded force + constant",
+        at_rest=True,
     )
 
 
@@ -97,6 +132,18 @@ _TURNING = Effect(
     "M = moment_sine*sin(x) + moment_cosine*cos(x)",
     slots=slots,
 )
+COMPONENT = Effect(
+    "gravity_load",
+    "added",
+    26,
+    added,
+    "A constant force of {force} acts in addition to the recorded one, as of a weight. "
+    "An offset of the force sensor does the same.",
+    "F = recorded force + force",
+    add_constant,
+    forms=("added",),
+    at_rest=True,
+)
 EFFECTS = (
     Effect(
         "gravity_load",
@@ -114,4 +161,5 @@ EFFECTS = (
         "A constant force of {force} acts against the positive direction, as of a weight or an offset of the input.",
         "F = force",
     ),
+    COMPONENT,
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form, spread
 from host.diagnosis.model.operators import digital_lag, lag, lagged_rows
 
@@ -19,8 +21,10 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Pass the signal (n,) through a first-order low pass of time constant p[0] (s)."""
-    return (digital_lag if form == "digital" else lag)(signal, c.dt_s, p[0], c.start)
+    """Pass the signal (n,) through a first-order low pass of time constant p[0] (s); form `digital`: once a sample."""
+    if form == "digital":
+        return np.repeat(digital_lag(signal[:: c.points], c.dt_s * c.points, p[0], c.start), c.points)
+    return lag(signal, c.dt_s, p[0], c.start)
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:

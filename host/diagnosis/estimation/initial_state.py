@@ -16,6 +16,9 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 STATE_STEPS = 3  # of parameters and initial states together
+SHARES = (1.0, 0.5, 0.25)  # of such a step that are tried
+STATE_ROUNDS = 4  # of such steps and a fit of the parameters alone, at most
+MUCH_LESS = 0.7  # cost relative to that of the round before, for another round
 FARTHEST = 4.0  # standard deviations of the measured state within which the estimated one stays
 
 
@@ -133,8 +136,10 @@ def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
     """`fit` after Gauss-Newton steps of all its parameters and the states of the recordings to fit, together.
 
     In turn they converge slowly where a state can take the place of an effect for as long as the plant remembers: an
-    offset of a tank's reading, for one. A step that does not lower the cost is undone and is the last. Then the states of
-    all recordings are estimated with these parameters, those of recordings that are held out too.
+    offset of a tank's reading, for one. A step that does not lower the cost is undone and is the last. On a linear path,
+    where the states are those of a plant, it is halved first; elsewhere a mode without damping would ring down through a
+    whole recording. Then the states of all recordings are estimated with these parameters, those of recordings that are
+    held out too.
     """
     parameters = problem.parameters(fit.terms)
     used = [segment for segment in problem.segments if segment.fit.any()]
@@ -154,15 +159,19 @@ def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
             ]
         )
         by = _least_squares(A, np.concatenate([r, weights * _pull(states)]))
-        trial, before = values.copy(), [state.value for state in states]
-        for index, step in zip(free(parameters), by, strict=False):
-            trial[index] = moved(parameters[index], values[index], float(step))
-        _move(states, by[J.shape[1] :])
-        r_new = problem.stacked(fit.terms, trial)
-        cost_new, _ = robust(r_new)
-        if not cost_new < cost:
+        before = [state.value for state in states]
+        for share in SHARES if problem.joint_states else SHARES[:1]:
+            trial = values.copy()
+            for index, step in zip(free(parameters), by, strict=False):
+                trial[index] = moved(parameters[index], values[index], share * float(step))
+            _move(states, share * by[J.shape[1] :])
+            r_new = problem.stacked(fit.terms, trial)
+            cost_new, _ = robust(r_new)
+            if cost_new < cost:
+                break
             for state, old in zip(states, before, strict=True):
                 state.put(old)
+        else:
             break
         values, r, cost = trial, r_new, cost_new
     for segment in problem.segments:
@@ -214,8 +223,15 @@ def begun_again(problem: Problem, fit: Fit) -> Fit:
 
     A delay of the input begins with another state of a linear plant than a delay of its reading does. With the state of
     one of them the other looks worse than it is; with that of the nominal fit, every effect looks better than it is.
+    What is known of a state beforehand weighs as much as the residual is large: far from the end it holds the states back,
+    and they hold back a delay. So this is repeated while it lowers the cost by much.
     """
     if not problem.joint_states:
         return fit
-    fit = fit_with_states(problem, fit, STATE_STEPS)
-    return minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
+    for _ in range(STATE_ROUNDS):
+        before = fit.cost
+        fit = fit_with_states(problem, fit, STATE_STEPS)
+        fit = minimize(problem, fit.terms, fit.values, rounds=problem.rules.further_iterations, tolerance=1e-4)
+        if not fit.cost < MUCH_LESS * before:
+            break
+    return fit

@@ -16,6 +16,7 @@ from host.diagnosis.model.model import ActiveEffect
 from host.diagnosis.models.axis import AxisModel
 from host.diagnosis.models.external import ExternalModel, module_path
 from host.diagnosis.models.linear import LinearModel
+from host.diagnosis.models.simulated import SimulatedModel
 from host.diagnosis.models.transmission import TransmissionModel
 from host.diagnosis.pipeline import Diagnosis
 from protocol.errors import InputError
@@ -51,6 +52,7 @@ def module_of(result: Diagnosis) -> str:
     for one in (runtime.ExportedEffect, runtime.ExportedRun):
         gathered.add(one)
     model = result.model.inner
+    active = model.components(active) if isinstance(model, SimulatedModel) else active
     law, initial = _law(model, theta, active, gathered)
     effects = []
     for candidate, values in sorted(active, key=lambda one: one[0].effect.order):

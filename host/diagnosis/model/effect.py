@@ -79,6 +79,7 @@ class Context:
     equations: dict[str, Array] = field(default_factory=dict)  # values (n,) of forms found by search
     start_rate: float = 0.0  # speed at the first sample beyond that of the motion: start of memory of second order
     starts: tuple[float, ...] = ()  # of an effect with `memories`: each of them, in this recording
+    points: int = 1  # of the signal in one sample, where it is held between samples
     _cache: dict[str, Array] = field(default_factory=dict)
 
     def moving(self, signal: Array) -> Array:

@@ -233,6 +233,7 @@ def apply_effects(
             segment.equations if finer == 1 else {k: np.repeat(v, finer) for k, v in segment.equations.items()},
             segment.start.get(rate_key(port), 0.0),
             tuple(segment.start.get(key, 0.0) for key in memory_keys(candidate)),
+            finer,
         )
         signal = candidate.effect.apply(signal, context, values, candidate.form)
     return signal

@@ -20,9 +20,19 @@ import numpy.typing as npt
 from scipy.signal import fftconvolve
 
 from host.diagnosis.effects import library
-from host.diagnosis.effects.gravity_load import payload
+from host.diagnosis.effects.gravity_load import COMPONENT, constant_load, payload
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.effect import FORCES, Candidate, Context, Effect, Parameter, Port, Scale, spread
+from host.diagnosis.model.effect import (
+    FORCES,
+    Candidate,
+    Context,
+    Effect,
+    Parameter,
+    Port,
+    Scale,
+    is_force,
+    spread,
+)
 from host.diagnosis.model.model import (
     ActiveEffect,
     Begin,
@@ -49,6 +59,7 @@ FIT_CALLS = 60  # simulations of a recording in which a candidate is fitted in f
 FITS = 10  # candidates that are fitted in full, about
 FORCE_OF = {"rad": "N m", "m": "N"}  # unit of the force that does work along a motion
 CHAIN = "payload"  # port of what hangs on an arm
+WEIGHT = "weight"  # port of a force that acts in addition to recorded loads
 MOST_LINKS = 4
 MOST_FORCED = 4  # pairs of a force and a motion up to which each force may act along each motion
 MOST_DYNAMIC = 4096  # samples of a step response that are used
@@ -122,6 +133,7 @@ class SimulatedModel(Model):
         self.session_offsets = [name for name in (*section.inputs, *section.outputs) if spec.channels[name].session_offset]
         inputs, outputs = section.inputs, section.outputs
         self.forced, self.chain = self._forced(), self._chain()
+        self.weighed = tuple(n for n in section.load if n in section.inputs and is_force(self.units[n]) and self.shifted)
         self.outputs = tuple(Output(name, self.units[name], self.subsystem_of(name)) for name in outputs)
         self.ports = (*self._signal_ports(), *self._offered_ports(offers))
         parameters = []
@@ -158,6 +170,7 @@ class SimulatedModel(Model):
             # The simulator may have no gain and no zero at an input: errors of them are candidates, too.
             kind = "motion+turn+scale" if self.units[channel] == "rad" else "motion+scale"
             kind += "+shift" if self.shifted else ""
+            kind += "+added" if channel in self.weighed else ""
             others = tuple(other for other in section.inputs if other != channel)
             found.append(Port(channel, kind, self.subsystem_of(channel), tuple(section.outputs), loads, others))
         for channel in section.outputs:
@@ -169,6 +182,9 @@ class SimulatedModel(Model):
         if self.chain:
             torques = tuple(dict.fromkeys(force for force, _ in self.chain))
             found.append(Port(CHAIN, "chain", self.subsystem_of(torques[-1]), torques, offers=(payload(len(self.chain)),)))
+        if self.weighed:
+            offers = (constant_load({name: self.units[name] for name in self.weighed}),)
+            found.append(Port(WEIGHT, "weight", self.subsystem_of(self.weighed[0]), tuple(section.outputs), offers=offers))
         return found
 
     def _chain(self) -> list[tuple[str, str]]:
@@ -230,6 +246,8 @@ class SimulatedModel(Model):
                 segment.units[port.name] = ""
             elif port.kind == "chain":
                 segment.units[port.name] = self.units[port.channels[0]]
+            elif port.kind == "weight":
+                segment.units[port.name] = self.units[self.weighed[0]]
             elif port.name in self.forced:
                 motion = segment.inputs[self.forced[port.name][1]]
                 segment.tolerances[port.name] = tolerance_of(motion, float(np.ptp(motion)))
@@ -324,7 +342,7 @@ class SimulatedModel(Model):
 
     def run_of(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> SimulatorRun:
         """Return the arguments of the simulator for one recording."""
-        begin = self._begin_of(segment)
+        begin, active = self._begin_of(segment), self.components(active)
         given = {}
         for name in self.section.inputs:
             signal = segment.inputs[name] + begin.get(f"offset:{name}", 0.0)
@@ -341,6 +359,18 @@ class SimulatedModel(Model):
         within = [effect for effect in active if effect[0].port.name in self.inside]
         inside = (segment, within) if within else None
         return SimulatorRun(given, values, segment.recording.time_s, initial, inside, self.rate_of(segment))
+
+    def components(self, active: list[ActiveEffect]) -> list[ActiveEffect]:
+        """`active` with an added load as one effect at each force that it adds to."""
+        ports, found = {port.name: port for port in self.ports}, []
+        for candidate, values in active:
+            if candidate.port.kind == "weight":
+                form = COMPONENT.forms[0]
+                parts = zip(self.weighed, values[:, None], strict=True)
+                found += [(Candidate(COMPONENT, ports[name], form=form), value) for name, value in parts]
+            else:
+                found.append((candidate, values))
+        return found
 
     def _undo(self, segment: Segment, initial: dict[str, float], active: list[ActiveEffect]) -> None:
         """Let each output and its rate begin where the effects on its reading, if affine, have what was read."""
@@ -465,6 +495,8 @@ class SimulatedModel(Model):
             return segment.inputs[self.forced[port.name][1]]
         if port.kind == "chain":
             return segment.inputs[self.chain[-1][1]]
+        if port.kind == "weight":
+            return segment.inputs[self.weighed[0]]
         if port.name in segment.inputs:
             return segment.inputs[port.name]
         row = segment.y[self.section.outputs.index(port.channels[0])]
@@ -472,12 +504,18 @@ class SimulatedModel(Model):
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Residual of the port's output; at an input, what it would have to be moved by, all outputs weighed by their
-        noise.
+        noise. For an added load, the component of which the least would do.
         """
+        if port.kind == "weight":
+            return min((self._need(segment, name, theta, residual) for name in self.weighed), key=np.linalg.norm)
         if port.name not in segment.inputs:
             return np.asarray(residual[self.section.outputs.index(port.channels[0])])
-        step = 1e-4 * (float(np.ptp(segment.inputs[port.name])) or 1.0)
-        moved = self._moved(segment, theta, [], port.name, np.full(segment.n, step))
+        return self._need(segment, port.name, theta, residual)
+
+    def _need(self, segment: Segment, channel: str, theta: Array, residual: Array) -> Array:
+        """What the input `channel` (n,) would have to be moved by."""
+        step = 1e-4 * (float(np.ptp(segment.inputs[channel])) or 1.0)
+        moved = self._moved(segment, theta, [], channel, np.full(segment.n, step))
         slope = (moved - self.simulate(segment, theta, [])) / step
         weight = segment.weights()
         s = np.where(np.isfinite(residual), slope, 0.0) / weight

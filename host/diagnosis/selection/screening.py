@@ -38,6 +38,7 @@ Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
 START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
 ABSORBED = 1e-10  # share of a response that the active parameters do not explain, below which they absorb it
+LARGEST = 30.0  # of a parameter's natural size: a start beyond it is made of what the active parameters hardly leave
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 
@@ -364,6 +365,7 @@ def _scan(
             continue
         a = np.linalg.lstsq(G / np.outer(size, size), g / size, rcond=1e-10)[0] / size
         if linear:
+            a = np.clip(a, -LARGEST, LARGEST)
             a = np.array(
                 [min(max(x * size_of(p, 0.0), p.low), p.high) / size_of(p, 0.0) for x, p in zip(a, linear, strict=True)]
             )

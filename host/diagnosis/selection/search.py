@@ -306,7 +306,7 @@ def _grow(
                 break
             progress(f"fitting {item.candidate.key}", count / len(promising))
             trials.append(try_fit(problem, best, item, noise_sd))
-        rank(trials, best)
+        rank(problem, trials, best)
         trials = _with_simpler(problem, best, trials, ranked, noise_sd)
         trials = with_wider(problem, best, trials, ranked, noise_sd)
         with_other_recordings(problem, best, trials, noise_sd)
@@ -401,7 +401,7 @@ def _with_simpler(problem: Problem, best: Fit, trials: list[Trial], ranked: list
     if not missing:
         return trials
     more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.simpler_fits])]
-    rank(more, best)
+    rank(problem, more, best)
     return more
 
 
@@ -421,7 +421,7 @@ def with_wider(problem: Problem, best: Fit, trials: list[Trial], ranked: list[Sc
     if not missing or problem.budget.spent():
         return trials
     more = [*trials, *(try_fit(problem, best, item, noise_sd) for item in missing[: problem.rules.wider_fits])]
-    rank(more, best)
+    rank(problem, more, best)
     return more
 
 
@@ -465,6 +465,9 @@ def _taken(problem: Problem, trial: Trial) -> Fit:
     set_starts(problem, trial.starts)
     best = refined(problem, trial.fit)
     reweigh(problem, best)
+    if len(problem.noise) > 1:  # the output that the mismatch was largest in weighs more now: the fit has moved with it
+        best = refined(problem, best)
+        reweigh(problem, best)
     if trial.candidate.effect.hides:  # the nominal parameters that the starts were found with were led astray
         set_starts(problem, first_needs(problem, best))
     return best
@@ -665,7 +668,7 @@ def _in_place_of(
         try_fit(problem, less, item, noise_sd)
         for item in [*own, *_varied(others, problem.rules)[: problem.rules.exchange_fits]]
     ]
-    rank(trials, less)
+    rank(problem, trials, less)
     with_other_recordings(problem, less, trials, noise_sd)
     found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from host.diagnosis.estimation.evidence import Gain
-from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.evidence import Gain, compare
+from host.diagnosis.estimation.fit import Fit, Problem, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
 WITHIN = 1.05  # samples: a delay up to this may be a matter of how the input was recorded
+SAME = 0.01  # of a log-likelihood: trials that differ by less, with as many parameters, are one equation
 
 
 @dataclass
@@ -81,9 +82,9 @@ def vanished(fit: Fit, term: Term, rules: SelectionRules) -> bool:
     return bool(amounts) and alone and all(abs(v) < rules.least_amount * min(map(abs, p.grid)) for p, v in amounts)
 
 
-def rank(trials: list[Trial], base: Fit) -> None:
+def rank(problem: Problem, trials: list[Trial], base: Fit) -> None:
     """Sorts trials by their likelihood on all samples, with one effective sample size for all, that of the trial with
-    the least error.
+    the least error. Of trials that are one equation under several ids, the effect that comes first in its order is first.
     """
     if not trials:
         return
@@ -94,7 +95,11 @@ def rank(trials: list[Trial], base: Fit) -> None:
         more = max(trial.fit.fitted - base.fitted, 0)
         trial.score = 0.5 * float(common @ trial.both.log_ratio) - rules.parameter_penalty * more
     trials.sort(key=lambda trial: trial.score, reverse=True)
-    top = trials[0]
+    _compare_on_common_samples(problem, trials, base)
+    alike = [trial for trial in trials if trials[0].score - trial.score < SAME and trial.fit.fitted == trials[0].fit.fitted]
+    top = min(alike, key=lambda trial: trial.candidate.effect.order)
+    trials.remove(top)
+    trials.insert(0, top)
     coarse = 0.5 * float(
         common @ (-np.log(1.0 - rules.refinement_error_reduction * np.minimum(1.0, 2.0 * top.both.excesses)))
     )
@@ -114,6 +119,29 @@ def rank(trials: list[Trial], base: Fit) -> None:
         best = max(simpler, key=lambda t: (-t.fit.fitted, t.score))
         trials.remove(best)
         trials.insert(0, best)
+
+
+def _compare_on_common_samples(problem: Problem, trials: list[Trial], base: Fit) -> None:
+    """Score the first of sorted trials again, and sort them, where a dead time of one hides samples that others predict.
+
+    A lag would else be credited with the first samples of a recording, of which a delay says nothing.
+    """
+    rules = problem.rules
+    first = [trial for trial in trials if trial.score > (1.0 - rules.reduced_form_tolerance) * trials[0].score]
+    fits = [base, *(trial.fit for trial in first)]
+    seen = [np.all([np.isfinite(r) for r in rows], axis=0) for rows in zip(*(fit.residuals for fit in fits), strict=True)]
+    if all(np.array_equal(mask, np.isfinite(r)) for fit in fits for mask, r in zip(seen, fit.residuals, strict=True)):
+        return
+    before = [np.where(mask, r, np.nan) for mask, r in zip(seen, base.residuals, strict=True)]
+    noise_sd = np.array([noise.sigma for noise in problem.noise])
+    gains = [compare(problem.segments, "both", before, trial.fit.residuals, noise_sd) for trial in first]
+    most = np.max([gain.independent for gain in gains], axis=0)
+    common = max(gains, key=lambda gain: float(most @ gain.log_ratio)).independent
+    for trial, gain in zip(first, gains, strict=True):
+        more = max(trial.fit.fitted - base.fitted, 0)
+        trial.score = 0.5 * float(common @ gain.log_ratio) - rules.parameter_penalty * more
+    first.sort(key=lambda trial: trial.score, reverse=True)
+    trials[: len(first)] = first
 
 
 def richer_gain(earned: Gain, more: int, rules: SelectionRules) -> float:
@@ -209,7 +237,7 @@ def refuted(heldout: Gain, rules: SelectionRules) -> bool:
     """Whether the error on held-out samples grows by as much as an effect has to take: not if they just do not excite it.
 
     The likelihood is that of the error without what a controller fed back (`compare`). An effect that lowers it can raise
-    the whole error: it explains the remainder, which may be small, by what it spoils of the rest.
+    the whole error: it explains the remainder, which may be small, and makes the other residual larger.
     """
     return heldout.share < -rules.least_error_reduction
 

@@ -169,13 +169,13 @@ def _equation_instead(
     sized = [form for place in predict_residual(problem, base, noise_sd) if place.port is port for form in place.forms]
     trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
-    rank(trials, base)
+    rank(problem, trials, base)
     winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
     if evolve and (winner is None or _left(problem, found, winner.fit, noise_sd) > problem.rules.partial_share):
         evolved = search_equation(problem, base, port)
         trials += [_tried(problem, base, noise_sd, target, form, 1.0) for form in evolved]
         forms += evolved
-        rank(trials, base)
+        rank(problem, trials, base)
         winner = next((trial for trial in trials if _earned(trial) and not _only_sampling(problem, trial)), None)
     if winner is None or not _better_than_known(problem, found, noise_sd, winner, bool(there)):
         return False

@@ -242,3 +242,35 @@ def test_a_slow_share_is_screened_with_the_state_that_a_recording_begins_with() 
     ranked = screen(problem, nominal, candidates(candidate_ports(problem), True), lambda *_: None)
     assert ranked[0].candidate.key == "creep_relaxation@knob"
     assert 0.5 < ranked[0].begin[0][1] < 4.0
+
+
+def fed(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+    """Reach of a rod that is fed in from where `offset` says, and buckles: a function of fed length alone."""
+    length = inputs["feed"] + p["offset"]
+    return {"x": length - 40.0 * length**2, "z": 2.0 * length**3}
+
+
+def test_a_start_is_not_made_of_what_a_nominal_parameter_hardly_leaves() -> None:
+    """An offset of the feed is a nominal parameter: what differences leave of its response asks for decimetres."""
+    content: dict[str, Any] = {
+        "name": "rod",
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {n: {"column": n, "unit": "m"} for n in ("feed", "x", "z")},
+        "callable": {"function": fed, "inputs": ["feed"], "outputs": ["x", "z"]},
+        "parameters": {"offset": {"value": 0.1, "unit": "m"}},
+    }
+    found = []
+    for k in range(2):
+        rng, t = np.random.default_rng(k), np.arange(600) * 0.02
+        feed = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + k) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
+        beat = 1e-3 * np.sin(2.0 * np.pi * 1.1 * t)
+        rows = fed({"feed": feed + beat}, {"offset": 0.1}, t)
+        found.append(
+            Table(f"r{k}", {"t": t, "feed": feed, **{n: x + 1e-4 * rng.standard_normal(600) for n, x in rows.items()}})
+        )
+    _, problem, _ = prepare(nominal_of(content), found)
+    nominal = fit_nominal(problem)
+    ranked = screen(problem, nominal, candidates(candidate_ports(problem), True), lambda *_: None)
+    starts = [begin for item in ranked if item.candidate.key == "sensor_bias@feed" for begin in item.begin]
+    assert starts and all(abs(begin[0]) < 0.05 for begin in starts)
