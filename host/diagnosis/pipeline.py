@@ -267,6 +267,7 @@ def _diagnosed(
         *_repeated(full),
         *between,
         *uncertain(problem, found.best, spans),
+        *model.findings(),
     ]
     if not found.best.terms and remainder.sure:
         result.findings += _jumps(full, found)

@@ -12,6 +12,7 @@ from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Parameter, Port
 from host.diagnosis.model.model import ActiveEffect, Model, Segment, scale_of
 from host.diagnosis.model.nominal import EffectSpec
+from host.diagnosis.model.readings import Finding
 from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
@@ -87,6 +88,10 @@ class Known(Model):
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """Call the model without the known effects."""
         return self._inner.announce(segments, theta[: self.own])
+
+    def findings(self) -> list[Finding]:
+        """Return what the model without the known effects has to say."""
+        return self._inner.findings()
 
     def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
         """Call the model without the known effects; a known effect that is not linear and time-invariant ends the path."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.effect import Candidate, Context, Parameter, Port, Scale, is_force, memory_keys, rate_key
 from host.diagnosis.model.operators import fill, quantum
+from host.diagnosis.model.readings import Finding
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -132,6 +133,10 @@ class Model(ABC):
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """Return the expected cost of a diagnosis if simulations take long; empty if they do not."""
         return ""
+
+    def findings(self) -> list[Finding]:
+        """Return what the model has to say after all simulations."""
+        return []
 
     def settle(self, segment: Segment, theta: Array) -> None:  # noqa: B027 - most models have nothing to settle
         """Prepare the recording for these nominal parameters: a measured output that is an input too, freed of noise."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.nominal import NominalSpec
-from host.diagnosis.models.simulated import SimulatedModel, SimulatorRun
+from host.diagnosis.models.simulated import FailedRun, SimulatedModel, SimulatorRun, attempted
 from protocol.errors import InputError
 from protocol.worker_process import end_with_parent
 
@@ -69,7 +69,7 @@ class ExternalModel(SimulatedModel):
         """Outputs of each of `runs`, in parallel where the file says that the function can."""
         if self._pool is None or len(runs) < 2:
             return super().run_many(runs)
-        call = _call_in_worker if isinstance(self._pool, ProcessPoolExecutor) else self._call
+        call = _call_in_worker if isinstance(self._pool, ProcessPoolExecutor) else self._attempt
         arguments = [self._arguments(run) for run in runs]
         return [self._checked(run, found) for run, found in zip(runs, self._pool.map(call, arguments), strict=True)]
 
@@ -80,6 +80,9 @@ class ExternalModel(SimulatedModel):
     def _call(self, arguments: tuple[Any, ...]) -> Mapping[str, Array]:
         return self.function(*arguments)
 
+    def _attempt(self, arguments: tuple[Any, ...]) -> Mapping[str, Array] | FailedRun:
+        return attempted(self.function, *arguments)
+
 
 _in_worker: list[Function] = []  # the function of a worker process
 
@@ -89,8 +92,9 @@ def _begin_worker(function: Function) -> None:
     _in_worker[:] = [function]
 
 
-def _call_in_worker(arguments: tuple[Any, ...]) -> Mapping[str, Array]:
-    return {name: np.asarray(row, dtype=np.float64) for name, row in _in_worker[0](*arguments).items()}
+def _call_in_worker(arguments: tuple[Any, ...]) -> Mapping[str, Array] | FailedRun:
+    found = attempted(_in_worker[0], *arguments)
+    return found if isinstance(found, FailedRun) else {n: np.asarray(row, dtype=np.float64) for n, row in found.items()}
 
 
 def arguments_of(function: Function) -> int:

@@ -11,9 +11,10 @@ import hashlib
 import time
 from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,7 @@ from host.diagnosis.model.model import (
 )
 from host.diagnosis.model.nominal import NominalSpec, OfferSpec, SimulatorSpec
 from host.diagnosis.model.operators import fill, smooth_derivatives
+from host.diagnosis.model.readings import Finding
 from host.diagnosis.models.moved import Moved, force_along
 from protocol.errors import InputError
 
@@ -110,6 +112,23 @@ class SimulatorRun:
         return digest.digest()
 
 
+@dataclass(frozen=True)
+class FailedRun:
+    """A run that raised an exception, in words."""
+
+    says: str
+
+
+def attempted(run: Callable[..., Mapping[str, Array]], *arguments: Any) -> Mapping[str, Array] | FailedRun:
+    """Return what `run` gives, or how it failed: code of others may raise anything where its parameters leave its range."""
+    try:
+        return run(*arguments)
+    except InputError:
+        raise
+    except Exception as error:
+        return FailedRun(f"{type(error).__name__}: {error}")
+
+
 @dataclass
 class ForcedSegment(Segment):
     """A recording with the motion that each force acts along, by channel; filled where one is first needed."""
@@ -147,6 +166,8 @@ class SimulatedModel(Model):
         self.moves = {channel: channel for channel in inputs}
         self.quiet_inputs = tuple(dict.fromkeys((*inputs, *section.load)))
         self.calls, self.call_s = 0, 0.0  # simulations of one recording so far, and the time they took
+        self.failed: list[str] = []  # of them, in words; none before the first that did not fail
+        self.succeeded = False
         self._kept: OrderedDict[Hashable, Array] = OrderedDict()
 
     @abstractmethod
@@ -333,7 +354,8 @@ class SimulatedModel(Model):
 
     def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
         """Outputs (outputs, n) of each of `runs`."""
-        return [self._checked(run, self.run(run.inputs, run.parameters, run.time_s, run.initial)) for run in runs]
+        arguments = [(run.inputs, run.parameters, run.time_s, run.initial) for run in runs]
+        return [self._checked(run, attempted(self.run, *own)) for run, own in zip(runs, arguments, strict=True)]
 
     @staticmethod
     def _begin_of(segment: Segment) -> dict[str, float]:
@@ -387,8 +409,14 @@ class SimulatedModel(Model):
         """Scale of time (1/s) of the derivatives among the initial state."""
         return 1.0
 
-    def _checked(self, run: SimulatorRun, found: Mapping[str, Array]) -> Array:
-        rows = []
+    def _checked(self, run: SimulatorRun, found: Mapping[str, Array] | FailedRun) -> Array:
+        """Outputs (outputs, n); not a number where the run failed. Raises InputError for outputs that are none."""
+        if isinstance(found, FailedRun):
+            if not self.succeeded:
+                raise InputError(f"{self.kind} {self.label}", found.says, "outputs for the nominal parameters")
+            self.failed.append(found.says)
+            return np.full((len(self.section.outputs), run.time_s.size), np.nan)
+        self.succeeded, rows = True, []
         for name in self.section.outputs:
             row = np.asarray(found[name] if isinstance(found, Mapping) and name in found else np.nan, dtype=np.float64)
             if row.shape != run.time_s.shape:
@@ -430,6 +458,15 @@ class SimulatedModel(Model):
             f"one simulation takes {each * 1e3:.3g} ms; a round of screening takes about {screening} of them "
             f"({screening * each:.0f} s), the fits of a round up to {fits} ({fits * each:.0f} s)"
         )
+
+    def findings(self) -> list[Finding]:
+        """Return what is to be said of runs that failed."""
+        if not self.failed:
+            return []
+        says = f"The simulator failed in {len(self.failed)} of {self.calls} runs, first with {self.failed[0]!r}. "
+        says += "Such a run counts as far from every recording. Let the simulator answer in all of its parameters' bounds, "
+        says += "or narrow these."
+        return [Finding("simulator_failed", self.section.inputs[0] if self.section.inputs else "", says)]
 
     def linear_path(self, segment: Segment, theta: Array) -> tuple[str, ...]:
         """Input and reading of a simulator with one of each that is linear and time-invariant, by four simulations.

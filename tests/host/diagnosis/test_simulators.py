@@ -274,3 +274,35 @@ def test_a_start_is_not_made_of_what_a_nominal_parameter_hardly_leaves() -> None
     ranked = screen(problem, nominal, candidates(candidate_ports(problem), True), lambda *_: None)
     starts = [begin for item in ranked if item.candidate.key == "sensor_bias@feed" for begin in item.begin]
     assert starts and all(abs(begin[0]) < 0.05 for begin in starts)
+
+
+def pulled_in(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+    """A rod as above; one that is pulled in altogether cannot be computed."""
+    if float(np.min(inputs["feed"])) + p["offset"] < 0.085:
+        raise ValueError("the rod is pulled in")
+    return fed(inputs, p, time_s)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_simulator_that_fails_in_some_runs_is_diagnosed(workers: int) -> None:
+    content: dict[str, Any] = {
+        "name": "rod",
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {n: {"column": n, "unit": "m"} for n in ("feed", "x", "z")},
+        "callable": {"function": f"{__name__}:pulled_in", "inputs": ["feed"], "outputs": ["x", "z"], "workers": workers},
+        "parameters": {"offset": {"value": 0.11, "unit": "m"}},
+    }
+    recordings = []
+    for k in range(3):
+        rng, t = np.random.default_rng(k), np.arange(600) * 0.02
+        feed = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + k) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
+        out = fed({"feed": np.interp(t - 0.05, t, feed)}, {"offset": 0.1}, t)
+        recordings.append({"t": t, "feed": feed, **{n: row + 1e-4 * rng.standard_normal(600) for n, row in out.items()}})
+    verdict = sd.diagnose(recordings, content)
+    assert verdict.effects[0]["id"] == "latency"
+    (failed,) = [f for f in verdict.data_findings if f["id"] == "simulator_failed"]
+    assert "the rod is pulled in" in str(failed["says"])
+    content["parameters"]["offset"] = {"value": 0.05, "unit": "m"}
+    with pytest.raises(InputError, match="the rod is pulled in"):
+        sd.diagnose(recordings, content)
