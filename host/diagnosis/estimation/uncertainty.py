@@ -32,6 +32,8 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     chance would, the interval is made of them.
     """
     parameters = problem.parameters(fit.terms)
+    if not free(parameters):
+        return [(float(v), float(v)) for v in fit.values]
     sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=True)]
     base = problem.stacked(fit.terms, fit.values)
     by_begin, known = _by_begin(problem, fit, base)

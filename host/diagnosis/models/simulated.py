@@ -65,6 +65,7 @@ WEIGHT = "weight"  # port of a force that acts in addition to recorded loads
 MOST_LINKS = 4
 MOST_FORCED = 4  # pairs of a force and a motion up to which each force may act along each motion
 MOST_DYNAMIC = 4096  # samples of a step response that are used
+SAME_RUN = 1e-6  # deviation, relative, up to which two runs are the same
 LINEAR = 1e-3  # deviation from superposition, relative, below which a simulator counts as linear
 
 
@@ -438,6 +439,17 @@ class SimulatedModel(Model):
     def label(self) -> str:
         """Name of the simulator in messages."""
         return self.kind
+
+    def try_out(self, segments: list[Segment], theta: Array) -> None:
+        """Simulate the first recording twice. Raises InputError for outputs that are no numbers or differ."""
+        first, again = (self.run_many([self.run_of(segments[0], theta, [])])[0] for _ in range(2))
+        for name, row, other in zip(self.section.outputs, first, again, strict=True):
+            if not np.isfinite(row).any():
+                raise InputError(f"{self.kind} {self.label}", f"no number in {name} with the nominal parameters", "numbers")
+            away = float(np.nanmax(np.abs(row - other)))
+            if away > SAME_RUN * float(np.nanmax(np.abs(row))):
+                found = f"{name} that differs by {away:.3g} between two runs"
+                raise InputError(f"{self.kind} {self.label}", found, "the same outputs for the same arguments")
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """Return the cost of the diagnosis in simulations, from one simulation of each fitted recording."""

@@ -412,7 +412,7 @@ class _Sums:
                 assert response.whole is not None
                 D = (np.where(seen, response.whole[:, :, mask], 0.0) / weighed).reshape(count, -1)
                 gram += D @ D.T
-                cross += D @ J.reshape(rates, -1).T
+                cross += D @ J.reshape(rates, D.shape[1]).T  # there may be no rate at all
                 pull += D @ r.ravel()
         size = np.sqrt(np.diag(own))
         size[size == 0.0] = 1.0

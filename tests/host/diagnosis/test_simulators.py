@@ -306,3 +306,74 @@ def test_a_simulator_that_fails_in_some_runs_is_diagnosed(workers: int) -> None:
     content["parameters"]["offset"] = {"value": 0.05, "unit": "m"}
     with pytest.raises(InputError, match="the rod is pulled in"):
         sd.diagnose(recordings, content)
+
+
+def swung(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+    """Tip of a rod of fed length that turns by an angle."""
+    length, angle = inputs["feed"] + p["offset"], p["gain"] * inputs["angle"]
+    return {"x": length * np.cos(angle), "z": length * np.sin(angle)}
+
+
+def swinging(number: int, gap: float = 0.0) -> dict[str, Array]:
+    """Feed and angle of several tones; the angle passes a gap."""
+    rng, t = np.random.default_rng(number), np.arange(800) * 0.02
+    feed = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + number) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
+    angle, turned = 0.3 * np.sin(2.0 * np.pi * 0.17 * t + 2.0 * number), np.empty(t.size)
+    at = angle[0]
+    for i, a in enumerate(angle):
+        turned[i] = at = min(max(at, a - 0.5 * gap), a + 0.5 * gap)
+    out = swung({"feed": feed, "angle": turned}, {"offset": 0.1, "gain": 1.0}, t)
+    rows = {name: row + 1e-4 * rng.standard_normal(t.size) for name, row in out.items()}
+    return {"t": t, "feed": feed, "angle": angle, **rows}
+
+
+def swing(function: Any = swung, **parameters: Any) -> dict[str, Any]:
+    """Nominal model of the rod that turns."""
+    return {
+        "name": "rod",
+        "kind": "callable",
+        "data": {"time": "t"},
+        "channels": {n: {"column": n, "unit": "rad" if n == "angle" else "m"} for n in ("feed", "angle", "x", "z")},
+        "callable": {"function": function, "inputs": ["feed", "angle"], "outputs": ["x", "z"]},
+        "parameters": parameters,
+    }
+
+
+FREE = {"offset": {"value": 0.11, "unit": "m"}, "gain": {"value": 0.9, "unit": "1"}}
+
+
+@pytest.mark.parametrize(("channel", "factor"), [("angle", 180.0 / np.pi), ("feed", 1e3)])
+@pytest.mark.parametrize("gap", [0.0, 0.02])
+def test_an_input_in_another_unit_is_found_behind_a_simulator_that_is_not_linear(
+    channel: str, factor: float, gap: float
+) -> None:
+    """An angle in degrees called rad: no output shows a factor, and two curves and a coupling were named."""
+    recordings = [{**r, channel: factor * r[channel]} for r in (swinging(k, gap) for k in (1, 2, 3))]
+    verdict = sd.diagnose(recordings, swing(**FREE))
+    assert [(f["id"], f["channel"]) for f in verdict.data_findings] == [("unit", channel)]
+    assert [effect["id"] for effect in verdict.effects] == (["backlash"] if gap else [])
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.02])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_simulator_may_have_no_free_parameter(gap: float, held: bool) -> None:
+    exact = {"offset": 0.1, "gain": 1.0}
+    nominal = swing(lambda i, p, t: swung(i, exact, t))
+    if held:
+        nominal = swing(**{name: {"value": value, "free": False} for name, value in exact.items()})
+    verdict = sd.diagnose([swinging(k, gap) for k in (1, 2, 3)], nominal)
+    assert [effect["id"] for effect in verdict.effects] == (["backlash"] if gap else [])
+
+
+def test_a_simulator_that_gives_no_numbers_or_others_each_time_is_refused() -> None:
+    rng = np.random.default_rng(1)
+
+    def shaken(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+        return {name: row + 1e-4 * rng.standard_normal(row.size) for name, row in swung(inputs, p, time_s).items()}
+
+    def lost(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+        return {**swung(inputs, p, time_s), "z": np.full(time_s.size, np.nan)}
+
+    for function, found in ((shaken, "differs by"), (lost, "no number in z")):
+        with pytest.raises(InputError, match=found):
+            sd.diagnose([swinging(k) for k in (1, 2, 3)], swing(function, **FREE))
