@@ -9,8 +9,9 @@ out, it is started from the readings in other units as well.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -42,14 +43,17 @@ def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[l
     pairs = [_freed(problem, segment, theta) for segment in problem.segments]
     names = [output.channel for output in model.outputs]
     several = len(names) > 1
-    by_input = _input_in_other_units(problem, theta, pairs) if several else None
-    if by_input is None:
+    mistake = _input_mistake(problem, theta, pairs, of_units=True) if several else None
+    if mistake is None:
         exchanged, order = _exchanged(problem, pairs, names)
         turned, change = _turned(problem, pairs, names, [row for row, other in enumerate(order) if other == row], theta)
         if exchanged or turned:
             return [_put_right(recording, names, order, change) for recording in recordings], [*exchanged, *turned]
-        by_input = None if several else _input_in_other_units(problem, theta, pairs)
-    return (list(recordings), []) if by_input is None else _with_input(problem, recordings, *by_input)
+        mistake = _input_mistake(problem, theta, pairs, of_units=False)
+    if mistake is None:
+        return list(recordings), []
+    right = [replace(recording, channels=mistake.put_right(recording.channels)) for recording in recordings]
+    return right, [mistake.finding(problem.columns)]
 
 
 def _exchanged(problem: Problem, pairs: list[Pair], names: list[str]) -> tuple[list[Finding], list[int]]:
@@ -61,7 +65,7 @@ def _exchanged(problem: Problem, pairs: list[Pair], names: list[str]) -> tuple[l
         for b in range(a + 1, len(names)):
             crossed, straight = min(alike[a, b], alike[b, a]), max(alike[a, a], alike[b, b])
             same = problem.model.outputs[a].unit == problem.model.outputs[b].unit
-            if same and crossed > ALIKE and straight < 0.5:
+            if same and ((crossed > ALIKE and straight < 0.5) or _match_exchanged(pairs, a, b)):
                 order[a], order[b] = b, a
                 first, second = (problem.columns.get(names[row], names[row]) for row in (a, b))
                 says = (
@@ -70,6 +74,15 @@ def _exchanged(problem: Problem, pairs: list[Pair], names: list[str]) -> tuple[l
                 says += "other. The diagnosis continues with them exchanged."
                 findings.append(Finding("swapped", first, says))
     return findings, order
+
+
+def _match_exchanged(pairs: list[Pair], a: int, b: int) -> bool:
+    """Whether all outputs are as simulated with the readings of two exchanged, and as they are recorded they are not."""
+    rows = list(range(pairs[0][0].shape[0]))
+    order = [b if row == a else a if row == b else row for row in rows]
+    crossed = [(y[order], out) for y, out in pairs]
+    as_simulated = all(_matches(crossed, row) for row in rows)
+    return as_simulated and _unexplained(crossed) < LEFT * _unexplained(pairs)
 
 
 def _turned(
@@ -119,37 +132,70 @@ def _of_start(problem: Problem, theta: Array) -> float:
     return 0.0
 
 
-def _input_in_other_units(problem: Problem, theta: Array, pairs: list[Pair]) -> tuple[str, float] | None:
-    """An input and the factor of units by which it has to be divided so that all outputs are as simulated, if one is.
+@dataclass(frozen=True)
+class InputMistake:
+    """Inputs that are to be divided by `factor`, or, where that is 1, two that are to be exchanged."""
+
+    names: tuple[str, ...]
+    factor: float = 1.0
+
+    def put_right(self, signals: dict[str, Array]) -> dict[str, Array]:
+        """`signals` (n,) by channel without the mistake."""
+        if self.factor == 1.0:
+            a, b = self.names
+            return {**signals, a: signals[b], b: signals[a]}
+        return {**signals, **{name: signals[name] / self.factor for name in self.names}}
+
+    def finding(self, columns: dict[str, str]) -> Finding:
+        """The sentence about it. columns: channel -> column."""
+        listed = [columns.get(name, name) for name in self.names]
+        which, are = (f"Columns {' and '.join(listed)}", "are") if len(listed) > 1 else (f"Column {listed[0]}", "is")
+        column, so = listed[0], "the outputs are as simulated"
+        if self.factor == 1.0:
+            says = f"{which} are probably exchanged: with them exchanged back, {so}. The diagnosis continues so."
+            return Finding("swapped", column, says)
+        if self.factor < 0.0:
+            says = f"{which} has the opposite sign of what the nominal model takes it for (channels.*.sign): with it "
+            return Finding("sign", column, f"{says}reversed, {so}. The diagnosis continues so.")
+        says = f"{which} {are} about {FACTORS[self.factor]} times what the nominal model takes it for. Divided by that, "
+        return Finding(
+            "unit", column, f"{says}{so}. The unit is probably another (channels.*.scale). The diagnosis continues so."
+        )
+
+
+def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], of_units: bool) -> InputMistake | None:
+    """The mistake of an input without which all outputs are as simulated, if one is: another unit, and unless only mistakes
+    `of_units` are tried, another sign or column.
 
     A simulator that is not linear answers an angle in degrees by another course, in which no output shows a factor.
     """
-    rows = range(len(problem.model.outputs))
-    if all(_matches(pairs, row) for row in rows):
+    if all(_matches(pairs, row) for row in range(len(problem.model.outputs))):
         return None
+    units, names = problem.segments[0].recording.units, list(problem.model.moves)
+    alike = [tuple(name for name in names if units.get(name) == unit) for unit in dict.fromkeys(units.values()) if unit]
+    together = [group for group in alike if len(group) > 1]
+    scaled = [*((name,) for name in names), *together]
+    mistakes = [InputMistake(which, factor) for which in scaled for factor in FACTORS]
+    if not of_units:  # what outputs say as well was looked for there
+        mistakes += [InputMistake((name,), -1.0) for name in names]
+        mistakes += [InputMistake(pair) for group in together for pair in itertools.combinations(group, 2)]
     most, found = LEFT * _unexplained(pairs), None
-    for name in problem.model.moves:
-        for factor in FACTORS:
-            for segments in (problem.segments[:1], problem.segments):
-                changed = [replace(s, inputs={**s.inputs, name: s.inputs[name] / factor}) for s in segments]
-                tried = [_freed(problem, segment, theta) for segment in changed]
-                if not all(_matches(tried, row) for row in rows):
-                    break
-            else:
-                if _unexplained(tried) < most:
-                    most, found = _unexplained(tried), (name, factor)
+    for mistake in mistakes:
+        left = _left_without(problem, theta, mistake)
+        if left < most:
+            most, found = left, mistake
     return found
 
 
-def _with_input(
-    problem: Problem, recordings: Sequence[Recording], name: str, factor: float
-) -> tuple[list[Recording], list[Finding]]:
-    """The recordings with an input divided by `factor`, and the sentence about it."""
-    column = problem.columns.get(name, name)
-    says = f"Column {column} is about {FACTORS[factor]} times what the nominal model takes it for. With it divided by that, "
-    says += "the outputs are as simulated. Its unit is probably another (channels.*.scale). The diagnosis continues so."
-    right = [replace(r, channels={**r.channels, name: r.channels[name] / factor}) for r in recordings]
-    return right, [Finding("unit", column, says)]
+def _left_without(problem: Problem, theta: Array, mistake: InputMistake) -> float:
+    """What is unexplained without `mistake`; infinite where an output is not as simulated, in the first recording or all."""
+    tried: list[Pair] = []
+    for segments in (problem.segments[:1], problem.segments):
+        changed = [replace(segment, inputs=mistake.put_right(segment.inputs)) for segment in segments]
+        tried = [_freed(problem, segment, theta) for segment in changed]
+        if not all(_matches(tried, row) for row in range(len(problem.model.outputs))):
+            return np.inf
+    return _unexplained(tried)
 
 
 def _matches(pairs: list[Pair], row: int) -> bool:

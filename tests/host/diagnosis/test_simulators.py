@@ -23,6 +23,7 @@ from host.diagnosis.pipeline import candidate_ports, prepare
 from host.diagnosis.selection.screening import screen
 from host.diagnosis.selection.search import fit_nominal
 from protocol.errors import InputError
+from tests.host.diagnosis import test_forces
 
 DT_S = 0.005
 
@@ -352,6 +353,24 @@ def test_an_input_in_another_unit_is_found_behind_a_simulator_that_is_not_linear
     verdict = sd.diagnose(recordings, swing(**FREE))
     assert [(f["id"], f["channel"]) for f in verdict.data_findings] == [("unit", channel)]
     assert [effect["id"] for effect in verdict.effects] == (["backlash"] if gap else [])
+
+
+JOINTS = ("shoulder_rad", "elbow_rad")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "found"),
+    [
+        (lambda r: {**r, "shoulder_rad": r["elbow_rad"], "elbow_rad": r["shoulder_rad"]}, ("swapped", "shoulder_rad")),
+        (lambda r: {**r, "shoulder_Nm": r["elbow_Nm"], "elbow_Nm": r["shoulder_Nm"]}, ("swapped", "shoulder_Nm")),
+        (lambda r: {**r, "elbow_rad": -r["elbow_rad"]}, ("sign", "elbow_rad")),
+        (lambda r: {**r, **{n: np.degrees(r[n]) for n in JOINTS}}, ("unit", "shoulder_rad")),
+    ],
+)
+def test_mistakes_in_the_columns_of_an_arm_are_found(mistake: Any, found: tuple[str, str]) -> None:
+    verdict = sd.diagnose([mistake(test_forces.recorded(k)) for k in range(3)], test_forces.nominal())
+    assert [(f["id"], f["channel"]) for f in verdict.data_findings] == [found]
+    assert verdict.effects == []
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.02])
