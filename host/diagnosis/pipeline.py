@@ -315,7 +315,7 @@ def _searched(
     low, high = share
     begin, later = low + 0.02 * (high - low), low + 0.85 * (high - low)
     model, problem, full = problems(spec, data.recordings, rules)
-    model.try_out(problem.segments, model.guess(problem.segments))
+    model.try_out(problem.segments)
     recordings, apart = readings_apart(problem, data.recordings)
     if apart:
         model, problem, full = problems(spec, recordings, rules)

@@ -15,5 +15,5 @@ class NoForce:
 
 
 def make(rig: Rig) -> NoForce:
-    """For `load_estimator`."""
+    """Return the estimator, as `load_estimator` asks a module for one."""
     return NoForce()

@@ -142,7 +142,7 @@ class VirtualRig:
         return Latest()
 
     def close(self) -> None:
-        """The scenario goes on."""
+        """Close nothing: the simulated rig is that of the whole scenario, and later commands use it."""
 
     def __enter__(self) -> VirtualRig:
         return self

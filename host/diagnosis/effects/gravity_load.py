@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from host.diagnosis.effects.sensor_bias import apply as shifted
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 
 
@@ -38,14 +39,15 @@ def slots(p: Array, form: str) -> dict[str, float]:
     return {"moment_sine": p[0], "moment_cosine": p[1]}
 
 
+ADDED = (
+    "A constant force of {} acts in addition to the recorded one, as of a weight. "
+    "An offset of the force sensor does the same."
+)
+
+
 def added(s: Scale, form: str) -> tuple[Parameter, ...]:
     """Return the parameter `force`, in the direction of one recorded component."""
     return (Parameter("force", s.unit, (s.need,), linear=True),)
-
-
-def add_constant(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Return one component (n,) of a force with the constant p[0] added."""
-    return np.asarray(signal + p[0])
 
 
 LENGTHS_M = (0.1, 0.4)  # of links, tried first: those of arms on a bench
@@ -83,21 +85,18 @@ def constant_load(loads: dict[str, str]) -> Effect:
 
     loads: channel of each component -> its unit.
     """
+    units = {f"added_{name.removesuffix('_' + unit.replace(' ', '_'))}": unit for name, unit in loads.items()}
 
     def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
-        units = {name: unit.replace(" ", "_") for name, unit in loads.items()}
-        stems = {name: name.removesuffix(f"_{unit}") for name, unit in units.items()}
-        return tuple(Parameter(f"added_{stems[name]}", unit, (s.need,), linear=True) for name, unit in loads.items())
+        return tuple(Parameter(name, unit, (s.need,), linear=True) for name, unit in units.items())
 
-    stems = [name.removesuffix("_" + unit.replace(" ", "_")) for name, unit in loads.items()]
-    vector = ", ".join(f"{{added_{stem}}}" for stem in stems)
+    vector = ", ".join(f"{{{name}}}" for name in units)
     return Effect(
         "gravity_load",
         "weight",
         26,
         parameters,
-        f"A constant force of ({vector}) acts in addition to the recorded one, as of a weight. "
-        "An offset of the force sensor does the same.",
+        ADDED.format(f"({vector})"),
         "F = recorded force + constant",
         at_rest=True,
     )
@@ -137,10 +136,9 @@ COMPONENT = Effect(
     "added",
     26,
     added,
-    "A constant force of {force} acts in addition to the recorded one, as of a weight. "
-    "An offset of the force sensor does the same.",
+    ADDED.format("{force}"),
     "F = recorded force + force",
-    add_constant,
+    shifted,
     forms=("added",),
     at_rest=True,
 )

@@ -85,9 +85,9 @@ class Known(Model):
         """Outputs of several recordings with the known effects at work."""
         return self._inner.simulate_all(segments, theta[: self.own], self.with_known(theta, active))
 
-    def try_out(self, segments: list[Segment], theta: Array) -> None:
+    def try_out(self, segments: list[Segment]) -> None:
         """Run the simulator without the known effects. Raises InputError."""
-        self._inner.try_out(segments, theta[: self.own])
+        self._inner.try_out(segments)
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """Call the model without the known effects."""

@@ -130,7 +130,7 @@ class Model(ABC):
         """Outputs of several recordings; a model that can runs them in parallel."""
         return [self.simulate(segment, theta, active) for segment in segments]
 
-    def try_out(self, segments: list[Segment], theta: Array) -> None:  # noqa: B027 - most models are the project's own
+    def try_out(self, segments: list[Segment]) -> None:  # noqa: B027 - most models are the project's own
         """Run the simulator of a user before anything is fitted. Raises InputError."""
 
     def announce(self, segments: list[Segment], theta: Array) -> str:

@@ -135,9 +135,7 @@ class AxisModel(Model):
             spread = np.array(
                 [max(largest * UNSEEN_S**2, float(np.std(twice))), max(largest * UNSEEN_S, float(np.std(once)))]
             )
-        elif (
-            spec.compare == "motion"
-        ):  # the input before the recording is unknown, and a delay puts it into its first moments
+        elif spec.compare == "motion":  # a delay puts the unknown input before the recording into its first moments
             spread = np.maximum(spread, UNKNOWN * np.array([np.ptp(x), np.ptp(v)]))
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)

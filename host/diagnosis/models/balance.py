@@ -47,6 +47,7 @@ class Balance:
     input: str  # channel of the force
     bump: Array  # (2 half + 1,) test function
     held: Array  # its integral over what each sample of the force stands for
+    recorded: Array  # (n,) the force as it is recorded, under that
     rows: Array  # (3, n) acceleration, speed and place of the motion under the test function
     noise: Noise
     kernels: Array  # (3, 2 half + 1) of the rows
@@ -98,30 +99,31 @@ def prepare(segment: Segment, force: str, motion: Array, seen: npt.NDArray[np.bo
     whole = (np.arange(segment.n) >= half) & (np.arange(segment.n) < segment.n - half) & (gap[last] == gap[first])
     segment.y[:, ~whole] = np.nan
     sigma_motion = white_level(motion)
-    held, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
+    held, under, noise = _held_force(segment.inputs[force], rows, kernels, s, length, sigma_motion, hold)
     sigma_force = reading_noise(segment.inputs[force])
-    return Balance(force, bump, held, rows, noise, kernels, s, length, sigma_motion, sigma_force)
+    return Balance(force, bump, held, under, rows, noise, kernels, s, length, sigma_motion, sigma_force)
 
 
 def held_as(balance: Balance, segment: Segment, hold: str) -> Balance:
     """`balance` with the force running between its samples as `hold` says."""
     recorded = segment.inputs[balance.input]
-    held, noise = _held_force(
+    held, under, noise = _held_force(
         recorded, balance.rows, balance.kernels, balance.support, balance.length, balance.sigma_motion, hold
     )
-    return replace(balance, held=held, noise=noise)
+    return replace(balance, held=held, recorded=under, noise=noise)
 
 
 def _held_force(
     recorded: Array, rows: Array, kernels: Array, s: Array, length: float, sigma_motion: float, hold: str
-) -> tuple[Array, Noise]:
-    """Weights of force samples under the test function, and the noise there."""
+) -> tuple[Array, Array, Noise]:
+    """Weights of force samples under the test function, the recorded force (n,) there, and the noise."""
     held = _held(s, length, float(s[1] - s[0]), hold)
     half = s.size // 2
     kept = slice(half, recorded.size - half)
     columns = np.vstack([rows, np.ones(recorded.size)])[:, kept].T
-    found: Array = np.asarray(np.linalg.lstsq(columns, _along_record(recorded, held)[kept], rcond=1e-12)[0])
-    return held, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, reading_noise(recorded), kernels, held)
+    under = _along_record(recorded, held)
+    found: Array = np.asarray(np.linalg.lstsq(columns, under[kept], rcond=1e-12)[0])
+    return held, under, _noise(np.asarray(found[:3], dtype=np.float64), sigma_motion, reading_noise(recorded), kernels, held)
 
 
 def _bump(s: Array, length: float) -> tuple[Array, Array, Array]:
@@ -242,7 +244,7 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
         need = need + _along_record(dry, balance.bump)
     finer = force.size // segment.n
     applied = _along_record(force, balance.held if finer == 1 else _finely(balance, recording.dt_s, finer))[::finer]
-    size = _passed(applied, _along_record(segment.inputs[balance.input], balance.held), np.isfinite(segment.y[0]))
+    size = _passed(applied, balance.recorded, np.isfinite(segment.y[0]))
     size *= min(quieted(balance, linear, p, recording.dt_s), 1.0)
     return np.asarray(need - applied)[None, :] / min(max(size, 1e-6), 1.0)
 

@@ -63,7 +63,7 @@ class ExternalModel(SimulatedModel):
         self, inputs: dict[str, Array], parameters: dict[str, float], time_s: Array, initial: dict[str, float]
     ) -> Mapping[str, Array]:
         """Call the function; offered parameters that are off are given with their nominal value."""
-        return self._call(self._arguments(SimulatorRun(inputs, parameters, time_s, initial)))
+        return self.function(*self._arguments(SimulatorRun(inputs, parameters, time_s, initial)))
 
     def run_many(self, runs: list[SimulatorRun]) -> list[Array]:
         """Outputs of each of `runs`, in parallel where the file says that the function can."""
@@ -76,9 +76,6 @@ class ExternalModel(SimulatedModel):
     def _arguments(self, run: SimulatorRun) -> tuple[Any, ...]:
         given = (run.inputs, {**self.offs, **run.parameters}, run.time_s)
         return (*given, run.initial) if self.takes_initial else given
-
-    def _call(self, arguments: tuple[Any, ...]) -> Mapping[str, Array]:
-        return self.function(*arguments)
 
     def _attempt(self, arguments: tuple[Any, ...]) -> Mapping[str, Array] | FailedRun:
         return attempted(self.function, *arguments)

@@ -440,9 +440,12 @@ class SimulatedModel(Model):
         """Name of the simulator in messages."""
         return self.kind
 
-    def try_out(self, segments: list[Segment], theta: Array) -> None:
+    def try_out(self, segments: list[Segment]) -> None:
         """Simulate the first recording twice. Raises InputError for outputs that are no numbers or differ."""
-        first, again = (self.run_many([self.run_of(segments[0], theta, [])])[0] for _ in range(2))
+        run, same = (self.run_of(segments[0], self.guess(segments), []) for _ in range(2))
+        key = run.key  # before the run, which may change its arguments
+        (first,), (again,) = self.run_many([run]), self.run_many([same])
+        self._keep(key, first)
         for name, row, other in zip(self.section.outputs, first, again, strict=True):
             if not np.isfinite(row).any():
                 raise InputError(f"{self.kind} {self.label}", f"no number in {name} with the nominal parameters", "numbers")

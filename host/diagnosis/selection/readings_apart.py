@@ -43,13 +43,14 @@ def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[l
     pairs = [_freed(problem, segment, theta) for segment in problem.segments]
     names = [output.channel for output in model.outputs]
     several = len(names) > 1
-    mistake = _input_mistake(problem, theta, pairs, of_units=True) if several else None
+    mistake = _input_mistake(problem, theta, pairs, _of_units(problem)) if several else None
     if mistake is None:
         exchanged, order = _exchanged(problem, pairs, names)
         turned, change = _turned(problem, pairs, names, [row for row, other in enumerate(order) if other == row], theta)
         if exchanged or turned:
             return [_put_right(recording, names, order, change) for recording in recordings], [*exchanged, *turned]
-        mistake = _input_mistake(problem, theta, pairs, of_units=False)
+        possible = _of_sign_or_column(problem) if several else [*_of_units(problem), *_of_sign_or_column(problem)]
+        mistake = _input_mistake(problem, theta, pairs, possible)
     if mistake is None:
         return list(recordings), []
     right = [replace(recording, channels=mistake.put_right(recording.channels)) for recording in recordings]
@@ -81,8 +82,7 @@ def _match_exchanged(pairs: list[Pair], a: int, b: int) -> bool:
     rows = list(range(pairs[0][0].shape[0]))
     order = [b if row == a else a if row == b else row for row in rows]
     crossed = [(y[order], out) for y, out in pairs]
-    as_simulated = all(_matches(crossed, row) for row in rows)
-    return as_simulated and _unexplained(crossed) < LEFT * _unexplained(pairs)
+    return _all_match(crossed) and _unexplained(crossed) < LEFT * _unexplained(pairs)
 
 
 def _turned(
@@ -126,8 +126,7 @@ def _of_start(problem: Problem, theta: Array) -> float:
                 begin, values=begin.values / factor, measured=begin.measured / factor, spread=begin.spread / factor
             )
             scaled.append(_freed(problem, replace(segment, y=segment.y / factor, begin=changed), theta))
-        correlation, gain = _likeness(scaled, 0, 0)
-        if correlation > MATCHED and abs(float(np.log(gain))) < NEAR_FACTOR:
+        if _all_match(scaled):
             return factor
     return 0.0
 
@@ -163,24 +162,34 @@ class InputMistake:
         )
 
 
-def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], of_units: bool) -> InputMistake | None:
-    """The mistake of an input without which all outputs are as simulated, if one is: another unit, and unless only mistakes
-    `of_units` are tried, another sign or column.
+def _alike(problem: Problem) -> list[tuple[str, ...]]:
+    """Inputs of one unit, where there are several."""
+    units = problem.segments[0].recording.units
+    groups = [tuple(n for n in problem.model.moves if units.get(n) == u) for u in dict.fromkeys(units.values()) if u]
+    return [group for group in groups if len(group) > 1]
+
+
+def _of_units(problem: Problem) -> list[InputMistake]:
+    """Each input, or all of one unit, in another one."""
+    which = [*((name,) for name in problem.model.moves), *_alike(problem)]
+    return [InputMistake(names, factor) for names in which for factor in FACTORS]
+
+
+def _of_sign_or_column(problem: Problem) -> list[InputMistake]:
+    """Each input reversed, and each two of one unit exchanged."""
+    pairs = [pair for group in _alike(problem) for pair in itertools.combinations(group, 2)]
+    return [*(InputMistake((name,), -1.0) for name in problem.model.moves), *(InputMistake(pair) for pair in pairs)]
+
+
+def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], possible: list[InputMistake]) -> InputMistake | None:
+    """The one of `possible` mistakes without which all outputs are as simulated, if there is one and they are not with it.
 
     A simulator that is not linear answers an angle in degrees by another course, in which no output shows a factor.
     """
-    if all(_matches(pairs, row) for row in range(len(problem.model.outputs))):
+    if _all_match(pairs):
         return None
-    units, names = problem.segments[0].recording.units, list(problem.model.moves)
-    alike = [tuple(name for name in names if units.get(name) == unit) for unit in dict.fromkeys(units.values()) if unit]
-    together = [group for group in alike if len(group) > 1]
-    scaled = [*((name,) for name in names), *together]
-    mistakes = [InputMistake(which, factor) for which in scaled for factor in FACTORS]
-    if not of_units:  # what outputs say as well was looked for there
-        mistakes += [InputMistake((name,), -1.0) for name in names]
-        mistakes += [InputMistake(pair) for group in together for pair in itertools.combinations(group, 2)]
     most, found = LEFT * _unexplained(pairs), None
-    for mistake in mistakes:
+    for mistake in possible:
         left = _left_without(problem, theta, mistake)
         if left < most:
             most, found = left, mistake
@@ -190,18 +199,17 @@ def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], of_units: 
 def _left_without(problem: Problem, theta: Array, mistake: InputMistake) -> float:
     """What is unexplained without `mistake`; infinite where an output is not as simulated, in the first recording or all."""
     tried: list[Pair] = []
-    for segments in (problem.segments[:1], problem.segments):
-        changed = [replace(segment, inputs=mistake.put_right(segment.inputs)) for segment in segments]
-        tried = [_freed(problem, segment, theta) for segment in changed]
-        if not all(_matches(tried, row) for row in range(len(problem.model.outputs))):
+    for segment in problem.segments:
+        tried.append(_freed(problem, replace(segment, inputs=mistake.put_right(segment.inputs)), theta))
+        if len(tried) in (1, len(problem.segments)) and not _all_match(tried):
             return np.inf
     return _unexplained(tried)
 
 
-def _matches(pairs: list[Pair], row: int) -> bool:
-    """Whether an output is as simulated, but for what parameters that are not exact make of it."""
-    correlation, gain = _likeness(pairs, row, row)
-    return correlation > MATCHED and abs(float(np.log(gain))) < NEAR_FACTOR
+def _all_match(pairs: list[Pair]) -> bool:
+    """Whether every output is as simulated, but for what parameters that are not exact make of it."""
+    likeness = (_likeness(pairs, row, row) for row in range(pairs[0][0].shape[0]))
+    return all(correlation > MATCHED and abs(float(np.log(gain))) < NEAR_FACTOR for correlation, gain in likeness)
 
 
 def _unexplained(pairs: list[Pair]) -> float:

@@ -463,9 +463,8 @@ def _joined(problem: Problem, pair: tuple[Fit, Gain, list[dict[str, float]]]) ->
 def _taken(problem: Problem, trial: Trial) -> Fit:
     """The fit of a trial brought to its end, memories started and outputs weighed as it has them."""
     set_starts(problem, trial.starts)
-    best = refined(problem, trial.fit)
-    reweigh(problem, best)
-    if len(problem.noise) > 1:  # the output that the mismatch was largest in weighs more now: the fit has moved with it
+    best = trial.fit
+    for _ in range(2 if len(problem.noise) > 1 else 1):  # the output that the mismatch was largest in weighs more afterwards
         best = refined(problem, best)
         reweigh(problem, best)
     if trial.candidate.effect.hides:  # the nominal parameters that the starts were found with were led astray

@@ -12,6 +12,7 @@ from host.diagnosis.estimation.fit import Fit, Problem, Term
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
+Array = npt.NDArray[np.float64]
 WITHIN = 1.05  # samples: a delay up to this may be a matter of how the input was recorded
 SAME = 0.01  # of a log-likelihood: trials that differ by less, with as many parameters, are one equation
 
@@ -57,7 +58,7 @@ def _reached(p: Parameter, value: float, natural: bool) -> bool:
     return bool((low and not p.vanishes and not natural) or (high and (p.shape or not natural)))
 
 
-def _drives(term: Term, values: npt.NDArray[np.float64]) -> bool:
+def _drives(term: Term, values: Array) -> bool:
     """Whether a friction's linear parts have both signs: at some speed it would push along with the motion.
 
     Where an output may count a force either way, their bounds allow both signs, but only to all of them alike.
@@ -89,11 +90,7 @@ def rank(problem: Problem, trials: list[Trial], base: Fit) -> None:
     if not trials:
         return
     rules = trials[0].rules
-    most = np.max([trial.both.independent for trial in trials], axis=0)
-    common = max(trials, key=lambda trial: float(most @ trial.both.log_ratio)).both.independent
-    for trial in trials:
-        more = max(trial.fit.fitted - base.fitted, 0)
-        trial.score = 0.5 * float(common @ trial.both.log_ratio) - rules.parameter_penalty * more
+    common = _scored(trials, [trial.both for trial in trials], base)
     trials.sort(key=lambda trial: trial.score, reverse=True)
     _compare_on_common_samples(problem, trials, base)
     alike = [trial for trial in trials if trials[0].score - trial.score < SAME and trial.fit.fitted == trials[0].fit.fitted]
@@ -121,13 +118,23 @@ def rank(problem: Problem, trials: list[Trial], base: Fit) -> None:
         trials.insert(0, best)
 
 
+def _scored(trials: list[Trial], gains: list[Gain], base: Fit) -> Array:
+    """Effective sample sizes (outputs,) of the gain that leaves least; the scores of `trials` are set with them."""
+    most = np.max([gain.independent for gain in gains], axis=0)
+    common = max(gains, key=lambda gain: float(most @ gain.log_ratio)).independent
+    for trial, gain in zip(trials, gains, strict=True):
+        more = max(trial.fit.fitted - base.fitted, 0)
+        trial.score = 0.5 * float(common @ gain.log_ratio) - trial.rules.parameter_penalty * more
+    return common
+
+
 def _compare_on_common_samples(problem: Problem, trials: list[Trial], base: Fit) -> None:
     """Score the first of sorted trials again, and sort them, where a dead time of one hides samples that others predict.
 
     A lag would else be credited with the first samples of a recording, of which a delay says nothing.
     """
-    rules = problem.rules
-    first = [trial for trial in trials if trial.score > (1.0 - rules.reduced_form_tolerance) * trials[0].score]
+    least = (1.0 - problem.rules.reduced_form_tolerance) * trials[0].score
+    first = [trial for trial in trials if trial.score > least]
     fits = [base, *(trial.fit for trial in first)]
     seen = [np.all([np.isfinite(r) for r in rows], axis=0) for rows in zip(*(fit.residuals for fit in fits), strict=True)]
     if all(np.array_equal(mask, np.isfinite(r)) for fit in fits for mask, r in zip(seen, fit.residuals, strict=True)):
@@ -135,11 +142,7 @@ def _compare_on_common_samples(problem: Problem, trials: list[Trial], base: Fit)
     before = [np.where(mask, r, np.nan) for mask, r in zip(seen, base.residuals, strict=True)]
     noise_sd = np.array([noise.sigma for noise in problem.noise])
     gains = [compare(problem.segments, "both", before, trial.fit.residuals, noise_sd) for trial in first]
-    most = np.max([gain.independent for gain in gains], axis=0)
-    common = max(gains, key=lambda gain: float(most @ gain.log_ratio)).independent
-    for trial, gain in zip(first, gains, strict=True):
-        more = max(trial.fit.fitted - base.fitted, 0)
-        trial.score = 0.5 * float(common @ gain.log_ratio) - rules.parameter_penalty * more
+    _scored(first, gains, base)
     first.sort(key=lambda trial: trial.score, reverse=True)
     trials[: len(first)] = first
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -251,26 +252,30 @@ def fed(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[st
     return {"x": length - 40.0 * length**2, "z": 2.0 * length**3}
 
 
-def test_a_start_is_not_made_of_what_a_nominal_parameter_hardly_leaves() -> None:
-    """An offset of the feed is a nominal parameter: what differences leave of its response asks for decimetres."""
-    content: dict[str, Any] = {
+def feeding(function: Any, offset_m: float, **section: Any) -> dict[str, Any]:
+    """Nominal model of the rod that is fed in."""
+    return {
         "name": "rod",
         "kind": "callable",
         "data": {"time": "t"},
         "channels": {n: {"column": n, "unit": "m"} for n in ("feed", "x", "z")},
-        "callable": {"function": fed, "inputs": ["feed"], "outputs": ["x", "z"]},
-        "parameters": {"offset": {"value": 0.1, "unit": "m"}},
+        "callable": {"function": function, "inputs": ["feed"], "outputs": ["x", "z"], **section},
+        "parameters": {"offset": {"value": offset_m, "unit": "m"}},
     }
-    found = []
-    for k in range(2):
-        rng, t = np.random.default_rng(k), np.arange(600) * 0.02
-        feed = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + k) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
-        beat = 1e-3 * np.sin(2.0 * np.pi * 1.1 * t)
-        rows = fed({"feed": feed + beat}, {"offset": 0.1}, t)
-        found.append(
-            Table(f"r{k}", {"t": t, "feed": feed, **{n: x + 1e-4 * rng.standard_normal(600) for n, x in rows.items()}})
-        )
-    _, problem, _ = prepare(nominal_of(content), found)
+
+
+def feed(number: int, acts: Callable[[Array, Array], Array]) -> dict[str, Array]:
+    """Recording of the rod: `acts` makes of time and feed (n,) what is fed in."""
+    rng, t = np.random.default_rng(number), np.arange(600) * 0.02
+    given = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + number) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
+    out = fed({"feed": acts(t, given)}, {"offset": 0.1}, t)
+    return {"t": t, "feed": given, **{name: row + 1e-4 * rng.standard_normal(t.size) for name, row in out.items()}}
+
+
+def test_a_start_is_not_made_of_what_a_nominal_parameter_hardly_leaves() -> None:
+    """An offset of the feed is a nominal parameter: what differences leave of its response asks for decimetres."""
+    runs = [feed(k, lambda t, given: given + 1e-3 * np.sin(2.0 * np.pi * 1.1 * t)) for k in range(2)]
+    _, problem, _ = prepare(nominal_of(feeding(fed, 0.1)), tables(*runs))
     nominal = fit_nominal(problem)
     ranked = screen(problem, nominal, candidates(candidate_ports(problem), True), lambda *_: None)
     starts = [begin for item in ranked if item.candidate.key == "sensor_bias@feed" for begin in item.begin]
@@ -286,27 +291,14 @@ def pulled_in(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> d
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_simulator_that_fails_in_some_runs_is_diagnosed(workers: int) -> None:
-    content: dict[str, Any] = {
-        "name": "rod",
-        "kind": "callable",
-        "data": {"time": "t"},
-        "channels": {n: {"column": n, "unit": "m"} for n in ("feed", "x", "z")},
-        "callable": {"function": f"{__name__}:pulled_in", "inputs": ["feed"], "outputs": ["x", "z"], "workers": workers},
-        "parameters": {"offset": {"value": 0.11, "unit": "m"}},
-    }
-    recordings = []
-    for k in range(3):
-        rng, t = np.random.default_rng(k), np.arange(600) * 0.02
-        feed = 0.01 * np.sin(2.0 * np.pi * 0.3 * t + k) + 0.005 * np.sin(2.0 * np.pi * 0.71 * t)
-        out = fed({"feed": np.interp(t - 0.05, t, feed)}, {"offset": 0.1}, t)
-        recordings.append({"t": t, "feed": feed, **{n: row + 1e-4 * rng.standard_normal(600) for n, row in out.items()}})
-    verdict = sd.diagnose(recordings, content)
+    function = f"{__name__}:pulled_in"
+    recordings = [feed(k, lambda t, given: np.interp(t - 0.05, t, given)) for k in range(3)]
+    verdict = sd.diagnose(recordings, feeding(function, 0.11, workers=workers))
     assert verdict.effects[0]["id"] == "latency"
     (failed,) = [f for f in verdict.data_findings if f["id"] == "simulator_failed"]
     assert "the rod is pulled in" in str(failed["says"])
-    content["parameters"]["offset"] = {"value": 0.05, "unit": "m"}
     with pytest.raises(InputError, match="the rod is pulled in"):
-        sd.diagnose(recordings, content)
+        sd.diagnose(recordings, feeding(function, 0.05, workers=workers))
 
 
 def swung(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:

@@ -14,7 +14,7 @@ from host.diagnosis.export.module import module_of
 from host.diagnosis.model.effect import Array
 
 PERIOD_S, NOISE_M = 0.02, 2e-5
-STIFFNESS_Nm2, TAPER_per_m = 0.01, 2.0
+STIFFNESS_Nm2 = 0.01
 COLUMNS = {"length_m": "m", "side_N": "N", "axial_N": "N", "side_m": "m", "axial_m": "m"}
 
 

@@ -42,7 +42,7 @@ CASES: dict[str, Case] = {}
 
 
 def case(name: str, build: Build, **more: Any) -> None:
-    """Add a case."""
+    """Add a case to CASES under its name; `more`: the other fields of `Case`."""
     assert name not in CASES
     CASES[name] = Case(build, **more)
 
