@@ -441,8 +441,9 @@ class SimulatedModel(Model):
         return self.kind
 
     def try_out(self, segments: list[Segment]) -> None:
-        """Simulate the first recording twice. Raises InputError for outputs that are no numbers or differ."""
-        run, same = (self.run_of(segments[0], self.guess(segments), []) for _ in range(2))
+        """Simulate a recording twice. Raises InputError for outputs that are no numbers, differ, or do not move."""
+        driven = [s for s in segments if any(np.ptp(s.inputs[name]) > 0.0 for name in self.section.inputs)]
+        run, same = (self.run_of((driven or segments)[0], self.guess(segments), []) for _ in range(2))
         key = run.key  # before the run, which may change its arguments
         (first,), (again,) = self.run_many([run]), self.run_many([same])
         self._keep(key, first)
@@ -453,6 +454,10 @@ class SimulatedModel(Model):
             if away > SAME_RUN * float(np.nanmax(np.abs(row))):
                 found = f"{name} that differs by {away:.3g} between two runs"
                 raise InputError(f"{self.kind} {self.label}", found, "the same outputs for the same arguments")
+        if driven and all(np.nanmax(row) - np.nanmin(row) <= SAME_RUN * np.nanmax(np.abs(row)) for row in first):
+            found = f"{self.section.outputs[0]} that stays at {np.nanmax(first[0]):.3g} while its inputs move"
+            wanted = "an output that answers: check what the simulator reads, or state parameters with which it moves"
+            raise InputError(f"{self.kind} {self.label}", found, wanted)
 
     def announce(self, segments: list[Segment], theta: Array) -> str:
         """Return the cost of the diagnosis in simulations, from one simulation of each fitted recording."""

@@ -376,7 +376,7 @@ def test_a_simulator_may_have_no_free_parameter(gap: float, held: bool) -> None:
     assert [effect["id"] for effect in verdict.effects] == (["backlash"] if gap else [])
 
 
-def test_a_simulator_that_gives_no_numbers_or_others_each_time_is_refused() -> None:
+def test_a_simulator_that_gives_no_numbers_others_each_time_or_one_is_refused() -> None:
     rng = np.random.default_rng(1)
 
     def shaken(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
@@ -385,6 +385,9 @@ def test_a_simulator_that_gives_no_numbers_or_others_each_time_is_refused() -> N
     def lost(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
         return {**swung(inputs, p, time_s), "z": np.full(time_s.size, np.nan)}
 
-    for function, found in ((shaken, "differs by"), (lost, "no number in z")):
+    def deaf(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+        return {name: np.full(time_s.size, 0.3) for name in swung(inputs, p, time_s)}
+
+    for function, found in ((shaken, "differs by"), (lost, "no number in z"), (deaf, "stays at 0.3 while its inputs move")):
         with pytest.raises(InputError, match=found):
             sd.diagnose([swinging(k) for k in (1, 2, 3)], swing(function, **FREE))

@@ -1,0 +1,213 @@
+"""Each threshold of the finder moved by 20 %, down and up: which verdicts of a finished run change, and for better or worse.
+
+python -m host.studies.proof.sensitivity --dir runs/prove_SEED --cases ode=6,own=3 --out moved.jsonl --docs docs/proof.md
+
+The cases of each world with the smallest files are taken. A rule that a case does not read cannot change its verdict and
+is not tried there. Results are appended to `--out` rule by rule; the same call continues a run that was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from host.diagnosis import diagnose
+from host.diagnosis.estimation.rules import RULES, SelectionRules
+from host.studies.proof.page import write_between
+from host.studies.proof.scoring import judge
+from host.studies.proof.worlds.suite import read_labels
+from protocol.worker_process import end_with_parent
+from sim.concealed.label import Label
+
+BY = 0.2  # relative
+NAMES = frozenset(field.name for field in fields(SelectionRules))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case of a finished run."""
+
+    world: str
+    label: Label
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """World and id."""
+        return f"{self.world} {self.label['id'].removeprefix('case_')}"
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files."""
+        return sum(path.stat().st_size for path in self.folder.iterdir())
+
+
+@dataclass(frozen=True)
+class Change:
+    """One rule at another value."""
+
+    rule: str
+    value: float
+
+    def applied(self) -> SelectionRules:
+        """All rules, with this one changed."""
+        changed: dict[str, Any] = {self.rule: self.value}
+        return replace(RULES, **changed)
+
+
+class _Noted(SelectionRules):
+    """Rules that note which of them are read, other than to copy or print all of them."""
+
+    read: set[str] = set()  # noqa: RUF012 - of the process, which makes one diagnosis at a time
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in NAMES and sys._getframe(1).f_globals.get("__name__") != "dataclasses":
+            _Noted.read.add(name)
+        return super().__getattribute__(name)
+
+
+def values_of(value: float) -> tuple[float, float]:
+    """A fifth less and a fifth more; of a whole number at least one less and one more.
+
+    Examples:
+        >>> values_of(6.0), values_of(10), values_of(2)
+        ((4.8, 7.2), (8, 12), (1, 3))
+    """
+    if isinstance(value, int):
+        return min(math.floor((1.0 - BY) * value), value - 1), max(math.ceil((1.0 + BY) * value), value + 1)
+    return round((1.0 - BY) * value, 12), round((1.0 + BY) * value, 12)
+
+
+def changes() -> list[Change]:
+    """Every rule at both of its other values."""
+    return [Change(rule, value) for rule, now in RULES.as_dict().items() for value in values_of(now)]
+
+
+def read_cases(run: Path, counts: dict[str, int]) -> list[Case]:
+    """Return the cases with the smallest files of worlds of a finished run. counts: how many of each world.
+
+    Raises OSError where labels are missing.
+    """
+    found = []
+    for world, most in counts.items():
+        labels = read_labels(run / world / "sealed" / "labels.json")
+        cases = [Case(world, label, run / world / "cases" / label["id"]) for label in labels]
+        found += sorted(cases, key=lambda case: (case.size, case.name))[:most]
+    return found
+
+
+def verdict_of(case: Case, change: Change | None) -> dict[str, Any]:
+    """Line of results: what is named with which probability, whether it is right, and which rules were read."""
+    _Noted.read = set()
+    rules = _Noted() if change is None else change.applied()
+    recordings = sorted(path for path in case.folder.iterdir() if path.name != "nominal.toml")
+    said = diagnose(recordings, case.folder / "nominal.toml", rules=rules).as_dict()
+    effects = [(f"{effect['id']}@{effect['subsystem']}", effect["probability"]) for effect in said["effects"]]
+    line = {"case": case.name, "verdict": said["verdict"], "effects": effects, "right": judge(case.label, said).right}
+    if change is None:
+        return line | {"rule": "", "read": sorted(_Noted.read)}
+    return line | {"rule": change.rule, "value": change.value}
+
+
+def _task(given: tuple[Case, Change | None]) -> dict[str, Any]:
+    return verdict_of(*given)
+
+
+def measure(cases: Sequence[Case], out: Path, jobs: int) -> list[dict[str, Any]]:
+    """Lines of results, old and new."""
+    lines = [json.loads(text) for text in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
+    done = {(line["case"], line["rule"], line.get("value")) for line in lines}
+    with ProcessPoolExecutor(max_workers=jobs, initializer=end_with_parent) as executor, out.open("a") as file:
+
+        def run(tasks: Iterable[tuple[Case, Change | None]]) -> Iterator[dict[str, Any]]:
+            todo = [
+                (case, change)
+                for case, change in tasks
+                if (case.name, change.rule if change else "", change.value if change else None) not in done
+            ]
+            for number, line in enumerate(executor.map(_task, todo), 1):
+                file.write(json.dumps(line) + "\n")
+                file.flush()
+                print(f"\r{number}/{len(todo)} {line['case']} {line['rule']:40s}", end="", file=sys.stderr)
+                yield line
+
+        lines += run((case, None) for case in cases)
+        as_is = {line["case"]: line for line in lines if not line["rule"]}
+        lines += run((case, change) for change in changes() for case in cases if change.rule in as_is[case.name]["read"])
+    return lines
+
+
+def named(line: dict[str, Any]) -> tuple[str, frozenset[str]]:
+    """What a verdict states, without probabilities."""
+    return line["verdict"], frozenset(name for name, _ in line["effects"])
+
+
+def block(lines: Sequence[dict[str, Any]], run: Path) -> str:
+    """Return the generated text: every rule with what its change does, and the cases."""
+    as_is = {line["case"]: line for line in lines if not line["rule"]}
+    seed = json.loads((run / "suite.json").read_text(encoding="utf-8"))["seed"]
+    right = sum(line["right"] for line in as_is.values())
+    rows, same = [], []
+    for rule, now in RULES.as_dict().items():
+        cells = [_cell(lines, Change(rule, value), as_is) for value in values_of(now)]
+        if all(cell == NOTHING for cell in cells):
+            same.append(f"`{rule}`")
+        else:
+            rows.append(f"| `{rule}` | {now:g} | {cells[0]} | {cells[1]} |")
+    worlds = dict.fromkeys(name.split()[0] for name in as_is)
+    counts = ", ".join(f"{sum(name.split()[0] == world for name in as_is)} of `{world}`" for world in worlds)
+    return "\n\n".join(
+        [
+            f"Seed {seed}, {len(as_is)} cases ({counts}). With the rules as they are, {right} verdicts are right. A "
+            "cell lists the cases whose verdict changes: `+` right only then, `-` right only before, `~` both or neither.",
+            "\n".join(["| rule | value | 20 % less | 20 % more |", "|---|---|---|---|", *rows]),
+            f"No verdict changes with the other {len(same)} rules: {', '.join(same)}.",
+        ]
+    )
+
+
+NOTHING = "none"
+
+
+def _cell(lines: Sequence[dict[str, Any]], change: Change, as_is: dict[str, dict[str, Any]]) -> str:
+    said = []
+    for line in lines:
+        before = as_is[line["case"]]
+        if line["rule"] != change.rule or line["value"] != change.value or named(line) == named(before):
+            continue
+        sign = "~" if line["right"] == before["right"] else "+" if line["right"] else "-"
+        said.append(f"{sign}{line['case']}")
+    return ", ".join(said) or NOTHING
+
+
+def _counts(text: str) -> dict[str, int]:
+    pairs = [part.split("=") for part in text.split(",")]
+    return {world: int(most) for world, most in pairs}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Change every rule and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m host.studies.proof.sensitivity")
+    parser.add_argument("--dir", type=Path, required=True, help="folder of a finished run of `seldinger prove`")
+    parser.add_argument("--cases", type=_counts, required=True, metavar="WORLD=N,...", help="of each world, the smallest N")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True, help="results, one JSON object a line")
+    parser.add_argument("--docs", type=Path, help="page whose table is replaced")
+    given = parser.parse_args(arguments)
+    lines = measure(read_cases(given.dir, given.cases), given.out, given.jobs)
+    text = block(lines, given.dir)
+    if given.docs is None:
+        print(text)
+    else:
+        write_between(given.docs, text, "sensitivity")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""The study that moves each threshold by a fifth."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from host.diagnosis.estimation.rules import RULES
+from host.studies.proof.sensitivity import Case, Change, block, changes, read_cases, values_of, verdict_of
+from tests.host.proof.test_runner import Built
+
+
+def test_whole_numbers_move_by_at_least_one() -> None:
+    assert values_of(6.0) == (4.8, 7.2)
+    assert values_of(10) == (8, 12)
+    assert values_of(2) == (1, 3)
+    assert values_of(-1.8) == (-1.44, -2.16)
+
+
+def test_every_rule_is_moved_both_ways() -> None:
+    rules = [change.rule for change in changes()]
+    assert sorted(rules) == sorted([*RULES.as_dict()] * 2)
+    for change in changes():
+        moved = change.applied().as_dict()
+        assert {name for name, value in moved.items() if value != RULES.as_dict()[name]} == {change.rule}
+
+
+def line(rule: str, value: float, effects: list[str], right: bool, case: str = "ode 0001") -> dict[str, Any]:
+    said = "missing_physics" if effects else "nothing_missing"
+    return {
+        "case": case,
+        "rule": rule,
+        "value": value,
+        "verdict": said,
+        "effects": [(e, 0.9) for e in effects],
+        "right": right,
+    }
+
+
+def test_the_table_lists_the_cases_whose_verdict_changes(tmp_path: Path) -> None:
+    (tmp_path / "suite.json").write_text(json.dumps({"seed": 5}))
+    less, more = values_of(RULES.significance)
+    lines = [
+        line("", 0.0, ["backlash@gear"], True),
+        line("", 0.0, [], False, "ode 0002"),
+        line("significance", less, [], False),
+        line("significance", more, ["backlash@gear"], True),
+        line("significance", more, ["rate_lag@gear"], True, "ode 0002"),
+        line("weak_significance", values_of(RULES.weak_significance)[0], ["backlash@gear"], True),
+    ]
+    text = block(lines, tmp_path)
+    assert "Seed 5, 2 cases (2 of `ode`). With the rules as they are, 1 verdicts are right." in text
+    assert "| `significance` | 0.01 | -ode 0001 | +ode 0002 |" in text
+    assert "| `weak_significance`" not in text and "`weak_significance`" in text
+
+
+def test_rules_that_a_case_reads_are_noted(built: Built) -> None:
+    folder, labels = built
+    label = next(la for la in labels if la["kind"] == "transmission" and la["category"] == "null")
+    case = Case("own", label, folder / "own" / "cases" / label["id"])  # type: ignore[arg-type]
+    said = verdict_of(case, None)
+    assert {"screening_log_likelihood", "absent_a"} <= set(said["read"])
+    assert set(said["read"]) < set(RULES.as_dict())
+    changed = verdict_of(case, Change("equation_fits", 4))
+    assert changed["verdict"] == said["verdict"] and "read" not in changed
+
+
+def test_the_smallest_cases_are_taken(built: Built) -> None:
+    folder, labels = built
+    cases = read_cases(folder, {"own": 3})
+    every = [Case("own", label, folder / "own" / "cases" / label["id"]).size for label in labels]  # type: ignore[arg-type]
+    assert [case.size for case in cases] == sorted(every)[:3]
