@@ -1,9 +1,9 @@
 """Each threshold of the finder moved by 20 %, down and up: which verdicts of a finished run change, and for better or worse.
 
-python -m host.studies.proof.sensitivity --dir runs/prove_SEED --cases ode=6,own=3 --out moved.jsonl --docs docs/proof.md
+python -m host.studies.proof.sensitivity --dir runs/prove_SEED --cases ode/0005 own/0024 --out m.jsonl --docs docs/proof.md
 
-The cases of each world with the smallest files are taken. A rule that a case does not read cannot change its verdict and
-is not tried there. Results are appended to `--out` rule by rule; the same call continues a run that was stopped.
+A rule that a case does not read cannot change its verdict and is not tried there. Results are appended to `--out` rule by
+rule; the same call continues a run that was stopped.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.studies.proof.page import write_between
 from host.studies.proof.scoring import judge
 from host.studies.proof.worlds.suite import read_labels
+from protocol.errors import InputError
 from protocol.worker_process import end_with_parent
 from sim.concealed.label import Label
 
@@ -40,13 +41,8 @@ class Case:
 
     @property
     def name(self) -> str:
-        """World and id."""
-        return f"{self.world} {self.label['id'].removeprefix('case_')}"
-
-    @property
-    def size(self) -> int:
-        """Bytes of its files."""
-        return sum(path.stat().st_size for path in self.folder.iterdir())
+        """World and number."""
+        return f"{self.world}/{self.label['id'].removeprefix('case_')}"
 
 
 @dataclass(frozen=True)
@@ -90,17 +86,17 @@ def changes() -> list[Change]:
     return [Change(rule, value) for rule, now in RULES.as_dict().items() for value in values_of(now)]
 
 
-def read_cases(run: Path, counts: dict[str, int]) -> list[Case]:
-    """Return the cases with the smallest files of worlds of a finished run. counts: how many of each world.
-
-    Raises OSError where labels are missing.
-    """
-    found = []
-    for world, most in counts.items():
-        labels = read_labels(run / world / "sealed" / "labels.json")
-        cases = [Case(world, label, run / world / "cases" / label["id"]) for label in labels]
-        found += sorted(cases, key=lambda case: (case.size, case.name))[:most]
-    return found
+def read_cases(run: Path, names: Sequence[str]) -> list[Case]:
+    """Return cases of a finished run by name, `world/number`. Raises InputError for others, OSError without labels."""
+    every = {}
+    for world in dict.fromkeys(name.partition("/")[0] for name in names):
+        for label in read_labels(run / world / "sealed" / "labels.json"):
+            case = Case(world, label, run / world / "cases" / label["id"])
+            every[case.name] = case
+    for name in names:
+        if name not in every:
+            raise InputError("--cases", name, "world/number of a case of the run, such as ode/0005")
+    return [every[name] for name in names]
 
 
 def verdict_of(case: Case, change: Change | None) -> dict[str, Any]:
@@ -161,8 +157,8 @@ def block(lines: Sequence[dict[str, Any]], run: Path) -> str:
             same.append(f"`{rule}`")
         else:
             rows.append(f"| `{rule}` | {now:g} | {cells[0]} | {cells[1]} |")
-    worlds = dict.fromkeys(name.split()[0] for name in as_is)
-    counts = ", ".join(f"{sum(name.split()[0] == world for name in as_is)} of `{world}`" for world in worlds)
+    worlds = dict.fromkeys(name.partition("/")[0] for name in as_is)
+    counts = ", ".join(f"{sum(name.partition('/')[0] == world for name in as_is)} of `{world}`" for world in worlds)
     return "\n\n".join(
         [
             f"Seed {seed}, {len(as_is)} cases ({counts}). With the rules as they are, {right} verdicts are right. A "
@@ -187,16 +183,11 @@ def _cell(lines: Sequence[dict[str, Any]], change: Change, as_is: dict[str, dict
     return ", ".join(said) or NOTHING
 
 
-def _counts(text: str) -> dict[str, int]:
-    pairs = [part.split("=") for part in text.split(",")]
-    return {world: int(most) for world, most in pairs}
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Change every rule and write the table."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.sensitivity")
     parser.add_argument("--dir", type=Path, required=True, help="folder of a finished run of `seldinger prove`")
-    parser.add_argument("--cases", type=_counts, required=True, metavar="WORLD=N,...", help="of each world, the smallest N")
+    parser.add_argument("--cases", nargs="+", required=True, help="world/number, such as ode/0005")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, required=True, help="results, one JSON object a line")
     parser.add_argument("--docs", type=Path, help="page whose table is replaced")
