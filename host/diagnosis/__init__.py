@@ -162,8 +162,9 @@ def diagnose(
         else:
             sources.append(source)
     sources += [] if sources else find_files(spec, [], data_folder)
+    rules = rules or RULES
     try:
-        result = run(spec, sources, progress, frozenset(without), rules or RULES, time_budget_s)
+        result = run(spec, sources, progress, frozenset(without), rules, time_budget_s)
     except NothingToCompare as nothing:
-        return Verdict(without_fit(nothing.findings, time.monotonic() - began), None)
+        return Verdict(without_fit(nothing.findings, rules, time.monotonic() - began), None)
     return Verdict(as_json(result, time.monotonic() - began), result)

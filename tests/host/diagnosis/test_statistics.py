@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from host.diagnosis.estimation import noise
 from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.estimation.uncertainty import _jackknife
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording
@@ -76,7 +77,7 @@ def test_nothing_gained_is_not_taken_for_something() -> None:
         rng = np.random.default_rng(seed)
         r = ar1(rng, 3000, 0.9)
         other = r - 0.03 * ar1(rng, 3000, 0.9)
-        small += compare([segment(3000)], "heldout", [r[None]], [other[None]], np.array([1.0])).p_value < 0.01
+        small += compare([segment(3000)], "heldout", [r[None]], [other[None]], np.array([1.0]), RULES).p_value < 0.01
     assert small <= 3
 
 
@@ -84,7 +85,7 @@ def test_a_gain_is_counted_by_independent_samples() -> None:
     rng = np.random.default_rng(0)
     r = ar1(rng, 8000, 0.9)
     s = np.sin(np.arange(8000) / 50.0)
-    gain = compare([segment(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]))
+    gain = compare([segment(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]), RULES)
     assert gain.p_value < 1e-6 and gain.share == pytest.approx(1 / 3, abs=0.05)
     assert gain.log_likelihood == pytest.approx(0.5 * 8000 / 19 * np.log(1.5), rel=0.4)
 
@@ -102,10 +103,10 @@ def test_whiteness_tells_noise_from_a_rest_that_is_none() -> None:
 def test_windows_follow_their_definition() -> None:
     t = np.arange(0, 20, 0.01)
     m = np.where((t > 5) & (t < 8), 1.0, 0.0) + np.where((t > 8.3) & (t < 9), 1.0, 0.0)
-    ((a, b),) = windows(m, t, 0.01)
+    ((a, b),) = windows(m, t, 0.01, RULES)
     assert a == pytest.approx(5.0, abs=0.3) and b == pytest.approx(9.0, abs=0.3)
     assert inside([(5.0, 9.0)], t).sum() == pytest.approx(400, abs=2)
-    assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)]) == [(1.0, 2.4), (3.0, 4.0)]
+    assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)], RULES) == [(1.0, 2.4), (3.0, 4.0)]
 
 
 def test_noise_by_steps_is_not_misled_by_a_slow_signal_or_by_jumps() -> None:
@@ -163,13 +164,13 @@ def test_noise_is_what_does_not_repeat() -> None:
     structure = np.sign(np.gradient(x))  # a residual that comes back with every period
     outputs = [structure + 0.02 * rng.standard_normal(t.size) for _ in range(2)]
     nowhere = [np.zeros(t.size, dtype=bool)] * 2
-    repeats = noise.repeated([[x], [np.roll(x, 37)]])
+    repeats = noise.repeated([[x], [np.roll(x, 37)]], RULES)
     assert {(a, b) for a, _, b, _ in repeats} == {(0, 0), (1, 1), (0, 1)}
-    found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]]))
+    found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]], RULES))
     assert found.source == noise.REPEATS and found.sigma == pytest.approx(0.02, rel=0.05)
     alone = noise.estimate(outputs, nowhere).sigma
     assert alone == pytest.approx(0.02, rel=0.15)  # the spectrum takes the jumps for noise, the middling difference does not
-    assert noise.repeated([[x], [rng.standard_normal(t.size)]])[0][2] == 0
+    assert noise.repeated([[x], [rng.standard_normal(t.size)]], RULES)[0][2] == 0
 
 
 def test_readings_that_are_none_are_found() -> None:
