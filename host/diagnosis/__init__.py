@@ -121,7 +121,7 @@ def diagnose(
         without: ids of effects that are not to be considered.
         known: effects to take for granted, `id@subsystem:key=value,...`.
         data_folder: where files that the nominal model names lie (default: SELDINGER_DATA).
-        rules: thresholds of selection (default: `host.diagnosis.estimation.rules.RULES`).
+        rules: thresholds, those of the data checks too (default: `host.diagnosis.estimation.rules.RULES`).
         time_budget_s: time after which nothing further is tried; the verdict then says `stopped_early`.
         progress: called with what is being done and the part of it that is done (0 to 1).
 

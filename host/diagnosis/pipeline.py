@@ -112,22 +112,24 @@ class NothingToCompare(Exception):
         self.findings = findings
 
 
-def inspected(spec: NominalSpec, sources: Sequence[Path | Table]) -> Inspected:
+def inspected(spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES) -> Inspected:
     """Recordings as they can be compared, and what is wrong with them. Raises InputError, NothingToCompare."""
     if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
         raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
     needed, optional = channels_of(spec)
-    data = inspect(spec, load(spec, tables, needed, optional), optional)
+    data = inspect(spec, load(spec, tables, needed, optional, rules.data), optional, rules.data)
     if not data.recordings:
         raise NothingToCompare(data.findings)
     return data
 
 
-def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
+def prepare(
+    spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES
+) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError, NothingToCompare."""
-    return problems(spec, inspected(spec, sources).recordings)
+    return problems(spec, inspected(spec, sources, rules).recordings, rules)
 
 
 def problems(
@@ -164,9 +166,11 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str],
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
         # single wild samples would raise the noise by which they are found
-        tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
+        tame = [
+            np.where(readings.wild(p.y[row], readings.scatter(p.y[row]), rules.data), np.nan, p.y[row]) for p in segments
+        ]
         found = noise_module.estimate(tame, still, repeats, model.simulates, rules)
-        seldom = [readings.repeated(p.y[row]) for p in segments]
+        seldom = [readings.repeated(p.y[row], rules.data) for p in segments]
         for segment, places in zip(segments, seldom, strict=True):
             if places is not None:
                 segment.repeats[row] = places
@@ -180,9 +184,11 @@ def _problem(model: Model, recordings: list[Recording], columns: dict[str, str],
             found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
         noises.append(found)
         for segment in segments:
-            segment.y[row, readings.wild(segment.y[row], found.sigma)] = np.nan
+            segment.y[row, readings.wild(segment.y[row], found.sigma, rules.data)] = np.nan
     for segment in segments:
-        segment.resolution = np.array([readings.resolution(y, switched=False) for y in segment.y]) / np.sqrt(12.0)
+        segment.resolution = np.array([readings.resolution(y, rules.data, switched=False) for y in segment.y]) / np.sqrt(
+            12.0
+        )
     return Problem(model, segments, noises, np.ones(len(model.outputs)), columns, rules)
 
 
@@ -228,7 +234,7 @@ def _diagnosed(
 ) -> Diagnosis:
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
-    data, done = inspected(spec, sources), None
+    data, done = inspected(spec, sources, rules), None
     axis = spec.axis
     if axis is not None and axis.runs_away and axis.compare is None:
         by_motion = spec.model_copy(update={"axis": axis.model_copy(update={"compare": "motion"})})
@@ -459,7 +465,7 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         residuals = [r[row] for r in found.nominal_full.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
         known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
-        line = common_line(residuals, known, simulated, periods)
+        line = common_line(residuals, known, simulated, periods, full.rules.data)
         if line is None:
             continue
         column = full.columns.get(output.channel, output.channel)

@@ -1,26 +1,34 @@
-"""Every threshold that decides what a diagnosis states, under its statistical name, with its reason: one home.
+"""The thresholds that decide what a diagnosis states, under their statistical names, with their reasons: one home.
 
 A rule is a number that the data are compared with: it changes what is named, refused or stated. Numerics (step sizes,
 iteration limits, lengths of filters, start values, limits of memory, sizes of a format) stay next to the code that uses
 them.
+
+Thresholds of the checks of the data before any fit are in `DataRules`, the field `data`. Numbers of a single effect or
+nominal model stay in its file; a model that estimates noise to prepare a recording uses the defaults.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from host.diagnosis.model.data_rules import DataRules
 
 
 @dataclass(frozen=True)
 class SelectionRules:
-    """Thresholds of estimation and selection. Log-likelihoods: natural logarithms, of independent samples only.
+    """Thresholds of estimation and selection, and `data`, those of the checks of the data before any fit.
 
-    Shares: of a variance.
+    Log-likelihoods: natural logarithms, of independent samples only. Shares: of a variance.
 
     An effect enters (forward selection) by its gain on held-out samples, by its gain on all samples where the held-out
     ones hardly call for it, or by an overwhelming gain in few episodes; it leaves (backward elimination) and is replaced
     (exchange) by the same measure.
     """
+
+    data: DataRules = field(default_factory=DataRules)
 
     # Noise: samples at rest, else what does not repeat, else the spectrum.
     rest_range_share: float = 0.002  # share of its range by which an input that rests may move,
@@ -230,8 +238,17 @@ class SelectionRules:
         return self.absent_a, self.absent_b, self.absent_c
 
     def as_dict(self) -> dict[str, float]:
-        """Rules by name, as a verdict prints them."""
-        return asdict(self)
+        """All rules by name, those of the data too, as a verdict prints them."""
+        own = asdict(self)
+        of_data = own.pop("data")
+        return {**own, **of_data}
+
+    def changed(self, **values: float) -> SelectionRules:
+        """The rules with other values of some; each name is that of a rule here or in `data`."""
+        of_data = {rule.name for rule in fields(self.data)}
+        data: dict[str, Any] = {name: value for name, value in values.items() if name in of_data}
+        own: dict[str, Any] = {name: value for name, value in values.items() if name not in of_data}
+        return replace(self, data=replace(self.data, **data), **own)
 
 
 RULES = SelectionRules()

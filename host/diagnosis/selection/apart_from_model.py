@@ -42,13 +42,17 @@ def outliers_of_residual(full: Problem, fit: Fit, recordings: Sequence[Recording
         jumps = _jumps(segment, full.model.quiet_inputs, rules)
         for row, output in enumerate(full.model.outputs):
             values = recording.channels.get(output.channel)
-            if values is None or not _as_read(segment.y[row], values) or np.isfinite(left[row]).sum() < 50:
+            if (
+                values is None
+                or not _as_read(segment.y[row], values)
+                or np.isfinite(left[row]).sum() < rules.data.outlier_fewest_samples
+            ):
                 continue
             noise = readings.scatter(left[row])
             alone = ~jumps | (np.abs(left[row]) > rules.input_jump_over_output * _span(values - left[row]))
-            bad = readings.wild(left[row], noise) & np.isfinite(values) & alone
+            bad = readings.wild(left[row], noise, rules.data) & np.isfinite(values) & alone
             rest = np.where(bad, np.nan, values)
-            if float(np.nanstd(rest)) <= readings.MOVES * noise:
+            if float(np.nanstd(rest)) <= rules.data.motion_over_noise * noise:
                 continue  # it may be blows that are meant, as in a channel by itself
             totals[output.channel] += values.size
             if bad.any():

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from host.diagnosis.estimation.fit import Problem
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.findings import FACTORS, NEAR_FACTOR, OPPOSITE, factor_of
+from host.diagnosis.model.findings import FACTORS, factor_of
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.readings import Finding
 
@@ -94,14 +94,14 @@ def _turned(
     for row in rows:
         name, column = names[row], problem.columns.get(names[row], names[row])
         correlation, gain = _likeness(pairs, row, row)
-        if correlation < OPPOSITE:
+        if correlation < rules.data.opposite_correlation:
             says = f"Column {column} moves against what the nominal model says (correlation {correlation:.2f}): "
             says += "it, or an input, has the opposite sign (channels.*.sign). "
             says += f"The diagnosis continues with {column} reversed."
             findings.append(Finding("sign", column, says))
             change[name] = -1.0
         alike = abs(correlation) > rules.simulator_unit_correlation
-        factor = factor_of(abs(gain), NEAR_FACTOR) if alike else 0.0
+        factor = factor_of(abs(gain), rules.data.unit_factor_stated) if alike else 0.0
         if abs(correlation) < rules.simulator_start_correlation and len(names) == 1:
             factor = _of_start(problem, theta)
         if factor:
@@ -210,8 +210,8 @@ def _left_without(problem: Problem, theta: Array, mistake: InputMistake) -> floa
 def _all_match(pairs: list[Pair], rules: SelectionRules) -> bool:
     """Whether every output is as simulated, but for what parameters that are not exact make of it."""
     likeness = (_likeness(pairs, row, row) for row in range(pairs[0][0].shape[0]))
-    least = rules.simulator_match_correlation
-    return all(correlation > least and abs(float(np.log(gain))) < NEAR_FACTOR for correlation, gain in likeness)
+    least, near = rules.simulator_match_correlation, rules.data.unit_factor_stated
+    return all(correlation > least and abs(float(np.log(gain))) < near for correlation, gain in likeness)
 
 
 def _unexplained(pairs: list[Pair]) -> float:

@@ -60,7 +60,7 @@ def test_whitened_noise_is_white() -> None:
 def test_wild_samples_are_found_and_steps_are_not() -> None:
     y = np.where(np.arange(300) > 150, 1.0, 0.0) + 0.001 * np.random.default_rng(0).normal(size=300)
     y[40] = 9.0
-    assert np.flatnonzero(readings.wild(y, 0.001)).tolist() == [40]
+    assert np.flatnonzero(readings.wild(y, 0.001, RULES.data)).tolist() == [40]
 
 
 @settings(max_examples=8, deadline=None)
@@ -180,9 +180,9 @@ def test_readings_that_are_none_are_found() -> None:
     codes = y.copy()
     for first in (100, 700, 1500):
         codes[first : first + 8] = -5.0
-    assert np.flatnonzero(readings.lost(codes)).size == 24 and not readings.lost(y).any()
-    assert readings.resolution(np.round(y / 0.2) * 0.2, switched=False) == pytest.approx(0.2)
-    assert readings.resolution(np.sign(y), switched=True) == 0.0
+    assert np.flatnonzero(readings.lost(codes, RULES.data)).size == 24 and not readings.lost(y, RULES.data).any()
+    assert readings.resolution(np.round(y / 0.2) * 0.2, RULES.data, switched=False) == pytest.approx(0.2)
+    assert readings.resolution(np.sign(y), RULES.data, switched=True) == 0.0
     last = y.copy()
     last[-1] = 9.0
-    assert np.flatnonzero(readings.wild(last, 0.002)).tolist() == [t.size - 1]
+    assert np.flatnonzero(readings.wild(last, 0.002, RULES.data)).tolist() == [t.size - 1]
