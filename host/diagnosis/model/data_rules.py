@@ -33,9 +33,7 @@ class DataRules:
     switched_levels: int = 20  # up to which a channel may be a switched signal
     repeated_fewest_readings: int = 20  # of a channel that repeats them, below which nothing is stated
     repeated_regular_share: float = 0.9  # of its readings that last equally long, from which it repeats them
-    repeated_fine_steps: float = (
-        4.0  # smallest changes in the usual one, at least: else it is a coarse reading that stays the same
-    )
+    repeated_fine_steps: float = 4.0  # smallest changes in the usual one; with less, a coarse reading stays the same
 
     # Copies: a channel that was computed from another one.
     copy_residual: float = 1e-7  # over span, below which a channel is a copy of another
