@@ -121,7 +121,7 @@ def diagnose(
         without: ids of effects that are not to be considered.
         known: effects to take for granted, `id@subsystem:key=value,...`.
         data_folder: where files that the nominal model names lie (default: SELDINGER_DATA).
-        rules: thresholds of selection (default: `host.diagnosis.estimation.rules.RULES`).
+        rules: thresholds, those of the data checks too (default: `host.diagnosis.estimation.rules.RULES`).
         time_budget_s: time after which nothing further is tried; the verdict then says `stopped_early`.
         progress: called with what is being done and the part of it that is done (0 to 1).
 
@@ -162,8 +162,9 @@ def diagnose(
         else:
             sources.append(source)
     sources += [] if sources else find_files(spec, [], data_folder)
+    rules = rules or RULES
     try:
-        result = run(spec, sources, progress, frozenset(without), rules or RULES, time_budget_s)
+        result = run(spec, sources, progress, frozenset(without), rules, time_budget_s)
     except NothingToCompare as nothing:
-        return Verdict(without_fit(nothing.findings, time.monotonic() - began), None)
+        return Verdict(without_fit(nothing.findings, rules, time.monotonic() - began), None)
     return Verdict(as_json(result, time.monotonic() - began), result)

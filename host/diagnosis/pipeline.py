@@ -50,7 +50,7 @@ from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, concluded, fit_nominal, forward, search
-from host.diagnosis.selection.trial import WITHIN, Trial, within_sample
+from host.diagnosis.selection.trial import Trial, within_sample
 from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
@@ -112,22 +112,24 @@ class NothingToCompare(Exception):
         self.findings = findings
 
 
-def inspected(spec: NominalSpec, sources: Sequence[Path | Table]) -> Inspected:
+def inspected(spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES) -> Inspected:
     """Recordings as they can be compared, and what is wrong with them. Raises InputError, NothingToCompare."""
     if spec.recorded_rig and not all(isinstance(source, Path) for source in sources):
         raise InputError("recordings", "arrays", "files (MCAP): a recorded rig is described in its own recordings")
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
     needed, optional = channels_of(spec)
-    data = inspect(spec, load(spec, tables, needed, optional), optional)
+    data = inspect(spec, load(spec, tables, needed, optional, rules.data), optional, rules.data)
     if not data.recordings:
         raise NothingToCompare(data.findings)
     return data
 
 
-def prepare(spec: NominalSpec, sources: Sequence[Path | Table]) -> tuple[Model, Problem, Problem]:
+def prepare(
+    spec: NominalSpec, sources: Sequence[Path | Table], rules: SelectionRules = RULES
+) -> tuple[Model, Problem, Problem]:
     """Model, the problem at the rate that is fitted, and the problem at full rate. Raises InputError, NothingToCompare."""
-    return problems(spec, inspected(spec, sources).recordings)
+    return problems(spec, inspected(spec, sources, rules).recordings, rules)
 
 
 def problems(
@@ -139,10 +141,10 @@ def problems(
         model = Known(model, spec.effect, recordings)
     factor = thinning(model, recordings)
     columns = {name: channel.column for name, channel in channels_of(spec)[0].items()}
-    full = replace(_problem(model, recordings, columns), rules=rules)
+    full = _problem(model, recordings, columns, rules)
     if factor <= 1:
         return model, full, full
-    return model, replace(_problem(model, [thin(r, factor) for r in recordings], columns), rules=rules), full
+    return model, _problem(model, [thin(r, factor) for r in recordings], columns, rules), full
 
 
 def thinning(model: Model, recordings: list[Recording]) -> int:
@@ -154,37 +156,40 @@ def thinning(model: Model, recordings: list[Recording]) -> int:
     return factor
 
 
-def _problem(model: Model, recordings: list[Recording], columns: dict[str, str]) -> Problem:
+def _problem(model: Model, recordings: list[Recording], columns: dict[str, str], rules: SelectionRules) -> Problem:
     segments = [model.prepare(r) for r in recordings]
     still = [
-        noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed)
+        noise_module.quiescent([p.inputs[name] for name in model.quiet_inputs], p.recording.dt_s, p.recording.timed, rules)
         for p in segments
     ]
-    repeats = noise_module.repeated([[p.inputs[name] for name in model.quiet_inputs] for p in segments])
+    repeats = noise_module.repeated([[p.inputs[name] for name in model.quiet_inputs] for p in segments], rules)
     noises: list[Noise] = []
     for row in range(len(model.outputs)):
         # single wild samples would raise the noise by which they are found
-        tame = [np.where(readings.wild(p.y[row], readings.scatter(p.y[row])), np.nan, p.y[row]) for p in segments]
-        found = noise_module.estimate(tame, still, repeats, model.simulates)
-        seldom = [readings.repeated(p.y[row]) for p in segments]
+        tame = [
+            np.where(readings.wild(p.y[row], readings.scatter(p.y[row]), rules.data), np.nan, p.y[row]) for p in segments
+        ]
+        found = noise_module.estimate(tame, still, repeats, model.simulates, rules)
+        seldom = [readings.repeated(p.y[row], rules.data) for p in segments]
         for segment, places in zip(segments, seldom, strict=True):
             if places is not None:
                 segment.repeats[row] = places
         if any(places is not None for places in seldom):  # the noise of readings, not of their repetitions
             kept = [slice(None) if places is None else np.unique(places) for places in seldom]
-            alone = noise_module.estimate(
-                [y[k] for y, k in zip(tame, kept, strict=True)], [m[k] for m, k in zip(still, kept, strict=True)]
-            )
+            read = [y[k] for y, k in zip(tame, kept, strict=True)]
+            alone = noise_module.estimate(read, [m[k] for m, k in zip(still, kept, strict=True)], rules=rules)
             found = replace(found, sigma=max(found.sigma, alone.sigma))
         own = [noise for noise in (model.noise_of(p) for p in segments) if noise is not None]
         if own:
             found = sorted(own, key=lambda noise: noise.sigma)[len(own) // 2]
         noises.append(found)
         for segment in segments:
-            segment.y[row, readings.wild(segment.y[row], found.sigma)] = np.nan
+            segment.y[row, readings.wild(segment.y[row], found.sigma, rules.data)] = np.nan
     for segment in segments:
-        segment.resolution = np.array([readings.resolution(y, switched=False) for y in segment.y]) / np.sqrt(12.0)
-    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns)
+        segment.resolution = np.array([readings.resolution(y, rules.data, switched=False) for y in segment.y]) / np.sqrt(
+            12.0
+        )
+    return Problem(model, segments, noises, np.ones(len(model.outputs)), columns, rules)
 
 
 def diagnose(
@@ -229,7 +234,7 @@ def _diagnosed(
 ) -> Diagnosis:
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
-    data, done = inspected(spec, sources), None
+    data, done = inspected(spec, sources, rules), None
     axis = spec.axis
     if axis is not None and axis.runs_away and axis.compare is None:
         by_motion = spec.model_copy(update={"axis": axis.model_copy(update={"compare": "motion"})})
@@ -404,12 +409,12 @@ def _past_delay(
     place = {*candidate.port.path, candidate.port.name}
     own = [t for t in found.best.terms if not (t.candidate.effect.invariant and t.candidate.port.name in place)]
     delay_s = found.best.values[len(problem.model.parameters) : len(model.parameters)]
-    if not own or float(np.sum(np.abs(delay_s))) > WITHIN * problem.segments[0].recording.dt_s:
+    if not own or float(np.sum(np.abs(delay_s))) > problem.rules.sampling_delay * problem.segments[0].recording.dt_s:
         return None
     noise_sd = np.array([n.sigma for n in problem.noise])
     before, rules = late.fit.residuals, problem.rules
-    ahead = compare(problem.segments, "both", before, found.best.residuals, noise_sd).log_likelihood
-    earned = compare(problem.segments, "both", begun.found.nominal.residuals, before, noise_sd).log_likelihood
+    ahead = compare(problem.segments, "both", before, found.best.residuals, noise_sd, problem.rules).log_likelihood
+    earned = compare(problem.segments, "both", begun.found.nominal.residuals, before, noise_sd, problem.rules).log_likelihood
     if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
         return None
     return _Searched(model, again, full, found, [*begun.findings, *late_by_a_sample(again, late, past=True)])
@@ -460,7 +465,7 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         residuals = [r[row] for r in found.nominal_full.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
         known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
-        line = common_line(residuals, known, simulated, periods)
+        line = common_line(residuals, known, simulated, periods, full.rules.data)
         if line is None:
             continue
         column = full.columns.get(output.channel, output.channel)
@@ -516,7 +521,7 @@ def _jumps(full: Problem, found: Found) -> list[Finding]:
     """Sentences on jumps of the nominal residual that no effect explains, such as those of a sensor that was moved."""
     findings = []
     for row, output in enumerate(full.model.outputs):
-        jumps = jumps_of([r[row] for r in found.nominal_full.residuals])
+        jumps = jumps_of([r[row] for r in found.nominal_full.residuals], full.rules)
         if not jumps:
             continue
         places = []
@@ -542,11 +547,11 @@ def candidate_ports(problem: Problem) -> tuple[Port, ...]:
 
 def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     """Where the refitted nominal model fails, with no effect to blame."""
-    residuals = found.nominal_full.residuals
+    residuals, rules = found.nominal_full.residuals, full.rules
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))
     spans = [
-        windows(r[top], p.recording.time_s, p.recording.dt_s, 1.3 * full.noise[top].sigma)
+        windows(r[top], p.recording.time_s, p.recording.dt_s, rules, rules.window_over_noise * full.noise[top].sigma)
         for p, r in zip(full.segments, residuals, strict=True)
     ]
     spans_s = _by_recording(full, spans)
@@ -610,9 +615,10 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
         if not rows:
             continue
         top = max(rows, key=lambda row: _weight(full, alone, row))
-        strong = [row for row in rows if _weight(full, alone, row) >= 0.5 * _weight(full, alone, top)]
+        least = full.rules.window_output_share * _weight(full, alone, top)
+        strong = [row for row in rows if _weight(full, alone, row) >= least]
         spans = [
-            joined([span for row in strong for span in _windows(segment, m[row])])
+            joined([span for row in strong for span in _windows(segment, m[row], full.rules)], full.rules)
             for segment, m in zip(full.segments, alone, strict=True)
         ]
         share = _share(full, found, spans, top)
@@ -641,7 +647,8 @@ def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
 def _rows_touched(full: Problem, change: list[Array]) -> list[int]:
     """Outputs in which the change is at least a third of the largest, in units of noise."""
     weights = [_weight(full, change, row) for row in range(len(full.noise))]
-    return [row for row, weight in enumerate(weights) if weight >= max(weights) / 3.0 and weight > 0.0]
+    least = max(weights) / full.rules.located_output_ratio
+    return [row for row, weight in enumerate(weights) if weight >= least and weight > 0.0]
 
 
 def _weight(full: Problem, change: list[Array], row: int) -> float:
@@ -661,8 +668,8 @@ def _by_recording(full: Problem, spans: list[list[tuple[float, float]]]) -> dict
     }
 
 
-def _windows(segment: Segment, change: Array) -> list[tuple[float, float]]:
-    return windows(change, segment.recording.time_s, segment.recording.dt_s)
+def _windows(segment: Segment, change: Array, rules: SelectionRules) -> list[tuple[float, float]]:
+    return windows(change, segment.recording.time_s, segment.recording.dt_s, rules)
 
 
 def _share(full: Problem, found: Found, spans: list[list[tuple[float, float]]], row: int) -> float:

@@ -26,14 +26,13 @@ from host.diagnosis.selection.search import Found
 Array = npt.NDArray[np.float64]
 LONGEST_S, MOST_SAMPLES = 40.0, 12000
 FINALISTS = 16
-PLAIN = 3.0  # separation from which a recording separates two models
 INSIDE = (0.02, 0.98)  # quantiles of the recorded inputs that a motion stays between
 
 
 @dataclass(frozen=True)
 class Design:
     """The best excitation against one rival. `separation`, and `had` by these recordings, in units of the remaining
-    residual.
+    residual. `separates`: whether a recording of the excitation separates the two.
     """
 
     candidate: Candidate
@@ -42,11 +41,7 @@ class Design:
     separation: float
     had: float
     inputs: dict[str, Array]
-
-    @property
-    def separates(self) -> bool:
-        """Whether a recording of the excitation separates the two."""
-        return self.separation > PLAIN
+    separates: bool
 
     @property
     def says(self) -> str:
@@ -112,14 +107,14 @@ def against(
         return None
     segment = top[2].segments[0]
     inputs = {name: segment.recording.channels[name] for name in asked(problem)}
-    return Design(candidate, other, top[1], top[0], had, inputs)
+    return Design(candidate, other, top[1], top[0], had, inputs, top[0] > problem.rules.experiment_separation)
 
 
 def weighed(problem: Problem, best: Fit) -> Problem:
     """`problem` with residuals in units of what `best` leaves, correlated samples counted once."""
     together = [max(correlation_time(r[row]) for r in best.residuals) for row in range(len(problem.noise))]
     scale = problem.scale * np.sqrt(np.maximum(together, 1.0))
-    return Problem(problem.model, problem.segments, problem.noise, scale, problem.columns)
+    return Problem(problem.model, problem.segments, problem.noise, scale, problem.columns, problem.rules)
 
 
 def difference(problem: Problem, one: Fit, two: Fit) -> Array:
@@ -170,7 +165,7 @@ def predicted(problem: Problem, best: Fit, recording: Recording) -> Problem | No
     segment = problem.model.prepare(recording)
     if not problem.model.inner.on_rig:
         problem.model.settle(segment, best.values[: len(problem.model.parameters)])
-    trial = Problem(problem.model, [segment], problem.noise, problem.scale, problem.columns)
+    trial = Problem(problem.model, [segment], problem.noise, problem.scale, problem.columns, problem.rules)
     segment.y = problem.simulate(segment, best.terms, best.values)
     return trial if np.isfinite(segment.y).all() and np.max(np.abs(segment.y)) < 1e100 else None
 
@@ -245,6 +240,6 @@ def lines(made: list[Design], candidate: Candidate) -> str:
 def planned(result: Any) -> list[Design]:
     """Return the useful designs of a diagnosis, each excitation once, the largest separation first."""
     seen: dict[str, Design] = {}
-    for one in sorted((d for d in result.designs if d.separation > PLAIN), key=lambda d: -d.separation):
+    for one in sorted((d for d in result.designs if d.separates), key=lambda d: -d.separation):
         seen.setdefault(f"{one.excitation.channel} {one.excitation.words} {one.excitation.held}", one)
     return list(seen.values())

@@ -23,38 +23,39 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.feedback import COMMON, unpredicted
+from host.diagnosis.estimation.feedback import unpredicted
 from host.diagnosis.estimation.noise import autoregression
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.operators import fill, lag, play
 
 Array = npt.NDArray[np.float64]
 ORDER = 20  # of the autoregression
-FEWEST = 30.0  # independent samples of all recordings together; with fewer, recordings are compared with each other too
-SIGNIFICANCE = 1e-3  # of each test, over all its bins, samples and features
 LONGEST = 512  # samples of a part of a recording, of which at least
 PARTS = 16.0  # of an integrated correlation time (an eighth of the time constant) that a slow residual is averaged over
-SIMULATED = 999  # noises, and the share of them that may look as much like a structure as the residual does:
-BY_CHANCE = 0.01
+SIMULATED = 999  # noises that a slow residual is compared with
 PLAYS, LAGS = (0.1, 0.3, 0.6), (1 / 60, 1 / 20, 1 / 6)  # memories: widths over the span, times over the recording's length
 EARLIER = (2, 3, 5, 8, 13, 21, 34, 55, 89)  # samples by which a cause precedes; the speed reads one sample ahead
 AVERAGES = 8  # of a recording estimate a coherence: 1 - (p)^(1 / (parts - 1)) is exceeded by chance with p (Carter 1987)
 
 
-def only_coloured(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]]) -> bool:
+def only_coloured(residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules) -> bool:
     """Whether residuals (n_i,) of recordings are coloured noise that no input (n_i,) of its recording explains."""
     pairs = [(r, u) for r, u in zip(residuals, inputs, strict=True) if np.isfinite(r).sum() >= 20 * ORDER]
     if not pairs:
         return False
     lines = [fill(r) - np.nanmean(r) for r, _ in pairs]
     new, own = _innovations(lines), [u for _, u in pairs]
-    if _jump(new) or _repeat(new) or (_follow(new, own) and _caused(new, own)):
+    significance = rules.coloured_significance
+    if _jump(new, significance) or _repeat(new, significance):
         return False
-    return not too_slow(residuals) or not _common(lines, own)
+    if _follow(new, own, significance) and _caused(new, own, rules):
+        return False
+    return not too_slow(residuals, rules) or not _common(lines, own, rules)
 
 
-def too_slow(residuals: Sequence[Array]) -> bool:
+def too_slow(residuals: Sequence[Array], rules: SelectionRules) -> bool:
     """Whether residuals (n_i,) of recordings have too few independent samples to be separated from a mismatch."""
-    return independent_samples(residuals) < FEWEST
+    return independent_samples(residuals) < rules.slow_noise_samples
 
 
 def independent_samples(residuals: Sequence[Array]) -> float:
@@ -62,7 +63,7 @@ def independent_samples(residuals: Sequence[Array]) -> float:
     return float(sum(np.isfinite(r).sum() / correlation_time(r - np.nanmean(r)) for r in residuals if np.isfinite(r).any()))
 
 
-def _common(lines: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
+def _common(lines: list[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules) -> bool:
     """Whether slow residuals (n_i,) of recordings share a structure that noise of their correlation time hardly has."""
     step = max(1, int(np.median([correlation_time(r) for r in lines]) / PARTS))
     rows = [_averaged(r, step) for r in lines]
@@ -75,7 +76,7 @@ def _common(lines: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
     tests = [(np.max(of_inputs / usual), np.max(by_inputs / usual, axis=0))] if tables[0] else []
     if len(rows) > 1:
         tests.append((_of_each_other([r[None, :] for r in rows])[0], _of_each_other(noises)))
-    limit = BY_CHANCE / max(len(tests), 1) * (SIMULATED + 1)
+    limit = rules.slow_structure_significance / max(len(tests), 1) * (SIMULATED + 1)
     return any(1 + np.count_nonzero(by_chance >= found) <= limit for found, by_chance in tests)
 
 
@@ -143,24 +144,24 @@ def _innovations(lines: list[Array]) -> list[Array]:
     return [e / spread for e in new]
 
 
-def _jump(new: list[Array]) -> bool:
+def _jump(new: list[Array], significance: float) -> bool:
     """Whether an innovation is larger than that of a normal process may be."""
     from scipy.stats import norm
 
     count = sum(e.size for e in new)
-    return max(float(np.max(np.abs(e))) for e in new) > float(norm.isf(0.5 * SIGNIFICANCE / count))
+    return max(float(np.max(np.abs(e))) for e in new) > float(norm.isf(0.5 * significance / count))
 
 
-def _repeat(new: list[Array]) -> bool:
+def _repeat(new: list[Array], significance: float) -> bool:
     """Whether a line stands out of the spectrum of the innovations."""
     for e in new:
         power = np.abs(np.fft.rfft(e - np.mean(e)))[1:-1] ** 2
-        if np.max(power) > np.mean(power) * np.log(power.size * len(new) / SIGNIFICANCE):
+        if np.max(power) > np.mean(power) * np.log(power.size * len(new) / significance):
             return True
     return False
 
 
-def _follow(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
+def _follow(new: list[Array], inputs: Sequence[Sequence[Array]], significance: float) -> bool:
     """Whether the innovations are coherent with a feature of an input."""
     from scipy.signal import csd, welch
 
@@ -182,13 +183,13 @@ def _follow(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
                 xx, ee, xe = np.sum(sums_, axis=0)
                 coherence = np.abs(xe[1:-1]) ** 2 / np.maximum((xx * ee)[1:-1].real, 1e-300)
                 parts = sum(e.size // size for e in new if min(LONGEST, e.size // AVERAGES) == size)
-                limit = 1.0 - (SIGNIFICANCE / (tests * coherence.size)) ** (1.0 / max(parts - 1, 1))
+                limit = 1.0 - (significance / (tests * coherence.size)) ** (1.0 / max(parts - 1, 1))
                 if np.max(coherence) > limit:
                     return True
     return False
 
 
-def _caused(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
+def _caused(new: list[Array], inputs: Sequence[Sequence[Array]], rules: SelectionRules) -> bool:
     """Whether earlier features of the inputs say something of the innovations (F test of a regression).
 
     A controller sends noise into its own and later rows of an input, so the two are coherent without any mismatch. Earlier
@@ -201,7 +202,7 @@ def _caused(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
     for e, own in zip(new, inputs, strict=True):
         features = [feature for u in own[:channels] for feature in _features(fill(u)[ORDER:])]
         first = EARLIER[-1]
-        steps = [_steps(fill(u))[ORDER:] for u in own[:channels]]
+        steps = [_steps(fill(u), rules)[ORDER:] for u in own[:channels]]
         table = np.column_stack(
             [feature[first - k : e.size - k] for feature in features for k in EARLIER]
             + [step[first - k : e.size - k] for step in steps for k in (0, 1)]
@@ -213,14 +214,14 @@ def _caused(new: list[Array], inputs: Sequence[Sequence[Array]]) -> bool:
     m = int(np.linalg.matrix_rank(X, rtol=1e-9))
     free = y.size - m - len(new)
     ratio = (float(y @ y) - float(explained @ explained)) / m / (float(explained @ explained) / free + 1e-300)
-    return bool(fisher.sf(ratio, m, free) < SIGNIFICANCE)
+    return bool(fisher.sf(ratio, m, free) < rules.coloured_significance)
 
 
-def _steps(u: Array) -> Array:
+def _steps(u: Array, rules: SelectionRules) -> Array:
     """Unpredicted changes of `u` (n,) that are too large for noise, zero elsewhere."""
     new = unpredicted(u)
     spread = 1.4826 * float(np.median(np.abs(new[ORDER:])))
-    return np.asarray(np.where(np.abs(new) > COMMON * spread, new, 0.0))
+    return np.asarray(np.where(np.abs(new) > rules.new_input_deviations * spread, new, 0.0))
 
 
 def _features(u: Array) -> list[Array]:

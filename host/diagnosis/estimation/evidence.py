@@ -9,11 +9,11 @@ import numpy.typing as npt
 from scipy import stats
 
 from host.diagnosis.estimation.feedback import freed
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-FEWEST_BLOCKS = 6
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ def correlation_time(r: Array, longest: int | None = None) -> float:
     return float(np.clip(total, 1.0, n / 4.0))
 
 
-def compare(segments: list[Segment], which: str, before: list[Array], after: list[Array], noise_sd: Array) -> Gain:
+def compare(
+    segments: list[Segment], which: str, before: list[Array], after: list[Array], noise_sd: Array, rules: SelectionRules
+) -> Gain:
     """Gain of `after` over `before` (residuals per segment, (outputs, n)) on samples `which` (`fit`, `heldout` or `both`).
 
     Gaussian likelihood with the level left free, N / 2 log(MSE) each output, where N counts independent samples only: it
@@ -75,14 +77,14 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
     by_output: list[list[float]] = []
     for row in range(noise_sd.size):
         b2, a2, n_eff, times = _pooled(segments, which, before, after, row)
-        if n_eff < 3.0:
+        if n_eff < rules.evidence_independent_samples:
             continue
         steps = max((float(s.resolution[row]) for s in segments if s.resolution is not None), default=0.0)
         least = 1e-6 * noise_sd[row] ** 2
         level_b, level_a = max(b2, steps**2) + least, max(a2, steps**2) + least
         independent[row], log_ratio[row] = n_eff, np.log(level_b / level_a)
         excess[row] = max(0.0, 1.0 - noise_sd[row] ** 2 / level_b)
-        excess_after[row] = max(0.0, 1.0 - 1.5 * noise_sd[row] ** 2 / level_a)
+        excess_after[row] = max(0.0, 1.0 - rules.excess_noise_ratio * noise_sd[row] ** 2 / level_a)
         by_output.append(_blocks(segments, which, before, after, row, times, level_a))
     gain = 0.5 * float(independent @ log_ratio)
     top = int(np.argmax(independent * log_ratio))
@@ -90,7 +92,7 @@ def compare(segments: list[Segment], which: str, before: list[Array], after: lis
     if before is not raw_before:
         b2, a2, _, _ = _pooled(segments, which, raw_before, raw_after, top)
         share, excess[top] = 1.0 - a2 / max(b2, 1e-300), max(0.0, 1.0 - noise_sd[top] ** 2 / max(b2, 1e-300))
-    return Gain(gain, _p_value(by_output), share, float(excess[top]), independent, log_ratio, excess_after)
+    return Gain(gain, _p_value(by_output, rules), share, float(excess[top]), independent, log_ratio, excess_after)
 
 
 def _freed(segments: list[Segment], residuals: list[Array]) -> list[Array]:
@@ -103,12 +105,12 @@ def _freed(segments: list[Segment], residuals: list[Array]) -> list[Array]:
     ]
 
 
-def _p_value(by_output: list[list[float]]) -> float:
+def _p_value(by_output: list[list[float]], rules: SelectionRules) -> float:
     """The smaller of: all outputs together, and the surest output times their number (Bonferroni)."""
     if not by_output:
         return 1.0
-    together = _sign_of_mean(np.concatenate([np.array(blocks) for blocks in by_output]))
-    alone = min(_sign_of_mean(np.array(blocks)) for blocks in by_output)
+    together = _sign_of_mean(np.concatenate([np.array(blocks) for blocks in by_output]), rules)
+    alone = min(_sign_of_mean(np.array(blocks), rules) for blocks in by_output)
     return float(min(1.0, together, alone * len(by_output))) if len(by_output) > 1 else together
 
 
@@ -150,12 +152,12 @@ def _blocks(
     return found
 
 
-def _sign_of_mean(blocks: Array) -> float:
+def _sign_of_mean(blocks: Array, rules: SelectionRules) -> float:
     """One-sided p-value that independent blocks do not gain: the smaller of t test and signed ranks (blocks of unlike
     size), doubled.
     """
-    if blocks.size < FEWEST_BLOCKS:
-        return 0.5 if blocks.size == 0 or np.mean(blocks) <= 0 else 0.04
+    if blocks.size < rules.evidence_blocks:
+        return 0.5 if blocks.size == 0 or np.mean(blocks) <= 0 else rules.few_blocks_p_value
     spread = np.std(blocks) + 1e-300
     t = np.mean(blocks) / (spread / np.sqrt(blocks.size))
     by_mean = stats.t.sf(t, blocks.size - 1)

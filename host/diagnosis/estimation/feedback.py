@@ -16,11 +16,13 @@ Earlier new input then holds noise as well, and a filter of the input could take
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill
 
@@ -29,12 +31,7 @@ ORDER = 20  # of the prediction of an input from its own past
 LAGS = 30  # later samples of the inputs together; the first later one is left out: it may be how an input is held
 SAMPLES_PER_LAG = 40  # recorded, at least
 MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
-LEAST_SHARE = 0.05  # of the residual's variance that later input has to say, beyond chance,
-COMMON = 5.0  # robust standard deviations up to which the new part of an input may be noise; more is a step of the set-point
-OVER_REST = 2.0  # least ratio of the residual's coefficients on the new part of the input and on the other part
-OVER_PAST = 2.0  # and over what earlier input says: a wrong model leaves a residual that earlier input explains
 PASSES = 3  # of a prediction that leaves out the rows of steps
-LEAST_SAID = 0.5  # of the new input by the motion so far, where a controller reads it; of the residual by the new input
 
 
 def unpredicted(x: Array) -> Array:
@@ -44,7 +41,7 @@ def unpredicted(x: Array) -> Array:
     return np.concatenate((np.zeros(ORDER), new))
 
 
-def common_part(x: Array) -> tuple[Array, Array]:
+def common_part(x: Array, rules: SelectionRules) -> tuple[Array, Array]:
     """The new part of `x` (n,) without steps of a set-point, and the rows (n,) of a step: both are 0 or False at the begin.
 
     Steps exceed all other new parts together. The prediction is fitted without their rows, and they are 0 in the result.
@@ -55,7 +52,7 @@ def common_part(x: Array) -> tuple[Array, Array]:
     for _ in range(PASSES):
         weights = np.linalg.lstsq(past[usual], x[ORDER:][usual], rcond=None)[0]
         new = x[ORDER:] - past @ weights
-        usual = np.abs(new) <= COMMON * 1.4826 * float(np.median(np.abs(new)))
+        usual = np.abs(new) <= rules.new_input_deviations * 1.4826 * float(np.median(np.abs(new)))
     steps = np.concatenate((np.zeros(ORDER, dtype=bool), ~usual))
     if np.count_nonzero(usual) < ORDER * SAMPLES_PER_LAG // 2:
         return np.zeros_like(x), steps
@@ -67,7 +64,7 @@ def _past(x: Array) -> Array:
     return np.column_stack([x[ORDER - k - 1 : x.size - k - 1] for k in range(ORDER)] + [np.ones(x.size - ORDER)])
 
 
-def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...]) -> bool:
+def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple[str, ...], rules: SelectionRules) -> bool:
     """Set `fed_back` of every segment, of the outputs whose residual is predicted by later `inputs` or at once.
 
     residuals: (outputs, n) of each segment. `fed_back[row]` is an orthonormal basis (n, lags), or None.
@@ -76,30 +73,30 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     a linear law with memory can then take that noise away, and nothing tells it from one that does not.
     """
     noisy = False
-    new = [_new_input(segment, inputs) for segment in segments]
+    new = [_new_input(segment, inputs, rules) for segment in segments]
     around: list[Array | None] = []
-    if _said_by_motion(segments, inputs) > LEAST_SAID:
+    if _said_by_motion(segments, inputs, rules) > rules.feedback_predicted_share:
         around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
     for segment, u in zip(segments, new, strict=True):
         segment.fed_back = [_later(u) for _ in range(segment.y.shape[0])]
     for row in range(segments[0].y.shape[0]):
         later = _share([segment.fed_back[row] for segment in segments], residuals, row)
         earlier = _share([_earlier(u) for u in new], residuals, row)
-        if later < LEAST_SHARE or later < OVER_PAST * earlier:
+        if later < rules.feedback_share or later < rules.feedback_over_past * earlier:
             for segment in segments:
                 segment.fed_back[row] = None
         if around:
-            noisy = noisy or _share(around, residuals, row) > LEAST_SAID
+            noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share
             for segment, basis in zip(segments, around, strict=True):
                 segment.fed_back[row] = basis
-        at_once = [part for name in inputs for part in _at_once(segments, residuals, row, name, earlier)]
-        for index, column in at_once:
+        at_once = [_at_once(segments, residuals, row, name, earlier, rules) for name in inputs]
+        for index, column in itertools.chain.from_iterable(at_once):
             segments[index].fed_back[row] = _with(segments[index].fed_back[row], column)
     return noisy
 
 
 def _at_once(
-    segments: list[Segment], residuals: list[Array], row: int, name: str, earlier: float
+    segments: list[Segment], residuals: list[Array], row: int, name: str, earlier: float, rules: SelectionRules
 ) -> list[tuple[int, Array]]:
     """New part of input `name` of each segment, by its index, if noise of this output is in it; else none."""
     parts = []
@@ -109,7 +106,7 @@ def _at_once(
             continue
         new = unpredicted(fill(x))
         spread = 1.4826 * float(np.median(np.abs(new[ORDER:])))
-        new = np.where(np.abs(new) <= COMMON * spread, new, 0.0)
+        new = np.where(np.abs(new) <= rules.new_input_deviations * spread, new, 0.0)
         rest = fill(x) - new
         parts.append((index, new, rest - np.mean(rest), np.nan_to_num(residual[row])))
     if not parts:
@@ -120,7 +117,9 @@ def _at_once(
         return []
     by_new, by_rest = np.linalg.lstsq(np.column_stack((new, rest)), r, rcond=1e-12)[0]
     share = by_new**2 * size / power
-    if share < LEAST_SHARE or share < OVER_PAST * earlier or abs(by_new) < OVER_REST * abs(by_rest):
+    if share < rules.feedback_share or share < rules.feedback_over_past * earlier:
+        return []
+    if abs(by_new) < rules.feedback_over_remainder * abs(by_rest):
         return []
     return [(index, part) for index, part, _, _ in parts if np.any(part)]
 
@@ -138,11 +137,11 @@ def freed(segment: Segment, row: int, residual: Array) -> Array:
     return residual - basis @ (basis.T @ np.nan_to_num(residual))
 
 
-def _new_input(segment: Segment, inputs: tuple[str, ...]) -> list[Array]:
+def _new_input(segment: Segment, inputs: tuple[str, ...], rules: SelectionRules) -> list[Array]:
     if not ORDER * SAMPLES_PER_LAG <= segment.n <= MOST_SAMPLES:
         return []
     moving = [fill(segment.inputs[name]) for name in inputs if name in segment.inputs and np.ptp(segment.inputs[name]) > 0.0]
-    new = [common_part(x)[0] for x in moving]
+    new = [common_part(x, rules)[0] for x in moving]
     return [u / np.std(u) for u in new if np.any(u)]
 
 
@@ -150,7 +149,7 @@ def _later(new: list[Array]) -> Array | None:
     return _basis(new, lambda u, k: np.concatenate((u[k + 1 :], np.zeros(k + 1))))
 
 
-def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...]) -> float:
+def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...], rules: SelectionRules) -> float:
     """Share of the variance of the new input that the measured motion, up to the same row, says (Granger 1969).
 
     A motion follows its input. It says something of a later one only through a controller. 0 where no law is compared
@@ -163,7 +162,7 @@ def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...]) -> float:
         x = fill(segment.read_motion)
         for name in inputs:
             u = fill(segment.inputs[name])
-            new, steps = common_part(u)
+            new, steps = common_part(u, rules)
             new, usual = new[ORDER:], np.logical_not(steps[ORDER:])
             if not np.any(new):
                 continue

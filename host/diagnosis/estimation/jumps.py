@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 SIDE = 20  # samples before and after a jump whose medians are compared
-LEAST = 8.0  # robust standard deviations of such differences, from which one is more than noise
-NEAR = 3  # samples before and after a jump,
-ABRUPT = 0.6  # between which at least this part of it happens: a ramp over the whole span has a seventh there
-MOST = 5  # jumps of a recording: a level that steps more often is no level
+NEAR = 3  # samples before and after a jump, between which most of it happens
 
 
 @dataclass(frozen=True)
@@ -27,30 +25,30 @@ class Jump:
     size: float
 
 
-def jumps_of(residuals: Sequence[Array]) -> list[Jump]:
+def jumps_of(residuals: Sequence[Array], rules: SelectionRules) -> list[Jump]:
     """Jumps in residuals (n_i,) of recordings, in order; none where the level steps again and again."""
     found: list[Jump] = []
     for number, r in enumerate(residuals):
         if np.isfinite(r).sum() < 10 * SIDE:
             continue
-        own = _jumps(fill(r), number)
-        if len(own) > MOST:
+        own = _jumps(fill(r), number, rules)
+        if len(own) > rules.jumps_per_recording:
             return []
         found += own
     return found
 
 
-def _jumps(r: Array, number: int) -> list[Jump]:
+def _jumps(r: Array, number: int, rules: SelectionRules) -> list[Jump]:
     shift, abrupt = _shift(r, SIDE), _shift(r, NEAR)
     level = 1.4826 * float(np.median(np.abs(shift - np.median(shift)))) + 1e-300
     found: list[Jump] = []
-    left = np.where(np.abs(shift) > LEAST * np.maximum(level, _scatter(r)), np.abs(shift), 0.0)
-    while left.size and np.max(left) > 0.0 and len(found) <= MOST:
+    left = np.where(np.abs(shift) > rules.jump_deviations * np.maximum(level, _scatter(r)), np.abs(shift), 0.0)
+    while left.size and np.max(left) > 0.0 and len(found) <= rules.jumps_per_recording:
         place = int(np.argmax(left))
         at = place + SIDE  # first sample after it
         near = np.arange(max(at - SIDE // 2, NEAR), min(at + SIDE // 2, r.size - NEAR) + 1)  # medians are flat about it
         sizes = abrupt[near - NEAR] * np.sign(shift[place])
-        near = near[sizes > ABRUPT * left[place]]
+        near = near[sizes > rules.jump_abrupt_share * left[place]]
         if near.size:
             steps = (r[near] - r[near - 1]) * np.sign(shift[place])
             found.append(Jump(number, int(near[np.argmax(steps)]), float(shift[place])))

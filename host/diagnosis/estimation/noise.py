@@ -8,21 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.operators import fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 ORDER = 3
-SHORTEST = 30  # samples of a stretch that counts
-SETTLING = 3.0  # first halves' variance against that of the second ones, from which on an output is still settling
-SAME = 2e-3  # deviation of two inputs over their own, below which the one repeats the other
-ALIKE = 0.8  # correlation of a channel with itself, from which a period is looked for
-FEWEST_REPEATED = 200  # samples
 REPEATS = "differences between repeats"
-# A slow plant is on its way while its input rests: what remains of a straight line is smooth and far above white noise.
-UNDER_WAY, ABOVE = 0.8, 3.0  # correlation of neighbours, and ratio to the noise that the spectrum suggests
-HELD = 0.05  # share of third differences that are zero, from which on readings repeat and their median says nothing
-QUIETEST = 0.05  # part of the spectrum that is taken for noise where nothing rests
 
 
 @dataclass(frozen=True)
@@ -61,14 +53,17 @@ def autocovariance_of(ar: Array, length: int = 400) -> Array:
     return np.array([float(response @ response)])
 
 
-def quiescent(inputs: list[Array], dt_s: float, timed: bool) -> Mask:
-    """Samples at which no input has moved (beyond resolution and 0.2 % of range) for half a second around them."""
+def quiescent(inputs: list[Array], dt_s: float, timed: bool, rules: SelectionRules = RULES) -> Mask:
+    """Samples at which no input has moved (beyond resolution and a small share of range) for half a second around them.
+
+    rules: a nominal model that prepares a recording uses the defaults.
+    """
     half = max(5, round(0.25 / dt_s)) if timed else 5
     still = np.ones(inputs[0].size, dtype=bool)
     for values in inputs:
         line = fill(values)
         span = np.ptp(line)
-        limit = max(2.1 * quantum(values), 0.002 * span)
+        limit = max(rules.rest_resolution_steps * quantum(values), rules.rest_range_share * span)
         windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, half, mode="edge"), 2 * half + 1)
         still &= (windows.max(axis=1) - windows.min(axis=1)) <= limit
     return still
@@ -80,7 +75,7 @@ def runs(mask: Mask, shortest: int) -> list[slice]:
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= shortest]
 
 
-def repeated(inputs: list[list[Array]]) -> list[tuple[int, slice, int, slice]]:
+def repeated(inputs: list[list[Array]], rules: SelectionRules) -> list[tuple[int, slice, int, slice]]:
     """Stretches in which all inputs of one recording repeat those of another, or its own of a period before.
 
     inputs: of each recording, its channels (n_i,). Returns (recording, samples, recording, samples) of each pair.
@@ -88,20 +83,20 @@ def repeated(inputs: list[list[Array]]) -> list[tuple[int, slice, int, slice]]:
     found = []
     for a in range(len(inputs)):
         for b in range(a, len(inputs)):
-            lag = _lag(inputs[a][0], inputs[b][0], own=a == b)
+            lag = _lag(inputs[a][0], inputs[b][0], rules, own=a == b)
             if lag is None:
                 continue
             first = slice(max(lag, 0), min(inputs[a][0].size, inputs[b][0].size + lag))
             second = slice(first.start - lag, first.stop - lag)
-            alike = first.stop - first.start >= FEWEST_REPEATED and all(
-                _same(x[first], y[second]) for x, y in zip(inputs[a], inputs[b], strict=True)
+            alike = first.stop - first.start >= rules.input_repeat_samples and all(
+                _same(x[first], y[second], rules) for x, y in zip(inputs[a], inputs[b], strict=True)
             )
             if alike:
                 found.append((a, first, b, second))
     return found
 
 
-def _lag(x: Array, y: Array, own: bool) -> int | None:
+def _lag(x: Array, y: Array, rules: SelectionRules, own: bool) -> int | None:
     """Samples by which `x` (n,) comes after `y` (m,) where both run alike best; of one channel with itself, its period."""
     x, y = fill(x) - np.mean(fill(x)), fill(y) - np.mean(fill(y))
     if not np.any(x) or not np.any(y):
@@ -116,14 +111,15 @@ def _lag(x: Array, y: Array, own: bool) -> int | None:
     if not below.size:
         return None
     mean = across[:most] / (x.size - np.arange(most)) * x.size / across[0]
-    peaks = np.flatnonzero((mean[1:-1] >= mean[:-2]) & (mean[1:-1] >= mean[2:]) & (mean[1:-1] > ALIKE)) + 1
+    high = mean[1:-1] > rules.input_period_correlation
+    peaks = np.flatnonzero((mean[1:-1] >= mean[:-2]) & (mean[1:-1] >= mean[2:]) & high) + 1
     near = [lag for peak in peaks[peaks > below[0]] for lag in range(peak - 2, peak + 3)]
-    return next((int(lag) for lag in near if _same(x[lag:], x[:-lag])), None)
+    return next((int(lag) for lag in near if _same(x[lag:], x[:-lag], rules)), None)
 
 
-def _same(x: Array, y: Array) -> bool:
+def _same(x: Array, y: Array, rules: SelectionRules) -> bool:
     x, y = fill(x), fill(y)
-    return float(np.std(x - y)) <= SAME * float(np.std(x)) and float(np.std(x)) > 0.0
+    return float(np.std(x - y)) <= rules.input_repeat_deviation * float(np.std(x)) and float(np.std(x)) > 0.0
 
 
 def estimate(
@@ -131,30 +127,34 @@ def estimate(
     still: list[Mask],
     repeats: Sequence[tuple[int, slice, int, slice]] = (),
     simulated: bool = False,
+    rules: SelectionRules = RULES,
 ) -> Noise:
     """Noise of one channel from several recordings: of its quiescent parts, else of what does not repeat.
 
     outputs: (n_i,) of each recording; still: its quiescent samples; repeats: stretches that repeat others (`repeated`).
-    simulated: whether the output is that of a simulator, which may be slow.
+    simulated: whether the output is that of a simulator, which may be slow. rules: a nominal model that prepares a
+    recording uses the defaults.
     """
     stretches = [
         values[part]
         for values, mask in zip(outputs, still, strict=True)
-        for part in runs(mask & np.isfinite(values), SHORTEST)
+        for part in runs(mask & np.isfinite(values), rules.rest_shortest_samples)
     ]
     segments = []
-    for segment in _settled(stretches):
+    for segment in _settled(stretches, rules):
         line = np.polynomial.polynomial.polyfit(np.arange(segment.size), segment, 1)
         segments.append(segment - np.polynomial.polynomial.polyval(np.arange(segment.size), line))
     step = max((quantum(values) for values in outputs), default=0.0)
     noise_sd = step / np.sqrt(12.0)
     source = "quiescent parts"
-    if sum(segment.size for segment in segments) < 100:
+    if sum(segment.size for segment in segments) < rules.rest_fewest_samples:
         differences = [(outputs[a][p] - outputs[b][q]) / np.sqrt(2.0) for a, p, b, q in repeats]
-        segments = [d[part] - np.mean(d[part]) for d in differences for part in runs(np.isfinite(d), FEWEST_REPEATED)]
+        segments = [
+            d[part] - np.mean(d[part]) for d in differences for part in runs(np.isfinite(d), rules.input_repeat_samples)
+        ]
         source = REPEATS
     if not segments:
-        return _of_spectrum(outputs, noise_sd)
+        return _of_spectrum(outputs, noise_sd, rules)
     table = []
     for segment in segments:
         spread = 1.4826 * np.median(np.abs(segment - np.median(segment))) + 1e-300
@@ -162,28 +162,31 @@ def estimate(
         table.append([tame[: tame.size - k] @ tame[k:] / (tame.size - 2.0) for k in range(ORDER + 1)])
     lags = _typical(np.array(table), np.array([segment.size for segment in segments]))
     sigma = float(np.sqrt(max(lags[0], 0.0)))
-    if simulated and source != REPEATS and lags[1] > UNDER_WAY * lags[0] and sigma > ABOVE * _high_frequency(outputs):
-        return _of_spectrum(outputs, noise_sd)
+    # A slow plant is on its way while its input rests: what remains of a straight line is smooth and far above white noise.
+    smooth = lags[1] > rules.under_way_correlation * lags[0]
+    if simulated and source != REPEATS and smooth and sigma > rules.under_way_over_noise * _high_frequency(outputs, rules):
+        return _of_spectrum(outputs, noise_sd, rules)
     if sigma <= noise_sd:
         return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")
     return Noise(sigma, autoregression(lags), source)
 
 
-def _of_spectrum(outputs: list[Array], resolution: float) -> Noise:
+def _of_spectrum(outputs: list[Array], resolution: float, rules: SelectionRules) -> Noise:
     """Noise of which no sample was seen alone."""
-    level = max(_high_frequency(outputs), resolution, 1e-300)
+    level = max(_high_frequency(outputs, rules), resolution, 1e-300)
     return Noise(level, np.zeros(0), "quietest part of the spectrum (no quiescent part)")
 
 
-def _settled(stretches: list[Array]) -> list[Array]:
+def _settled(stretches: list[Array], rules: SelectionRules) -> list[Array]:
     """Without their first halves as long as these vary far more than the second ones, as they do where the inputs stand
     but the output is still on its way; too few to judge by are left as they are.
     """
     while len(stretches) >= 4:
         halves = [(segment[: segment.size // 2], segment[segment.size // 2 :]) for segment in stretches]
-        if np.median([np.var(first) / (np.var(second) + 1e-300) for first, second in halves]) < SETTLING:
+        ratios = [np.var(first) / (np.var(second) + 1e-300) for first, second in halves]
+        if np.median(ratios) < rules.settling_variance_ratio:
             break
-        stretches = [second for _, second in halves if second.size >= SHORTEST]
+        stretches = [second for _, second in halves if second.size >= rules.rest_shortest_samples]
     return stretches
 
 
@@ -207,7 +210,7 @@ def autoregression(lags: Array) -> Array:
     return np.asarray(solve_toeplitz(damped[:-1], damped[1:]))
 
 
-def _high_frequency(outputs: list[Array]) -> float:
+def _high_frequency(outputs: list[Array], rules: SelectionRules) -> float:
     """Standard deviation of white noise as strong as the quietest twentieth of the spectrum, or as the middling third
     difference, whichever is less.
 
@@ -225,10 +228,10 @@ def _high_frequency(outputs: list[Array]) -> float:
             size = min(256, line.size // 4)
             freedom = 2.0 * (1 + (line.size - size) // (size - size // 2))
             _, power = welch(line, fs=1.0, nperseg=size, window="blackman")
-            low = chi2.ppf(QUIETEST, freedom) / freedom
-            level = float(np.sqrt(0.5 * np.quantile(power[1:-1], QUIETEST) / low))
+            low = chi2.ppf(rules.quietest_share, freedom) / freedom
+            level = float(np.sqrt(0.5 * np.quantile(power[1:-1], rules.quietest_share) / low))
             steps = np.diff(line, 3)
-            if np.mean(steps == 0.0) < HELD:
+            if np.mean(steps == 0.0) < rules.held_reading_share:
                 level = min(level, 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(20.0))
             spread.append(level)
         elif np.count_nonzero(np.isfinite(values)) > 8:  # too short for a spectrum: third differences of what is smooth

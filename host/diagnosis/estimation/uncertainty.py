@@ -15,9 +15,6 @@ from host.diagnosis.estimation.fit import Fit, Problem, free, jacobian, size_of
 from host.diagnosis.model.findings import Finding
 
 Array = npt.NDArray[np.float64]
-DECADE = 10.0  # ratio of an interval's ends, from which a positive parameter counts as not seen
-UNSEEN = 0.1  # part of the largest contribution that half an interval of a signed parameter may move
-LARGER = 0.95  # chance below which scatter between recordings stays, if formulas are true
 
 
 def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[float, float]]:
@@ -45,7 +42,8 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     spread, freedom = _jackknife(_blocks(problem, J, base), prior)
     fine = np.maximum(quantile * even, stats.t.ppf(0.5 + 0.5 * level, freedom) * spread)
     coarse, count = _across_recordings(problem, fit, sizes, inverse)
-    scattered = coarse > stats.f.ppf(LARGER, count - 1, np.maximum(freedom, 2.0)) * (fine / quantile) ** 2
+    by_chance = stats.f.ppf(problem.rules.scatter_probability, count - 1, np.maximum(freedom, 2.0))
+    scattered = coarse > by_chance * (fine / quantile) ** 2
     wide = float(stats.t.ppf(0.5 + 0.5 * level, count - 1)) * np.sqrt(np.maximum(coarse, 0.0))
     widths = np.where(scattered, np.maximum(wide, fine), fine)
     out = [(float(v), float(v)) for v in fit.values]
@@ -63,10 +61,10 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
 def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> list[Finding]:
     """Nominal parameters that these recordings do not show: at a bound, or with an interval over a decade.
 
-    One that may be negative counts only where half its interval changes the outputs by more than UNSEEN of what the
-    parameter that contributes most does, and of what the outputs vary (the one that contributes most may be held).
+    One that may be negative counts only where half its interval changes the outputs by more than `undetermined_change` of
+    what the parameter that contributes most does, and of what the outputs vary (the one that contributes most may be held).
     """
-    parameters = problem.model.parameters
+    parameters, rules = problem.model.parameters, problem.rules
     sizes = [size_of(p, v) for p, v in zip(parameters, fit.values, strict=False)]
     base = problem.stacked(fit.terms, fit.values)
     moving = [index for index in free(problem.parameters(fit.terms)) if index < len(parameters)]
@@ -83,10 +81,12 @@ def uncertain(problem: Problem, fit: Fit, spans: list[tuple[float, float]]) -> l
     found = []
     for index in moving:
         p, value, (low, high) = parameters[index], float(fit.values[index]), spans[index]
-        at_bound = p.log and (value <= 1.01 * p.low or value >= 0.99 * p.high)
-        wide = low * high <= 0.0 or low / high <= 1.0 / DECADE or low / high >= DECADE
+        near = rules.nominal_bound_share
+        at_bound = p.log and (value <= (1.0 + near) * p.low or value >= (1.0 - near) * p.high)
+        widest = rules.undetermined_ratio
+        wide = low * high <= 0.0 or low / high <= 1.0 / widest or low / high >= widest
         if not p.log:
-            wide = wide and 0.5 * (high - low) * rates[index] > UNSEEN * varied
+            wide = wide and 0.5 * (high - low) * rates[index] > rules.undetermined_change * varied
         if at_bound or wide:
             where = "ended at a bound" if at_bound else "can be anything"
             says = f"The nominal parameter {p.name} {where} from {low:.3g} to {high:.3g} {p.unit}".rstrip()

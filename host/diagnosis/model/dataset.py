@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from host.diagnosis.model.rig_recording import rig_rows
 from host.diagnosis.model.tables import Table, is_table, read_table
@@ -21,8 +22,6 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 BLOCKS_OF_A_LONE_RECORDING = 10
-FEWEST_ROWS = 50  # of a recording
-GAP_SAMPLES = 10  # missing in a row in every channel, beyond which an input cannot be bridged by a line
 # Of an even grid: points for each row, and points in all, above which its gaps are cut short.
 MOST_EMPTY, LARGEST_GRID = 10, 1_000_000
 
@@ -95,10 +94,12 @@ def _separated(table: Table, by: str | None) -> list[Table]:
     ]
 
 
-def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec], optional: set[str]) -> list[Recording]:
+def load(
+    spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec], optional: set[str], rules: DataRules
+) -> list[Recording]:
     """Recordings of `tables`; `needed`: the channels of the model; those in `optional` may be absent. Raises InputError."""
     segments: list[Recording] = []
-    wholes = [_one(spec, table.name, table.columns, needed, optional) for table in tables]
+    wholes = [_one(spec, table, needed, optional, rules) for table in tables]
     shared = one_clock(wholes)
     first = min(whole.time_s[0] for whole in wholes)
     for whole in wholes:
@@ -108,21 +109,21 @@ def load(spec: NominalSpec, tables: list[Table], needed: dict[str, ChannelSpec],
         segments += [
             _cut(whole, segment.name, segment.rows[0], segment.rows[1], lead=spec.data.lead_rows) for segment in cuts
         ] or [whole]
-    parts = [part for segment in segments for part in _at_gaps(segment)]
+    parts = [part for segment in segments for part in _at_gaps(segment, rules)]
     return _split(_named_apart(parts), spec.data.heldout)
 
 
-def _at_gaps(segment: Recording) -> list[Recording]:
-    """The recording, cut where nothing was recorded for more than GAP_SAMPLES.
+def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
+    """The recording, cut where nothing was recorded for more than `gap_samples`.
 
     What went in there is not known, so neither is the state behind it: each part is simulated from a state of its own.
-    Time runs on. Parts of fewer than FEWEST_ROWS are left out, unless there is no other.
+    Time runs on. Parts of fewer than `least_rows` are left out, unless there is no other.
     """
     seen = np.any([np.isfinite(values) for values in segment.channels.values()], axis=0)
     rows = np.flatnonzero(seen)
     if rows.size == 0:
         return [segment]
-    ends = np.flatnonzero(np.diff(rows) > GAP_SAMPLES)
+    ends = np.flatnonzero(np.diff(rows) > rules.gap_samples)
     if ends.size == 0:
         return [segment]
     firsts, lasts = [rows[0], *rows[ends + 1]], [*rows[ends], rows[-1]]
@@ -130,7 +131,7 @@ def _at_gaps(segment: Recording) -> list[Recording]:
     for first, last in zip(firsts, lasts, strict=True):
         part = slice(int(first), int(last) + 1)
         used = segment.fit[part].any() or not segment.fit.any()
-        if last + 1 - first >= FEWEST_ROWS and used:
+        if last + 1 - first >= rules.least_rows and used:
             channels = {name: values[part] for name, values in segment.channels.items()}
             fit, heldout = segment.fit[part], segment.heldout[part]
             parts.append(replace(segment, time_s=segment.time_s[part], channels=channels, fit=fit, heldout=heldout))
@@ -153,9 +154,8 @@ def one_clock(recordings: list[Recording]) -> bool:
     return len(spans) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(spans))
 
 
-def _one(
-    spec: NominalSpec, name: str, columns: dict[str, Array], needed: dict[str, ChannelSpec], optional: set[str]
-) -> Recording:
+def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], optional: set[str], rules: DataRules) -> Recording:
+    name, columns = table.name, table.columns
     channels = {}
     for key, channel in needed.items():
         if channel.column in columns:
@@ -166,8 +166,8 @@ def _one(
     short = [key for key, values in channels.items() if values.size != n]
     if short:
         raise InputError(f"channels.{short[0]}", f"{channels[short[0]].size} rows in {name}", f"{n} rows")
-    if n < FEWEST_ROWS:
-        raise InputError("recording", f"{n} rows in {name}", f"at least {FEWEST_ROWS} rows")
+    if n < rules.least_rows:
+        raise InputError("recording", f"{n} rows in {name}", f"at least {rules.least_rows} rows")
     infinite = tuple(key for key, values in channels.items() if np.isinf(values).any())
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
     time_s, timed = _time_line(spec, name, columns, n)
@@ -175,8 +175,8 @@ def _one(
     if dt_s <= 0.0:
         raise InputError("data.time", f"more than half of the stamps of {name} repeat", "seconds that increase")
     jitter = float(np.max(np.abs(np.diff(time_s) - dt_s))) / dt_s
-    if timed and jitter > 0.2:
-        time_s, channels = _even(time_s, dt_s, channels, spec.held_inputs)
+    if timed and jitter > rules.uneven_period_share:
+        time_s, channels = _even(time_s, dt_s, channels, spec.held_inputs, rules.gap_samples)
     nothing = np.zeros(time_s.size, dtype=bool)
     units = {key: channel.unit for key, channel in needed.items()}
     return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter, infinite=infinite)
@@ -197,12 +197,12 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
     return np.arange(n, dtype=np.float64), False
 
 
-def _grid(time_s: Array, dt_s: float) -> Array:
+def _grid(time_s: Array, dt_s: float, gap_samples: int) -> Array:
     """Even grid over the stamps. Where gaps are most of it, as between two days in one file, they are cut short."""
     if (time_s[-1] - time_s[0]) / dt_s <= max(MOST_EMPTY * time_s.size, LARGEST_GRID):
         return np.asarray(np.arange(time_s[0], time_s[-1] + 0.5 * dt_s, dt_s))
-    empty = dt_s * np.arange(-GAP_SAMPLES - 1, 0)  # enough for the recording to be divided there
-    ends = np.flatnonzero(np.diff(time_s) > 2.0 * (GAP_SAMPLES + 2) * dt_s)
+    empty = dt_s * np.arange(-gap_samples - 1, 0)  # enough for the recording to be divided there
+    ends = np.flatnonzero(np.diff(time_s) > 2.0 * (gap_samples + 2) * dt_s)
     parts = []
     for first, last in zip([0, *(ends + 1)], [*ends, time_s.size - 1], strict=True):
         parts += [time_s[first] + empty] if first else []
@@ -210,13 +210,15 @@ def _grid(time_s: Array, dt_s: float) -> Array:
     return np.concatenate(parts)
 
 
-def _even(time_s: Array, dt_s: float, channels: dict[str, Array], held: tuple[str, ...]) -> tuple[Array, dict[str, Array]]:
+def _even(
+    time_s: Array, dt_s: float, channels: dict[str, Array], held: tuple[str, ...], gap_samples: int
+) -> tuple[Array, dict[str, Array]]:
     """Even grid; a grid point further than one and a half periods from any sample stays missing.
 
     held: channels that keep their value from each stamp to the next. Their grid has the mean over each period, so that what
     integrates them goes as far as it went; a line between two samples would begin a step before its stamp.
     """
-    grid = _grid(time_s, dt_s)
+    grid = _grid(time_s, dt_s, gap_samples)
     after = np.clip(np.searchsorted(time_s, grid), 1, time_s.size - 1)
     hole = (time_s[after] - time_s[after - 1]) > 3.0 * dt_s
     even = {}

@@ -7,23 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.operators import constant_speed, fill, quantum
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Places = npt.NDArray[np.int64]
-
-ALONE = 12.0  # noise standard deviations from the median of the neighbours, and
-LOCAL = 8.0  # local spreads, from which a sample stands alone
-MOVES = 5.0  # deviations of the other samples over noise, from which a channel carries a motion and no single blows
-CODES = 3  # returns to the same value, from which that is a code for a lost reading
-LONGEST_CODE = 50  # samples in a row of such a code
-COARSEST = 1000.0  # steps in the range of a channel, below which its resolution is said
-FEWEST_READINGS = 20  # of a channel that repeats them, below which nothing is said
-REGULAR = 0.9  # share of its readings that last equally long, to a sample or a multiple, from which on it repeats them
-FINE_STEPS = 4.0  # smallest changes between two readings, below which what stays the same is a coarse reading
-FEW_LEVELS = 20  # levels up to which a channel may be a switched signal
 
 
 @dataclass(frozen=True)
@@ -37,14 +27,15 @@ class Finding:
     says: str
 
 
-def wild(values: Array, sigma: float) -> Mask:
+def wild(values: Array, sigma: float, rules: DataRules) -> Mask:
     """Samples of `values` (n,) that stand alone, far from the median of their seven neighbours. sigma: noise."""
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(fill(values), 3, mode="reflect"), 7)
     middle = np.median(windows, axis=1)
     spread = np.sort(np.abs(windows - middle[:, None]), axis=1)[:, 4]
     away = np.abs(fill(values) - middle)
-    step = resolution(values, switched=False)
-    return np.asarray((away > ALONE * sigma + LOCAL * spread) & (away > 2.5 * step) & np.isfinite(values))
+    far = away > rules.outlier_noise_deviations * sigma + rules.outlier_local_spreads * spread
+    step = resolution(values, rules, switched=False)
+    return np.asarray(far & (away > rules.outlier_resolution_steps * step) & np.isfinite(values))
 
 
 def scatter(values: Array) -> float:
@@ -57,26 +48,28 @@ def scatter(values: Array) -> float:
     return float(1.4826 * max(about, bends))
 
 
-def lost(values: Array) -> Mask:
+def lost(values: Array, rules: DataRules) -> Mask:
     """Samples of a code for a lost reading: one value, again and again, that the channel jumps to and back from."""
     line = fill(values)
     step = np.abs(np.diff(line))
     moved = step[step > 0.0]
     if moved.size < 10:
         return np.zeros(line.size, dtype=bool)
-    far = max(ALONE * float(np.median(moved)), 4.0 * float(np.quantile(moved, 0.9)))
+    far = rules.outlier_noise_deviations * float(np.median(moved))
+    far = max(far, rules.lost_jump_ratio * float(np.quantile(moved, 0.9)))
+    longest = rules.lost_code_samples
     starts = np.flatnonzero(step > far) + 1
     found = np.zeros(line.size, dtype=bool)
     codes: dict[float, list[slice]] = {}
     for first in starts:
         last = first
-        while last < line.size and last - first <= LONGEST_CODE and line[last] == line[first]:
+        while last < line.size and last - first <= longest and line[last] == line[first]:
             last += 1
-        ends = last < line.size and last - first <= LONGEST_CODE and abs(line[last] - line[first]) > far
+        ends = last < line.size and last - first <= longest and abs(line[last] - line[first]) > far
         if ends and (line[last] - line[first]) * (line[first - 1] - line[first]) > 0.0:
             codes.setdefault(float(line[first]), []).append(slice(int(first), int(last)))
     for spans in codes.values():
-        if len(spans) >= CODES:
+        if len(spans) >= rules.lost_code_returns:
             for span in spans:
                 found[span] = True
     ordinary = np.count_nonzero(~found) > 0.5 * line.size
@@ -84,7 +77,7 @@ def lost(values: Array) -> Mask:
 
 
 def without_outliers(
-    recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding]
+    recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding], rules: DataRules
 ) -> list[Recording]:
     """Recordings in which samples of the channels `names` that are no readings are missing; a finding says how many.
 
@@ -96,15 +89,15 @@ def without_outliers(
         cleaned = []
         for recording in recordings:
             values = recording.channels.get(name)
-            if values is None or np.count_nonzero(np.isfinite(values)) < 50:
+            if values is None or np.count_nonzero(np.isfinite(values)) < rules.outlier_fewest_samples:
                 cleaned.append(recording)
                 continue
             noise = scatter(values)
-            bad = wild(values, noise)
+            bad = wild(values, noise, rules)
             rest = np.where(bad, np.nan, values)
-            if float(np.nanstd(rest)) <= MOVES * noise:
+            if float(np.nanstd(rest)) <= rules.motion_over_noise * noise:
                 bad = np.zeros(values.size, dtype=bool)
-            bad |= lost(values)
+            bad |= lost(values, rules)
             if bad.any():
                 where = recording.begin_s + float(recording.time_s[int(np.argmax(bad))])
                 unit = "s" if recording.timed else "samples"
@@ -121,14 +114,14 @@ def without_outliers(
     return recordings
 
 
-def resolution(values: Array, switched: bool) -> float:
+def resolution(values: Array, rules: DataRules, switched: bool) -> float:
     """Step in which a channel reads, 0 if it is not visibly coarse. switched: few levels may be meant."""
     step = quantum(values)
     if step > 0.0:
         return step
     good = values[np.isfinite(values)]
     levels = np.unique(good)
-    if switched or not 3 <= levels.size <= FEW_LEVELS or good.size < 10 * levels.size:
+    if switched or not 3 <= levels.size <= rules.switched_levels or good.size < 10 * levels.size:
         return 0.0
     steps = np.diff(levels)
     smallest = float(np.min(steps))
@@ -136,21 +129,23 @@ def resolution(values: Array, switched: bool) -> float:
     return smallest if bool(even.all()) and not constant_speed(values, smallest) else 0.0
 
 
-def repeated(values: Array) -> Places | None:
+def repeated(values: Array, rules: DataRules) -> Places | None:
     """Sample (n,) whose reading each sample of `values` (n,) repeats, where a sensor is read more seldom than it is logged.
 
     None where readings do not last equally long: a coarse reading stays the same for as long as the motion is slow.
     """
     new = np.concatenate(([0], np.flatnonzero(np.diff(values) != 0.0) + 1))
     lasts = np.diff(new)
-    if lasts.size < FEWEST_READINGS:
+    if lasts.size < rules.repeated_fewest_readings:
         return None
     period = int(np.median(lasts))
     if period < 2:
         return None
     regular = np.abs(lasts - period * np.maximum(np.round(lasts / period), 1)) <= 1
     steps = np.abs(np.diff(values[new]))
-    if np.mean(regular) < REGULAR or float(np.nanmedian(steps)) < FINE_STEPS * float(np.nanmin(steps)):
+    if np.mean(regular) < rules.repeated_regular_share:
+        return None
+    if float(np.nanmedian(steps)) < rules.repeated_fine_steps * float(np.nanmin(steps)):
         return None
     return np.asarray(new[np.searchsorted(new, np.arange(values.size), side="right") - 1])
 
@@ -162,15 +157,16 @@ def coarse(
     columns: dict[str, str],
     units: dict[str, str],
     findings: list[Finding],
+    rules: DataRules,
 ) -> None:
-    """Channels that read in steps, of which fewer than `COARSEST` make their range. driven: outputs, whose few levels are
-    not meant.
+    """Channels that read in steps, of which fewer than `resolution_steps` make their range. driven: outputs, whose few
+    levels are not meant.
     """
     for name in names:
         found = [r.channels[name] for r in recordings if name in r.channels and np.isfinite(r.channels[name]).any()]
-        steps = [resolution(values, name not in driven) for values in found]
+        steps = [resolution(values, rules, name not in driven) for values in found]
         spans = [float(np.nanmax(values) - np.nanmin(values)) for values in found]
-        if not steps or min(steps) <= 0.0 or max(spans) > COARSEST * max(steps):
+        if not steps or min(steps) <= 0.0 or max(spans) > rules.resolution_steps * max(steps):
             continue
         step, column, unit = max(steps), columns.get(name, name), units.get(name, "")
         says = f"Column {column} reads in steps of {step:.4g} {unit}".rstrip()
@@ -178,7 +174,9 @@ def coarse(
         findings.append(Finding("quantized", column, says))
 
 
-def counts(recordings: list[Recording], names: list[str], columns: dict[str, str], units: dict[str, str]) -> list[str]:
+def counts(
+    recordings: list[Recording], names: list[str], columns: dict[str, str], units: dict[str, str], rules: DataRules
+) -> list[str]:
     """Channels that hold whole numbers only, many of them, though their unit is none of whole numbers."""
     found = []
     for name in names:
@@ -187,7 +185,7 @@ def counts(recordings: list[Recording], names: list[str], columns: dict[str, str
         whole = together.size > 0 and bool(np.all(together == np.round(together)))
         if (
             whole
-            and np.unique(together).size > FEW_LEVELS
+            and np.unique(together).size > rules.switched_levels
             and units.get(name, "") in ("rad", "m", "m/s", "m/s2", "N", "N m")
         ):
             found.append(name)

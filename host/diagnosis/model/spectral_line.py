@@ -16,12 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import median_filter
 
+from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 AROUND = 41  # bins of which the median is the level of the noise
-SIGNIFICANCE = 1e-4  # over all bins of all recordings
-LEAST_SHARE = 0.05  # of the variance of the residual that is in the line
 FEWEST = 4 * AROUND  # samples
 
 
@@ -34,11 +33,16 @@ class Tone:
 
 
 def common_line(
-    residuals: Sequence[Array], inputs: Sequence[Sequence[Array]], simulated: Sequence[Array], periods_s: Sequence[float]
+    residuals: Sequence[Array],
+    inputs: Sequence[Sequence[Array]],
+    simulated: Sequence[Array],
+    periods_s: Sequence[float],
+    rules: DataRules = DataRules(),
 ) -> Tone | None:
     """The line at one frequency in all residuals (n_i,) that no input (n_i,) of its recording has; None if there is none.
 
-    simulated: output (n_i,) of each recording; it moves less than the residual at that frequency.
+    simulated: output (n_i,) of each recording; it moves less than the residual at that frequency. rules: an effect that
+    reads its start values from a residual uses the defaults.
     """
     if not residuals or min(int(np.isfinite(r).sum()) for r in residuals) < FEWEST:
         return None
@@ -48,7 +52,7 @@ def common_line(
         x = fill(r)
         over = _over_level(x)
         bin_ = int(np.argmax(over))
-        limit = np.log(count / SIGNIFICANCE)
+        limit = np.log(count / rules.line_significance)
         if over[bin_] < limit or any(np.max(_over_level(fill(u))[max(bin_ - 1, 0) : bin_ + 2]) > limit for u in own):
             return None
         near = slice(max(bin_ - 2, 0), bin_ + 3)
@@ -59,14 +63,15 @@ def common_line(
     widest = max(1.0 / (r.size * dt_s) for r, dt_s in zip(residuals, periods_s, strict=True))
     amplitude = float(np.sqrt(np.mean([each.amplitude**2 for each in found])))
     share = 0.5 * amplitude**2 / float(np.nanvar(np.concatenate(residuals)))
-    return Tone(float(np.mean(hertz)), amplitude) if np.ptp(hertz) < widest and share > LEAST_SHARE else None
+    return Tone(float(np.mean(hertz)), amplitude) if np.ptp(hertz) < widest and share > rules.line_variance_share else None
 
 
-def stands_out(x: Array, frequency_Hz: float, dt_s: float) -> bool:
+def stands_out(x: Array, frequency_Hz: float, dt_s: float, rules: DataRules = DataRules()) -> bool:
     """Whether the spectrum of `x` (n,) has a line at `frequency_Hz`."""
     bin_ = round(frequency_Hz * x.size * dt_s)
     near = _over_level(x)[max(bin_ - 1, 0) : bin_ + 2]
-    return x.size >= FEWEST and near.size > 0 and float(np.max(near)) > float(np.log(x.size / 2 / SIGNIFICANCE))
+    limit = float(np.log(x.size / 2 / rules.line_significance))
+    return x.size >= FEWEST and near.size > 0 and float(np.max(near)) > limit
 
 
 def distorted(x: Array) -> list[Array]:

@@ -111,7 +111,9 @@ def over_time(result: Diagnosis) -> ReportFigure:
     y = segment.y[row] / size
     nominal = y - result.found.nominal_full.residuals[index][row] / size
     best = y - result.found.best_full.residuals[index][row] / size
-    spans = joined([span for place in result.located for span in place.windows_s[segment.recording.name]])
+    spans = joined(
+        [span for place in result.located for span in place.windows_s[segment.recording.name]], result.problem.rules
+    )
     noise_sd = result.figures.noise_sd[row] / size
 
     def draw(figure: Figure, narrow: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from host.diagnosis.design.experiment import lines as experiment_lines
-from host.diagnosis.estimation.rules import RULES
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, alike_everywhere, memory_keys
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import NominalSpec
@@ -22,9 +22,6 @@ from host.diagnosis.selection.posterior import Posterior, calibrated, of_refused
 # Findings on what these data cannot decide, the most important one first.
 UNDECIDED = ("line", "noise_fed_back", "slow_noise", "noise_unseen", "within_sample", "excitation")
 REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  # findings that ask for no change of the data
-NOT_WHITE = 1e-3  # p-value of held-out whiteness below which the residual is reported not to be noise
-WORSE = 1.05  # ratio of held-out errors, from which one counts as worse
-PARTLY = 0.05  # share of the mismatch left, from which on a verdict says so
 
 
 def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
@@ -76,7 +73,7 @@ def worse(result: Diagnosis) -> list[str]:
     for recording, channels in per_recording(result).items():
         for channel, error in channels.items():
             before, after, unit = error["rmse_before"], error["rmse_after"], units[channel]
-            if after > WORSE * before:
+            if after > result.problem.rules.worse_error_ratio * before:
                 says = f"{channel} in {recording}: held-out RMS error {before:.3g} {unit} before, {after:.3g} {unit} with"
                 found.append(says + " the effects.")
     return found
@@ -198,7 +195,7 @@ def words(effect_id: str) -> str:
     return effect_id.replace("_", " ")
 
 
-def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
+def without_fit(findings: list[Finding], rules: SelectionRules, seconds: float) -> dict[str, Any]:
     """The verdict on recordings in which there is nothing to compare: findings about the data, no physics."""
     nothing = dict.fromkeys(("rmse_before", "rmse_after", "noise_floor", "whiteness_p_before", "whiteness_p_after"))
     return {
@@ -206,7 +203,7 @@ def without_fit(findings: list[Finding], seconds: float) -> dict[str, Any]:
         "located": [],
         "data_findings": [finding_json(finding) for finding in findings],
         "probability_none": 1.0,
-        "rules": RULES.as_dict(),
+        "rules": rules.as_dict(),
         "effects": [],
         "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
         "worse": [],
@@ -258,7 +255,7 @@ def _located(location: Location, result: Diagnosis) -> dict[str, Any]:
         "windows_unit": "s" if result.full.segments[0].recording.timed else "samples",
         "subsystem": location.subsystem,
         "channels": location.channels,
-        "windows_s": every_window(location),
+        "windows_s": every_window(location, result.problem.rules),
         "windows_by_recording": {name: [list(span) for span in spans] for name, spans in location.windows_s.items()},
         "condition": location.condition.says if location.condition else "all along",
         "residual_share": location.residual_share,
@@ -288,11 +285,12 @@ def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
     return found
 
 
-def every_window(location: Location) -> list[list[float]]:
+def every_window(location: Location, rules: SelectionRules) -> list[list[float]]:
     """Windows of all recordings in order, those that overlap made one: recordings may lie on one clock, or each start
     at zero.
     """
-    return [list(span) for span in joined([span for spans in location.windows_s.values() for span in spans])]
+    spans = [span for each in location.windows_s.values() for span in each]
+    return [list(span) for span in joined(spans, rules)]
 
 
 def effects(result: Diagnosis) -> list[dict[str, Any]]:
@@ -305,8 +303,8 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
         at += count
         entries.append((standing.gain.log_likelihood, _effect(result, term.parameters, values, spans, standing)))
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
-    white = result.figures.white_after[result.figures.primary] > NOT_WHITE
-    if ranked and result.remainder.sure and result.remainder.share > PARTLY:
+    white = result.figures.white_after[result.figures.primary] > result.problem.rules.white_significance
+    if ranked and result.remainder.sure and result.remainder.share > result.problem.rules.partly_explained_share:
         ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result.remainder.share)}."
     elif ranked and not white:
         figures = result.figures

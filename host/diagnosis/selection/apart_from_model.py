@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
@@ -24,8 +25,6 @@ from host.diagnosis.model.readings import Finding
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 NEAR = 3  # samples about a jump of an input: half of the neighbours by which a sample is judged
-MOST_IN_ONE = 0.6  # share of what a signal moves in these samples that one step makes: a smooth turning point has 0.56
-OVER = 2.0  # times what the output moves there: an error of the timing leaves one, one of the gain no more than another
 STILL = 1e-9  # of a signal's range, below which it does not move
 
 
@@ -34,21 +33,26 @@ def outliers_of_residual(full: Problem, fit: Fit, recordings: Sequence[Recording
 
     full: the problem at the rate that was recorded. Only outputs that are compared as they were read are examined.
     """
+    rules = full.rules
     counts = dict.fromkeys((output.channel for output in full.model.outputs), 0)
     totals, first = dict(counts), dict.fromkeys(counts, "")
     cleaned = []
     for segment, recording in zip(full.segments, recordings, strict=True):
         left = full.left(segment, fit.terms, fit.values)
-        jumps = _jumps(segment, full.model.quiet_inputs)
+        jumps = _jumps(segment, full.model.quiet_inputs, rules)
         for row, output in enumerate(full.model.outputs):
             values = recording.channels.get(output.channel)
-            if values is None or not _as_read(segment.y[row], values) or np.isfinite(left[row]).sum() < 50:
+            if (
+                values is None
+                or not _as_read(segment.y[row], values)
+                or np.isfinite(left[row]).sum() < rules.data.outlier_fewest_samples
+            ):
                 continue
             noise = readings.scatter(left[row])
-            alone = ~jumps | (np.abs(left[row]) > OVER * _span(values - left[row]))
-            bad = readings.wild(left[row], noise) & np.isfinite(values) & alone
+            alone = ~jumps | (np.abs(left[row]) > rules.input_jump_over_output * _span(values - left[row]))
+            bad = readings.wild(left[row], noise, rules.data) & np.isfinite(values) & alone
             rest = np.where(bad, np.nan, values)
-            if float(np.nanstd(rest)) <= readings.MOVES * noise:
+            if float(np.nanstd(rest)) <= rules.data.motion_over_noise * noise:
                 continue  # it may be blows that are meant, as in a channel by itself
             totals[output.channel] += values.size
             if bad.any():
@@ -75,7 +79,7 @@ def _as_read(y: Array, values: Array) -> bool:
     return y.size == values.size and bool(both.any()) and bool(np.array_equal(y[both], values[both]))
 
 
-def _jumps(segment: Segment, inputs: Sequence[str]) -> Mask:
+def _jumps(segment: Segment, inputs: Sequence[str], rules: SelectionRules) -> Mask:
     """Samples (n,) about which an input jumps: one step makes most of all that it moves there."""
     found = np.zeros(segment.n, dtype=bool)
     for name in inputs:
@@ -86,7 +90,7 @@ def _jumps(segment: Segment, inputs: Sequence[str]) -> Mask:
         windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, NEAR, mode="edge"), 2 * NEAR + 1)
         span = windows.max(axis=1) - windows.min(axis=1)
         step = np.max(np.abs(np.diff(windows, axis=1)), axis=1)
-        found |= (step > MOST_IN_ONE * span) & (span > STILL * float(np.ptp(line)))
+        found |= (step > rules.input_jump_share * span) & (span > STILL * float(np.ptp(line)))
     return found
 
 

@@ -13,9 +13,6 @@ from host.diagnosis.model.readings import Finding
 
 Array = npt.NDArray[np.float64]
 
-LEFT = 0.1  # share of the mismatch's power above noise that recordings may leave, each with its own parameters
-FEWEST = 50  # samples of a recording per parameter
-
 
 @dataclass(frozen=True)
 class Apart:
@@ -37,7 +34,7 @@ def unlike_recordings(problem: Problem, nominal: Fit, noise_sd: Array) -> list[F
     moving = free(list(problem.model.parameters))
     if len(problem.segments) < 2 or not moving:
         return []
-    if min(segment.n for segment in problem.segments) < FEWEST * len(moving):
+    if min(segment.n for segment in problem.segments) < problem.rules.session_samples_per_parameter * len(moving):
         return []
     apart = _apart(problem, nominal, noise_sd)
     if apart is None:
@@ -80,7 +77,7 @@ def _apart(problem: Problem, nominal: Fit, noise_sd: Array) -> Apart | None:
         fits.append(fit)
         residuals += fit.residuals
         left = _levels(problem, residuals)
-        if left[row] ** 2 - noise_sd[row] ** 2 > LEFT * excess[row]:
+        if left[row] ** 2 - noise_sd[row] ** 2 > problem.rules.session_residual_share * excess[row]:
             set_starts(problem, begun)
             return None
         spans.append(tuple(intervals(alone, fit)))

@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import whiteness
 from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill, white_level
 
 Array = npt.NDArray[np.float64]
-ROUNDED = 1.15  # residual over that of rounding to the resolution, which is not white while a motion is slow
 
 
 def at_white_noise(problem: Problem, fit: Fit) -> bool:
@@ -26,19 +26,20 @@ def at_white_noise(problem: Problem, fit: Fit) -> bool:
     A reading in steps is explained if its residual is no larger than that of rounding. The residual of a model with effects
     need not be white.
     """
-    levels = [_levels(segment, r) for segment, r in zip(problem.segments, fit.residuals, strict=True)]
+    rules = problem.rules
+    levels = [_levels(segment, r, rules) for segment, r in zip(problem.segments, fit.residuals, strict=True)]
     if fit.terms:
-        return all(bool(np.all(level <= problem.rules.simulated_over_noise)) for level in levels)
-    if not all(bool(np.all(level <= problem.rules.simulated_over_noise_nominal)) for level in levels):
+        return all(bool(np.all(level <= rules.simulated_over_noise)) for level in levels)
+    if not all(bool(np.all(level <= rules.simulated_over_noise_nominal)) for level in levels):
         return False
     for row in range(len(problem.noise)):
-        rounded = [_rms(r[row]) <= _rounding(s)[row] for s, r in zip(problem.segments, fit.residuals, strict=True)]
+        rounded = [_rms(r[row]) <= _rounding(s, rules)[row] for s, r in zip(problem.segments, fit.residuals, strict=True)]
         scaled = [
-            r[row] / (problem.rules.simulated_over_noise_nominal * white_level(fill(s.y[row])))
+            r[row] / (rules.simulated_over_noise_nominal * white_level(fill(s.y[row])))
             for s, r, coarse in zip(problem.segments, fit.residuals, rounded, strict=True)
             if not coarse
         ]
-        if whiteness(scaled, [np.isfinite(r) for r in scaled]) < problem.rules.simulated_whiteness:
+        if whiteness(scaled, [np.isfinite(r) for r in scaled]) < rules.simulated_whiteness:
             return False
     return True
 
@@ -46,20 +47,23 @@ def at_white_noise(problem: Problem, fit: Fit) -> bool:
 def ran_away(problem: Problem, fit: Fit) -> bool:
     """Whether the residual of the nominal `fit` is beyond what single effects leave, in every recording."""
     return all(
-        bool(np.any(_levels(segment, r) > problem.rules.ran_away_over_noise))
+        bool(np.any(_levels(segment, r, problem.rules) > problem.rules.ran_away_over_noise))
         for segment, r in zip(problem.segments, fit.residuals, strict=True)
     )
 
 
-def _levels(segment: Segment, residuals: Array) -> Array:
+def _levels(segment: Segment, residuals: Array, rules: SelectionRules) -> Array:
     """Residual RMS over white noise, of each output (outputs,)."""
-    noise = [max(white_level(fill(y)), coarse, 1e-300) for y, coarse in zip(segment.y, _rounding(segment), strict=True)]
+    rounding = _rounding(segment, rules)
+    noise = [max(white_level(fill(y)), coarse, 1e-300) for y, coarse in zip(segment.y, rounding, strict=True)]
     return np.array([_rms(r) for r in residuals]) / np.array(noise)
 
 
-def _rounding(segment: Segment) -> Array:
+def _rounding(segment: Segment, rules: SelectionRules) -> Array:
     """RMS of the residual that rounding of each output (outputs,) explains."""
-    return np.zeros(len(segment.y)) if segment.resolution is None else ROUNDED * segment.resolution
+    if segment.resolution is None:
+        return np.zeros(len(segment.y))
+    return rules.simulated_over_rounding * segment.resolution
 
 
 def _rms(r: Array) -> float:

@@ -48,8 +48,8 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         if terms:
             less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
             set_starts(problem, begun)
-        gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd)
-        both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
+        gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd, problem.rules)
+        both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
         crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
         gain = crossed or gain
         alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
@@ -92,7 +92,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         step = next(s for s in found.steps if any(t.candidate.key == rival.key for t in s.trials))
         trial = next(t for t in step.trials if t.candidate.key == rival.key)
         other = _with_rival(problem, found.best, standing[k].candidate, trial)
-        ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd)
+        ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd, problem.rules)
         likelier = coarse(ahead, other.fitted - before.fitted, problem.rules) > 0.0
         if other.names in seen or not likelier or at_bound(other):
             set_starts(problem, begun)
@@ -121,7 +121,7 @@ def _pairs(problem: Problem, found: Found, candidate: Candidate, noise_sd: Array
     for pair in found.pairs:
         if candidate in [term.candidate for term in pair.terms]:
             return []  # another effect was named when they were compared
-        ahead = compare(problem.segments, "both", pair.residuals, found.best.residuals, noise_sd)
+        ahead = compare(problem.segments, "both", pair.residuals, found.best.residuals, noise_sd, problem.rules)
         if ahead.log_likelihood < problem.rules.equal_log_likelihood:
             difference = coarse(ahead, found.best.fitted - pair.fitted, problem.rules) + float(np.log(len(pair.terms)))
             parts += [(term.candidate, difference) for term in pair.terms]
@@ -200,7 +200,7 @@ def _rests_on(problem: Problem, less: Fit, best: Fit, noise_sd: Array, parameter
         keep = [k for k in range(len(problem.segments)) if k != left_out]
         segments = [problem.segments[k] for k in keep]
         before, after = [less.residuals[k] for k in keep], [best.residuals[k] for k in keep]
-        gain = compare(segments, "both", before, after, noise_sd).log_likelihood if keep else 0.0
+        gain = compare(segments, "both", before, after, noise_sd, problem.rules).log_likelihood if keep else 0.0
         gains.append((gain, segment.recording.name))
     gain, name = min(gains)
     return name if gain < needed else ""
@@ -230,7 +230,7 @@ def _better_said(
     if candidate.effect.searched:
         return ()
     for trial in equations_for(problem, less, candidate.port, noise_sd):
-        behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd)
+        behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd, problem.rules)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
             # its form was chosen among hundreds: it is no simpler than an effect with more parameters
             more = max(trial.fit.fitted - found.best.fitted, 0)
@@ -268,9 +268,9 @@ def _equals(
             continue
         if at_bound(other) and other.fitted > best.fitted:
             continue  # its further parameter ended at a bound, so it says what the simpler one says
-        ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd)
-        held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd)
-        rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd)
+        ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd, problem.rules)
+        held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd, problem.rules)
+        rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd, problem.rules)
         refitted.append((trial.candidate, ahead_of_rival(ahead, best.fitted - other.fitted, problem.rules)))
         if trial.candidate.name == candidate.name:
             continue  # another form of the same answer

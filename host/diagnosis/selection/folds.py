@@ -14,7 +14,6 @@ from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.trial import Trial, at_bound, called_for, of_sampling, refuted, vanished
 
 Array = npt.NDArray[np.float64]
-MOST_FOLDS = 4  # of the recordings to fit
 
 
 def with_other_recordings(problem: Problem, base: Fit, trials: list[Trial], noise_sd: Array) -> None:
@@ -50,7 +49,7 @@ def _where_called_for(
     problem: Problem, base: Fit, fit: Fit, more: int, noise_sd: Array, starts: list[dict[str, float]]
 ) -> Gain | None:
     rules = problem.rules
-    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
+    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd, problem.rules)
     least = rules.pooled_log_likelihood + rules.parameter_penalty * more
     if not problem.apart or trained.log_likelihood < least or problem.budget.spent():
         return None
@@ -65,7 +64,7 @@ def _crossed(problem: Problem, base: Fit, fit: Fit, noise_sd: Array, starts: lis
     begun = get_starts(problem)
     used = [k for k, segment in enumerate(problem.segments) if segment.fit.any()]
     before, after = list(base.residuals), list(fit.residuals)
-    for fold in np.array_split(used, min(MOST_FOLDS, len(used))):
+    for fold in np.array_split(used, min(problem.rules.crossed_folds, len(used))):
         part = replace(
             problem,
             segments=[_exchanged(segment, k in fold, k in used) for k, segment in enumerate(problem.segments)],
@@ -76,7 +75,7 @@ def _crossed(problem: Problem, base: Fit, fit: Fit, noise_sd: Array, starts: lis
             for k in fold:
                 residuals[k] = again.residuals[k]
     set_starts(problem, begun)
-    return compare(problem.segments, "both", before, after, noise_sd)
+    return compare(problem.segments, "both", before, after, noise_sd, problem.rules)
 
 
 def _exchanged(segment: Segment, out: bool, used: bool) -> Segment:

@@ -98,7 +98,7 @@ def pair_instead(
         fit = _fitted_anew(problem, nominal, a, b, restart)
         starts = get_starts(problem)
         passed = _passed(problem, nominal, fit, noise_sd)
-        ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd)
+        ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd, problem.rules)
         more = fit.fitted - one.fitted
         lead = ahead.log_likelihood - rules.parameter_penalty * max(more, 0)
         if lead < -rules.equal_log_likelihood or passed is None:
@@ -199,9 +199,9 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> boo
     if any(bound_by(fit, term) for term in fit.terms):
         return False
     more = fit.fitted - alone.fitted
-    held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd)
-    trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd)
-    both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd)
+    held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd, problem.rules)
+    trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd, problem.rules)
+    both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd, problem.rules)
     shown = min(held.log_likelihood, trained.log_likelihood - more) >= problem.rules.heldout_log_likelihood + more
     return held.share >= problem.rules.further_error_reduction and (
         (shown and held.p_value <= problem.rules.significance) or _pooled(problem, held, both, more)
@@ -215,8 +215,8 @@ def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
 def _passed(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> tuple[float, Gain] | None:
     """Score of a pair and its gain on held-out samples; None if it does not pass what a single effect has to."""
     rules, more = problem.rules, fit.fitted - nominal.fitted
-    held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd)
-    both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
+    held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd, problem.rules)
+    both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
     shown = sure and held.log_likelihood > rules.heldout_log_likelihood + more

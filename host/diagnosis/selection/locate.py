@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.fit import Fit, Problem
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import fill, since_reversal
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-AVERAGE_S, JOIN_S, SHORTEST_S = 0.5, 0.5, 0.3
-SHIFTS = 60
-FALSE_DISCOVERY = 0.05
+AVERAGE_S = 0.5  # that a moving RMS is taken over
+SHIFTS = 60  # circular ones, by which a condition is compared with chance
 
 
 @dataclass(frozen=True)
@@ -36,26 +36,28 @@ def moving_rms(values: Array, dt_s: float) -> Array:
     return np.sqrt(power / np.maximum(count, 1.0))
 
 
-def windows(mismatch: Array, time_s: Array, dt_s: float, level: float | None = None) -> list[tuple[float, float]]:
+def windows(
+    mismatch: Array, time_s: Array, dt_s: float, rules: SelectionRules, level: float | None = None
+) -> list[tuple[float, float]]:
     """Return the time spans in which the moving RMS of `mismatch` exceeds half of its own 95th percentile (or `level`);
     short gaps are closed, short spans dropped.
     """
     rms = moving_rms(fill(mismatch), dt_s)
-    high = rms > (0.5 * np.quantile(rms, 0.95) if level is None else level)
+    high = rms > (rules.window_level * np.quantile(rms, rules.window_quantile) if level is None else level)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], high.astype(np.int8), [0]))))
     spans = [[time_s[a], time_s[b - 1]] for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    return joined([(float(a), float(b)) for a, b in spans])
+    return joined([(float(a), float(b)) for a, b in spans], rules)
 
 
-def joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def joined(spans: list[tuple[float, float]], rules: SelectionRules) -> list[tuple[float, float]]:
     """Windows in order, those nearer than half a second made one, those shorter than 0.3 s dropped."""
     out: list[list[float]] = []
     for a, b in sorted(spans):
-        if out and a - out[-1][1] < JOIN_S:
+        if out and a - out[-1][1] < rules.window_gap_s:
             out[-1][1] = max(out[-1][1], b)
         else:
             out.append([a, b])
-    return [(a, b) for a, b in out if b - a >= SHORTEST_S]
+    return [(a, b) for a, b in out if b - a >= rules.window_shortest_s]
 
 
 def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
@@ -97,7 +99,7 @@ def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1
 
     `stride`: every so many samples are looked at.
     """
-    energy, tables = [], []
+    energy, tables, rules = [], [], problem.rules
     for segment, m in zip(problem.segments, mismatch, strict=True):
         energy.append(np.where(np.isfinite(m[row]), m[row], 0.0)[::stride] ** 2)
         tables.append({name: values[::stride] for name, values in features(problem, segment).items()})
@@ -116,21 +118,22 @@ def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1
                 mask = values <= limit if side == "below" else values >= limit
                 held = float(together[mask].sum()) / total
                 part = float(mask.mean())
-                if held - part < 0.1 or not 0.02 < part < 0.7:
+                usual = rules.condition_fewest_share < part < rules.condition_most_share
+                if held - part < rules.condition_excess or not usual:
                     continue
                 by_chance = np.array([float(np.roll(together, s)[mask].sum()) / total for s in shifts])
                 z = (held - by_chance.mean()) / (by_chance.std() + 1e-12)
                 p = max(float(np.mean(by_chance >= held)), float(np.exp(-0.5 * z * z)) if z > 0 else 1.0)
                 found.append((held - part, Condition(_words(name, side, limit, problem), held, part, p)))
-    return _discover(found)
+    return _discover(found, rules.condition_false_discovery)
 
 
-def _discover(found: list[tuple[float, Condition]]) -> Condition | None:
+def _discover(found: list[tuple[float, Condition]], rate: float) -> Condition | None:
     """Largest excess among those that pass Benjamini and Hochberg's bound."""
     if not found:
         return None
     order = sorted(found, key=lambda item: item[1].p_value)
-    passed = [k for k, (_, c) in enumerate(order) if c.p_value <= FALSE_DISCOVERY * (k + 1) / len(order)]
+    passed = [k for k, (_, c) in enumerate(order) if c.p_value <= rate * (k + 1) / len(order)]
     if not passed:
         return None
     return max(order[: passed[-1] + 1], key=lambda item: item[0])[1]

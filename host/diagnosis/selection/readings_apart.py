@@ -17,17 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.fit import Problem
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.dataset import Recording
-from host.diagnosis.model.findings import FACTORS, NEAR_FACTOR, OPPOSITE, factor_of
+from host.diagnosis.model.findings import FACTORS, factor_of
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.readings import Finding
 
 Array = npt.NDArray[np.float64]
 Pair = tuple[Array, Array]  # measured and simulated outputs (outputs, n) of a recording
-ALIKE = 0.95  # correlation with what is simulated, from which on a factor between the two is one of units
-MATCHED = 0.9  # and where the gain is near one as well
-LEFT = 0.1  # of what is unexplained, that an input in other units leaves at most
-UNLIKE = 0.8  # correlation below which a simulator with one output is started from its reading in other units
 
 
 def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[list[Recording], list[Finding]]:
@@ -59,14 +56,15 @@ def readings_apart(problem: Problem, recordings: Sequence[Recording]) -> tuple[l
 
 def _exchanged(problem: Problem, pairs: list[Pair], names: list[str]) -> tuple[list[Finding], list[int]]:
     """What is to be said of exchanged outputs, and for each output the one whose column it is in."""
-    rows, findings = range(len(names)), []
+    rows, findings, rules = range(len(names)), [], problem.rules
     alike = np.array([[_likeness(pairs, measured, simulated)[0] for simulated in rows] for measured in rows])
     order = list(rows)
     for a in rows:
         for b in range(a + 1, len(names)):
             crossed, straight = min(alike[a, b], alike[b, a]), max(alike[a, a], alike[b, b])
             same = problem.model.outputs[a].unit == problem.model.outputs[b].unit
-            if same and ((crossed > ALIKE and straight < 0.5) or _match_exchanged(pairs, a, b)):
+            follow = crossed > rules.simulator_unit_correlation and straight < rules.simulator_own_correlation
+            if same and (follow or _match_exchanged(pairs, a, b, rules)):
                 order[a], order[b] = b, a
                 first, second = (problem.columns.get(names[row], names[row]) for row in (a, b))
                 says = (
@@ -77,12 +75,13 @@ def _exchanged(problem: Problem, pairs: list[Pair], names: list[str]) -> tuple[l
     return findings, order
 
 
-def _match_exchanged(pairs: list[Pair], a: int, b: int) -> bool:
+def _match_exchanged(pairs: list[Pair], a: int, b: int, rules: SelectionRules) -> bool:
     """Whether all outputs are as simulated with the readings of two exchanged, and as they are recorded they are not."""
     rows = list(range(pairs[0][0].shape[0]))
     order = [b if row == a else a if row == b else row for row in rows]
     crossed = [(y[order], out) for y, out in pairs]
-    return _all_match(crossed) and _unexplained(crossed) < LEFT * _unexplained(pairs)
+    most = rules.simulator_unexplained_ratio * _unexplained(pairs)
+    return _all_match(crossed, rules) and _unexplained(crossed) < most
 
 
 def _turned(
@@ -91,17 +90,19 @@ def _turned(
     """What is to be said of outputs of another sign or unit, and what they have to be multiplied by."""
     findings: list[Finding] = []
     change: dict[str, float] = {}
+    rules = problem.rules
     for row in rows:
         name, column = names[row], problem.columns.get(names[row], names[row])
         correlation, gain = _likeness(pairs, row, row)
-        if correlation < OPPOSITE:
+        if correlation < rules.data.opposite_correlation:
             says = f"Column {column} moves against what the nominal model says (correlation {correlation:.2f}): "
             says += "it, or an input, has the opposite sign (channels.*.sign). "
             says += f"The diagnosis continues with {column} reversed."
             findings.append(Finding("sign", column, says))
             change[name] = -1.0
-        factor = factor_of(abs(gain), NEAR_FACTOR) if abs(correlation) > ALIKE else 0.0
-        if abs(correlation) < UNLIKE and len(names) == 1:
+        alike = abs(correlation) > rules.simulator_unit_correlation
+        factor = factor_of(abs(gain), rules.data.unit_factor_stated) if alike else 0.0
+        if abs(correlation) < rules.simulator_start_correlation and len(names) == 1:
             factor = _of_start(problem, theta)
         if factor:
             says = f"Column {column} is about {FACTORS[factor]} times what the nominal model says: the unit of it, or "
@@ -126,7 +127,7 @@ def _of_start(problem: Problem, theta: Array) -> float:
                 begin, values=begin.values / factor, measured=begin.measured / factor, spread=begin.spread / factor
             )
             scaled.append(_freed(problem, replace(segment, y=segment.y / factor, begin=changed), theta))
-        if _all_match(scaled):
+        if _all_match(scaled, problem.rules):
             return factor
     return 0.0
 
@@ -186,9 +187,9 @@ def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], possible: 
 
     A simulator that is not linear answers an angle in degrees by another course, in which no output shows a factor.
     """
-    if _all_match(pairs):
+    if _all_match(pairs, problem.rules):
         return None
-    most, found = LEFT * _unexplained(pairs), None
+    most, found = problem.rules.simulator_unexplained_ratio * _unexplained(pairs), None
     for mistake in possible:
         left = _left_without(problem, theta, mistake)
         if left < most:
@@ -201,15 +202,16 @@ def _left_without(problem: Problem, theta: Array, mistake: InputMistake) -> floa
     tried: list[Pair] = []
     for segment in problem.segments:
         tried.append(_freed(problem, replace(segment, inputs=mistake.put_right(segment.inputs)), theta))
-        if len(tried) in (1, len(problem.segments)) and not _all_match(tried):
+        if len(tried) in (1, len(problem.segments)) and not _all_match(tried, problem.rules):
             return np.inf
     return _unexplained(tried)
 
 
-def _all_match(pairs: list[Pair]) -> bool:
+def _all_match(pairs: list[Pair], rules: SelectionRules) -> bool:
     """Whether every output is as simulated, but for what parameters that are not exact make of it."""
     likeness = (_likeness(pairs, row, row) for row in range(pairs[0][0].shape[0]))
-    return all(correlation > MATCHED and abs(float(np.log(gain))) < NEAR_FACTOR for correlation, gain in likeness)
+    least, near = rules.simulator_match_correlation, rules.data.unit_factor_stated
+    return all(correlation > least and abs(float(np.log(gain))) < near for correlation, gain in likeness)
 
 
 def _unexplained(pairs: list[Pair]) -> float:

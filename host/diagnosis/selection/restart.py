@@ -8,8 +8,6 @@ from host.diagnosis.estimation.fit import Fit, Problem, robust, starts
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.screening import Screened, enough, term_of
 
-KEPT = 3
-
 
 def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -> list[Screened]:
     """Candidates that the refitted nominal model cannot vouch for, each with nominal parameters of its own to start from.
@@ -27,7 +25,7 @@ def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -
         begin = starts(term, {}, {})
         tried = [np.concatenate((theta, begin)) for theta in begins]
         tried.sort(key=lambda values: robust(few.stacked((term,), values))[0])
-        nominals = [values[: -begin.size] for values in tried[:KEPT]]
+        nominals = [values[: -begin.size] for values in tried[: problem.rules.nominal_restarts]]
         if nominals:
             found.append(Screened(candidate, term, (), 0.0, [begin] * len(nominals), nominals))
     return found

@@ -58,7 +58,10 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates
 def _better(problem: Problem, base: Fit, fits: Mapping[str, Fit]) -> str | None:
     """The hold of the best of `fits`, if that is better than `base` by as much as an effect has to be; else None."""
     rules, noise_sd = problem.rules, np.array([noise.sigma for noise in problem.noise])
-    gains = {hold: compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd) for hold, fit in fits.items()}
+    gains = {
+        hold: compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd, problem.rules)
+        for hold, fit in fits.items()
+    }
     best = max(gains, key=lambda hold: gains[hold].log_likelihood)
     sure = gains[best].log_likelihood > rules.pooled_log_likelihood and gains[best].p_value < rules.significance
     return best if sure else None

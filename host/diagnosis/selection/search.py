@@ -109,7 +109,7 @@ def fit_nominal(problem: Problem) -> Fit:
         reweigh(problem, fit)
         fit = minimize(problem, (), fit.values, states=True)
     fit = settled(problem, begun_again(problem, fit))
-    fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs)
+    fed = find_feedback(problem.segments, fit.residuals, problem.model.quiet_inputs, problem.rules)
     problem.noise_fed = fed and _at_noise(problem, fit)
     return fit
 
@@ -147,9 +147,9 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     fit = _restart(problem, fit, fit.terms[-1].candidate)
     after = get_starts(problem)
     set_starts(problem, begun)
-    heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd)
-    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd)
-    both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd)
+    heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd, problem.rules)
+    trained = compare(problem.segments, "fit", base.residuals, fit.residuals, noise_sd, problem.rules)
+    both = compare(problem.segments, "both", base.residuals, fit.residuals, noise_sd, problem.rules)
     return Trial(
         fit.terms[-1].candidate,
         fit,
@@ -526,7 +526,9 @@ def _detour(
             steps = [Step("joint", term.candidate.key, pair[1], first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
             likelier = _ahead(problem, other, best, noise_sd)
-            earned = compare(problem.segments, "both", found.nominal.residuals, base.residuals, noise_sd).log_likelihood
+            earned = compare(
+                problem.segments, "both", found.nominal.residuals, base.residuals, noise_sd, problem.rules
+            ).log_likelihood
             _grow(problem, other, candidate_effects, noise_sd, earned, progress)
             if likelier or _ahead(problem, other, best, noise_sd):
                 best, begun, scale = other, get_starts(problem), problem.scale.copy()
@@ -540,7 +542,7 @@ def _detour(
 
 def _ahead(problem: Problem, other: Found, best: Found, noise_sd: Array) -> bool:
     """Whether another beginning ends plainly likelier, with one effect more at most."""
-    ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd)
+    ahead = compare(problem.segments, "both", best.best.residuals, other.best.residuals, noise_sd, problem.rules)
     more = max(other.best.fitted - best.best.fitted, 0)
     least = problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
     return ahead.log_likelihood > least and len(other.best.terms) <= len(best.best.terms) + 1
@@ -548,7 +550,7 @@ def _ahead(problem: Problem, other: Found, best: Found, noise_sd: Array) -> bool
 
 def _total(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> float:
     """Likelihood on all samples that a structure has earned, less the price of its parameters."""
-    gain = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd)
+    gain = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
     return gain.log_likelihood - problem.rules.parameter_penalty * (fit.fitted - nominal.fitted)
 
 
@@ -563,7 +565,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
             other = finish(
                 problem, minimize(problem, (*rest, new), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             )
-            ahead = compare(problem.segments, "both", best.residuals, other.residuals, noise_sd)
+            ahead = compare(problem.segments, "both", best.residuals, other.residuals, noise_sd, problem.rules)
             more = other.fitted - best.fitted
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
@@ -615,8 +617,8 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             begin = np.concatenate((values, start))
             other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
             other = _restart(problem, finish(problem, begun_again(problem, other)), simple.candidate)
-            earned = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd)
-            ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd)
+            earned = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
+            ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd, problem.rules)
             more = found.best.fitted - other.fitted
             if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
                 found.steps.append(Step("reduce", key, ahead, [trial]))
@@ -674,7 +676,7 @@ def _in_place_of(
     if winner is None or winner.candidate.key == term.candidate.key:
         return
     simpler = winner.fit.fitted < found.best.fitted and related(winner.candidate, term.candidate)
-    ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd)
+    ahead = compare(problem.segments, "both", found.best.residuals, winner.fit.residuals, noise_sd, problem.rules)
     more = winner.fit.fitted - found.best.fitted
     if (
         simpler  # preferred by `rank`, which weighs what the finer shape takes more
@@ -713,7 +715,8 @@ def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list
             same = sum(other.candidate.effect.id == effect for other in kept)
             at_port = {other.candidate.effect.id for other in kept if other.candidate.port.name == port}
             known = effect in at_port
-            if known is further and same < 3 and (known or len(at_port) < most_here) and not any(item is k for k in kept):
+            room = same < rules.fits_per_effect and (known or len(at_port) < most_here)
+            if known is further and room and not any(item is k for k in kept):
                 kept.append(item)
             if len(kept) == rules.fits_per_step:
                 return kept
@@ -722,22 +725,23 @@ def _varied(items: list[Screened], rules: SelectionRules, here: int = 0) -> list
 
 def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fit:
     """Backward: drop what no longer earns its place."""
-    dropped = True
+    dropped, rules = True, problem.rules
     while dropped and len(best.terms) > 1:
         dropped = False
         for term in best.terms:
             terms, values = without(best, problem, (term.candidate.key,))
             begun = get_starts(problem)
             less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
-            gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd)
-            held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd)
-            least = 0.5 * max(problem.rules.least_error_reduction, problem.rules.least_excess_reduction * gain.excess)
-            price = problem.rules.parameter_penalty * term.fitted
-            few = gain.log_likelihood < problem.rules.heldout_log_likelihood + price
-            gone = vanished(best, term, problem.rules)
+            gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd, problem.rules)
+            held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd, problem.rules)
+            least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
+            price = rules.parameter_penalty * term.fitted
+            few = gain.log_likelihood < rules.heldout_log_likelihood + price
+            gone = vanished(best, term, rules)
             if held.log_likelihood < 0.0:
                 held = unexcited(problem, less, best, term.fitted, noise_sd, held) or held
-            if gone or few or gain.share < least or held.log_likelihood < 0.0:
+            small = gain.share < rules.removal_tolerance * least
+            if gone or few or small or held.log_likelihood < 0.0:
                 best, dropped = less, True
                 steps.append(Step("backward", term.candidate.key, gain))
                 break

@@ -13,8 +13,6 @@ from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, same_place
 
 Array = npt.NDArray[np.float64]
-WITHIN = 1.05  # samples: a delay up to this may be a matter of how the input was recorded
-SAME = 0.01  # of a log-likelihood: trials that differ by less, with as many parameters, are one equation
 
 
 @dataclass
@@ -93,7 +91,8 @@ def rank(problem: Problem, trials: list[Trial], base: Fit) -> None:
     common = _scored(trials, [trial.both for trial in trials], base)
     trials.sort(key=lambda trial: trial.score, reverse=True)
     _compare_on_common_samples(problem, trials, base)
-    alike = [trial for trial in trials if trials[0].score - trial.score < SAME and trial.fit.fitted == trials[0].fit.fitted]
+    least = rules.same_equation_log_likelihood
+    alike = [trial for trial in trials if trials[0].score - trial.score < least and trial.fit.fitted == trials[0].fit.fitted]
     top = min(alike, key=lambda trial: trial.candidate.effect.order)
     trials.remove(top)
     trials.insert(0, top)
@@ -101,7 +100,9 @@ def rank(problem: Problem, trials: list[Trial], base: Fit) -> None:
         common @ (-np.log(1.0 - rules.refinement_error_reduction * np.minimum(1.0, 2.0 * top.both.excesses)))
     )
     near = top.score - max(
-        rules.heldout_log_likelihood, rules.refinement_tolerance * top.score, min(coarse, 0.3 * top.score)
+        rules.heldout_log_likelihood,
+        rules.refinement_tolerance * top.score,
+        min(coarse, rules.refinement_score_share * top.score),
     )
     # A form whose further parameters ended at zero is the form without them, which may have begun a fit less luckily.
     same, much = top.fit.fitted - _zeros(top.fit), (1.0 - rules.reduced_form_tolerance) * top.score
@@ -141,7 +142,7 @@ def _compare_on_common_samples(problem: Problem, trials: list[Trial], base: Fit)
         return
     before = [np.where(mask, r, np.nan) for mask, r in zip(seen, base.residuals, strict=True)]
     noise_sd = np.array([noise.sigma for noise in problem.noise])
-    gains = [compare(problem.segments, "both", before, trial.fit.residuals, noise_sd) for trial in first]
+    gains = [compare(problem.segments, "both", before, trial.fit.residuals, noise_sd, problem.rules) for trial in first]
     _scored(first, gains, base)
     first.sort(key=lambda trial: trial.score, reverse=True)
     trials[: len(first)] = first
@@ -155,7 +156,8 @@ def richer_gain(earned: Gain, more: int, rules: SelectionRules) -> float:
     score = earned.log_likelihood
     left = np.log(1.0 - rules.refinement_error_reduction * np.minimum(1.0, 2.0 * earned.excesses))
     coarse = 0.5 * float(earned.independent @ -left)
-    least = max(rules.heldout_log_likelihood, rules.refinement_tolerance * score, min(coarse, 0.3 * score))
+    coarse = min(coarse, rules.refinement_score_share * score)
+    least = max(rules.heldout_log_likelihood, rules.refinement_tolerance * score, coarse)
     return least + rules.parameter_penalty * more
 
 
@@ -177,7 +179,7 @@ def of_sampling(trial: Trial) -> bool:
     term = trial.fit.terms[-1]
     own = zip(term.parameters, trial.fit.values_of(term), strict=True)
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
-    return late_s < WITHIN * trial.period_s
+    return late_s < trial.rules.sampling_delay * trial.period_s
 
 
 def within_sample(trials: list[Trial], base: Fit) -> Trial | None:
@@ -258,7 +260,7 @@ def _alone(trial: Trial, more: int) -> bool:
         gain.log_likelihood > rules.heldout_log_likelihood + more
         and gain.p_value < rules.significance
         and gain.share > _least(trial, gain)
-        and trial.trained.log_likelihood > rules.heldout_log_likelihood + 2.0 * more
+        and trial.trained.log_likelihood > rules.heldout_log_likelihood + rules.parameter_penalty * more
     )
 
 
@@ -271,7 +273,7 @@ def sure_together(rules: SelectionRules, heldout: Gain, both: Gain, more: int) -
     """Whether all samples together are sure where held-out ones are few. more: number of further parameters."""
     return (
         both.log_likelihood > rules.pooled_log_likelihood + rules.parameter_penalty * more
-        and both.p_value < 0.1 * rules.significance
+        and both.p_value < rules.pooled_significance
         and heldout.log_likelihood > rules.weak_log_likelihood
         and heldout.p_value < rules.weak_significance
     )

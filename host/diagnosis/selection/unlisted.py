@@ -17,7 +17,7 @@ from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
-from host.diagnosis.selection.trial import WITHIN, Trial, rank, within_sample
+from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
 
@@ -68,7 +68,9 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     return any(
         _power(problem, found.best.residuals, row)
         > ((measured if noise.source in MEASURED else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
-        or (not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals])))  # no noise does that
+        or (
+            not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals], problem.rules))
+        )  # no noise does that
         for row, noise in enumerate(problem.noise)
     )
 
@@ -83,7 +85,7 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
                 [*(segment.inputs[name] for name in problem.model.quiet_inputs), segment.y[row] - r[row]]
                 for segment, r in zip(problem.segments, fit.residuals, strict=True)
             ]
-            if only_coloured([r[row] for r in fit.residuals], known):
+            if only_coloured([r[row] for r in fit.residuals], known, problem.rules):
                 levels[row] = np.sqrt(_power(problem, fit.residuals, row))
     return levels
 
@@ -94,7 +96,8 @@ def slow_outputs(problem: Problem, fit: Fit, noise_sd: Array) -> list[int]:
     return [
         row
         for row in range(noise_sd.size)
-        if levels[row] > rules.residual_over_guessed_noise * noise_sd[row] and too_slow([r[row] for r in fit.residuals])
+        if levels[row] > rules.residual_over_guessed_noise * noise_sd[row]
+        and too_slow([r[row] for r in fit.residuals], rules)
     ]
 
 
@@ -197,7 +200,7 @@ def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, 
     term = winner.fit.terms[-1]
     begin = np.concatenate((best.values, winner.fit.values_of(term)))
     both = finish(problem, minimize(problem, (*best.terms, term), begin, rounds=8, tolerance=1e-4))
-    gain = compare(problem.segments, "heldout", winner.fit.residuals, both.residuals, noise_sd)
+    gain = compare(problem.segments, "heldout", winner.fit.residuals, both.residuals, noise_sd, problem.rules)
     more = both.fitted - winner.fit.fitted
     return gain.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * more
 
@@ -234,7 +237,10 @@ def _earned(trial: Trial) -> bool:
 def _only_sampling(problem: Problem, trial: Trial) -> bool:
     """Whether an equation shifts its port's own input by no more than a sample: how the input was held, not physics."""
     own = problem.columns.get(problem.model.moves.get(trial.candidate.port.name, ""), "")
-    return trial.candidate.effect.equation == f"rate({own})" and abs(trial.fit.values[-1]) < WITHIN * trial.period_s
+    return (
+        trial.candidate.effect.equation == f"rate({own})"
+        and abs(trial.fit.values[-1]) < problem.rules.sampling_delay * trial.period_s
+    )
 
 
 def _tried(problem: Problem, base: Fit, noise_sd: Array, target: Port, form: Form, size: float) -> Trial:
@@ -252,7 +258,7 @@ def _left(problem: Problem, found: Found, fit: Fit, noise_sd: Array) -> float:
 def _better_than_known(problem: Problem, found: Found, noise_sd: Array, winner: Trial, instead: bool) -> bool:
     """Whether an equation beats the known effects it takes the place of, or else all those that were tried and refused."""
     if instead:
-        gain = compare(problem.segments, "heldout", found.best.residuals, winner.fit.residuals, noise_sd)
+        gain = compare(problem.segments, "heldout", found.best.residuals, winner.fit.residuals, noise_sd, problem.rules)
         return gain.log_likelihood > problem.rules.heldout_log_likelihood
     last = found.steps[-1].trials if found.steps else []
     return all(

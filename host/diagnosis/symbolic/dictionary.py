@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, Term, free, size_of
+from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale
 from host.diagnosis.model.model import Segment
 from host.diagnosis.model.operators import lag, play
@@ -28,12 +29,8 @@ LAGS_S = (0.05, 0.2, 0.6, 2.0, 6.0)
 WAVES = tuple(np.arange(0.5, 10.0, 0.4))  # cycles over the span
 MOST_SIGNALS = 4
 OFF_CENTRE = 0.03  # part of the range by which its middle has to be off zero for a product of deviations to be another form
-MOST_FORMS = 2  # joined to predict_residual
-BEST = 6  # forms that are fitted again
-CHOICES = 3  # best forms on the samples to fit, of which those held out choose
 WILD = 3.0  # robust standard deviations beyond which a residual counts less (Huber 1964)
 CURVES = ("abs", "sqrt", "square", "exp", "tanh")  # functions of which an equation of a static curve is made
-NEW = 1e-3  # part of a form that must be seen past nominal parameters and forms chosen before
 
 
 @dataclass(frozen=True)
@@ -321,32 +318,31 @@ def _best(
     port: Port | None,
 ) -> PredictedPart:
     """Greedy choice among `forms`, one more as long as held-out samples are predicted better."""
-    sums = _Sums(problem, fit, noise_sd, slopes, responses)
+    rules, sums = problem.rules, _Sums(problem, fit, noise_sd, slopes, responses)
     best = PredictedPart(subsystem, port, 0.0, 1.0, 0.0, 0.0)
     chosen: list[int] = []
     worth: tuple[tuple[Form, float], ...] = ()
-    for _ in range(MOST_FORMS):
+    for _ in range(rules.forms_joined):
         gain = sums.gains(chosen)
-        order = _by_gain(gain, forms, problem.rules.form_length_penalty)
+        order = _by_gain(gain, forms, rules)
         if not order:
             break
-        worth = worth or tuple((forms[k], float(sums.sizes([k])[0])) for k in order[:BEST])
+        worth = worth or tuple((forms[k], float(sums.sizes([k])[0])) for k in order[: rules.forms_refitted])
         tried = []
-        for k in order[:CHOICES]:  # chosen by held-out samples, which is paid for
+        for k in order[: rules.forms_judged]:  # chosen by held-out samples, which is paid for
             sizes = sums.sizes([*chosen, k])
             after = [
                 r - response.to([*chosen, k], sizes) + np.tensordot(sums.absorbed([*chosen, k], sizes), slope, 1)
                 for r, response, slope in zip(fit.residuals, responses, slopes, strict=True)
             ]
-            tried.append((compare(problem.segments, "heldout", fit.residuals, after, noise_sd), k, after))
+            tried.append((compare(problem.segments, "heldout", fit.residuals, after, noise_sd, problem.rules), k, after))
         held, k, after = max(tried, key=lambda one: one[0].log_likelihood)
         chosen = [*chosen, k]
         likelihood = held.log_likelihood - len(chosen) * (1.0 + np.log(len(tried)))
         if likelihood > best.log_likelihood:
-            trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd).log_likelihood
+            trained = compare(problem.segments, "fit", fit.residuals, after, noise_sd, problem.rules).log_likelihood
             power = fallen(problem, fit.residuals, after, noise_sd)
             best = PredictedPart(subsystem, port, likelihood, held.p_value, held.share, trained, worth, power)
-    rules = problem.rules
     sure = (
         min(best.log_likelihood, best.trained) > rules.predictable_log_likelihood
         and best.share > rules.predictable_error_reduction
@@ -366,10 +362,10 @@ def fallen(problem: Problem, before: list[Array], after: list[Array], noise_sd: 
     return total
 
 
-def _by_gain(gain: Array, forms: list[Form], penalty: float) -> list[int]:
+def _by_gain(gain: Array, forms: list[Form], rules: SelectionRules) -> list[int]:
     """Forms by their gain, a shorter one before a longer one that gains hardly more."""
-    order = [int(k) for k in np.argsort(-gain) if gain[k] > 0.0][: 4 * BEST]
-    return sorted(order, key=lambda k: -gain[k] * (1.0 - penalty * forms[k].length))
+    order = [int(k) for k in np.argsort(-gain) if gain[k] > 0.0][: 4 * rules.forms_refitted]
+    return sorted(order, key=lambda k: -gain[k] * (1.0 - rules.form_length_penalty * forms[k].length))
 
 
 def _weights(r: Array) -> Array:
@@ -418,6 +414,7 @@ class _Sums:
         size[size == 0.0] = 1.0
         self.inverse = np.linalg.pinv(own / np.outer(size, size), rcond=1e-9) / np.outer(size, size) if rates else own
         self.cross, self.size = cross, np.diag(gram)
+        self.least_new = problem.rules.form_new_share
         self.gram, self.pull = gram - cross @ self.inverse @ cross.T, pull - cross @ self.inverse @ start
 
     def gains(self, chosen: list[int]) -> Array:
@@ -427,7 +424,7 @@ class _Sums:
             solved = np.linalg.lstsq(self.gram[np.ix_(chosen, chosen)], self.gram[chosen], rcond=1e-10)[0]
             left = self.pull - self.pull[chosen] @ solved
             size = size - np.sum(self.gram[chosen] * solved, axis=0)
-        seen = size > NEW * self.size + 1e-300
+        seen = size > self.least_new * self.size + 1e-300
         return np.where(seen, 0.5 * left**2 / np.where(seen, size, 1.0), 0.0)
 
     def sizes(self, chosen: list[int]) -> Array:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording, find_files, load, read_tables, thin
 from host.diagnosis.model.findings import _dead
 from host.diagnosis.model.nominal import NominalSpec, read_nominal
@@ -48,7 +49,7 @@ def table(path: Path, start: float = 0.0, n: int = 100) -> Path:
 
 def read(folder: Path, files: list[Path], text: str = TOML) -> list[Recording]:
     nominal = spec(folder, text)
-    return load(nominal, read_tables(nominal, files), *channels_of(nominal))
+    return load(nominal, read_tables(nominal, files), *channels_of(nominal), DataRules())
 
 
 def test_every_kind_of_file_gives_the_same_columns(tmp_path: Path) -> None:
@@ -131,7 +132,7 @@ def test_infinite_values_are_missing_and_said(tmp_path: Path) -> None:
     (one,) = read(tmp_path, [path])
     assert np.isnan(one.channels["motor"][1]) and one.infinite == ("motor",)
     findings: list[Finding] = []
-    _dead([one], {"motor"}, {"motor": "a"}, findings)
+    _dead([one], {"motor"}, {"motor": "a"}, findings, DataRules())
     assert [finding.says for finding in findings] == ["Column a holds infinite values. They count as missing."]
 
 

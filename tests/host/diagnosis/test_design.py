@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from host.diagnosis.design import experiment
+from host.diagnosis.estimation.rules import RULES
 
 
 def test_motions_that_cannot_be_better_are_not_linearized(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -31,7 +32,7 @@ def test_motions_that_cannot_be_better_are_not_linearized(monkeypatch: pytest.Mo
         (k, SimpleNamespace(number=k, segments=[recording], stacked=lambda *_, size=size: np.array([size])))
         for k, size in enumerate(whole)
     ]
-    given: Any = SimpleNamespace(terms=(), values=np.zeros(1))
+    given: Any = SimpleNamespace(terms=(), values=np.zeros(1), rules=RULES)
     found: Any = experiment.against(given, given, given, given, given, made)
     first = np.argsort(-whole)[: experiment.FINALISTS]
     assert found.excitation == first[np.argmax((whole * share)[first])] and len(tried) < experiment.FINALISTS

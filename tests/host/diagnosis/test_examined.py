@@ -146,7 +146,7 @@ def test_coloured_noise_is_told_from_physics(seed: int) -> None:
     n, t = 4000, np.arange(4000) * 0.01
     inputs = [[sway(10 * seed + k, t, 1.7, 0.3)] for k in range(3)]
     noise = [shaken(10 * seed + k, n) for k in range(3)]
-    assert only_coloured(noise, inputs)
+    assert only_coloured(noise, inputs, RULES)
     small = [0.02 * np.random.default_rng(k).standard_normal(n) for k in range(3)]
     for physics in (
         lambda x: x**3,
@@ -154,7 +154,7 @@ def test_coloured_noise_is_told_from_physics(seed: int) -> None:
         lambda x: np.r_[np.zeros(9), x[9:] - x[:-9]],
         lambda x: np.convolve(x, np.exp(-t / 0.5) * 0.02)[:n],
     ):
-        assert not only_coloured([physics(u[0]) + e for u, e in zip(inputs, small, strict=True)], inputs)
+        assert not only_coloured([physics(u[0]) + e for u, e in zip(inputs, small, strict=True)], inputs, RULES)
 
 
 def wander(seed: int, n: int, samples: float) -> Array:
@@ -193,14 +193,16 @@ def test_slow_noise_is_told_from_what_recordings_have_in_common(seed: int) -> No
     n = 1000
     inputs = [[sway(10 * seed + k, np.arange(n) * 0.05, 0.2, 0.25)] for k in range(3)]
     noise = [wander(10 * seed + k, n, 150.0) for k in range(3)]
-    assert only_coloured(noise, inputs)
+    assert only_coloured(noise, inputs, RULES)
     shared = wander(10 * seed, n, 300.0)
     fine = [0.05 * e + 0.01 * np.random.default_rng([seed, k]).standard_normal(n) for k, e in enumerate(noise)]
-    assert too_slow([shared] * 3) and not only_coloured([e + shared for e in fine], inputs)
+    assert too_slow([shared] * 3, RULES) and not only_coloured([e + shared for e in fine], inputs, RULES)
     forms = (lambda x: x**3, np.abs, lambda x: np.arange(n) / n, lambda x: signal.lfilter([0.005], [1.0, -0.995], x) - x)
     for physics in forms:
         shaped = [physics(u[0]) for u in inputs]
-        assert not only_coloured([(f - np.mean(f)) / np.std(f) + e for f, e in zip(shaped, fine, strict=True)], inputs)
+        assert not only_coloured(
+            [(f - np.mean(f)) / np.std(f) + e for f, e in zip(shaped, fine, strict=True)], inputs, RULES
+        )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -217,9 +219,9 @@ def test_noise_that_a_controller_feeds_back_is_no_physics(seed: int) -> None:
             y += 0.01 * (u[i] - y)
         noise.append(e)
         inputs.append([u])
-    assert only_coloured(noise, inputs)
+    assert only_coloured(noise, inputs, RULES)
     late = [np.r_[np.zeros(6), 0.2 * (u[0][6:] - u[0][:-6])] for u in inputs]
-    assert not only_coloured([a + b for a, b in zip(late, noise, strict=True)], inputs)
+    assert not only_coloured([a + b for a, b in zip(late, noise, strict=True)], inputs, RULES)
 
 
 def test_jumps_at_other_instants_in_each_recording_are_reported() -> None:
@@ -237,12 +239,12 @@ def test_jumps_at_other_instants_in_each_recording_are_reported() -> None:
 
 def test_jumps_are_told_from_noise_and_from_friction() -> None:
     rng, t = np.random.default_rng(5), np.arange(0.0, 40.0, 0.01)
-    assert not jumps_of([rng.standard_t(3, t.size), shaken(1, t.size)])
-    assert not jumps_of([0.3 * np.sign(np.cos(2.0 * np.pi * 0.4 * t)) + 0.01 * rng.standard_normal(t.size)])
+    assert not jumps_of([rng.standard_t(3, t.size), shaken(1, t.size)], RULES)
+    assert not jumps_of([0.3 * np.sign(np.cos(2.0 * np.pi * 0.4 * t)) + 0.01 * rng.standard_normal(t.size)], RULES)
     lone = 0.01 * rng.standard_normal(t.size)
     lone[::397] += 0.5
-    assert not jumps_of([lone])
-    (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)])
+    assert not jumps_of([lone], RULES)
+    (jump,) = jumps_of([0.01 * rng.standard_normal(t.size) + 0.2 * (t > 17.0)], RULES)
     assert abs(jump.sample - 1701) <= 1 and jump.size == pytest.approx(0.2, rel=0.1)
 
 

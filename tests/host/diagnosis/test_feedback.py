@@ -9,6 +9,7 @@ import pytest
 
 from host.diagnosis import diagnose
 from host.diagnosis.estimation.feedback import find_feedback, freed
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.locate import windows
@@ -60,7 +61,7 @@ def test_only_noise_that_comes_back_is_taken_off(through: float, share: float) -
     every = np.ones(3000, dtype=bool)
     recording = Recording("a", t, 0.01, True, {"u": u}, every, ~every)
     segment = Segment(recording, noise[None, :], every, ~every, {"u": u})
-    find_feedback([segment], [noise[None, :]], ("u",))
+    find_feedback([segment], [noise[None, :]], ("u",), RULES)
     left = float(np.var(freed(segment, 0, noise)) / np.var(noise))
     assert left == pytest.approx(share, abs=0.05)
 
@@ -114,4 +115,4 @@ def test_noise_in_a_loop_around_a_free_mass_is_no_resonance(
 def test_windows_of_a_recording_shorter_than_their_average() -> None:
     t = np.arange(2000) * 1e-5
     mismatch = np.where(t > 0.01, 1.0, 0.0)
-    assert windows(mismatch, t, 1e-5) == []
+    assert windows(mismatch, t, 1e-5, RULES) == []

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 from host.diagnosis import diagnose
 from host.diagnosis.estimation.feedback import common_part
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.effect import Array
 from host.diagnosis.model.operators import reading_noise, wander_at_rest, white_level
 from host.diagnosis.models.balance import at_rest
@@ -85,7 +86,7 @@ def test_steps_of_an_input_are_no_noise() -> None:
 def test_the_new_part_of_an_input_is_found_next_to_steps() -> None:
     rng = np.random.default_rng(6)
     noise = 0.01 * rng.standard_normal(2000)
-    new, steps = common_part(np.repeat(rng.uniform(-2.0, 2.0, 20), 100) + noise)
+    new, steps = common_part(np.repeat(rng.uniform(-2.0, 2.0, 20), 100) + noise, RULES)
     assert np.count_nonzero(steps) < 60
     assert 0.01 < np.std(new[~steps]) < 0.015  # a level is predicted from some noisy samples
 

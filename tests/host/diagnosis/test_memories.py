@@ -13,6 +13,7 @@ from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import minimize
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.estimation.noise import estimate
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
@@ -133,7 +134,7 @@ def test_a_jump_above_the_noise_around_it_is_found() -> None:
     rng = np.random.default_rng(4)
     size = 0.1 + np.abs(np.sin(np.arange(3000) / 200.0))
     residual = size * rng.standard_normal(3000)
-    assert not jumps_of([residual])
+    assert not jumps_of([residual], RULES)
     residual[1900:] += 6.0
-    (jump,) = jumps_of([residual])
+    (jump,) = jumps_of([residual], RULES)
     assert abs(jump.sample - 1900) <= 2 and jump.size == pytest.approx(6.0, abs=1.0)

@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lsim
 
 import seldinger as sd
+from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.readings import repeated
 
 RATE_HZ = 100.0
@@ -60,6 +61,6 @@ def test_a_delay_behind_it_is_found_with_its_whole_value() -> None:
 def test_a_coarse_reading_of_a_slow_motion_repeats_nothing() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     for motion in (np.sin(0.7 * t), np.abs((t % 4.0) - 2.0)):
-        assert repeated(np.asarray(np.round(motion, 2), dtype=float)) is None
-    assert repeated(np.random.default_rng(1).standard_normal(500)) is None
-    assert repeated(np.zeros(500)) is None
+        assert repeated(np.asarray(np.round(motion, 2), dtype=float), DataRules()) is None
+    assert repeated(np.random.default_rng(1).standard_normal(500), DataRules()) is None
+    assert repeated(np.zeros(500), DataRules()) is None

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from host.diagnosis.estimation import noise
 from host.diagnosis.estimation.evidence import compare, correlation_time, whiteness
+from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.estimation.uncertainty import _jackknife
 from host.diagnosis.model import readings
 from host.diagnosis.model.dataset import Recording
@@ -59,7 +60,7 @@ def test_whitened_noise_is_white() -> None:
 def test_wild_samples_are_found_and_steps_are_not() -> None:
     y = np.where(np.arange(300) > 150, 1.0, 0.0) + 0.001 * np.random.default_rng(0).normal(size=300)
     y[40] = 9.0
-    assert np.flatnonzero(readings.wild(y, 0.001)).tolist() == [40]
+    assert np.flatnonzero(readings.wild(y, 0.001, RULES.data)).tolist() == [40]
 
 
 @settings(max_examples=8, deadline=None)
@@ -76,7 +77,7 @@ def test_nothing_gained_is_not_taken_for_something() -> None:
         rng = np.random.default_rng(seed)
         r = ar1(rng, 3000, 0.9)
         other = r - 0.03 * ar1(rng, 3000, 0.9)
-        small += compare([segment(3000)], "heldout", [r[None]], [other[None]], np.array([1.0])).p_value < 0.01
+        small += compare([segment(3000)], "heldout", [r[None]], [other[None]], np.array([1.0]), RULES).p_value < 0.01
     assert small <= 3
 
 
@@ -84,7 +85,7 @@ def test_a_gain_is_counted_by_independent_samples() -> None:
     rng = np.random.default_rng(0)
     r = ar1(rng, 8000, 0.9)
     s = np.sin(np.arange(8000) / 50.0)
-    gain = compare([segment(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]))
+    gain = compare([segment(8000)], "heldout", [(r + s)[None]], [r[None]], np.array([1.0]), RULES)
     assert gain.p_value < 1e-6 and gain.share == pytest.approx(1 / 3, abs=0.05)
     assert gain.log_likelihood == pytest.approx(0.5 * 8000 / 19 * np.log(1.5), rel=0.4)
 
@@ -102,10 +103,10 @@ def test_whiteness_tells_noise_from_a_rest_that_is_none() -> None:
 def test_windows_follow_their_definition() -> None:
     t = np.arange(0, 20, 0.01)
     m = np.where((t > 5) & (t < 8), 1.0, 0.0) + np.where((t > 8.3) & (t < 9), 1.0, 0.0)
-    ((a, b),) = windows(m, t, 0.01)
+    ((a, b),) = windows(m, t, 0.01, RULES)
     assert a == pytest.approx(5.0, abs=0.3) and b == pytest.approx(9.0, abs=0.3)
     assert inside([(5.0, 9.0)], t).sum() == pytest.approx(400, abs=2)
-    assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)]) == [(1.0, 2.4), (3.0, 4.0)]
+    assert joined([(3.0, 4.0), (1.0, 2.0), (2.2, 2.4), (6.0, 6.1)], RULES) == [(1.0, 2.4), (3.0, 4.0)]
 
 
 def test_noise_by_steps_is_not_misled_by_a_slow_signal_or_by_jumps() -> None:
@@ -163,13 +164,13 @@ def test_noise_is_what_does_not_repeat() -> None:
     structure = np.sign(np.gradient(x))  # a residual that comes back with every period
     outputs = [structure + 0.02 * rng.standard_normal(t.size) for _ in range(2)]
     nowhere = [np.zeros(t.size, dtype=bool)] * 2
-    repeats = noise.repeated([[x], [np.roll(x, 37)]])
+    repeats = noise.repeated([[x], [np.roll(x, 37)]], RULES)
     assert {(a, b) for a, _, b, _ in repeats} == {(0, 0), (1, 1), (0, 1)}
-    found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]]))
+    found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]], RULES))
     assert found.source == noise.REPEATS and found.sigma == pytest.approx(0.02, rel=0.05)
     alone = noise.estimate(outputs, nowhere).sigma
     assert alone == pytest.approx(0.02, rel=0.15)  # the spectrum takes the jumps for noise, the middling difference does not
-    assert noise.repeated([[x], [rng.standard_normal(t.size)]])[0][2] == 0
+    assert noise.repeated([[x], [rng.standard_normal(t.size)]], RULES)[0][2] == 0
 
 
 def test_readings_that_are_none_are_found() -> None:
@@ -179,9 +180,9 @@ def test_readings_that_are_none_are_found() -> None:
     codes = y.copy()
     for first in (100, 700, 1500):
         codes[first : first + 8] = -5.0
-    assert np.flatnonzero(readings.lost(codes)).size == 24 and not readings.lost(y).any()
-    assert readings.resolution(np.round(y / 0.2) * 0.2, switched=False) == pytest.approx(0.2)
-    assert readings.resolution(np.sign(y), switched=True) == 0.0
+    assert np.flatnonzero(readings.lost(codes, RULES.data)).size == 24 and not readings.lost(y, RULES.data).any()
+    assert readings.resolution(np.round(y / 0.2) * 0.2, RULES.data, switched=False) == pytest.approx(0.2)
+    assert readings.resolution(np.sign(y), RULES.data, switched=True) == 0.0
     last = y.copy()
     last[-1] = 9.0
-    assert np.flatnonzero(readings.wild(last, 0.002)).tolist() == [t.size - 1]
+    assert np.flatnonzero(readings.wild(last, 0.002, RULES.data)).tolist() == [t.size - 1]
