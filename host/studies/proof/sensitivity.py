@@ -14,12 +14,13 @@ import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from host.diagnosis import diagnose
 from host.diagnosis.estimation.rules import RULES, SelectionRules
+from host.diagnosis.model.data_rules import DataRules
 from host.studies.proof.page import write_between
 from host.studies.proof.scoring import judge
 from host.studies.proof.worlds.suite import read_labels
@@ -28,7 +29,7 @@ from protocol.worker_process import end_with_parent
 from sim.concealed.label import Label
 
 BY = 0.2  # relative
-NAMES = frozenset(field.name for field in fields(SelectionRules))
+NAMES = frozenset(RULES.as_dict())
 
 
 @dataclass(frozen=True)
@@ -54,19 +55,26 @@ class Change:
 
     def applied(self) -> SelectionRules:
         """All rules, with this one changed."""
-        changed: dict[str, Any] = {self.rule: self.value}
-        return replace(RULES, **changed)
+        return RULES.changed(**{self.rule: self.value})
 
 
-class _Noted(SelectionRules):
+class _Notes:
     """Rules that note which of them are read, other than to copy or print all of them."""
 
-    read: set[str] = set()  # noqa: RUF012 - of the process, which makes one diagnosis at a time
+    read: ClassVar[set[str]] = set()  # of the process, which makes one diagnosis at a time
 
     def __getattribute__(self, name: str) -> Any:
         if name in NAMES and sys._getframe(1).f_globals.get("__name__") != "dataclasses":
-            _Noted.read.add(name)
+            _Notes.read.add(name)
         return super().__getattribute__(name)
+
+
+class _NotedData(_Notes, DataRules):
+    pass
+
+
+class _Noted(_Notes, SelectionRules):
+    pass
 
 
 def values_of(value: float) -> tuple[float, float]:
@@ -101,14 +109,14 @@ def read_cases(run: Path, names: Sequence[str]) -> list[Case]:
 
 def verdict_of(case: Case, change: Change | None) -> dict[str, Any]:
     """Line of results: what is named with which probability, whether it is right, and which rules were read."""
-    _Noted.read = set()
-    rules = _Noted() if change is None else change.applied()
+    _Notes.read.clear()
+    rules = _Noted(_NotedData()) if change is None else change.applied()
     recordings = sorted(path for path in case.folder.iterdir() if path.name != "nominal.toml")
     said = diagnose(recordings, case.folder / "nominal.toml", rules=rules).as_dict()
     effects = [(f"{effect['id']}@{effect['subsystem']}", effect["probability"]) for effect in said["effects"]]
     line = {"case": case.name, "verdict": said["verdict"], "effects": effects, "right": judge(case.label, said).right}
     if change is None:
-        return line | {"rule": "", "read": sorted(_Noted.read)}
+        return line | {"rule": "", "read": sorted(_Notes.read)}
     return line | {"rule": change.rule, "value": change.value}
 
 
