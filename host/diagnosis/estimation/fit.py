@@ -18,6 +18,7 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
+LARGEST_AMPLITUDE = 1000.0  # natural sizes: beyond, effects that cancel each other grow without end
 BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
 MODE_LINES = 3  # highest lines of the residual at which a mode is tried, before its grid
@@ -186,7 +187,20 @@ def moved(p: Parameter, value: float, by: float) -> float:
 
     Where a simulation has diverged, no parameter changes it and the step of least squares has no bound.
     """
-    new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + float(np.clip(by, -FAR, FAR)) * size_of(p, value)
+    if p.log:
+        return float(min(max(value * np.exp(np.clip(by, -3.0, 3.0)), p.low), p.high))
+    return within(p, value, value + float(np.clip(by, -FAR, FAR)) * size_of(p, value))
+
+
+def within(p: Parameter, value: float, new: float) -> float:
+    """`new` in the bounds of a parameter that was `value`; an amplitude also within a multiple of its natural size.
+
+    Two jumps a sample apart, or two forces along a direction that no output shows, cancel each other at any size. A
+    simulator that gets such inputs may take very long.
+    """
+    if p.linear:
+        most = max(LARGEST_AMPLITUDE * size_of(p, 0.0), abs(value))
+        new = min(max(new, -most), most)
     return float(min(max(new, p.low), p.high))
 
 
@@ -316,7 +330,7 @@ def minimize(
                 trial[index] = (
                     moved(p, values[index], by[place])
                     if p.log
-                    else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
+                    else within(p, values[index], values[index] + by[place] * sizes[index])
                 )
             raw_new = problem.stacked(terms, trial)
             r_new = raw_new if begins is None else begins.freed(raw_new)

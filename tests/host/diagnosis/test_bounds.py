@@ -10,7 +10,7 @@ import pytest
 
 import seldinger as sd
 from host.diagnosis.effects import candidates
-from host.diagnosis.estimation.fit import Fit, Term
+from host.diagnosis.estimation.fit import LARGEST_AMPLITUDE, Fit, Term, within
 from host.diagnosis.estimation.rules import RULES, Budget
 from host.diagnosis.model.effect import Array, Candidate, Parameter, Port
 from host.diagnosis.model.nominal import nominal_of
@@ -116,3 +116,12 @@ def test_several_effects_of_one_name_may_leave_together(monkeypatch: pytest.Monk
     problem: Any = SimpleNamespace(rules=RULES, budget=Budget())
     search._exchange(problem, found, [], np.zeros(1), lambda *_: None)
     assert asked == [first] and found.best.terms == (other,)
+
+
+def test_amplitudes_that_cancel_each_other_do_not_grow_without_end() -> None:
+    jump, free = Parameter("jump", "N", (0.01,), linear=True), Parameter("stiffness", "N/m", (10.0,))
+    most = 0.01 * LARGEST_AMPLITUDE
+    assert within(jump, 0.0, 1e6) == most and within(jump, 0.0, -1e6) == -most
+    assert within(jump, 3.0 * most, 1e6) == 3.0 * most, "a start value beyond it is kept"
+    assert within(free, 0.0, 1e6) == 1e6
+    assert within(Parameter("share", "1", (0.1,), 0.0, 1.0, linear=True), 0.5, 7.0) == 1.0
