@@ -18,7 +18,7 @@ from host.diagnosis.model.model import ActiveEffect, Model, Segment
 Array = npt.NDArray[np.float64]
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
 FAR = 1e6
-LARGEST_AMPLITUDE = 1000.0  # natural sizes: beyond, effects that cancel each other grow without end
+LARGEST_AMPLITUDE = 1000.0  # of an effect, in natural sizes
 BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
 MODE_LINES = 3  # highest lines of the residual at which a mode is tried, before its grid
@@ -182,23 +182,15 @@ def size_of(p: Parameter, value: float) -> float:
     return max(abs(value), max((abs(g) for g in p.grid), default=0.0)) or 1.0
 
 
-def moved(p: Parameter, value: float, by: float) -> float:
+def moved(p: Parameter, value: float, by: float, of_effect: bool) -> float:
     """`value` moved by `by` in the parameter's own scale, kept in bounds and finite.
 
-    Where a simulation has diverged, no parameter changes it and the step of least squares has no bound.
+    Where a simulation has diverged, no parameter changes it and the step of least squares has no bound. Amplitudes of an
+    effect stay within multiples of their natural size: two jumps a sample apart, or two forces along a direction that no
+    output shows, cancel each other at any size, and a simulator that gets such inputs may take very long.
     """
-    if p.log:
-        return float(min(max(value * np.exp(np.clip(by, -3.0, 3.0)), p.low), p.high))
-    return within(p, value, value + float(np.clip(by, -FAR, FAR)) * size_of(p, value))
-
-
-def within(p: Parameter, value: float, new: float) -> float:
-    """`new` in the bounds of a parameter that was `value`; an amplitude also within a multiple of its natural size.
-
-    Two jumps a sample apart, or two forces along a direction that no output shows, cancel each other at any size. A
-    simulator that gets such inputs may take very long.
-    """
-    if p.linear:
+    new = value * np.exp(np.clip(by, -3.0, 3.0)) if p.log else value + float(np.clip(by, -FAR, FAR)) * size_of(p, value)
+    if of_effect and p.linear:
         most = max(LARGEST_AMPLITUDE * size_of(p, 0.0), abs(value))
         new = min(max(new, -most), most)
     return float(min(max(new, p.low), p.high))
@@ -306,7 +298,7 @@ def minimize(
             if problem.late_s(terms, start) <= waits_s:
                 break
         return fit
-    parameters = problem.parameters(terms)
+    parameters, nominal = problem.parameters(terms), len(problem.model.parameters)
     values = np.array([min(max(v, p.low), p.high) for v, p in zip(start, parameters, strict=True)])
     moving = free(parameters)
     begins = free_states(problem, terms, values) if states and moving else None
@@ -328,9 +320,9 @@ def minimize(
             for place, index in enumerate(moving):
                 p = parameters[index]
                 trial[index] = (
-                    moved(p, values[index], by[place])
-                    if p.log
-                    else within(p, values[index], values[index] + by[place] * sizes[index])
+                    moved(p, values[index], by[place], of_effect=True)
+                    if p.log or index >= nominal
+                    else min(max(values[index] + by[place] * sizes[index], p.low), p.high)
                 )
             raw_new = problem.stacked(terms, trial)
             r_new = raw_new if begins is None else begins.freed(raw_new)

@@ -163,7 +163,8 @@ def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
         for share in SHARES if problem.joint_states else SHARES[:1]:
             trial = values.copy()
             for index, step in zip(free(parameters), by, strict=False):
-                trial[index] = moved(parameters[index], values[index], share * float(step))
+                of_effect = index >= len(problem.model.parameters)
+                trial[index] = moved(parameters[index], values[index], share * float(step), of_effect)
             _move(states, share * by[J.shape[1] :])
             r_new = problem.stacked(fit.terms, trial)
             cost_new, _ = robust(r_new)

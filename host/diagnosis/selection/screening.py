@@ -448,7 +448,7 @@ def _absorbed(
         by = np.linalg.lstsq(J[:, :columns], aim, rcond=1e-10)[0]
         found = trial.copy()
         for index, step in zip(free(parameters), by, strict=False):
-            found[index] = moved(parameters[index], trial[index], float(step))
+            found[index] = moved(parameters[index], trial[index], float(step), index >= len(problem.model.parameters))
         left = _known(problem, terms, found, base)
         ends.append((found, left - S @ (S.T @ left)))
     return min(ends, key=lambda end: float(end[1] @ end[1]))

@@ -10,7 +10,7 @@ import pytest
 
 import seldinger as sd
 from host.diagnosis.effects import candidates
-from host.diagnosis.estimation.fit import LARGEST_AMPLITUDE, Fit, Term, within
+from host.diagnosis.estimation.fit import LARGEST_AMPLITUDE, Fit, Term, moved
 from host.diagnosis.estimation.rules import RULES, Budget
 from host.diagnosis.model.effect import Array, Candidate, Parameter, Port
 from host.diagnosis.model.nominal import nominal_of
@@ -20,6 +20,7 @@ from host.diagnosis.selection import search
 from host.diagnosis.selection.screening import screen
 from host.diagnosis.selection.search import Found, fit_nominal, try_fit, with_wider
 from host.diagnosis.selection.trial import at_bound, called_for, wider
+from tests.host.proof import everyday
 
 PRESS: dict[str, Any] = {
     "name": "press",
@@ -119,9 +120,20 @@ def test_several_effects_of_one_name_may_leave_together(monkeypatch: pytest.Monk
 
 
 def test_amplitudes_that_cancel_each_other_do_not_grow_without_end() -> None:
-    jump, free = Parameter("jump", "N", (0.01,), linear=True), Parameter("stiffness", "N/m", (10.0,))
-    most = 0.01 * LARGEST_AMPLITUDE
-    assert within(jump, 0.0, 1e6) == most and within(jump, 0.0, -1e6) == -most
-    assert within(jump, 3.0 * most, 1e6) == 3.0 * most, "a start value beyond it is kept"
-    assert within(free, 0.0, 1e6) == 1e6
-    assert within(Parameter("share", "1", (0.1,), 0.0, 1.0, linear=True), 0.5, 7.0) == 1.0
+    jump, most = Parameter("jump", "N", (0.01,), linear=True), 0.01 * LARGEST_AMPLITUDE
+    assert moved(jump, 0.0, 1e6, of_effect=True) == most and moved(jump, 0.0, -1e6, of_effect=True) == -most
+    assert moved(jump, 3.0 * most, 1e6, of_effect=True) == 3.0 * most, "a start value beyond it is kept"
+    assert moved(Parameter("share", "1", (0.1,), 0.0, 1.0, linear=True), 0.5, 70.0, of_effect=True) == 1.0
+
+
+def test_a_nominal_parameter_may_be_far_from_its_start() -> None:
+    stiffness = Parameter("stiffness", "N/m", (0.0,), linear=True)
+    assert moved(stiffness, 0.0, 2e5, of_effect=False) == 2e5
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e9])
+def test_a_force_in_another_unit_is_fitted(factor: float) -> None:
+    """No value of the spring is stated: its parameters may have any size."""
+    pressed = [everyday.spring(seed) for seed in (1, 2)]
+    verdict = sd.diagnose([{**columns, "f": factor * columns["f"]} for columns in pressed], everyday.spring_nominal())
+    assert verdict.verdict == "nothing_missing"
