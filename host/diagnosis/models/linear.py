@@ -126,14 +126,13 @@ class LinearModel(SimulatedModel):
         )
         return A, B, C, D
 
-    def sampled(self, parameters: Mapping[str, float], dt_s: float) -> tuple[Array, Array, Array, Array, Array]:
-        """Ad, the weights of the input at a sample and at the next, C and D. Raises InputError for another period."""
-        A, B, C, D = self.matrices(parameters)
+    def sampled(self, A: Array, B: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Ad, and the weights of the input at a sample and at the next. Raises InputError for another period."""
         if self.spec.period_s is not None:
             if abs(dt_s / self.spec.period_s - 1.0) > SAME_PERIOD:
                 raise InputError("linear.period_s", self.spec.period_s, f"the period of the recordings, {dt_s:g} s")
-            return A, B, np.zeros_like(B), C, D
-        return (*sampled(A, B, dt_s, self.hold), C, D)
+            return A, B, np.zeros_like(B)
+        return sampled(A, B, dt_s, self.hold)
 
     def hold_as(self, segments: list[Segment], hold: str) -> None:
         """Let the inputs run between samples as `hold` says."""
@@ -198,7 +197,7 @@ class LinearModel(SimulatedModel):
         if not (np.isfinite(A).all() and np.isfinite(B).all() and np.isfinite(C).all()):
             return {name: np.full(run.time_s.size, np.nan) for name in self.spec.outputs}
         begin = self._begin_state(run, A, C)
-        Ad, B0, B1, C, D = self.sampled(parameters, dt_s)
+        Ad, B0, B1 = self.sampled(A, B, dt_s)
         if self.spec.feedback is None:
             u = np.vstack([run.inputs[name] for name in self.spec.inputs])
             return dict(zip(names, response(Ad, B0, B1, C, D, u, begin), strict=True))
@@ -311,14 +310,24 @@ def sampled(A: Array, B: Array, dt_s: float, hold: str) -> tuple[Array, Array, A
 @njit(cache=True)
 def response(A: Array, B0: Array, B1: Array, C: Array, D: Array, u: Array, begin: Array) -> Array:
     """Outputs (outputs, n) to inputs u (inputs, n) from the state `begin`."""
-    n = u.shape[1]
-    out = np.empty((C.shape[0], n))
-    x = begin.copy()
+    n, order = u.shape[1], begin.size
+    out = np.zeros((C.shape[0], n))
+    x, after = begin.copy(), np.empty(order)
+    # Loops: for a few states, each call of a matrix product takes longer than its arithmetic.
     for k in range(n):
-        now = np.ascontiguousarray(u[:, k])
-        out[:, k] = C @ x + D @ now
-        after = np.ascontiguousarray(u[:, min(k + 1, n - 1)])
-        x = A @ x + B0 @ now + B1 @ after
+        later = min(k + 1, n - 1)
+        for row in range(C.shape[0]):
+            for j in range(order):
+                out[row, k] += C[row, j] * x[j]
+            for j in range(u.shape[0]):
+                out[row, k] += D[row, j] * u[j, k]
+        for i in range(order):
+            after[i] = 0.0
+            for j in range(order):
+                after[i] += A[i, j] * x[j]
+            for j in range(u.shape[0]):
+                after[i] += B0[i, j] * u[j, k] + B1[i, j] * u[j, later]
+        x[:] = after
     return out
 
 
@@ -336,16 +345,27 @@ def closed_loop(
     n = reference.size
     y, command = np.empty((C.shape[0], n)), np.empty(n)
     x, z = begin.copy(), np.zeros(Ak.shape[0])
+    x_after, z_after = np.empty(x.size), np.empty(z.size)
     u = 0.0
     for k in range(n):
-        y[:, k] = C @ x + D[:, 0] * u
+        for row in range(C.shape[0]):
+            y[row, k] = D[row, 0] * u
+            for j in range(x.size):
+                y[row, k] += C[row, j] * x[j]
         error = reference[k] - y[fed, k] - changes[1, k]
         command[k] = Dk[0, 0] * error
         for j in range(z.size):
             command[k] += Ck[0, j] * z[j]
-        z = Ak @ z + Bk[:, 0] * error
         u = command[k] + changes[0, k]
-        x = A @ x + B[:, 0] * u
+        for i in range(z.size):
+            z_after[i] = Bk[i, 0] * error
+            for j in range(z.size):
+                z_after[i] += Ak[i, j] * z[j]
+        for i in range(x.size):
+            x_after[i] = B[i, 0] * u
+            for j in range(x.size):
+                x_after[i] += A[i, j] * x[j]
+        x[:], z[:] = x_after, z_after
     return y, command
 
 
