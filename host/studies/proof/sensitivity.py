@@ -80,13 +80,17 @@ class _Noted(_Notes, SelectionRules):
 def values_of(value: float) -> tuple[float, float]:
     """A fifth less and a fifth more; of a whole number at least one less and one more.
 
+    A share that a fifth more would bring above one comes a fifth nearer to one.
+
     Examples:
-        >>> values_of(6.0), values_of(10), values_of(2)
-        ((4.8, 7.2), (8, 12), (1, 3))
+        >>> values_of(6.0), values_of(10), values_of(2), values_of(0.95)
+        ((4.8, 7.2), (8, 12), (1, 3), (0.76, 0.96))
     """
     if isinstance(value, int):
         return min(math.floor((1.0 - BY) * value), value - 1), max(math.ceil((1.0 + BY) * value), value + 1)
-    return round((1.0 - BY) * value, 12), round((1.0 + BY) * value, 12)
+    share = value < 1.0 < (1.0 + BY) * value
+    more = 1.0 - (1.0 - BY) * (1.0 - value) if share else (1.0 + BY) * value
+    return round((1.0 - BY) * value, 12), round(more, 12)
 
 
 def changes() -> list[Change]:

@@ -17,6 +17,7 @@ def test_whole_numbers_move_by_at_least_one() -> None:
     assert values_of(10) == (8, 12)
     assert values_of(2) == (1, 3)
     assert values_of(-1.8) == (-1.44, -2.16)
+    assert values_of(0.95) == (0.76, 0.96)
 
 
 def test_every_rule_is_moved_both_ways() -> None:
