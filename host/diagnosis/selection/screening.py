@@ -39,6 +39,7 @@ SCREEN_ROWS = 24000  # residuals to screen by, about
 START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
 ABSORBED = 1e-10  # share of a response that the active parameters do not explain, below which they absorb it
 LARGEST = 30.0  # of a parameter's natural size: a start beyond it is made of what the active parameters hardly leave
+LATE_STARTS = 3  # of a delay, besides those of its grid
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 
@@ -133,6 +134,7 @@ class Point:
     left: Array
     values: Array | None = None  # parameters of the terms before it, where they were fitted with it
     begun: int = 0  # states that recordings begin from, among what took it
+    deepest: bool = False  # whether it is the delay of whole samples that leaves least (`_late_s`)
 
 
 def screen(
@@ -187,6 +189,8 @@ def screen(
         left = max(float(rest @ rest) - points[0].taken, 1e-300)
         n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
         promise = 0.5 * n_eff * np.log(reference / left) - term.fitted - points[0].begun
+        # One step from a wrong delay may take more than one from the right delay, whose rates have farther to go.
+        points.sort(key=lambda point: not point.deepest)
         nominal = [point.values for point in points[:2] if point.values is not None]
         begin = [point.begin for point in points[: len(nominal) or 3]]
         found.append(Screened(candidate, term, drop, float(promise), begin, nominal))
@@ -335,7 +339,12 @@ def _scan(
     fast = term.candidate.port.name in slopes
     shifts = not linear and not fast and term.candidate.effect.shifts == "time"
     each = len(values) + 2 if shifts else max(len(linear), 1)  # simulations of one point
-    for point in grid_points(tuned(term, lines), max(5, most // each)):
+    tried, deepest = [*grid_points(tuned(term, lines), max(5, most // each))], {}
+    if shifts and len(term.parameters) == 1 and term.parameters[0].dead_time:
+        p = term.parameters[0]
+        late = [{p.name: late_s} for late_s in _late_s(problem, base, Q) if p.low < late_s < p.high]
+        tried, deepest = [*tried, *late], late[0] if late else {}
+    for point in tried:
         columns = []
         options: list[Any] = [*linear] or [None]
         for p in options:
@@ -350,7 +359,8 @@ def _scan(
             if again is not None:
                 found, left = again
                 taken = float(rest @ rest - left @ left)
-                points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1]))
+                own = point is deepest
+                points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1], own))
             continue
         if term.candidate.effect.memories:  # it is nothing but what each recording begins with
             left = rest - S @ (S.T @ rest)
@@ -378,6 +388,39 @@ def _scan(
             most_taken, left = taken, r - (a @ D - Q @ (B.T @ a))
         points.append(Point(taken, starts(term, amplitude, point), left, None, S.shape[1]))
     return points
+
+
+def _late_s(problem: Problem, base: Array, Q: Array) -> list[float]:
+    """Delays (s) at which the simulated outputs and their rates, shifted, leave least of the measured ones.
+
+    The error has a minimum for each period of the motion, and a grid of few delays may miss the right one. Here all delays
+    of whole samples are compared: columns X of the outputs and their rates, shifted by d, leave
+    y'y - c' (X'X)^-1 c of the measured y, where c(d) = sum over t of y(t) X(t - d) is a correlation.
+    """
+    used = [segment for segment in problem.segments if segment.fit.any()]
+    longest, columns, first = max(segment.n for segment in used) // 4, Q.shape[1] + 1, 0
+    products, squares = np.zeros((longest, columns)), np.zeros((longest, columns, columns))
+    energy, counted = np.zeros(longest), np.zeros(longest)
+    for segment in used:
+        n = int(segment.fit.sum())
+        lags = min(longest, n)
+        size = 1 << int(np.ceil(np.log2(2 * n)))
+        for row in range(len(problem.noise)):
+            part, first = slice(first, first + n), first + n
+            y = np.nan_to_num(segment.y[row, segment.fit] / problem.scale[row])
+            X = np.column_stack((y - base[part], Q[part]))
+            across = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(X.T, size)), size)
+            products[:lags] += across[:, :lags].T
+            squares[:lags] += np.cumsum(X[:, :, None] * X[:, None, :], axis=0)[::-1][:lags]
+            energy[:lags] += np.cumsum(y[::-1] ** 2)[::-1][:lags]
+            counted[:lags] += n - np.arange(lags)
+    scale = np.sqrt(np.einsum("kii->ki", squares) + 1e-300)
+    shaped = squares / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(columns)
+    weights = np.linalg.solve(shaped, (products / scale)[:, :, None])[:, :, 0]
+    left = (energy - np.einsum("ki,ki->k", products / scale, weights)) / np.maximum(counted, 1.0)
+    valleys = np.flatnonzero((left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:])) + 1
+    best = valleys[np.argsort(left[valleys])[:LATE_STARTS]]
+    return [float(lag) * problem.segments[0].recording.dt_s for lag in best]
 
 
 def _known(problem: Problem, terms: tuple[Term, ...], trial: Array, base: Array) -> Array:
