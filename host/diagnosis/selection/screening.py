@@ -39,7 +39,7 @@ SCREEN_ROWS = 24000  # residuals to screen by, about
 START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
 ABSORBED = 1e-10  # share of a response that the active parameters do not explain, below which they absorb it
 LARGEST = 30.0  # of a parameter's natural size: a start beyond it is made of what the active parameters hardly leave
-LATE_STARTS = 3  # of a delay, besides those of its grid
+LATE_STARTS = 3  # of a delay, in addition to its grid
 GRID = 160  # grid points of one candidate where its effect is linearized, without a simulation
 
 

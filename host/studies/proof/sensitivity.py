@@ -33,7 +33,7 @@ NAMES = frozenset(RULES.as_dict())
 
 
 @dataclass(frozen=True)
-class Case:
+class LabelledCase:
     """One case of a finished run."""
 
     world: str
@@ -98,12 +98,12 @@ def changes() -> list[Change]:
     return [Change(rule, value) for rule, now in RULES.as_dict().items() for value in values_of(now)]
 
 
-def read_cases(run: Path, names: Sequence[str]) -> list[Case]:
+def read_cases(run: Path, names: Sequence[str]) -> list[LabelledCase]:
     """Return cases of a finished run by name, `world/number`. Raises InputError for others, OSError without labels."""
     every = {}
     for world in dict.fromkeys(name.partition("/")[0] for name in names):
         for label in read_labels(run / world / "sealed" / "labels.json"):
-            case = Case(world, label, run / world / "cases" / label["id"])
+            case = LabelledCase(world, label, run / world / "cases" / label["id"])
             every[case.name] = case
     for name in names:
         if name not in every:
@@ -111,7 +111,7 @@ def read_cases(run: Path, names: Sequence[str]) -> list[Case]:
     return [every[name] for name in names]
 
 
-def verdict_of(case: Case, change: Change | None) -> dict[str, Any]:
+def verdict_of(case: LabelledCase, change: Change | None) -> dict[str, Any]:
     """Line of results: what is named with which probability, whether it is right, and which rules were read."""
     _Notes.read.clear()
     rules = _Noted(_NotedData()) if change is None else change.applied()
@@ -124,17 +124,17 @@ def verdict_of(case: Case, change: Change | None) -> dict[str, Any]:
     return line | {"rule": change.rule, "value": change.value}
 
 
-def _task(given: tuple[Case, Change | None]) -> dict[str, Any]:
+def _task(given: tuple[LabelledCase, Change | None]) -> dict[str, Any]:
     return verdict_of(*given)
 
 
-def measure(cases: Sequence[Case], out: Path, jobs: int) -> list[dict[str, Any]]:
+def measure(cases: Sequence[LabelledCase], out: Path, jobs: int) -> list[dict[str, Any]]:
     """Lines of results, old and new."""
     lines = [json.loads(text) for text in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
     done = {(line["case"], line["rule"], line.get("value")) for line in lines}
     with ProcessPoolExecutor(max_workers=jobs, initializer=end_with_parent) as executor, out.open("a") as file:
 
-        def run(tasks: Iterable[tuple[Case, Change | None]]) -> Iterator[dict[str, Any]]:
+        def run(tasks: Iterable[tuple[LabelledCase, Change | None]]) -> Iterator[dict[str, Any]]:
             todo = [
                 (case, change)
                 for case, change in tasks

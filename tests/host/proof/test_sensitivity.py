@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from host.diagnosis.estimation.rules import RULES
-from host.studies.proof.sensitivity import Case, block, changes, read_cases, values_of, verdict_of
+from host.studies.proof.sensitivity import LabelledCase, block, changes, read_cases, values_of, verdict_of
 from protocol.errors import InputError
 from tests.host.proof.test_runner import Built
 
@@ -60,7 +60,7 @@ def test_the_table_lists_the_cases_whose_verdict_changes(tmp_path: Path) -> None
 def test_rules_that_a_case_reads_are_noted(built: Built) -> None:
     folder, labels = built
     label = next(la for la in labels if la["kind"] == "transmission" and la["category"] == "null")
-    case = Case("own", label, folder / "own" / "cases" / label["id"])  # type: ignore[arg-type]
+    case = LabelledCase("own", label, folder / "own" / "cases" / label["id"])  # type: ignore[arg-type]
     said = verdict_of(case, None)
     assert {"screening_log_likelihood", "absent_a"} <= set(said["read"])
     assert set(said["read"]) < set(RULES.as_dict())
