@@ -158,41 +158,58 @@ def named(line: dict[str, Any]) -> tuple[str, frozenset[str]]:
 
 
 def block(lines: Sequence[dict[str, Any]], run: Path) -> str:
-    """Return the generated text: every rule with what its change does, and the cases."""
+    """Return the generated text: what the change of each rule does, and which rules no case reads."""
     as_is = {line["case"]: line for line in lines if not line["rule"]}
     seed = json.loads((run / "suite.json").read_text(encoding="utf-8"))["seed"]
     right = sum(line["right"] for line in as_is.values())
-    rows, same = [], []
+    read = set().union(*(line["read"] for line in as_is.values()))
+    rows = ["| rule | value | 20 % less | 20 % more | probability |", "|---|---|---|---|---|"]
+    same = []
     for rule, now in RULES.as_dict().items():
-        cells = [_cell(lines, Change(rule, value), as_is) for value in values_of(now)]
-        if all(cell == NOTHING for cell in cells):
-            same.append(f"`{rule}`")
-        else:
-            rows.append(f"| `{rule}` | {now:g} | {cells[0]} | {cells[1]} |")
+        moved = [[line for line in lines if line["rule"] == rule and line["value"] == value] for value in values_of(now)]
+        cells = [_cell(each, as_is) for each in moved]
+        most = max((_shift(line, as_is[line["case"]]) for each in moved for line in each), default=0.0)
+        if cells != [NOTHING, NOTHING] or most >= VISIBLE:
+            rows.append(f"| `{rule}` | {now:g} | {cells[0]} | {cells[1]} | {most:.2f} |")
+        elif rule in read:
+            same.append(rule)
     worlds = dict.fromkeys(name.partition("/")[0] for name in as_is)
     counts = ", ".join(f"{sum(name.partition('/')[0] == world for name in as_is)} of `{world}`" for world in worlds)
+    unread = [rule for rule in RULES.as_dict() if rule not in read]
     return "\n\n".join(
         [
-            f"Seed {seed}, {len(as_is)} cases ({counts}). With the rules as they are, {right} verdicts are right. A "
-            "cell lists the cases whose verdict changes: `+` right only then, `-` right only before, `~` both or neither.",
-            "\n".join(["| rule | value | 20 % less | 20 % more |", "|---|---|---|---|", *rows]),
-            f"No verdict changes with the other {len(same)} rules: {', '.join(same)}.",
+            f"Seed {seed}, {len(as_is)} cases ({counts}). With the rules as they are, {right} verdicts are right. A cell "
+            "lists the cases whose names change: `+` right only then, `-` right only before, `~` both or neither. The last "
+            "column is the largest change of an effect's stated probability.",
+            "\n".join(rows),
+            f"With {len(same)} other rules no name changes, and no probability by {VISIBLE:g}: {_listed(same)}.",
+            f"None of these cases reads the other {len(unread)} rules: {_listed(unread)}.",
         ]
     )
 
 
 NOTHING = "none"
+VISIBLE = 0.01  # change of a probability
 
 
-def _cell(lines: Sequence[dict[str, Any]], change: Change, as_is: dict[str, dict[str, Any]]) -> str:
+def _listed(rules: Sequence[str]) -> str:
+    return ", ".join(f"`{rule}`" for rule in rules) or NOTHING
+
+
+def _cell(lines: Sequence[dict[str, Any]], as_is: dict[str, dict[str, Any]]) -> str:
     said = []
     for line in lines:
         before = as_is[line["case"]]
-        if line["rule"] != change.rule or line["value"] != change.value or named(line) == named(before):
-            continue
-        sign = "~" if line["right"] == before["right"] else "+" if line["right"] else "-"
-        said.append(f"{sign}{line['case']}")
+        if named(line) != named(before):
+            sign = "~" if line["right"] == before["right"] else "+" if line["right"] else "-"
+            said.append(f"{sign}{line['case']}")
     return ", ".join(said) or NOTHING
+
+
+def _shift(line: dict[str, Any], before: dict[str, Any]) -> float:
+    """Largest change of the probability of an effect that is named both times."""
+    now, then = dict(map(tuple, line["effects"])), dict(map(tuple, before["effects"]))
+    return max((abs(now[name] - then[name]) for name in now if name in then), default=0.0)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -28,15 +28,17 @@ def test_every_rule_is_moved_both_ways() -> None:
         assert {name for name, value in moved.items() if value != rules[name]} == {change.rule}
 
 
-def line(rule: str, value: float, effects: list[str], right: bool, case: str = "ode/0001") -> dict[str, Any]:
+def line(rule: str, value: float, effects: dict[str, float], right: bool, case: str = "ode/0001") -> dict[str, Any]:
     said = "missing_physics" if effects else "nothing_missing"
+    read = {} if rule else {"read": ["significance", "coarsening", "prior_none"]}
     return {
         "case": case,
         "rule": rule,
         "value": value,
         "verdict": said,
-        "effects": [(e, 0.9) for e in effects],
+        "effects": [*effects.items()],
         "right": right,
+        **read,
     }
 
 
@@ -44,17 +46,20 @@ def test_the_table_lists_the_cases_whose_verdict_changes(tmp_path: Path) -> None
     (tmp_path / "suite.json").write_text(json.dumps({"seed": 5}))
     less, more = values_of(RULES.significance)
     lines = [
-        line("", 0.0, ["backlash@gear"], True),
-        line("", 0.0, [], False, "ode/0002"),
-        line("significance", less, [], False),
-        line("significance", more, ["backlash@gear"], True),
-        line("significance", more, ["rate_lag@gear"], True, "ode/0002"),
-        line("weak_significance", values_of(RULES.weak_significance)[0], ["backlash@gear"], True),
+        line("", 0.0, {"backlash@gear": 0.9}, True),
+        line("", 0.0, {}, False, "ode/0002"),
+        line("significance", less, {}, False),
+        line("significance", more, {"backlash@gear": 0.9}, True),
+        line("significance", more, {"rate_lag@gear": 0.6}, True, "ode/0002"),
+        line("coarsening", values_of(RULES.coarsening)[1], {"backlash@gear": 0.86}, True),
+        line("prior_none", values_of(RULES.prior_none)[0], {"backlash@gear": 0.9}, True),
     ]
     text = block(lines, tmp_path)
     assert "Seed 5, 2 cases (2 of `ode`). With the rules as they are, 1 verdicts are right." in text
-    assert "| `significance` | 0.01 | -ode/0001 | +ode/0002 |" in text
-    assert "| `weak_significance`" not in text and "`weak_significance`" in text
+    assert "| `significance` | 0.01 | -ode/0001 | +ode/0002 | 0.00 |" in text
+    assert "| `coarsening` | 60 | none | none | 0.04 |" in text
+    assert "With 1 other rules no name changes, and no probability by 0.01: `prior_none`." in text
+    assert f"None of these cases reads the other {len(RULES.as_dict()) - 3} rules: `rest_range_share`, " in text
 
 
 def test_rules_that_a_case_reads_are_noted(built: Built) -> None:
