@@ -319,6 +319,7 @@ def minimize(
             trial = values.copy()
             for place, index in enumerate(moving):
                 p = parameters[index]
+                # A nominal parameter may be any number of natural sizes away: its columns may be in another unit.
                 trial[index] = (
                     moved(p, values[index], by[place], of_effect=True)
                     if p.log or index >= nominal

@@ -42,7 +42,7 @@ class LabelledCase:
 
     @property
     def name(self) -> str:
-        """World and number."""
+        """Name in `--cases` and in the table, such as ode/0005."""
         return f"{self.world}/{self.label['id'].removeprefix('case_')}"
 
 
@@ -124,10 +124,6 @@ def verdict_of(case: LabelledCase, change: Change | None) -> dict[str, Any]:
     return line | {"rule": change.rule, "value": change.value}
 
 
-def _task(given: tuple[LabelledCase, Change | None]) -> dict[str, Any]:
-    return verdict_of(*given)
-
-
 def measure(cases: Sequence[LabelledCase], out: Path, jobs: int) -> list[dict[str, Any]]:
     """Lines of results, old and new."""
     lines = [json.loads(text) for text in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
@@ -140,7 +136,7 @@ def measure(cases: Sequence[LabelledCase], out: Path, jobs: int) -> list[dict[st
                 for case, change in tasks
                 if (case.name, change.rule if change else "", change.value if change else None) not in done
             ]
-            for number, line in enumerate(executor.map(_task, todo), 1):
+            for number, line in enumerate(executor.map(verdict_of, *zip(*todo, strict=True)) if todo else (), 1):
                 file.write(json.dumps(line) + "\n")
                 file.flush()
                 print(f"\r{number}/{len(todo)} {line['case']} {line['rule']:40s}", end="", file=sys.stderr)
