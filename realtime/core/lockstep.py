@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,7 +27,7 @@ def _nothing(topic: str, message: Message) -> None:
 
 
 class LockstepLoop:
-    """Runs the drivers, the core and the tick in turn.
+    """Runs the drivers, the core and the tick in turn. `step` and `request` may be called from different threads.
 
     Args:
         rig: the rig file.
@@ -42,6 +43,7 @@ class LockstepLoop:
         self.sensors = SensorClients(rig)
         names = [name for name in INPUTS.names or () if name != "now_ns"]
         records = {name: getattr(self._inputs, name) for name in names}
+        self._lock = threading.RLock()  # one step of the core at a time; what `publish` calls may make a request in turn
         self._leases = 0
         self.core = RigCore(rig, records, self._timing, force_source, new_lease=self._next_lease)
         self.params = self.core.params
@@ -60,6 +62,23 @@ class LockstepLoop:
 
     def step(self, now_ns: int, arriving: FromRig) -> ToRig:
         """Run one period: process the received data, run the tick, return the data to send."""
+        with self._lock:
+            return self._step(now_ns, arriving)
+
+    def request(self, name: str, payload: bytes) -> Reply | None:
+        """Answer a request of commander `name`, at the time of the newest period."""
+        with self._lock:
+            return self._step_core(self.now_ns, Arrived(requests=[CommandRequest(name, payload)])).replies[0]
+
+    def estimate_at(self, estimate: ForceEstimate) -> None:
+        """Queue a force estimate that arrives at its `published_ns`."""
+        self._estimates.append(estimate)
+
+    def log(self, now_ns: int, level: str, source: str, text: str) -> None:
+        """Publish a log line of another part of the simulated rig."""
+        self.publish("log", Log(stamp_ns=now_ns, level=level, source=source, text=text[:500]))
+
+    def _step(self, now_ns: int, arriving: FromRig) -> ToRig:
         if self.core.now_ns:
             self.missed_ticks += max(round((now_ns - self.core.now_ns) / self.period_ns) - 1, 0)
         readings = self.sensors.feed(arriving, now_ns)
@@ -74,18 +93,6 @@ class LockstepLoop:
         self._ticks.append(Tick(int(self._state.ticks), self._outputs))
         commands, self._frames = b"".join(self._frames), []
         return self.sensors.outgoing(setpoint + commands, now_ns)
-
-    def request(self, name: str, payload: bytes) -> Reply | None:
-        """Answer a request of commander `name`, at the time of the newest period."""
-        return self._step_core(self.now_ns, Arrived(requests=[CommandRequest(name, payload)])).replies[0]
-
-    def estimate_at(self, estimate: ForceEstimate) -> None:
-        """Queue a force estimate that arrives at its `published_ns`."""
-        self._estimates.append(estimate)
-
-    def log(self, now_ns: int, level: str, source: str, text: str) -> None:
-        """Publish a log line of another part of the simulated rig."""
-        self.publish("log", Log(stamp_ns=now_ns, level=level, source=source, text=text[:500]))
 
     def _step_core(self, now_ns: int, arrived: Arrived) -> Leaving:
         arrived.ticks, self._ticks = self._ticks, []

@@ -93,6 +93,30 @@ def test_the_step_edges_are_the_same_beside(kind: str, alone: tuple[str, int]) -
     assert digest_beside(kind) == alone
 
 
+def test_requests_of_several_threads_are_each_answered_between_periods() -> None:
+    rig, replies, ended = load_rig(RIG_FILE), list[Reply | None](), threading.Event()
+    with LibraryBoard() as board:
+        run = Scenario(rig, World(rig, simulated_plant(rig, 1), board, 1), lambda topic, message: None)
+
+        def flood() -> None:
+            while not ended.is_set():
+                replies.append(run.loop.request("flood", b"junk"))
+
+        threads, interval_s = [threading.Thread(target=flood) for _ in range(3)], sys.getswitchinterval()
+        sys.setswitchinterval(1e-5)
+        try:
+            for thread in threads:
+                thread.start()
+            assert run.arm()
+        finally:
+            ended.set()
+            for thread in threads:
+                thread.join()
+            sys.setswitchinterval(interval_s)
+        counts = run.loop.core.gate.counts
+        assert len(replies) == counts["malformed"] + counts["flooded"] > 1000
+
+
 def test_a_stop_gets_through_a_flood() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     done: list[str] = []

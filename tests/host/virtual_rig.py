@@ -10,7 +10,7 @@ import threading
 import time
 
 from protocol.rig_file import Rig
-from protocol.topics import Message, Reply
+from protocol.topics import Message
 from protocol.zenoh_session import Session
 from sim.board import SimulatedBoard
 from sim.scenario import Scenario
@@ -25,7 +25,7 @@ class VirtualRig:
     def __init__(self, rig: Rig, session: Session) -> None:
         self._rig, self._session = rig, session
         self._publishers = {}
-        self._lock, self._ending = threading.Lock(), threading.Event()
+        self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="virtual rig", daemon=True)
         self.failure: BaseException | None = None
 
@@ -39,15 +39,10 @@ class VirtualRig:
             self._publishers[topic] = self._session.publisher(topic)
         self._publishers[topic].put(message)
 
-    def _request(self, name: str, payload: bytes) -> Reply | None:
-        with self._lock:
-            return self._scenario.loop.request(name, payload)
-
     def _run(self) -> None:
         try:
             while not self._ending.is_set():
-                with self._lock:
-                    self._scenario.step()
+                self._scenario.step()
                 time.sleep(STEP_S)
         except BaseException as failure:
             self.failure = failure
@@ -56,7 +51,7 @@ class VirtualRig:
     def __enter__(self) -> VirtualRig:
         self._board = SimulatedBoard("native").__enter__()
         self._scenario = Scenario(self._rig, World(self._rig, simulated_plant(self._rig, 1), self._board, 1), self._publish)
-        self._server = self._session.serve_requests(self._request)
+        self._server = self._session.serve_requests(self._scenario.loop.request)
         self._thread.start()
         return self
 
