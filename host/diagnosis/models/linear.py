@@ -307,26 +307,31 @@ def sampled(A: Array, B: Array, dt_s: float, hold: str) -> tuple[Array, Array, A
     return step, held - ramp, ramp
 
 
+@njit(cache=True, inline="always")
+def add_product(out: Array, M: Array, v: Array) -> None:
+    """Add M v to `out`.
+
+    A loop, inlined: for a few states a call, of a matrix product or of a function on parts of arrays, takes longer than its
+    arithmetic.
+    """
+    for i in range(M.shape[0]):
+        for j in range(M.shape[1]):
+            out[i] += M[i, j] * v[j]
+
+
 @njit(cache=True)
 def response(A: Array, B0: Array, B1: Array, C: Array, D: Array, u: Array, begin: Array) -> Array:
     """Outputs (outputs, n) to inputs u (inputs, n) from the state `begin`."""
-    n, order = u.shape[1], begin.size
+    n = u.shape[1]
     out = np.zeros((C.shape[0], n))
-    x, after = begin.copy(), np.empty(order)
-    # Loops: for a few states, each call of a matrix product takes longer than its arithmetic.
+    x, after = begin.copy(), np.empty(begin.size)
     for k in range(n):
-        later = min(k + 1, n - 1)
-        for row in range(C.shape[0]):
-            for j in range(order):
-                out[row, k] += C[row, j] * x[j]
-            for j in range(u.shape[0]):
-                out[row, k] += D[row, j] * u[j, k]
-        for i in range(order):
-            after[i] = 0.0
-            for j in range(order):
-                after[i] += A[i, j] * x[j]
-            for j in range(u.shape[0]):
-                after[i] += B0[i, j] * u[j, k] + B1[i, j] * u[j, later]
+        add_product(out[:, k], C, x)
+        add_product(out[:, k], D, u[:, k])
+        after[:] = 0.0
+        add_product(after, A, x)
+        add_product(after, B0, u[:, k])
+        add_product(after, B1, u[:, min(k + 1, n - 1)])
         x[:] = after
     return out
 
@@ -343,28 +348,22 @@ def closed_loop(
     A, B, C, D = plant
     Ak, Bk, Ck, Dk = controller
     n = reference.size
-    y, command = np.empty((C.shape[0], n)), np.empty(n)
+    y, command = np.zeros((C.shape[0], n)), np.zeros(n)
     x, z = begin.copy(), np.zeros(Ak.shape[0])
     x_after, z_after = np.empty(x.size), np.empty(z.size)
-    u = 0.0
+    u, error = np.zeros(1), np.zeros(1)
     for k in range(n):
-        for row in range(C.shape[0]):
-            y[row, k] = D[row, 0] * u
-            for j in range(x.size):
-                y[row, k] += C[row, j] * x[j]
-        error = reference[k] - y[fed, k] - changes[1, k]
-        command[k] = Dk[0, 0] * error
-        for j in range(z.size):
-            command[k] += Ck[0, j] * z[j]
-        u = command[k] + changes[0, k]
-        for i in range(z.size):
-            z_after[i] = Bk[i, 0] * error
-            for j in range(z.size):
-                z_after[i] += Ak[i, j] * z[j]
-        for i in range(x.size):
-            x_after[i] = B[i, 0] * u
-            for j in range(x.size):
-                x_after[i] += A[i, j] * x[j]
+        add_product(y[:, k], D, u)
+        add_product(y[:, k], C, x)
+        error[0] = reference[k] - y[fed, k] - changes[1, k]
+        add_product(command[k : k + 1], Dk, error)
+        add_product(command[k : k + 1], Ck, z)
+        u[0] = command[k] + changes[0, k]
+        z_after[:], x_after[:] = 0.0, 0.0
+        add_product(z_after, Bk, error)
+        add_product(z_after, Ak, z)
+        add_product(x_after, B, u)
+        add_product(x_after, A, x)
         x[:], z[:] = x_after, z_after
     return y, command
 

@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, Step, refined
+from host.diagnosis.selection.search import Found, Step, refined, unsure
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -53,9 +53,9 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
         gain = crossed or gain
         alike, rivals = _equals(problem, found, term.candidate, less, both, noise_sd)
-        said = _better_said(problem, found, term.candidate, less, noise_sd)
+        said = _better_said(problem, found, term.candidate, less, both, noise_sd)
         alike += tuple(candidate for candidate, _ in said if candidate.name != term.candidate.name)
-        paired = _pairs(problem, found, term.candidate, noise_sd)
+        paired = _pairs(problem, found, term.candidate, both, noise_sd)
         alike += tuple(dict.fromkeys(part for part, _ in paired if part not in alike))
         least = -np.log(problem.rules.prior_equal / max(len(alike), 1))
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
@@ -93,7 +93,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
         trial = next(t for t in step.trials if t.candidate.key == rival.key)
         other = _with_rival(problem, found.best, standing[k].candidate, trial)
         ahead = compare(problem.segments, "both", before.residuals, other.residuals, noise_sd, problem.rules)
-        likelier = coarse(ahead, other.fitted - before.fitted, problem.rules) > 0.0
+        likelier = coarse(ahead, other.fitted - before.fitted, standing[k].both, problem.rules) > 0.0
         if other.names in seen or not likelier or at_bound(other):
             set_starts(problem, begun)
             return standing
@@ -110,7 +110,9 @@ def _simpler(found: Found, rival: Candidate, standing: Standing) -> bool:
     return any(trial.fit.terms[-1].fitted < standing.parameters for trial in tried)
 
 
-def _pairs(problem: Problem, found: Found, candidate: Candidate, noise_sd: Array) -> list[tuple[Candidate, float]]:
+def _pairs(
+    problem: Problem, found: Found, candidate: Candidate, earned: Gain, noise_sd: Array
+) -> list[tuple[Candidate, float]]:
     """Effects of pairs that do as well as `candidate`, the only effect that is named: each with its coarsened difference.
 
     A pair is one explanation: its two effects share its weight.
@@ -123,7 +125,9 @@ def _pairs(problem: Problem, found: Found, candidate: Candidate, noise_sd: Array
             return []  # another effect was named when they were compared
         ahead = compare(problem.segments, "both", pair.residuals, found.best.residuals, noise_sd, problem.rules)
         if ahead.log_likelihood < problem.rules.equal_log_likelihood:
-            difference = coarse(ahead, found.best.fitted - pair.fitted, problem.rules) + float(np.log(len(pair.terms)))
+            difference = coarse(ahead, found.best.fitted - pair.fitted, earned, problem.rules) + float(
+                np.log(len(pair.terms))
+            )
             parts += [(term.candidate, difference) for term in pair.terms]
     return parts
 
@@ -139,20 +143,27 @@ def without_improbable(
     """Standings and remainder without the least probable effect, where another one is probable and it is not.
 
     An effect enters by what it gains on held-out samples, which formulas that are only nearly true let small further
-    effects do. It stays if no other one is probable without it: what it explained then counts as physics that is in no
-    list. Probabilities are those before calibration. None where all stay. Changes `found.best`.
+    effects do. It stays if no other one is probable and sure without it: what it explained then counts as physics that is
+    in no list. It stays too where it or one of its rivals is probable and removes more than an inexact formula leaves: then
+    its name is in doubt, and not that something is there. Probabilities are those before calibration. None where all stay.
+    Changes `found.best`.
     """
     least = problem.rules.further_probability
-    probable = [probability_of(one, remainder.share, problem.rules).raw for one in standing]
-    if len(probable) < 2 or max(probable) < least or min(probable) >= least or problem.budget.spent():
+    probable = [probability_of(one, remainder.share, problem.rules) for one in standing]
+    doubtful = [
+        (p.raw, k)
+        for k, (p, one) in enumerate(zip(probable, standing, strict=True))
+        if p.raw < least and (p.raw_listed < least or one.share < problem.rules.partial_share)
+    ]
+    if not doubtful or max(p.raw for p in probable) < least or problem.budget.spent():
         return None
-    weakest = standing[int(np.argmin(probable))]
+    weakest = standing[min(doubtful)[1]]
     begun, before = get_starts(problem), found.best
     terms, values = without(before, problem, (weakest.candidate.key,))
     found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
     fewer = standings(problem, found, noise_sd)
     left = remainder_of(problem, found, noise_sd)
-    if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least:
+    if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least or unsure(problem, found.best):
         found.best = before
         set_starts(problem, begun)
         return None
@@ -222,7 +233,7 @@ def with_unlisted_rival(standing: list[Standing], remainder: Remainder) -> list[
 
 
 def _better_said(
-    problem: Problem, found: Found, candidate: Candidate, less: Fit, noise_sd: Array
+    problem: Problem, found: Found, candidate: Candidate, less: Fit, earned: Gain, noise_sd: Array
 ) -> tuple[tuple[Candidate, float], ...]:
     """An equation that does plainly better in the place of `candidate`: if it says something else, `candidate` may be the
     wrong name; if it says the same, the form of `candidate` is not exact, and no rival's form has to be the better name.
@@ -234,7 +245,7 @@ def _better_said(
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
             # its form was chosen among hundreds: it is no simpler than an effect with more parameters
             more = max(trial.fit.fitted - found.best.fitted, 0)
-            return ((trial.candidate, -coarse(behind, more, problem.rules)),)
+            return ((trial.candidate, -coarse(behind, more, earned, problem.rules)),)
     return ()
 
 
@@ -271,7 +282,8 @@ def _equals(
         ahead = compare(problem.segments, "both", other.residuals, best.residuals, noise_sd, problem.rules)
         held = compare(problem.segments, "heldout", other.residuals, best.residuals, noise_sd, problem.rules)
         rival = compare(problem.segments, "both", less.residuals, other.residuals, noise_sd, problem.rules)
-        refitted.append((trial.candidate, ahead_of_rival(ahead, best.fitted - other.fitted, problem.rules)))
+        more = max(earned, rival, key=lambda gain: gain.log_likelihood)
+        refitted.append((trial.candidate, ahead_of_rival(ahead, best.fitted - other.fitted, more, problem.rules)))
         if trial.candidate.name == candidate.name:
             continue  # another form of the same answer
         if len(kept) < problem.rules.most_equals and _indistinguishable(ahead, held, earned, rival, problem.rules):

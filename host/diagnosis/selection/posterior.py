@@ -5,8 +5,9 @@ effects; an equation of recorded signals in its place; nothing there at all; and
 
     dl(M) = log-likelihood of the extended model - that of M
 
-computed on independent samples only (n, autocorrelation taken out), dk the parameters that it has more than M, each of
-which costs c = `parameter_penalty`, and r = coarsening / (n + coarsening),
+computed on independent samples only (autocorrelation taken out), dk the parameters that it has more than M, each of which
+costs c = `parameter_penalty`, and r = coarsening / (n + coarsening), where n counts each independent sample by the share of
+its error that the effect removes,
 
     w(effect) = 1,   w(rival) = exp(-r dl + c dk),   w(nothing) = max(exp(-dl + c dk), p-value on held-out blocks)
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
@@ -21,8 +22,9 @@ another form or a rival weighs more than what was fitted, w(none) and w(other) a
 Here `left` is the share of the mismatch above noise that the extended model leaves. Probabilities are w over their sum;
 rivals that are indistinguishable (`equivalence`) have at least the weight `prior_equal` together.
 The power r is the coarsened posterior for models that are only nearly true (Miller & Dunson 2019): beyond `coarsening`
-independent samples, more data say nothing more of a formula that idealizes. `nothing` is compared without it, since noise
-is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.
+samples, more data say nothing more of a formula that idealizes. A sample of which the effect is only a small part is noise
+for the most part, which hides what the formula idealizes, and counts by that part. `nothing` is compared without it, since
+noise is known. w(none) is the same likelihood ratio against a model that would leave no more than an exact formula does.
 w(other): an effect that removes the `share` of the mismatch may stand for what the inexact formula of another one leaves, up
 to `exact_share`; its prior is scale-free. It counts as none of these at the place of the small effect.
 
@@ -49,7 +51,7 @@ EDGE = 1e-4  # probabilities are kept this far from 0 and 1 before they are cali
 class Posterior:
     """Probability of an effect, of its rivals by name, of nothing in its place, and of physics that is in no list.
 
-    raw: of the effect, before calibration.
+    raw: of the effect, before calibration; raw_listed: of the effect or one of its rivals, before calibration.
     """
 
     effect: float
@@ -57,25 +59,43 @@ class Posterior:
     nothing: float
     none: float
     raw: float
+    raw_listed: float
 
 
-def coarse(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
-    """Coarsened difference of log-likelihoods of two models, the first with so many parameters more."""
-    n = float(np.sum(ahead.independent))
-    power = rules.coarsening / (n + rules.coarsening)
+def showing(earned: Gain) -> float:
+    """Independent samples, each counted by the share of its error that the effect with the gain `earned` removes."""
+    return float(np.sum(earned.independent * -np.expm1(-np.maximum(earned.log_ratio, 0.0))))
+
+
+def coarse(ahead: Gain, parameters_more: int, earned: Gain, rules: SelectionRules) -> float:
+    """Coarsened difference of log-likelihoods of two models, the first with so many parameters more.
+
+    earned: gain of the effect in question, over the model without it.
+    """
+    power = rules.coarsening / (showing(earned) + rules.coarsening)
     return power * ahead.log_likelihood - rules.parameter_penalty * parameters_more
 
 
-def ahead_of_rival(ahead: Gain, parameters_more: int, rules: SelectionRules) -> float:
+def ahead_of_rival(ahead: Gain, parameters_more: int, earned: Gain, rules: SelectionRules) -> float:
     """Coarsened difference of a named effect from its rival; the cost of parameters that have earned it is coarsened too.
 
-    They have earned it where all samples gain more than the cost, and more of the error than an idealized formula leaves.
-    The full cost against the coarsened likelihood would let a rival with fewer parameters win on every long recording.
+    They have earned it where all samples gain more than the cost, and the rival leaves more than an idealized formula
+    does, of the error or of what the effect removes. The full cost against the coarsened likelihood would let a rival with
+    fewer parameters win on every long recording.
     """
     cost = rules.parameter_penalty * parameters_more
-    if 0.0 < cost < ahead.log_likelihood and ahead.share > rules.equal_error:
-        return coarse(replace(ahead, log_likelihood=ahead.log_likelihood - cost), 0, rules)
-    return coarse(ahead, parameters_more, rules)
+    more = ahead.share > rules.equal_error or _left_of(ahead, earned) > rules.exact_share
+    if 0.0 < cost < ahead.log_likelihood and more:
+        return coarse(replace(ahead, log_likelihood=ahead.log_likelihood - cost), 0, earned, rules)
+    return coarse(ahead, parameters_more, earned, rules)
+
+
+def _left_of(ahead: Gain, earned: Gain) -> float:
+    """Share of what an effect removes (`earned`) that a rival leaves (`ahead` of it), in the output where that is most."""
+    if not ahead.log_ratio.size:
+        return 0.0
+    top = int(np.argmax(ahead.independent * ahead.log_ratio))
+    return float(np.expm1(ahead.log_ratio[top]) / max(np.expm1(earned.log_ratio[top]), 1e-300))
 
 
 def posterior(
@@ -102,12 +122,13 @@ def posterior(
     none = odds * (max(left, rules.exact_share) / rules.exact_share) ** (0.5 * rules.coarsening_none)
     none += odds * min(rules.exact_share / max(share, 1e-300), 1.0 / odds)
     none *= max([*forms, *(weight for _, weight in weights)])  # its prior odds are those against the best that was fitted
-    total = own + sum(weight for _, weight in weights) + nothing + none
+    listed = own + sum(weight for _, weight in weights)
+    total = listed + nothing + none
     raw = own / total
     stated = calibrated(raw, *rules.effect_curve)
     share = (1.0 - stated) / (1.0 - raw) if raw < 1.0 else 0.0  # of what is not the effect, every part alike
     others = tuple((rival, share * weight / total) for rival, weight in weights)
-    return Posterior(stated, others, share * nothing / total, share * none / total, raw)
+    return Posterior(stated, others, share * nothing / total, share * none / total, raw, listed / total)
 
 
 def calibrated(p: float, a: float, b: float, c: float) -> float:

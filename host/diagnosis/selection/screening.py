@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from host.diagnosis.model.operators import fill
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 SCREEN_ROWS = 24000  # residuals to screen by, about
+Slopes = dict[str, list[dict[str, Any]]]  # port -> of every segment that is fitted, what the model linearized there
 START_STEP = 0.01  # of a port's RMS motion, by which the state at a recording's first sample is moved
 ABSORBED = 1e-10  # share of a response that the active parameters do not explain, below which they absorb it
 LARGEST = 30.0  # of a parameter's natural size: a start beyond it is made of what the active parameters hardly leave
@@ -134,7 +136,67 @@ class Point:
     left: Array
     values: Array | None = None  # parameters of the terms before it, where they were fitted with it
     begun: int = 0  # states that recordings begin from, among what took it
-    deepest: bool = False  # whether it is the delay of whole samples that leaves least (`_late_s`)
+    deepest: bool = False  # whether it is the delay of whole samples that leaves least (`Base.late_s`)
+
+
+@dataclass
+class Base:
+    """What is fitted without the effects that a candidate replaces: responses are compared with what it leaves.
+
+    residuals: (rows,), weighted and stacked; Q: (rows, columns), orthonormal, of the rates of all that is fitted.
+    slopes: of ports that are linearized. lines: frequencies (Hz) that stand out of the residual.
+    """
+
+    problem: Problem
+    terms: tuple[Term, ...]
+    values: Array
+    residuals: Array
+    Q: Array
+    slopes: Slopes
+    lines: Array
+
+    @cached_property
+    def rest(self) -> Array:
+        """The residuals past all that is fitted: orthogonal to the columns of `Q`."""
+        return np.asarray(self.residuals - self.Q @ (self.Q.T @ self.residuals))
+
+    @cached_property
+    def energy(self) -> float:
+        """Squared error of `rest`."""
+        return float(self.rest @ self.rest)
+
+    @cached_property
+    def late_s(self) -> list[float]:
+        """Delays (s) at which the simulated outputs and their rates, shifted, leave least of the measured ones.
+
+        The error has a minimum for each period of the motion, and a grid of few delays may miss the right one. Here all
+        delays of whole samples are compared: columns X of the outputs and their rates, shifted by d, leave
+        y'y - c' (X'X)^-1 c of the measured y, where c(d) = sum over t of y(t) X(t - d) is a correlation.
+        """
+        used = [segment for segment in self.problem.segments if segment.fit.any()]
+        longest, columns, first = max(segment.n for segment in used) // 4, self.Q.shape[1] + 1, 0
+        products, squares = np.zeros((longest, columns)), np.zeros((longest, columns, columns))
+        energy, counted = np.zeros(longest), np.zeros(longest)
+        for segment in used:
+            n = int(segment.fit.sum())
+            lags = min(longest, n)
+            size = 1 << int(np.ceil(np.log2(2 * n)))
+            for row in range(len(self.problem.noise)):
+                part, first = slice(first, first + n), first + n
+                y = np.nan_to_num(segment.y[row, segment.fit] / self.problem.scale[row])
+                X = np.column_stack((y - self.residuals[part], self.Q[part]))
+                across = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(X.T, size)), size)
+                products[:lags] += across[:, :lags].T
+                squares[:lags] += np.cumsum(X[:, :, None] * X[:, None, :], axis=0)[::-1][:lags]
+                energy[:lags] += np.cumsum(y[::-1] ** 2)[::-1][:lags]
+                counted[:lags] += n - np.arange(lags)
+        scale = np.sqrt(np.einsum("kii->ki", squares) + 1e-300)
+        shaped = squares / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(columns)
+        weights = np.linalg.solve(shaped, (products / scale)[:, :, None])[:, :, 0]
+        left = (energy - np.einsum("ki,ki->k", products / scale, weights)) / np.maximum(counted, 1.0)
+        valleys = np.flatnonzero((left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:])) + 1
+        best = valleys[np.argsort(left[valleys])[:LATE_STARTS]]
+        return [float(lag) * self.problem.segments[0].recording.dt_s for lag in best]
 
 
 def screen(
@@ -146,7 +208,7 @@ def screen(
     problem = _smaller(problem)
     r = problem.stacked(fit.terms, fit.values)
     found = []
-    bases: dict[tuple[str, ...], tuple[tuple[Term, ...], Array, Array, Array, Array]] = {}
+    bases: dict[tuple[str, ...], Base] = {}
     few = _independent(problem, r)
     sizes: dict[str, float] = {}
     slopes = _slopes(problem, fit)
@@ -172,21 +234,16 @@ def screen(
             begins = free_states(problem, terms, values) if problem.joint_states else None
             if begins is not None:  # states of a linear plant take over what an offset or a ramp does at first
                 J = np.hstack((J, begins.rates))
-            Q = np.linalg.qr(J)[0] if J.shape[1] else J
-            bases[drop] = (terms, values, base, Q, base - Q @ (Q.T @ base))
-        terms, values, base, Q, rest = bases[drop]
+            bases[drop] = Base(problem, terms, values, base, np.linalg.qr(J)[0] if J.shape[1] else J, slopes, lines)
         term = _seeded(problem, fit, term_of(problem, candidate, fit, sizes))
-        quick = candidate.port.name in slopes
-        if not term.parameters or (candidate.effect.joins and _absorbs(problem, (*terms, term), values, term, base, Q)):
+        if not term.parameters or (candidate.effect.joins and _absorbs(bases[drop], term)):
             continue
-        points = _scan(
-            problem, (*terms, term), values, term, base, Q, rest, GRID if quick else problem.model.scan_points, slopes, lines
-        )
+        points = _scan(bases[drop], term)
         if not points:
             continue
         points.sort(key=lambda point: point.taken, reverse=True)
         reference = float(r @ r)
-        left = max(float(rest @ rest) - points[0].taken, 1e-300)
+        left = max(bases[drop].energy - points[0].taken, 1e-300)
         n_eff = max(few, _independent(problem, points[0].left)) if reference > 1.05 * left else few
         promise = 0.5 * n_eff * np.log(reference / left) - term.fitted - points[0].begun
         # One step from a wrong delay may take more than one from the right delay, whose rates have farther to go.
@@ -197,12 +254,13 @@ def screen(
     return sorted(found, key=lambda item: item.promise, reverse=True)
 
 
-def _absorbs(problem: Problem, terms: tuple[Term, ...], values: Array, term: Term, base: Array, Q: Array) -> bool:
+def _absorbs(base: Base, term: Term) -> bool:
     """Whether the nominal parameters absorb one of the effects that `term` joins: then it is the other one alone."""
     for p in term.parameters:
         amplitude = {q.name: size_of(q, 0.0) if q is p else 0.0 for q in term.parameters}
-        change = base - problem.stacked(terms, np.concatenate((values, starts(term, amplitude, {}))))
-        left = change - Q @ (Q.T @ change)
+        trial = np.concatenate((base.values, starts(term, amplitude, {})))
+        change = base.residuals - base.problem.stacked((*base.terms, term), trial)
+        left = change - base.Q @ (base.Q.T @ change)
         if float(left @ left) <= ABSORBED * float(change @ change):
             return True
     return False
@@ -222,9 +280,6 @@ def _resting(problem: Problem) -> set[str]:
     return found
 
 
-Slopes = dict[str, list[dict[str, Any]]]  # port -> of every segment that is fitted, what the model linearized there
-
-
 def _slopes(problem: Problem, fit: Fit) -> Slopes:
     """Ports at which the model answers without a simulation, with what it needs for that."""
     parted = problem.parted(fit.terms, fit.values)
@@ -232,13 +287,12 @@ def _slopes(problem: Problem, fit: Fit) -> Slopes:
     return {name: found for name in found[0] if all(name in each for each in found)}
 
 
-def _fast(problem: Problem, terms: tuple[Term, ...], trial: Array, slopes: Slopes) -> Array:
-    """Weighted change of the outputs by the last term, linearized at its axis."""
-    term = terms[-1]
-    n = len(problem.model.parameters)
+def _fast(base: Base, term: Term, trial: Array) -> Array:
+    """Weighted change of the outputs by `term`, the last one of `trial`, linearized at its axis."""
+    problem, n = base.problem, len(base.problem.model.parameters)
     rows = []
     used = [segment for segment in problem.segments if segment.fit.any()]
-    for segment, S in zip(used, slopes[term.candidate.port.name], strict=True):
+    for segment, S in zip(used, base.slopes[term.candidate.port.name], strict=True):
         change = problem.model.change(segment, trial[:n], S, term.candidate, trial[-len(term.parameters) :])
         rows.append(np.where(np.isfinite(segment.y), change, 0.0)[:, segment.fit] / problem.scale[:, None])
     return np.concatenate([row.ravel() for row in rows])
@@ -317,32 +371,23 @@ def _seeded(problem: Problem, fit: Fit, term: Term) -> Term:
     return replace(term, parameters=seeds(evidence, term.parameters, term.candidate.form))
 
 
-def _scan(
-    problem: Problem,
-    terms: tuple[Term, ...],
-    values: Array,
-    term: Term,
-    base: Array,
-    Q: Array,
-    rest: Array,
-    most: int,
-    slopes: Slopes,
-    lines: Array,
-) -> list[Point]:
-    """Compute the response of the term at each grid point; `rest` is orthogonal to the columns of `Q`.
+def _scan(base: Base, term: Term) -> list[Point]:
+    """Compute the response of `term` at each grid point.
 
     A term with memory gets the state that each recording begins from as further unknowns, and pays for them.
     """
+    problem, values, terms, Q, rest = base.problem, base.values, (*base.terms, term), base.Q, base.rest
     points: list[Point] = []
     most_taken = 0.0
     linear = [p for p in term.parameters if p.linear]
-    fast = term.candidate.port.name in slopes
+    fast = term.candidate.port.name in base.slopes
     shifts = not linear and not fast and term.candidate.effect.shifts == "time"
     each = len(values) + 2 if shifts else max(len(linear), 1)  # simulations of one point
-    tried, deepest = [*grid_points(tuned(term, lines), max(5, most // each))], {}
+    most = GRID if fast else problem.model.scan_points
+    tried, deepest = [*grid_points(tuned(term, base.lines), max(5, most // each))], {}
     if shifts and len(term.parameters) == 1 and term.parameters[0].dead_time:
         p = term.parameters[0]
-        late = [{p.name: late_s} for late_s in _late_s(problem, base, Q) if p.low < late_s < p.high]
+        late = [{p.name: late_s} for late_s in base.late_s if p.low < late_s < p.high]
         tried, deepest = [*tried, *late], late[0] if late else {}
     for point in tried:
         columns = []
@@ -352,19 +397,19 @@ def _scan(
             if p is not None:
                 amplitude[p.name] = size_of(p, 0.0)
             trial = np.concatenate((values, starts(term, amplitude, point)))
-            columns.append(_fast(problem, terms, trial, slopes) if fast else base - _known(problem, terms, trial, base))
-        S = _begun(problem, terms, trial, Q, slopes, columns[-1] if fast else None)
+            columns.append(_fast(base, term, trial) if fast else base.residuals - _known(base, terms, trial))
+        S = _begun(base, term, trial, columns[-1] if fast else None)
         if shifts:
-            again = _absorbed(problem, terms, values, trial, base, S)
+            again = _absorbed(base, terms, trial, S)
             if again is not None:
                 found, left = again
-                taken = float(rest @ rest - left @ left)
+                taken = base.energy - float(left @ left)
                 own = point is deepest
                 points.append(Point(taken, found[values.size :], left, found[: values.size], S.shape[1], own))
             continue
         if term.candidate.effect.memories:  # it is nothing but what each recording begins with
             left = rest - S @ (S.T @ rest)
-            points.append(Point(float(rest @ rest - left @ left), starts(term, {}, point), left, None, S.shape[1]))
+            points.append(Point(base.energy - float(left @ left), starts(term, {}, point), left, None, S.shape[1]))
             continue
         D = np.array(columns)
         D, r = D - (D @ S) @ S.T, rest - S @ (S.T @ rest)
@@ -381,7 +426,7 @@ def _scan(
             )
         elif not 0.2 < a[0] < 5.0:
             continue
-        taken = float(2.0 * a @ g - a @ G @ a) + float(rest @ rest - r @ r)
+        taken = float(2.0 * a @ g - a @ G @ a) + (base.energy - float(r @ r))
         amplitude = {p.name: float(x) * size_of(p, 0.0) for x, p in zip(a, linear, strict=False)}
         left = rest
         if taken > most_taken:
@@ -390,55 +435,22 @@ def _scan(
     return points
 
 
-def _late_s(problem: Problem, base: Array, Q: Array) -> list[float]:
-    """Delays (s) at which the simulated outputs and their rates, shifted, leave least of the measured ones.
-
-    The error has a minimum for each period of the motion, and a grid of few delays may miss the right one. Here all delays
-    of whole samples are compared: columns X of the outputs and their rates, shifted by d, leave
-    y'y - c' (X'X)^-1 c of the measured y, where c(d) = sum over t of y(t) X(t - d) is a correlation.
-    """
-    used = [segment for segment in problem.segments if segment.fit.any()]
-    longest, columns, first = max(segment.n for segment in used) // 4, Q.shape[1] + 1, 0
-    products, squares = np.zeros((longest, columns)), np.zeros((longest, columns, columns))
-    energy, counted = np.zeros(longest), np.zeros(longest)
-    for segment in used:
-        n = int(segment.fit.sum())
-        lags = min(longest, n)
-        size = 1 << int(np.ceil(np.log2(2 * n)))
-        for row in range(len(problem.noise)):
-            part, first = slice(first, first + n), first + n
-            y = np.nan_to_num(segment.y[row, segment.fit] / problem.scale[row])
-            X = np.column_stack((y - base[part], Q[part]))
-            across = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(X.T, size)), size)
-            products[:lags] += across[:, :lags].T
-            squares[:lags] += np.cumsum(X[:, :, None] * X[:, None, :], axis=0)[::-1][:lags]
-            energy[:lags] += np.cumsum(y[::-1] ** 2)[::-1][:lags]
-            counted[:lags] += n - np.arange(lags)
-    scale = np.sqrt(np.einsum("kii->ki", squares) + 1e-300)
-    shaped = squares / (scale[:, :, None] * scale[:, None, :]) + 1e-9 * np.eye(columns)
-    weights = np.linalg.solve(shaped, (products / scale)[:, :, None])[:, :, 0]
-    left = (energy - np.einsum("ki,ki->k", products / scale, weights)) / np.maximum(counted, 1.0)
-    valleys = np.flatnonzero((left[1:-1] < left[:-2]) & (left[1:-1] <= left[2:])) + 1
-    best = valleys[np.argsort(left[valleys])[:LATE_STARTS]]
-    return [float(lag) * problem.segments[0].recording.dt_s for lag in best]
-
-
-def _known(problem: Problem, terms: tuple[Term, ...], trial: Array, base: Array) -> Array:
+def _known(base: Base, terms: tuple[Term, ...], trial: Array) -> Array:
     """Residuals of `trial`; those of `base` where a dead time makes them of what was before the recording."""
-    r = problem.stacked(terms, trial, unseen=np.inf)
-    return np.where(r >= FAR, base, r)
+    r = base.problem.stacked(terms, trial, unseen=np.inf)
+    return np.where(r >= FAR, base.residuals, r)
 
 
-def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array, slopes: Slopes, now: Array | None) -> Array:
-    """What the state at a recording's first sample does of the last term's memory: orthonormal columns, one a recording.
+def _begun(base: Base, term: Term, trial: Array, now: Array | None) -> Array:
+    """What the state at a recording's first sample does of the memory of `term`: orthonormal columns, one a recording.
 
     They are orthogonal to `Q` too, so that they and the term share the residual. Without them an effect with a long memory
     is taken for what it would be if the first samples had told its state.
 
     now: the term's response with the states so far, where the model answers without a simulation.
     """
-    candidate = terms[-1].candidate
-    none = np.zeros((Q.shape[0], 0))
+    problem, candidate = base.problem, term.candidate
+    none = np.zeros((base.Q.shape[0], 0))
     if not candidate.effect.remembers or not candidate.effect.timed:
         return none  # a memory of places, not of times, is soon overwritten
     port, before, keys = candidate.port.name, get_starts(problem), memory_keys(candidate)
@@ -449,7 +461,9 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array, sl
     )
 
     def response() -> Array:
-        return _fast(problem, terms, trial, slopes) if port in slopes else -problem.stacked(terms, trial)
+        if port in base.slopes:
+            return _fast(base, term, trial)
+        return -problem.stacked((*base.terms, term), trial)
 
     now = response() if now is None else now
     rows = len(problem.noise)
@@ -463,22 +477,20 @@ def _begun(problem: Problem, terms: tuple[Term, ...], trial: Array, Q: Array, sl
         for index, (first, last) in enumerate(itertools.pairwise(edges)):
             columns[first:last, number * len(used) + index] = change[first:last]
     most = float(np.max(np.sum(columns**2, axis=0), initial=0.0)) ** 0.5
-    columns -= Q @ (Q.T @ columns)
+    columns -= base.Q @ (base.Q.T @ columns)
     size = np.sqrt(np.sum(columns**2, axis=0))
     seen = np.flatnonzero(size > 1e-9 * max(most, 1e-300))
     return np.asarray(np.linalg.qr(columns[:, seen])[0]) if seen.size else none
 
 
-def _absorbed(
-    problem: Problem, terms: tuple[Term, ...], values: Array, trial: Array, base: Array, S: Array
-) -> tuple[Array, Array] | None:
+def _absorbed(base: Base, terms: tuple[Term, ...], trial: Array, S: Array) -> tuple[Array, Array] | None:
     """All parameters fitted again from a shift in time at a grid point, and the residual then; None where they cannot be.
 
     Rates of the nominal model take most of a small delay. Next to one that is fitted they have to give it back first: a
     change of the outputs at their present values says nothing then. The shift itself moves as well where that leaves less:
     a delay of a part of a sample lies between the points of the grid.
     """
-    r = _known(problem, terms, trial, base)
+    problem, r = base.problem, _known(base, terms, trial)
     parameters = problem.parameters(terms)
     sizes = [size_of(p, v) for p, v in zip(parameters, trial, strict=True)]
     J, aim = jacobian(problem, terms, trial, problem.stacked(terms, trial), sizes), r - S @ (S.T @ r)
@@ -492,6 +504,6 @@ def _absorbed(
         found = trial.copy()
         for index, step in zip(free(parameters), by, strict=False):
             found[index] = moved(parameters[index], trial[index], float(step), index >= len(problem.model.parameters))
-        left = _known(problem, terms, found, base)
+        left = _known(base, terms, found)
         ends.append((found, left - S @ (S.T @ left)))
     return min(ends, key=lambda end: float(end[1] @ end[1]))

@@ -274,13 +274,13 @@ def drop_unsure(problem: Problem, found: Found) -> None:
     The evidence counts independent samples. Where an effect was called for in some parts of the recordings only, or by a
     few, the jackknife of its interval shows that they do not agree on it.
     """
-    while unsure := _unsure(problem, found.best):
-        terms, values = without(found.best, problem, (unsure[-1].candidate.key,))
-        found.steps.append(Step("remove", unsure[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
+    while doubtful := unsure(problem, found.best):
+        terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
+        found.steps.append(Step("remove", doubtful[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
         found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
 
 
-def _unsure(problem: Problem, fit: Fit) -> list[Term]:
+def unsure(problem: Problem, fit: Fit) -> list[Term]:
     """Terms of one amplitude whose interval contains zero."""
     amplitudes = [term for term in fit.terms if len(term.parameters) == 1 and term.parameters[0].linear]
     if not amplitudes:

@@ -32,6 +32,7 @@ from tests.host.diagnosis.test_export import COMMON, KINDS
 BACKLASH = Candidate(next(e for e in library() if e.id == "backlash"), Port("cable", "motion", "cable", ("angle",)))
 PORT = Port("cable", "motion+limit", "cable", ("angle",))
 NOTHING = Gain(0.0, 1.0, 0.0)
+WHOLE = Gain(200.0, 1e-9, 1.0, independent=np.array([60.0]), log_ratio=np.array([40.0]))  # removes all of the error
 
 
 def trial(likelihood: float, share: float) -> Trial:
@@ -144,7 +145,7 @@ def test_an_equation_chosen_among_hundreds_is_no_simpler_than_an_effect(monkeypa
     monkeypatch.setattr(equivalence, "equations_for", lambda *_: [found])
     monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
     problem: Any = SimpleNamespace(rules=RULES, segments=[])
-    ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, np.ones(1))
+    ((rival, difference),) = equivalence._better_said(problem, Found(best, best, []), limit, best, WHOLE, np.ones(1))
     assert rival is equation and difference == pytest.approx(-6.0 * RULES.coarsening / (60.0 + RULES.coarsening))
 
 
@@ -178,8 +179,19 @@ def test_parameters_that_have_earned_their_cost_are_no_case_for_a_simpler_rival(
 ) -> None:
     """Each cost its full penalty against a likelihood that is coarsened to a thousandth."""
     ahead = Gain(likelihood, 1e-9, share, independent=np.array([40000.0]))
-    assert (ahead_of_rival(ahead, 4, RULES) > 0.0) is stays
-    assert ahead_of_rival(ahead, -4, RULES) > 4 * RULES.parameter_penalty
+    earned = Gain(140000.0, 1e-9, 0.999, independent=np.array([40000.0]), log_ratio=np.array([7.0]))
+    assert (ahead_of_rival(ahead, 4, earned, RULES) > 0.0) is stays
+    assert ahead_of_rival(ahead, -4, earned, RULES) > 4 * RULES.parameter_penalty
+
+
+def test_noise_hides_what_a_formula_idealizes() -> None:
+    """A lead of 12 over a rival with two parameters fewer counts behind noise, and not where formulas show."""
+    n = np.array([17000.0])
+    ahead = Gain(12.0, 1e-9, 0.026, independent=n, log_ratio=np.array([0.0014]))
+    small = Gain(103.0, 1e-9, 0.012, independent=n, log_ratio=np.array([0.012]))
+    large = Gain(60000.0, 1e-9, 0.999, independent=n, log_ratio=np.array([7.0]))
+    assert ahead_of_rival(ahead, 2, small, RULES) > 1.0
+    assert ahead_of_rival(ahead, 2, large, RULES) < -3.0
 
 
 def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
@@ -219,7 +231,7 @@ def test_a_pair_that_does_as_well_shares_the_probability(lead: float, named: boo
     ahead = Gain(lead, 0.2, 0.01, independent=np.array([60.0]))
     monkeypatch.setattr(equivalence, "compare", lambda *_: ahead)
     problem: Any = SimpleNamespace(rules=RULES, segments=[])
-    parts = equivalence._pairs(problem, Found(best, best, [], pairs=[pair]), loop, np.ones(1))
+    parts = equivalence._pairs(problem, Found(best, best, [], pairs=[pair]), loop, WHOLE, np.ones(1))
     assert [part for part, _ in parts] == ([gap, late] if named else [])
     if named:
         gain = Gain(400.0, 1e-9, 0.9, independent=np.array([400.0]), log_ratio=np.array([2.0]), excesses=np.array([0.1]))
@@ -289,11 +301,19 @@ def test_what_a_delay_within_a_sample_explains_has_no_other_name(place: str, lea
     assert only_sampling(named, [held, named]) is refused
 
 
-@pytest.mark.parametrize(("left", "removed"), [(0.0, True), (0.6, False)])
+@pytest.mark.parametrize(
+    ("left", "share", "ahead", "removed"),
+    [
+        (0.0, 0.05, -1.0, True),
+        (0.6, 0.05, -1.0, False),
+        (0.0, 0.4, -1.0, False),  # a rival is likelier, but one of the two is there
+        (0.0, 0.4, 9.0, False),  # probable itself
+    ],
+)
 def test_an_improbable_effect_stays_if_no_other_is_probable_without_it(
-    monkeypatch: pytest.MonkeyPatch, left: float, removed: bool
+    monkeypatch: pytest.MonkeyPatch, left: float, share: float, ahead: float, removed: bool
 ) -> None:
-    """left: share of the mismatch that remains after the removal."""
+    """left, share: of the mismatch, after the removal, and by the weak effect; ahead: of its rival."""
     rng, t = np.random.default_rng(5), np.arange(900) * 0.02
     u = np.sin(2.0 * np.pi * 0.3 * t)
     y = u + 0.2 * np.cos(2.0 * np.pi * 0.11 * t) + 1e-2 * rng.standard_normal(900)
@@ -306,8 +326,9 @@ def test_an_improbable_effect_stays_if_no_other_is_probable_without_it(
     )
     values = np.concatenate((nominal.values, [1e-3], [0.2]))
     found = Found(nominal, finish(problem, Fit(terms, values)), [])
-    gain, equal = Gain(80.0, 1e-9, 0.5), ((BACKLASH, -1.0),)
-    strong, weak = (Standing(t.candidate, gain, gain, (), rivals) for t, rivals in zip(terms, ((), equal), strict=True))
+    gain, equal = Gain(80.0, 1e-9, 0.5), ((BACKLASH, ahead),)
+    strong = Standing(terms[0].candidate, gain, gain, ())
+    weak = Standing(terms[1].candidate, gain, gain, (), equal, share=share)
     monkeypatch.setattr(equivalence, "standings", lambda *_: [strong])
     monkeypatch.setattr(equivalence, "remainder_of", lambda *_: Remainder(None, left))
     before = found.best
