@@ -180,7 +180,8 @@ class _Inspection:
             if copied.whole:
                 self.recordings = []
                 return
-        for name in {name for recording in self.recordings for name in recording.channels} - {path.input, path.output}:
+        names = dict.fromkeys(name for recording in self.recordings for name in recording.channels)
+        for name in (name for name in names if name not in (path.input, path.output)):
             copied = copy_of(self.recordings, path.output, name, self.rules)
             if copied is not None and copied.whole and self.spec.kind != "rig":
                 column = self.columns[name]
@@ -432,7 +433,7 @@ def _clipped(y: Array, x: Array, side: float, rules: DataRules) -> float:
     if np.ptp(x) == 0.0:
         return 0.0
     y = side * y
-    x = side * x * (1.0 if float(np.corrcoef(x, side * y)[0, 1]) * side >= 0.0 else -1.0)
+    x = x if float(np.corrcoef(x, y)[0, 1]) >= 0.0 else -x
     at = (y >= np.max(y)).astype(np.int8)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], at, [0]))))
     total = 0
@@ -450,8 +451,8 @@ def _tone(recording: Recording, name: str, rules: DataRules) -> float:
     window = np.blackman(x.size)
     power = np.abs(np.fft.rfft((x - np.mean(x)) * window)) ** 2
     top = int(np.argmax(power))
-    near = power[max(top - 3, 0) : top + 4].sum()
-    around = np.arange(max(top - 3, 0), top + 4)
+    around = np.arange(max(top - 3, 0), min(top + 4, power.size))
+    near = power[around].sum()
     turns = float(around @ power[around] / near) / (x.size * recording.dt_s) if top > 3 else 0.0
     return turns if top > 3 and near > rules.tone_power_share * power.sum() else 0.0
 
