@@ -79,23 +79,25 @@ def coarse(ahead: Gain, parameters_more: int, earned: Gain, rules: SelectionRule
 def ahead_of_rival(ahead: Gain, parameters_more: int, earned: Gain, rules: SelectionRules) -> float:
     """Coarsened difference of a named effect from its rival; the cost of parameters that have earned it is coarsened too.
 
-    They have earned it where all samples gain more than the cost, and the rival leaves more than an idealized formula
-    does, of the error or of what the effect removes. The full cost against the coarsened likelihood would let a rival with
-    fewer parameters win on every long recording.
+    They have earned it where all samples gain more than the cost, and the model without them leaves more than an idealized
+    formula does, of the error or of what the effect removes. The full cost against the coarsened likelihood would let the
+    model with fewer parameters win on every long recording.
     """
+    if ahead.log_likelihood < 0.0:
+        share = -float(np.expm1(np.min(ahead.log_ratio)))
+        behind = replace(ahead, log_likelihood=-ahead.log_likelihood, log_ratio=-ahead.log_ratio, share=share)
+        return -ahead_of_rival(behind, -parameters_more, earned, rules)
     cost = rules.parameter_penalty * parameters_more
-    more = ahead.share > rules.equal_error or _left_of(ahead, earned) > rules.exact_share
-    if 0.0 < cost < ahead.log_likelihood and more:
+    if 0.0 < cost < ahead.log_likelihood and _exceeds_idealization(ahead, earned, rules):
         return coarse(replace(ahead, log_likelihood=ahead.log_likelihood - cost), 0, earned, rules)
     return coarse(ahead, parameters_more, earned, rules)
 
 
-def _left_of(ahead: Gain, earned: Gain) -> float:
-    """Share of what an effect removes (`earned`) that a rival leaves (`ahead` of it), in the output where that is most."""
-    if not ahead.log_ratio.size:
-        return 0.0
+def _exceeds_idealization(ahead: Gain, earned: Gain, rules: SelectionRules) -> bool:
+    """Whether a model that another one is `ahead` of leaves more than an idealized formula does."""
     top = int(np.argmax(ahead.independent * ahead.log_ratio))
-    return float(np.expm1(ahead.log_ratio[top]) / max(np.expm1(earned.log_ratio[top]), 1e-300))
+    of_effect = np.expm1(ahead.log_ratio[top]) / max(np.expm1(earned.log_ratio[top]), 1e-300)
+    return bool(ahead.share > rules.equal_error or of_effect > rules.exact_share)
 
 
 def posterior(

@@ -178,7 +178,7 @@ def test_parameters_that_have_earned_their_cost_are_no_case_for_a_simpler_rival(
     likelihood: float, share: float, stays: bool
 ) -> None:
     """Each cost its full penalty against a likelihood that is coarsened to a thousandth."""
-    ahead = Gain(likelihood, 1e-9, share, independent=np.array([40000.0]))
+    ahead = Gain(likelihood, 1e-9, share, independent=np.array([40000.0]), log_ratio=np.array([-np.log(1.0 - share)]))
     earned = Gain(140000.0, 1e-9, 0.999, independent=np.array([40000.0]), log_ratio=np.array([7.0]))
     assert (ahead_of_rival(ahead, 4, earned, RULES) > 0.0) is stays
     assert ahead_of_rival(ahead, -4, earned, RULES) > 4 * RULES.parameter_penalty
@@ -192,6 +192,8 @@ def test_noise_hides_what_a_formula_idealizes() -> None:
     large = Gain(60000.0, 1e-9, 0.999, independent=n, log_ratio=np.array([7.0]))
     assert ahead_of_rival(ahead, 2, small, RULES) > 1.0
     assert ahead_of_rival(ahead, 2, large, RULES) < -3.0
+    behind = Gain(-12.0, 0.9, -0.001, independent=n, log_ratio=np.array([-0.0014]))
+    assert ahead_of_rival(behind, -2, small, RULES) == pytest.approx(-ahead_of_rival(ahead, 2, small, RULES))
 
 
 def test_further_forms_do_not_fill_the_places_of_other_effects() -> None:
