@@ -56,7 +56,7 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str], 
     data = _Inspection(spec, rules, recordings, {key: channel.column for key, channel in spec.channels.items()})
     paths = pairs_of(spec)
     vital = {name for path in paths for name in (path.input, path.output)}
-    data.recordings = _dead(recordings, vital, data.columns, data.findings, rules)
+    data.dead(vital)
     if not data.recordings:
         return Inspected([], data.findings)
     data.stamps()
@@ -108,6 +108,32 @@ class _Inspection:
     def shift_back(self, name: str, lead: int) -> None:
         """Put the values of channel `name` `lead` samples later, in every recording; its first samples are missing."""
         self.change(name, lambda values: np.concatenate((np.full(lead, np.nan), values[:-lead])))
+
+    def dead(self, vital: set[str]) -> None:
+        """Channels that say nothing; only recordings are left in which every vital one is measured and moves."""
+        names = dict.fromkeys(name for recording in self.recordings for name in recording.channels)
+        unusable: set[str] = set()
+        for name in names:
+            column = self.columns.get(name, name)
+            with_it = [recording for recording in self.recordings if name in recording.channels]
+            values = np.concatenate([recording.channels[name] for recording in with_it])
+            good = values[np.isfinite(values)]
+            empty = [recording.name for recording in self.recordings if _seen(recording, name) == 0.0]
+            if empty:
+                where = "in every recording" if len(empty) == len(self.recordings) else "in " + ", ".join(empty)
+                self.find("missing", column, f"Column {column} holds no number {where}.")
+                unusable |= set(empty) if name in vital else set()
+            elif (share := _lost(self.recordings, name, self.rules)) > self.rules.missing_share:
+                self.find("missing", column, f"{share:.0%} of the samples of column {column} are missing.")
+            if any(name in recording.infinite for recording in self.recordings):
+                self.find("missing", column, f"Column {column} holds infinite values. They count as missing.")
+            if good.size and float(np.ptp(good)) <= self.rules.constant_span * max(float(np.max(np.abs(good))), 1e-300):
+                says = f"Column {column} has the same value, {good[0]:.4g}, in every sample."
+                if name in vital:
+                    says += " If this channel does not change, it cannot be compared with the nominal model."
+                    unusable |= {recording.name for recording in self.recordings}
+                self.find("constant", column, says)
+        self.recordings = [recording for recording in self.recordings if recording.name not in unusable]
 
     def stamps(self) -> None:
         """Irregular stamps, recordings of unlike sampling periods, and stamps that are probably no seconds."""
@@ -371,35 +397,6 @@ def _with(recording: Recording, name: str, values: Array) -> Recording:
 
 def _exchanged(recording: Recording, one: str, other: str) -> Recording:
     return _with(_with(recording, one, recording.channels[other]), other, recording.channels[one])
-
-
-def _dead(
-    recordings: list[Recording], vital: set[str], columns: dict[str, str], findings: list[Finding], rules: DataRules
-) -> list[Recording]:
-    """Recordings in which every vital channel is measured and moves in at least one of them."""
-    names = list(dict.fromkeys(name for recording in recordings for name in recording.channels))
-    unusable: set[str] = set()
-    for name in names:
-        column = columns.get(name, name)
-        all_values = [recording.channels[name] for recording in recordings if name in recording.channels]
-        empty = [recording.name for recording in recordings if _seen(recording, name) == 0.0]
-        together = np.concatenate(all_values)
-        good = together[np.isfinite(together)]
-        if empty:
-            where = "in every recording" if len(empty) == len(recordings) else "in " + ", ".join(empty)
-            findings.append(Finding("missing", column, f"Column {column} holds no number {where}."))
-            unusable |= set(empty) if name in vital else set()
-        elif (share := _lost(recordings, name, rules)) > rules.missing_share:
-            findings.append(Finding("missing", column, f"{share:.0%} of the samples of column {column} are missing."))
-        if any(name in recording.infinite for recording in recordings):
-            findings.append(Finding("missing", column, f"Column {column} holds infinite values. They count as missing."))
-        if good.size and float(np.ptp(good)) <= rules.constant_span * max(float(np.max(np.abs(good))), 1e-300):
-            says = f"Column {column} has the same value, {good[0]:.4g}, in every sample."
-            if name in vital:
-                says += " If this channel does not change, it cannot be compared with the nominal model."
-                unusable |= {recording.name for recording in recordings}
-            findings.append(Finding("constant", column, says))
-    return [recording for recording in recordings if recording.name not in unusable]
 
 
 def _lost(recordings: list[Recording], name: str, rules: DataRules) -> float:

@@ -9,9 +9,8 @@ import pytest
 
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording, find_files, load, read_tables, thin
-from host.diagnosis.model.findings import _dead
+from host.diagnosis.model.findings import inspect
 from host.diagnosis.model.nominal import NominalSpec, read_nominal
-from host.diagnosis.model.readings import Finding
 from host.diagnosis.model.tables import Table, read_table, table_of
 from host.diagnosis.models import channels_of
 from protocol.errors import InputError
@@ -131,9 +130,10 @@ def test_infinite_values_are_missing_and_said(tmp_path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
     (one,) = read(tmp_path, [path])
     assert np.isnan(one.channels["motor"][1]) and one.infinite == ("motor",)
-    findings: list[Finding] = []
-    _dead([one], {"motor"}, {"motor": "a"}, findings, DataRules())
-    assert [finding.says for finding in findings] == ["Column a holds infinite values. They count as missing."]
+    findings = [
+        finding.says for finding in inspect(spec(tmp_path), [one], set(), DataRules()).findings if finding.id == "missing"
+    ]
+    assert findings == ["Column a holds infinite values. They count as missing."]
 
 
 @pytest.mark.parametrize("terms", ["[]", '["mass", "mass"]'])
