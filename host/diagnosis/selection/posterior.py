@@ -13,8 +13,9 @@ its error that the effect removes,
     w(none)   = prior_none / (1 - prior_none) * (max(left, exact_share) / exact_share)^(coarsening_none / 2)
     w(other)  = prior_none / (1 - prior_none) * exact_share / share      only where further effects are named
 
-Where dl is more than c dk > 0, and more of the error than an idealized formula leaves, the cost is coarsened with the
-likelihood, w(rival) = exp(-r (dl - c dk)): the further parameters of the effect have earned it (`ahead_of_rival`).
+Where dl is more than c dk > 0, and the rival leaves more than an idealized formula does, the cost is coarsened with the
+likelihood, w(rival) = exp(-r (dl - c dk)): the further parameters of the effect have earned it. So are those of a rival
+that is as far ahead (`ahead_of_rival`).
 
 An effect is a name, whatever the form: the weight of another form of it, an equation that says the same, is its own. Where
 another form or a rival weighs more than what was fitted, w(none) and w(other) are multiplied by its weight.
