@@ -83,7 +83,8 @@ def _as_address(figure: Figure) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     svg = re.sub(r"font: ([^;\"]*?)'?DejaVu Sans'?[^;\"]*", lambda match: f"font: {match[1]}{_FONTS}", buffer.getvalue())
-    svg = re.sub(r"(\d+\.\d{2})\d+", r"\1", svg)
+    # Hundredths of a point are enough for places, and only for them: numbers of the text stay as they are.
+    svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), svg)
     return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 

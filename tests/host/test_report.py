@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import msgpack
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from host.recordings.header import RecordingHeader
@@ -26,7 +27,7 @@ from host.report.demo_summary import demo_result, print_summary
 from host.report.run_figures import RunFigures
 from host.report.run_report import lateness_of, render, verdict_of, write_report
 from host.report.run_summary import BoardHealth, _refusals, missing_numbers, spans, summarize
-from host.report.style import thinned
+from host.report.style import report_figure, thinned
 from protocol.enums import SafetyAction
 from protocol.requests import plain
 from protocol.topics import (
@@ -504,3 +505,17 @@ def test_thinning_keeps_the_peaks() -> None:
     assert len(kept) <= 1400 and kept.max() == 5.0 and kept.min() == -3.0
     short = np.array([1.0, np.nan, 2.0])
     assert thinned(np.arange(3.0), short)[1].tolist() == [1.0, 2.0]
+
+
+def test_numbers_of_a_picture_keep_their_digits() -> None:
+    """Places in the picture are shortened, the numbers at its ticks are not."""
+
+    def draw(figure: Figure, narrow: bool) -> None:
+        axes = figure.add_subplot()
+        axes.plot([-0.002, 0.003], [0.0, 1.0])
+        axes.set_xticks([-0.002, 0.001, 0.003])
+
+    picture = report_figure(draw, 3.0, 3.0, "", "", "")
+    svg = base64.b64decode(picture.wide.split(",")[1]).decode()
+    assert {"−0.002", "0.001", "0.003"} <= set(re.findall(r">([^<>\s]+)</text>", svg))
+    assert not re.search(r'd="[^"]*\.\d{3}', svg)

@@ -172,18 +172,20 @@ def loop(result: Diagnosis) -> ReportFigure | None:
     x = result.model.motion(segment, port)
     left = result.found.nominal_full.residuals[index][row] / size
     extra = left - result.found.best_full.residuals[index][row] / size
-    travel = next(
-        (f"{words} ({unit})" for words, key, unit in result.model.travel if key.endswith(name)), result.model.travel[0][0]
-    )
-    if port.kind.startswith("motion") and name not in ("insertion", "roll", "knob"):
-        travel = f"{result.model.travel[0][0]} ({result.model.travel[0][2]})"
+    seen = [travel for travel in result.model.travel if np.array_equal(segment.inputs.get(travel[1], ()), x)]
+    words, _, moved_unit = seen[0] if seen else (f"signal at {port.name.replace('_', ' ')}", "", "")
+    moved_size, moved_unit = scaled(moved_unit, float(np.nanmax(np.abs(x), initial=0.0)))
+    x = x / moved_size
 
     def draw(figure: Figure, narrow: bool) -> None:
         axes: Axes = figure.add_subplot()
         step = max(1, x.size // 6000)
         axes.plot(x[::step], left[::step], ".", color=ESTIMATED, ms=2.0, label="recording minus nominal")
         axes.plot(x[::step], extra[::step], color=INK, lw=1.0, label="response of the effects")
-        axes.set(xlabel=travel, ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})")
+        axes.set(
+            xlabel=f"{words} ({moved_unit})" if moved_unit else words,
+            ylabel=f"{result.model.outputs[row].channel.replace('_', ' ')} ({unit})",
+        )
         legend_above(axes, 1 if narrow else 2)
 
     return report_figure(

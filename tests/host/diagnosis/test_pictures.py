@@ -1,0 +1,43 @@
+"""Pictures of a report, read as text: the axes of the loop."""
+
+from __future__ import annotations
+
+import base64
+import re
+
+import numpy as np
+
+from host.diagnosis import diagnose
+from host.diagnosis.report.pictures import loop
+
+TWO_LINKS = {
+    "name": "wrist",
+    "kind": "transmission",
+    "data": {"time": "t"},
+    "channels": {name: {"column": name, "unit": "rad"} for name in ("motor", "gear", "tendon", "jaw")},
+    "link": [
+        {"subsystem": "upper", "input": "motor", "output": "gear"},
+        {"subsystem": "lower", "input": "tendon", "output": "jaw"},
+    ],
+}
+
+
+def recorded(seed: int) -> dict[str, np.ndarray]:
+    """Play of 0.8 mrad behind a tendon that moves by 10 mrad; the other link has none."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 12.0, 0.02)
+    motor, tendon = (0.3 * np.sin(1.3 * t + rng.uniform(0.0, 6.0)), 0.01 * np.sin(1.9 * t + rng.uniform(0.0, 6.0)))
+    jaw = tendon.copy()
+    for k in range(1, t.size):
+        jaw[k] = min(max(jaw[k - 1], tendon[k] - 4e-4), tendon[k] + 4e-4)
+    gear, jaw = (values + 3e-5 * rng.standard_normal(t.size) for values in (motor, jaw))
+    return {"t": t, "motor": motor, "gear": gear, "tendon": tendon, "jaw": jaw}
+
+
+def test_the_loop_is_drawn_over_the_motion_of_its_own_link_in_units_that_can_be_read() -> None:
+    result = diagnose([recorded(seed) for seed in (1, 2)], TWO_LINKS).diagnosis
+    assert [term.candidate.name for term in result.found.best.terms] == ["backlash@lower"]
+    picture = loop(result)
+    assert picture is not None
+    words = re.findall(r">([^<>]+)</text>", base64.b64decode(picture.wide.split(",")[1]).decode())
+    assert "tendon (mrad)" in words and "jaw (mrad)" in words
+    assert {"−5", "0", "5"} <= {word.removesuffix(".0") for word in words}
