@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from host.diagnosis.pipeline import Diagnosis
 from host.diagnosis.report.pictures import pictures, shown
 from host.diagnosis.report.quantities import interval, quantity, short
-from host.diagnosis.report.verdict import at_bound, likelier, remains, words
+from host.diagnosis.report.verdict import at_bound, likelier, remaining_power, remains, words
 
 TEMPLATES = Path(__file__).parents[2] / "report" / "templates"
 NBSP = "\u00a0"
@@ -57,7 +57,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
         scripts=[Path(path).name for path in verdict.get("scripts", ())],
         on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
-        partly=remains(result.remainder.share).replace("its power", "the power of the mismatch"),
+        partly=remains(result).replace("its power", "the power of the mismatch"),
         noises=_noises(result),
         output=result.model.outputs[row].channel.replace("_", " "),
         recording=segment.recording.name,
@@ -123,7 +123,7 @@ def lines(result: Diagnosis, verdict: dict[str, Any]) -> list[Line]:
     if verdict["located"]:
         found.append(Line("where", words(verdict["located"][0]["subsystem"]), verdict["located"][0]["condition"]))
     if result.found.best.terms:
-        left = 100.0 * result.remainder.share
+        left = 100.0 * remaining_power(result)
         rms = f"of its RMS above noise ({left:.2g}{NBSP}% of its power)"
         found.append(Line("remaining mismatch", f"{10.0 * max(left, 0.0) ** 0.5:.0f}{NBSP}%", rms))
     return found

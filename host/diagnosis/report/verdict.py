@@ -305,7 +305,7 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
     ranked = [entry for _, entry in sorted(entries, key=lambda item: -item[0])]
     white = result.figures.white_after[result.figures.primary] > result.problem.rules.white_significance
     if ranked and result.remainder.sure and result.remainder.share > result.problem.rules.partly_explained_share:
-        ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result.remainder.share)}."
+        ranked[0]["says"] += f" This explains the mismatch only partly: {remains(result)}."
     elif ranked and not white:
         figures = result.figures
         share = figures.after[figures.primary] / max(figures.before[figures.primary], 1e-300)
@@ -313,9 +313,19 @@ def effects(result: Diagnosis) -> list[dict[str, Any]]:
     return ranked
 
 
-def remains(power: float) -> str:
+def remaining_power(result: Diagnosis) -> float:
+    """Share of the mismatch's power above noise that remains: by the stated errors, or what is predictable if more."""
+    figures, row = result.figures, result.figures.primary
+    noise = figures.noise_sd[row] ** 2
+    before, after = figures.before[row] ** 2 - noise, figures.after[row] ** 2 - noise
+    stated = float(np.clip(np.nan_to_num(after) / before, 0.0, 1.0)) if before > 0.0 else 0.0
+    return max(stated, result.remainder.share)
+
+
+def remains(result: Diagnosis) -> str:
     """The mismatch above noise that remains, as power and as amplitude: 4 % of the power are 20 % of the RMS."""
-    return f"{power:.0%} of its power above noise remains, {np.sqrt(max(power, 0.0)):.0%} of its RMS"
+    power = remaining_power(result)
+    return f"{power:.0%} of its power above noise remains, {np.sqrt(power):.0%} of its RMS"
 
 
 def _effect(

@@ -1,14 +1,18 @@
-"""Pictures of a report, read as text: the axes of the loop."""
+"""Pictures and figures of a report: the axes of the loop, and what remains of the mismatch."""
 
 from __future__ import annotations
 
 import base64
 import re
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from host.diagnosis import diagnose
 from host.diagnosis.report.pictures import loop
+from host.diagnosis.report.verdict import remaining_power, remains
 
 TWO_LINKS = {
     "name": "wrist",
@@ -41,3 +45,15 @@ def test_the_loop_is_drawn_over_the_motion_of_its_own_link_in_units_that_can_be_
     words = re.findall(r">([^<>]+)</text>", base64.b64decode(picture.wide.split(",")[1]).decode())
     assert "tendon (mrad)" in words and "jaw (mrad)" in words
     assert {"−5", "0", "5"} <= {word.removesuffix(".0") for word in words}
+
+
+@pytest.mark.parametrize(
+    ("after", "predictable", "remaining"),
+    [(30.2, 0.0, 0.048), (30.2, 0.3, 0.3), (24.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)],
+)
+def test_what_remains_agrees_with_the_errors_that_are_stated(after: float, predictable: float, remaining: float) -> None:
+    """86.7 before, noise 24.1: an error above the noise is not called a remainder of nothing."""
+    figures = SimpleNamespace(before=np.array([86.7]), after=np.array([after]), noise_sd=np.array([24.1]), primary=0)
+    result: Any = SimpleNamespace(figures=figures, remainder=SimpleNamespace(share=predictable))
+    assert remaining_power(result) == pytest.approx(remaining, abs=1e-3)
+    assert remains(result).startswith(f"{remaining:.0%} of its power")
