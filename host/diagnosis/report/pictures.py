@@ -33,6 +33,7 @@ FAULT, SHADE = "#b03a32", "#f6e3da"
 ORDER = ("base", "insertion", "roll", "knob", "shape", "contact", "pose_sensor", "force_sensor")  # along the rig
 # Arrows go from box to box; the gap at both ends is in points.
 ARROW = {"arrowstyle": "->", "color": MUTED, "lw": 0.9, "shrinkA": 4.0, "shrinkB": 4.0}
+LINEAR_UP_TO = 5.0  # ratio of the largest and the smallest error: up to it a logarithmic axis would have one or two ticks
 SIDE_BY_SIDE = ("pose_sensor", "force_sensor")
 
 
@@ -226,11 +227,12 @@ def before_after(result: Diagnosis) -> ReportFigure:
         axes.plot(before, place, "o", color=FAULT, ms=5, label="nominal, refitted")
         axes.plot(after, place, "o", color=INK, ms=5, label="extended")
         axes.axvline(1.0, color=TRUTH, lw=0.9, ls=":")
-        axes.set_xscale("log")
         axes.set_yticks(place, names)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        if max(np.max(before), np.max(after)) > LINEAR_UP_TO * min(np.min(before), np.min(after)):
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(
             xlabel="RMS error on held-out samples, in units of the noise (dotted: the noise itself)",
             ylim=(-0.6, len(rows) - 0.4),

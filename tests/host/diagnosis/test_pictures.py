@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
-from host.diagnosis.report.pictures import loop
+from host.diagnosis.report.pictures import before_after, loop
 from host.diagnosis.report.verdict import remaining_power, remains
+from host.report.style import ReportFigure
 
 TWO_LINKS = {
     "name": "wrist",
@@ -37,12 +38,16 @@ def recorded(seed: int) -> dict[str, np.ndarray]:
     return {"t": t, "motor": motor, "gear": gear, "tendon": tendon, "jaw": jaw}
 
 
+def words_of(picture: ReportFigure) -> list[str]:
+    return re.findall(r">([^<>]+)</text>", base64.b64decode(picture.wide.split(",")[1]).decode())
+
+
 def test_the_loop_is_drawn_over_the_motion_of_its_own_link_in_units_that_can_be_read() -> None:
     result = diagnose([recorded(seed) for seed in (1, 2)], TWO_LINKS).diagnosis
     assert [term.candidate.name for term in result.found.best.terms] == ["backlash@lower"]
     picture = loop(result)
     assert picture is not None
-    words = re.findall(r">([^<>]+)</text>", base64.b64decode(picture.wide.split(",")[1]).decode())
+    words = words_of(picture)
     assert "tendon (mrad)" in words and "jaw (mrad)" in words
     assert {"−5", "0", "5"} <= {word.removesuffix(".0") for word in words}
 
@@ -57,3 +62,11 @@ def test_what_remains_agrees_with_the_errors_that_are_stated(after: float, predi
     result: Any = SimpleNamespace(figures=figures, remainder=SimpleNamespace(share=predictable))
     assert remaining_power(result) == pytest.approx(remaining, abs=1e-3)
     assert remains(result).startswith(f"{remaining:.0%} of its power")
+
+
+@pytest.mark.parametrize(("errors", "ticks"), [((0.97, 1.31), {"1", "1.1", "1.2"}), ((0.9, 40.0), {"1", "2", "5", "10"})])
+def test_the_axis_of_errors_has_ticks_whatever_their_range(errors: tuple[float, float], ticks: set[str]) -> None:
+    figures = SimpleNamespace(before=np.array(errors[::-1]), after=np.array(errors), noise_sd=np.ones(2), primary=0)
+    model = SimpleNamespace(outputs=[SimpleNamespace(channel=name) for name in ("x", "y")])
+    result: Any = SimpleNamespace(figures=figures, model=model)
+    assert ticks <= set(words_of(before_after(result)))
