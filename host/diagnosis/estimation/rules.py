@@ -79,6 +79,7 @@ class SelectionRules:
     simulator_match_correlation: float = 0.9  # from which an output is as simulated, where the gain is near one as well
     simulator_unexplained_ratio: float = 0.1  # of what is unexplained, that a mistake put right leaves at most
     simulator_start_correlation: float = 0.8  # below which a simulator of one output is started in other units
+    simulator_largest_response: float = 30.0  # of the measured motion, to first order, that an input put right may cause
 
     # Samples that stand alone in the residual at a jump of an input.
     input_jump_share: float = 0.6  # of what a signal moves there that one step makes: a smooth turning point has 0.56

@@ -190,11 +190,30 @@ def _input_mistake(problem: Problem, theta: Array, pairs: list[Pair], possible: 
     if _all_match(pairs, problem.rules):
         return None
     most, found = problem.rules.simulator_unexplained_ratio * _unexplained(pairs), None
+    responses: dict[tuple[str, ...], float] = {}
     for mistake in possible:
+        if 0.0 < mistake.factor < 1.0:
+            if mistake.names not in responses:
+                responses[mistake.names] = _response(problem, theta, mistake.names)
+            if responses[mistake.names] > mistake.factor * problem.rules.simulator_largest_response:
+                continue
         left = _left_without(problem, theta, mistake)
         if left < most:
             most, found = left, mistake
     return found
+
+
+def _response(problem: Problem, theta: Array, names: tuple[str, ...]) -> float:
+    """What inputs, multiplied by 1 + a, cause for each a to first order, over what is measured, in the output where most.
+
+    An input that is recorded too small causes little. What would move the outputs by a thousand times what is measured is
+    not tried: a simulator of large deflections takes minutes for forces that would tear the thing apart.
+    """
+    segment, by = problem.segments[0], 1e-3
+    more = {**segment.inputs, **{name: segment.inputs[name] * (1.0 + by) for name in names}}
+    now, then = (problem.model.simulate(replace(segment, inputs=given), theta, []) for given in (segment.inputs, more))
+    caused = np.nanstd(np.asarray(then) - np.asarray(now), axis=1) / by
+    return float(np.nanmax(caused / np.maximum(np.nanstd(segment.y, axis=1), 1e-300), initial=0.0))
 
 
 def _left_without(problem: Problem, theta: Array, mistake: InputMistake) -> float:

@@ -21,6 +21,7 @@ from host.diagnosis.model.effect import Array
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import candidate_ports, prepare
+from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.screening import screen
 from host.diagnosis.selection.search import fit_nominal
 from protocol.errors import InputError
@@ -335,7 +336,24 @@ def swing(function: Any = swung, **parameters: Any) -> dict[str, Any]:
 FREE = {"offset": {"value": 0.11, "unit": "m"}, "gain": {"value": 0.9, "unit": "1"}}
 
 
-@pytest.mark.parametrize(("channel", "factor"), [("angle", 180.0 / np.pi), ("feed", 1e3)])
+def test_inputs_that_would_cause_far_more_than_is_measured_are_not_tried() -> None:
+    """A simulator of large deflections takes minutes for a thousand times the force, or a feed of metres."""
+    most = 0.0
+
+    def watched(inputs: dict[str, Array], p: dict[str, float], time_s: Array) -> dict[str, Array]:
+        nonlocal most
+        most = max(most, float(np.max(np.abs(inputs["feed"]))))
+        return fed(inputs, p, time_s)
+
+    runs = [feed(k, lambda t, given: given + 0.02 * np.sin(2.0 * np.pi * 1.1 * t)) for k in range(2)]
+    _, problem, _ = prepare(nominal_of(feeding(watched, 0.1)), tables(*runs))
+    readings_apart(problem, [segment.recording for segment in problem.segments])
+    assert most < 1.0
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor"), [("angle", 180.0 / np.pi), ("angle", np.pi / 180.0), ("feed", 1e3), ("feed", 1e-3)]
+)
 @pytest.mark.parametrize("gap", [0.0, 0.02])
 def test_an_input_in_another_unit_is_found_behind_a_simulator_that_is_not_linear(
     channel: str, factor: float, gap: float
