@@ -28,7 +28,8 @@ from host.diagnosis.model.operators import fill
 
 Array = npt.NDArray[np.float64]
 ORDER = 20  # of the prediction of an input from its own past
-LAGS = 30  # later samples of the inputs together; the first later one is left out: it may be how an input is held
+LAGS = 30  # later samples of the inputs together
+HELD = 2  # first later sample by which feedback is found: the one before may show how an input is held
 SAMPLES_PER_LAG = 40  # recorded, at least
 MOST_SAMPLES = 60000  # of a recording; a longer one is compared as it is
 PASSES = 3  # of a prediction that leaves out the rows of steps
@@ -77,14 +78,14 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     around: list[Array | None] = []
     if _said_by_motion(segments, inputs, rules) > rules.feedback_predicted_share:
         around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
-    for segment, u in zip(segments, new, strict=True):
-        segment.fed_back = [_later(u) for _ in range(segment.y.shape[0])]
+    for segment in segments:
+        segment.fed_back = [None] * segment.y.shape[0]
     for row in range(segments[0].y.shape[0]):
-        later = _share([segment.fed_back[row] for segment in segments], residuals, row)
+        later = _share([_later(u, HELD) for u in new], residuals, row)
         earlier = _share([_earlier(u) for u in new], residuals, row)
-        if later < rules.feedback_share or later < rules.feedback_over_past * earlier:
-            for segment in segments:
-                segment.fed_back[row] = None
+        if later >= max(rules.feedback_share, rules.feedback_over_past * earlier):
+            for segment, u in zip(segments, new, strict=True):
+                segment.fed_back[row] = _later(u, 1)  # a rate that is interpolated sees the next sample, and its noise
         if around:
             noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share
             for segment, basis in zip(segments, around, strict=True):
@@ -145,8 +146,8 @@ def _new_input(segment: Segment, inputs: tuple[str, ...], rules: SelectionRules)
     return [u / np.std(u) for u in new if np.any(u)]
 
 
-def _later(new: list[Array]) -> Array | None:
-    return _basis(new, lambda u, k: np.concatenate((u[k + 1 :], np.zeros(k + 1))))
+def _later(new: list[Array], first: int) -> Array | None:
+    return _basis(new, lambda u, k: np.concatenate((u[k + first - 1 :], np.zeros(k + first - 1))))
 
 
 def _said_by_motion(segments: list[Segment], inputs: tuple[str, ...], rules: SelectionRules) -> float:

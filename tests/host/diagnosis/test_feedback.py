@@ -51,6 +51,29 @@ def test_a_delay_longer_than_a_step_is_found_to_its_size_in_recordings_cut_from_
     assert found["parameters"]["delay_s"]["value"] == pytest.approx(0.06, abs=0.004)
 
 
+def held(number: int, rate_hz: float = 200.0, steps: int = 10, late_steps: int = 6) -> dict[str, Any]:
+    """The same spring and damper in a loop that holds a force: it reads the force with its noise and 3 ms late."""
+    rng, n = np.random.default_rng([78, number]), 4000
+    h = 1.0 / (rate_hz * steps)
+    fine, rows = np.arange(n * steps) * h, np.arange(n) / rate_hz
+    wanted = 0.006 * np.sin(2.0 * np.pi * np.outer(fine, [0.2, 0.5, 0.9]) + rng.uniform(0.0, 6.28, 3)).sum(axis=1)
+    noise = np.interp(fine, rows, 0.01 * rng.standard_normal(n))
+    x, read = wanted.copy(), np.zeros(fine.size)
+    moved = 0.0
+    for k in range(1, fine.size):
+        if k > late_steps:
+            moved += 40.0 * h * (wanted[k - late_steps] - read[k - late_steps] / STIFFNESS)
+        x[k] = wanted[k] + moved
+        read[k] = STIFFNESS * x[k] + DAMPING * (x[k] - x[k - 1]) / h + noise[k]
+    return {"t": rows[200:] - rows[200], "x": x[::steps][200:], "f": read[::steps][200:]}
+
+
+def test_noise_that_comes_back_within_a_sample_is_no_delay() -> None:
+    """A rate that is interpolated sees the next sample, and in it the noise of this one."""
+    verdict = diagnose([held(number) for number in (1, 2, 3)], PRESS)
+    assert (verdict.verdict, [effect["id"] for effect in verdict.effects]) == ("nothing_missing", [])
+
+
 @pytest.mark.parametrize(("through", "share"), [(0.5, 0.3), (0.0, 1.0)])
 def test_only_noise_that_comes_back_is_taken_off(through: float, share: float) -> None:
     rng = np.random.default_rng(3)
