@@ -105,12 +105,13 @@ def write_between(page: Path, text: str, mark: str = "worlds") -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Score a finished run and write or print its tables."""
     parser = argparse.ArgumentParser(prog="python -m host.studies.proof.page")
-    parser.add_argument("--dir", type=Path, required=True, help="folder of the judged run")
+    parser.add_argument("--dir", type=Path, nargs="+", required=True, help="folders of judged runs, in this order")
     parser.add_argument("--calibrate-on", type=Path, action="append", default=[], help="folder of another finished run")
     parser.add_argument("--world", help="only this world, in a short form between marks of its name")
     parser.add_argument("--docs", type=Path, help="page whose block is to be written; else it is printed")
     given = parser.parse_args(arguments)
-    text = world_block(given.dir, given.world) if given.world else block(given.dir, given.calibrate_on)
+    runs = given.dir
+    text = "\n\n".join(world_block(run, given.world) if given.world else block(run, given.calibrate_on) for run in runs)
     if given.docs is None:
         print(text)
     else:
