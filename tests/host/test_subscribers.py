@@ -108,13 +108,14 @@ def test_requests_of_several_threads_are_each_answered_between_periods() -> None
             for thread in threads:
                 thread.start()
             assert run.arm()
+            until(lambda: len(replies) > 1000, "requests next to the periods")
         finally:
             ended.set()
             for thread in threads:
                 thread.join()
             sys.setswitchinterval(interval_s)
         counts = run.loop.core.gate.counts
-        assert len(replies) == counts["malformed"] + counts["flooded"] > 1000
+        assert len(replies) == counts["malformed"] + counts["flooded"]
 
 
 def test_a_stop_gets_through_a_flood() -> None:
