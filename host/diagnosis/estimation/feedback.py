@@ -78,14 +78,15 @@ def find_feedback(segments: list[Segment], residuals: list[Array], inputs: tuple
     around: list[Array | None] = []
     if _said_by_motion(segments, inputs, rules) > rules.feedback_predicted_share:
         around = [_around(u, segment.spread) for segment, u in zip(segments, new, strict=True)]
+    after, before = [_later(u, HELD) for u in new], [_earlier(u) for u in new]
+    handed_on = [_later(u, 1) for u in new]  # a rate that is interpolated sees the next sample, and its noise
     for segment in segments:
         segment.fed_back = [None] * segment.y.shape[0]
     for row in range(segments[0].y.shape[0]):
-        later = _share([_later(u, HELD) for u in new], residuals, row)
-        earlier = _share([_earlier(u) for u in new], residuals, row)
+        later, earlier = _share(after, residuals, row), _share(before, residuals, row)
         if later >= max(rules.feedback_share, rules.feedback_over_past * earlier):
-            for segment, u in zip(segments, new, strict=True):
-                segment.fed_back[row] = _later(u, 1)  # a rate that is interpolated sees the next sample, and its noise
+            for segment, basis in zip(segments, handed_on, strict=True):
+                segment.fed_back[row] = basis
         if around:
             noisy = noisy or _share(around, residuals, row) > rules.feedback_predicted_share
             for segment, basis in zip(segments, around, strict=True):

@@ -94,7 +94,7 @@ class _Inspection:
     findings: list[Finding] = field(default_factory=list)
 
     def find(self, id: str, column: str, says: str) -> None:
-        """Add one finding."""
+        """State what is wrong with a column of the recordings, in the sentence `says`; `id` as in `Finding`."""
         self.findings.append(Finding(id, column, says))
 
     def change(self, name: str, changed: Callable[[Array], Array]) -> None:
