@@ -125,20 +125,32 @@ def reading(s: Scale, form: str) -> tuple[Parameter, ...]:
     )
 
 
-def _wave(c: Context, p: Array) -> Array:
-    phase = 2.0 * np.pi * p[6] * c.time_s
+def reading_on_a_line(s: Scale, form: str) -> tuple[Parameter, ...]:
+    """Amplitudes along the base axes of an oscillation with one phase, the phase and the frequency.
+
+    A base that oscillates on a line has as many parameters: neither of the two is preferred for having fewer.
+    """
+    phase = Parameter("phase", "rad", (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0), -np.pi, 2.0 * np.pi, step=0.1)
+    return (*(Parameter(f"amplitude_{a}", s.unit, (s.need,), linear=True) for a in "xyz"), phase, frequency(s, 5.0))
+
+
+def _wave(c: Context, p: Array, form: str) -> Array:
+    """An oscillation of three readings, (3, n)."""
+    phase = 2.0 * np.pi * p[-1] * c.time_s
+    if form == "line":
+        return np.outer(p[:3], np.sin(phase + p[3]))
     return np.outer(p[0:6:2], np.sin(phase)) + np.outer(p[1:6:2], np.cos(phase))
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
     """Add an oscillation that no motion causes to both positions; orientations and forces are unchanged."""
-    wave = _wave(c, p)
+    wave = _wave(c, p, form)
     return {**run, "tip": run["tip"] + wave, "shaft": run["shaft"] + wave}
 
 
 def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
     """The force reads with a line."""
-    return np.asarray(signal + _wave(c, p))
+    return np.asarray(signal + _wave(c, p, form))
 
 
 EFFECTS = (
@@ -162,6 +174,32 @@ EFFECTS = (
         "The force readings contain an oscillation at {frequency} that no contact causes.",
         "F = F + sine*sin(2 pi f t) + cosine*cos(2 pi f t)",
         apply_force,
+        timed=True,
+        at_rest=True,
+        several=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "pose",
+        88,
+        reading_on_a_line,
+        "The tracker's positions contain an oscillation on a line at {frequency} that no motion causes.",
+        "x = x + amplitude*sin(2 pi f t + phase)",
+        apply_pose,
+        forms=("line",),
+        timed=True,
+        at_rest=True,
+        several=True,
+    ),
+    Effect(
+        "periodic_disturbance",
+        "forces",
+        88,
+        reading_on_a_line,
+        "The force readings contain an oscillation with one phase at {frequency} that no contact causes.",
+        "F = F + amplitude*sin(2 pi f t + phase)",
+        apply_force,
+        forms=("line",),
         timed=True,
         at_rest=True,
         several=True,

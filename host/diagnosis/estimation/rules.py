@@ -108,7 +108,10 @@ class SelectionRules:
     refinement_score_share: float = 0.3  # part of its score beyond which a finer form need not gain
     reduced_form_tolerance: float = 0.1  # and where the richer form's further parameters ended at zero
     same_equation_log_likelihood: float = 0.01  # trials that differ by less, with as many parameters, are one equation
-    sampling_delay: float = 1.05  # samples: a delay up to this may be a matter of how the input was recorded
+    sampling_delay: float = 1.05  # samples: a delay up to this may be a matter of how the input was recorded,
+    integrator_delay: float = 0.25  # one up to this of the simulation's steps (two in a sample, input held in each),
+    sampling_delay_margin: float = 0.1  # and one this near to a half or to a whole sample, since formulas are idealized,
+    sampling_delay_deviations: float = 3.0  # or within so many of its standard deviations
     removal_tolerance: float = 0.5  # part of the least error reductions with which an effect stays (backward elimination)
 
     # Search effort: how many candidates are fitted, never how long.

@@ -83,7 +83,7 @@ def late_by_a_sample(problem: Problem, late: Trial, past: bool = False) -> list[
     period_s, port = problem.segments[0].recording.dt_s, late.candidate.port
     says = f"A delay of up to one sample ({period_s:.3g} s) at {port.name.replace('_', ' ')} removes {late.both.share:.0%} "
     says += "of the squared error. No effect is named for it: these recordings cannot separate a delay or lag of this size "
-    says += "from an input that is recorded one sample early or late. "
+    says += "from the way in which the input is held between samples, recorded or simulated. "
     says += (
         "The diagnosis continues with this delay."
         if past

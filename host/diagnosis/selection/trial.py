@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -169,17 +170,26 @@ def _zeros(fit: Fit) -> int:
 
 
 def of_sampling(trial: Trial) -> bool:
-    """Whether a delay or lag of an axis' input, all of a drifting one, is within one sample: that is how the input was
-    held between samples, not physics.
+    """Whether a delay or lag of an axis' input, all of a drifting one, may be how the input was held between samples or
+    recorded, which is no physics: it is within a sample, and no time between those that this could take.
+
+    An input that is held where it should run straight is half a sample late, one that is recorded after its sample a whole
+    one, and an integrator of a few steps in a sample a small part of one. A delay d that gains the log-likelihood L over
+    none has about the standard deviation d / sqrt(2 L): L is a parabola in d.
     """
-    shift = trial.candidate.effect.shifts
+    shift, rules = trial.candidate.effect.shifts, trial.rules
     if not shift or not trial.candidate.port.held:
         return False
     longest_s = max(r.shape[1] for r in trial.fit.residuals) * trial.period_s
     term = trial.fit.terms[-1]
     own = zip(term.parameters, trial.fit.values_of(term), strict=True)
     late_s = sum(abs(float(value)) * (longest_s if p.unit == "s/s" else 1.0) for p, value in own if p.unit in ("s", "s/s"))
-    return late_s < trial.rules.sampling_delay * trial.period_s
+    late = late_s / trial.period_s
+    if late > rules.sampling_delay:
+        return False
+    spread = late / math.sqrt(2.0 * max(trial.both.log_likelihood, 0.5))
+    margin = max(rules.sampling_delay_margin, rules.sampling_delay_deviations * spread)
+    return late < rules.integrator_delay + margin or min(abs(late - 0.5), abs(late - 1.0)) < margin
 
 
 def within_sample(trials: list[Trial], base: Fit) -> Trial | None:

@@ -122,23 +122,39 @@ def test_noise_that_was_never_recorded_alone_is_said_to_be_unknown(rest: float, 
     assert content["next"].startswith("The residual of column y") is bool(found)
 
 
-def test_a_delay_within_a_sample_is_stated_and_not_named() -> None:
-    """A held force that acts half a sample late: no other effect is named for it, and the finding says what it may be."""
+def late_force(late_steps: int) -> list[dict[str, Array]]:
+    """Recordings of 30 s at 50 Hz of a mass and a damper: a held force that acts some steps of 2 ms late."""
     runs = []
     for seed in (31, 32):
         rng, t = np.random.default_rng(seed), 0.02 * np.arange(1500)
         force = np.repeat(rng.uniform(-1.0, 1.0, t.size // 5), 5)
-        fine = np.concatenate((np.zeros(5), np.repeat(force, 10)))[: 10 * t.size]  # 2 ms steps, 10 ms late
+        fine = np.concatenate((np.zeros(late_steps), np.repeat(force, 10)))[: 10 * t.size]
         speed, place, keep = 0.0, 0.0, np.exp(-3.0 * 0.002 / 0.5)
         x = np.empty(fine.size)
         for k, f in enumerate(fine):
             x[k], ahead = place, keep * speed + (1.0 - keep) * f / 3.0
             place, speed = place + 0.001 * (speed + ahead), ahead
         runs.append({"t": t, "f": force, "x": x[::10] + 2e-5 * rng.standard_normal(t.size)})
-    held = {**STAGE, "axis": {**STAGE["axis"], "hold": "zero", "reads": "position"}}
-    content = diagnose(runs, held).as_dict()
+    return runs
+
+
+HELD = {**STAGE, "axis": {**STAGE["axis"], "hold": "zero", "reads": "position"}}
+
+
+@pytest.mark.parametrize("late_steps", [5, 10])
+def test_a_delay_that_a_recording_may_have_is_stated_and_not_named(late_steps: int) -> None:
+    """A half or a whole sample: no effect is named for it, and the finding says what it may be."""
+    content = diagnose(late_force(late_steps), HELD).as_dict()
     assert content["verdict"] == "nothing_missing" and ids(content) == {"within_sample"}
     assert content["next"].startswith("A delay of up to one sample (0.02 s)")
+
+
+def test_a_delay_within_a_sample_that_no_recording_has_is_named() -> None:
+    """0.7 of a sample: neither a held input nor one that is recorded late."""
+    content = diagnose(late_force(7), HELD).as_dict()
+    (effect,) = content["effects"]
+    assert effect["id"] == "latency" and "within_sample" not in ids(content)
+    assert effect["parameters"]["delay_s"]["value"] == pytest.approx(0.014, abs=0.0005)
 
 
 @pytest.mark.parametrize(("damping", "found"), [(-1.7e-5, False), (1.7e-5, True)])
@@ -341,8 +357,9 @@ def test_jumps_of_dry_friction_do_not_count_as_noise() -> None:
 
 
 @pytest.mark.slow
-def test_what_a_delay_within_a_sample_hides_is_named_with_its_true_size() -> None:
-    """A force of +-1 N that lags by 4 ms, four fifths of a sample, and reaches 0.8 N only."""
+@pytest.mark.parametrize(("lag_s", "named"), [(0.004, {"saturation", "rate_lag"}), (0.005, {"saturation"})])
+def test_what_a_delay_within_a_sample_hides_is_named_with_its_true_size(lag_s: float, named: set[str]) -> None:
+    """A force of +-1 N that reaches 0.8 N only and lags by four fifths of a sample, or by a whole one."""
     runs = []
     for seed in (41, 42):
         rng, n, step = np.random.default_rng(seed), 500, 1e-4
@@ -352,11 +369,12 @@ def test_what_a_delay_within_a_sample_hides_is_named_with_its_true_size() -> Non
         for k, f in enumerate(np.repeat(np.clip(force, -0.8, 0.8), 50)):
             if k % 50 == 0:
                 x[k // 50] = place
-            lagged += (f - lagged) * (1.0 - np.exp(-step / 0.004))
+            lagged += (f - lagged) * (1.0 - np.exp(-step / lag_s))
             speed += step * (lagged - 4.0 * speed - 250.0 * place) / 0.3
             place += step * speed
         runs.append({"t": 0.005 * np.arange(n), "f": force, "x": x + 1e-5 * rng.standard_normal(n)})
     held = {**SPRUNG, "axis": {**SPRUNG["axis"], "hold": "zero", "reads": "position"}}
     content = diagnose(runs, held).as_dict()
-    assert [effect["id"] for effect in content["effects"]] == ["saturation"] and "within_sample" in ids(content)
+    assert {effect["id"] for effect in content["effects"]} == named and content["effects"][0]["id"] == "saturation"
+    assert ("within_sample" in ids(content)) is ("rate_lag" not in named)
     assert content["effects"][0]["parameters"]["limit_N"]["value"] == pytest.approx(0.8, abs=0.004)
