@@ -46,16 +46,19 @@ class Remainder:
 
 def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
-    mattered most; noise may be larger than its estimate by `noise_uncertainty`.
+    mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than what is left.
     """
     shares, weights = [], []
     noise_sd = _levels(problem, found.best, noise_sd)
     for row in range(noise_sd.size):
-        before = _power(problem, found.nominal.residuals, row) - noise_sd[row] ** 2
-        after = _power(problem, found.best.residuals, row) - (problem.rules.noise_uncertainty * noise_sd[row]) ** 2
+        left = _power(problem, found.best.residuals, row)
+        # An effect that is there at rest too, a line in a reading, is part of the noise that was measured at rest.
+        noise = min(float(noise_sd[row]) ** 2, left)
+        before = _power(problem, found.nominal.residuals, row) - noise
+        after = left - problem.rules.noise_uncertainty**2 * noise
         if before > 0.0:
             shares.append(float(np.clip(after / before, 0.0, 1.0)))
-            weights.append(before / noise_sd[row] ** 2)
+            weights.append(before / max(noise, 1e-300))
     return shares[int(np.argmax(weights))] if shares else 0.0
 
 
