@@ -13,11 +13,12 @@ from host.diagnosis.estimation.evidence import correlation_time
 from host.diagnosis.estimation.noise import Noise
 from host.diagnosis.estimation.rules import RULES, Budget, SelectionRules
 from host.diagnosis.model.effect import Candidate, Parameter, cornered
-from host.diagnosis.model.model import ActiveEffect, Model, Segment
+from host.diagnosis.model.model import ActiveEffect, Begin, Model, Segment
 
 Array = npt.NDArray[np.float64]
+RAN_AWAY = 1e12  # residual, in units of noise, beyond which a simulation has run away
 HUBER = 4.0  # residuals beyond this many scales pull with constant force
-FAR = 1e6
+FAR = 1e6  # residual, in units of noise, at which those of a fit are cut
 LARGEST_AMPLITUDE = 1000.0  # of an effect, in natural sizes
 BEGIN = "begin:"  # key of a state that a recording begins from, among its starts of memory
 WAIT = 1.3  # of a dead time's start value: so much of a recording is left out while it is fitted
@@ -249,6 +250,28 @@ class FreeStates:
         return np.vstack((J - self.rates @ change, self.weight[:, None] * change))
 
 
+def answers_to_begin(
+    problem: Problem, terms: tuple[Term, ...], values: Array, base: Array, begin: Begin
+) -> list[tuple[int, Array]]:
+    """Change of the weighted simulation by each unknown state that a recording begins with, for one standard deviation.
+
+    base: stacked residuals with the states as they are. Where the simulation runs away from there, as that of a loop that
+    saturates may, the state moves by a thousandth; if it runs away even so, the change is zero.
+    """
+    out, now = [], begin.values
+    for k in np.flatnonzero(begin.spread > 0.0):
+        column = np.zeros(base.size)
+        for share in (1.0, 1e-3):
+            begin.values = now + np.eye(now.size)[k] * share * begin.spread[k]
+            moved = problem.stacked(terms, values)
+            if float(np.max(np.abs(moved), initial=0.0)) < FAR:
+                column = (base - moved) / share
+                break
+        out.append((int(k), column))
+    begin.values = now
+    return out
+
+
 def free_states(problem: Problem, terms: tuple[Term, ...], values: Array) -> FreeStates | None:
     """Initial states that are estimated, linearized where they are now; None if no recording has any."""
     base = problem.stacked(terms, values)
@@ -260,13 +283,10 @@ def free_states(problem: Problem, terms: tuple[Term, ...], values: Array) -> Fre
             continue
         left = base[part].reshape(rows, -1)
         level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in left]))
-        now = begin.values
-        for k in np.flatnonzero(begin.spread > 0.0):
-            begin.values = now + np.eye(now.size)[k] * begin.spread[k]
-            columns.append(base - problem.stacked(terms, values))
-            away.append((now[k] - begin.measured[k]) / begin.spread[k])
+        for k, column in answers_to_begin(problem, terms, values, base, begin):
+            columns.append(column)
+            away.append((begin.values[k] - begin.measured[k]) / begin.spread[k])
             levels.append(level)
-        begin.values = now
     if not columns:
         return None
     S, prior = np.array(columns).T, np.array(levels)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, Term, free, jacobian, minimize, moved, robust, size_of
+from host.diagnosis.estimation.fit import RAN_AWAY, Fit, Problem, Term, free, jacobian, minimize, moved, robust, size_of
 from host.diagnosis.model.effect import memory_keys, rate_key
 from host.diagnosis.model.model import ActiveEffect, Model, Segment
 
@@ -111,15 +111,20 @@ def _memory_span(segment: Segment, term: Term, fit: Fit, motion: Array) -> float
     return share * float(np.ptp(moved_by)) or 1.0
 
 
+def _weighed(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask) -> Array:
+    """Weighted residual (samples,) of a recording, NaN where nothing was read or the simulation ran away."""
+    r = (problem.left(segment, fit.terms, values)[:, mask] / problem.scale[:, None]).ravel()
+    return np.where(np.abs(r) < RAN_AWAY, r, np.nan)
+
+
 def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: Mask) -> tuple[Array, Array, list[_State]]:
-    """Weighted residual (samples,) of a recording and its change (samples, k) per standard deviation of each state."""
+    """Weighted residual (samples,) of a recording and its change (samples, k) per standard deviation of each state.
 
-    def left() -> Array:
-        r = problem.left(segment, fit.terms, values)[:, mask] / problem.scale[:, None]
-        return np.nan_to_num(r, nan=0.0, posinf=0.0, neginf=0.0).ravel()
-
+    A state from which the simulation runs away, as a loop may that saturates, stays where it is: its change is zero.
+    """
     states = _states(problem, segment, fit)
-    r, columns = left(), []
+    r, columns = _weighed(problem, segment, fit, values, mask), []
+    seen = np.isfinite(r)
     for state in states:
         now = state.value
         state.put(now + state.spread)
@@ -127,9 +132,10 @@ def _answers(problem: Problem, segment: Segment, fit: Fit, values: Array, mask: 
         if by < 0.5:  # at its upper end
             state.put(now - state.spread)
             by = (state.value - now) / state.spread
-        columns.append((r - left()) / by)
+        change = (r - _weighed(problem, segment, fit, values, mask)) / by
+        columns.append(np.where(seen, change, 0.0) if np.isfinite(change[seen]).all() else np.zeros(r.size))
         state.put(now)
-    return r, np.array(columns).reshape(-1, r.size).T, states
+    return np.where(seen, r, 0.0), np.array(columns).reshape(-1, r.size).T, states
 
 
 def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
@@ -180,7 +186,15 @@ def fit_with_states(problem: Problem, fit: Fit, steps: int) -> Fit:
         if states:
             weight = _heaviest(problem, own)
             A = np.vstack([columns, weight * np.eye(len(states))])
-            _move(states, _least_squares(A, np.concatenate([own, weight * _pull(states)])))
+            b = np.concatenate([own, weight * _pull(states)])
+            before = [state.value for state in states]
+            _move(states, _least_squares(A, b))
+            # A full step lowers the cost where the outputs are linear in the states. In a loop that saturates it may not.
+            now = _weighed(problem, segment, fit, values, np.ones(segment.n, dtype=bool))
+            b_new = np.concatenate([now, weight * _pull(states)])
+            if not np.isfinite(now[own != 0.0]).all() or np.nansum(b_new**2) > np.sum(b**2) * (1.0 + 1e-9):
+                for state, old in zip(states, before, strict=True):
+                    state.put(old)
     return Fit(fit.terms, values, cost=cost)
 
 

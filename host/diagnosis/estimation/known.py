@@ -31,6 +31,7 @@ class Known(Model):
         self.travel, self.moves, self.unlisted_at = inner.travel, inner.moves, inner.unlisted_at
         self.pointwise, self.either_sign = inner.pointwise, inner.either_sign
         self.holds, self.hold, self.hold_stated = inner.holds, inner.hold, inner.hold_stated
+        self.hold_words = inner.hold_words
         segments = [inner.prepare(recording) for recording in recordings]
         self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []
         for spec in effects:

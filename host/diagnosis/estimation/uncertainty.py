@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from host.diagnosis.estimation.evidence import correlation_time
-from host.diagnosis.estimation.fit import Fit, Problem, free, jacobian, size_of
+from host.diagnosis.estimation.fit import Fit, Problem, answers_to_begin, free, jacobian, size_of
 from host.diagnosis.model.findings import Finding
 
 Array = npt.NDArray[np.float64]
@@ -137,12 +137,9 @@ def _by_begin(problem: Problem, fit: Fit, base: Array) -> tuple[Array, Array]:
         begin = segment.begin
         if n and begin is not None:
             level = float(np.mean([np.mean(row**2) * correlation_time(row) for row in part]))
-            values = begin.values
-            for k in np.flatnonzero(begin.spread > 0.0):
-                begin.values = values + np.eye(values.size)[k] * begin.spread[k]
-                columns.append(base - problem.stacked(fit.terms, fit.values))
+            for _, column in answers_to_begin(problem, fit.terms, fit.values, base, begin):
+                columns.append(column)
                 known.append(level)
-            begin.values = values
     used = [k for k, column in enumerate(columns) if np.any(column)]
     if not used:
         return np.zeros((base.size, 0)), np.zeros(0)

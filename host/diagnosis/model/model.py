@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,9 @@ class Output:
     channel: str
     unit: str
     subsystem: str
+
+
+HOLD_WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
 
 
 @dataclass
@@ -102,6 +106,7 @@ class Model(ABC):
     holds: tuple[str, ...] = ()  # ways in which the input may run between its samples, where the model has a choice,
     hold: str = ""  # the one that it takes,
     hold_stated: bool = False  # and whether its file states it
+    hold_words: tuple[str, Mapping[str, str]] = ("", HOLD_WORDS)  # of what it says (empty: of its inputs), and what
     either_sign: bool = False  # whether a force that is read may count against the motion as well as with it
     simulates: bool = False  # whether it runs a simulator, whose law cannot be read: data are checked against its outputs
     pointwise: bool = False  # whether outputs answer the signal at a port sample by sample: then `sensitivity` is defined

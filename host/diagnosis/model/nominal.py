@@ -235,7 +235,7 @@ class LinearSpec(SimulatorSpec):
     """Transfer function (one input, one output; falling powers of s or z), or state space, of any order.
 
     Coefficients are numbers or expressions of parameters. `period_s`: of a discrete model, left out for a continuous one;
-    `hold`: its input between samples.
+    `hold`: its input between samples; with feedback, whether the controller works once a sample or continuously.
     """
 
     subsystem: str = "plant"
@@ -246,7 +246,7 @@ class LinearSpec(SimulatorSpec):
     C: list[list[Coefficient]] | None = None
     D: list[list[Coefficient]] | None = None
     period_s: float | None = Field(default=None, gt=0)
-    hold: Literal["zero", "linear"] = "zero"
+    hold: Literal["zero", "linear", "held_reference"] = "zero"
     feedback: FeedbackSpec | None = None
 
     @model_validator(mode="after")

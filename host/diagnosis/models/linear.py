@@ -6,12 +6,13 @@
 A continuous model is sampled exactly for an input that is held, or straight, between samples (Franklin, Powell and
 Workman, Digital Control of Dynamic Systems, 1998, section 4.3). Effects inside the loop enter as changes of the plant's
 input and of the output that is fed back; the linear loop is solved for these changes until they are those that its own
-signals cause.
+signals cause. With `hold = "zero"` the controller works once a sample and its command is held; else it works continuously,
+and the reference runs straight between samples ("linear") or is held ("held_reference").
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,13 @@ WIDE = 2.0  # standard deviation of a state that is not measured, in spans of wh
 MOST_ROUNDS = 80  # of the loop with effects inside
 SETTLED = 1e-7  # change of the loop's signals in a round, relative
 HOLDS = ("zero", "linear")
+LOOP_WORDS = {
+    "zero": "works once a sample, and its command is held",
+    "linear": "works continuously, and the reference runs straight between samples",
+    "held_reference": "works continuously, and the reference is held between samples",
+}
+COMMAND = "command"  # whose free response says with what state a controller begins
+DIVERGED = 1e9  # change in a round, relative to that of the first, from which rounds do not settle any more
 MEMORY = 6  # rounds that the next one is made of (Anderson acceleration)
 
 
@@ -64,7 +72,12 @@ class LinearModel(SimulatedModel):
         self.shifted = self.spec.feedback is None and self._integrates()
         super().__init__(spec, self.spec, spec.offer)
         self.hold, self.hold_stated = self.spec.hold, "hold" in self.spec.model_fields_set
-        self.holds = HOLDS if self.spec.period_s is None and self.spec.feedback is None else ()
+        holds = HOLDS if self.spec.feedback is None else tuple(LOOP_WORDS)
+        self.holds = holds if self.spec.period_s is None else ()
+        if self.hold not in holds:
+            raise InputError("linear.hold", self.hold, f"one of {', '.join(holds)} without linear.feedback")
+        if self.spec.feedback is not None:
+            self.hold_words = ("The controller", LOOP_WORDS)
         if self.spec.feedback is not None:
             output, channels = self.spec.feedback.output, tuple(self.spec.outputs)
             self.inside_units = {actuation: self.units.get(self.spec.feedback.actuation, ""), fed_back: self.units[output]}
@@ -157,7 +170,36 @@ class LinearModel(SimulatedModel):
                 names.append(f"{name}_{k}")
                 means.append(value if k == 0 else speed / rate if k == 1 and self.spec.period_s is None else 0.0)
                 sds.append(size)
+        if self.spec.feedback is not None:
+            command, first = self._expected_command(segment)
+            order = len(self.spec.feedback.denominator) - 1
+            names += [f"{COMMAND}_{k}" for k in range(order)]
+            means += [first, *[0.0] * order][:order]
+            sds += [WIDE * (float(np.nanmax(command) - np.nanmin(command)) or 1.0)] * order
         return names, means, sds
+
+    def _expected_command(self, segment: Segment) -> tuple[Array, float]:
+        """The command (n,) of a nominal controller that begins at rest, from what was recorded of its error, and what a
+        controller under way adds to the first of it (0 where its command was not recorded).
+        """
+        loop = self.spec.feedback
+        assert loop is not None
+        y = super().motion(segment, next(p for p in self.ports if p.name == f"{loop.output}_reading"))
+        Ak, Bk, Ck, Dk = self._controller({**self.offs, **{p.name: p.grid[0] for p in self.parameters}})
+        dt_s = segment.recording.dt_s
+        Akd, Bk0, Bk1 = (Ak, Bk, 0.0 * Bk) if self.spec.period_s is not None else sampled(Ak, Bk, dt_s, "zero")
+        error = segment.inputs[loop.reference] - y
+        command = response(Akd, Bk0, Bk1, Ck, Dk, error[None, :], np.zeros(Ak.shape[0]))[0]
+        if not loop.actuation:
+            return command, 0.0
+        (value, _), _ = first_state(segment.y[self.spec.outputs.index(loop.actuation)], dt_s)
+        return command, value - float(command[0])
+
+    def _controller(self, parameters: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
+        """State space of the controller for these parameters."""
+        loop = self.spec.feedback
+        assert loop is not None
+        return _realized(_values(loop.numerator, parameters), _values(loop.denominator, parameters))
 
     def rate_of(self, segment: Segment) -> float:
         """Rate of the first output; a discrete model counts in samples."""
@@ -167,12 +209,14 @@ class LinearModel(SimulatedModel):
         actuation = self.spec.feedback.actuation if self.spec.feedback is not None else ""
         return [name for name in self.spec.outputs if name != actuation]
 
-    def _begin_state(self, run: SimulatorRun, A: Array, C: Array) -> Array:
-        """State at the first sample from the free response that `initial` describes, in a scale of time of its own."""
-        if not run.initial:
+    def _begin_state(self, run: SimulatorRun, A: Array, C: Array, names: list[str]) -> Array:
+        """State at the first sample from the free responses `names` (rows of C) that `initial` describes, in a scale of
+        time of its own.
+        """
+        if not run.initial or not A.size:
             return np.zeros(A.shape[0])
         scale, rows, wanted = run.rate, [], []
-        for row, name in zip(C, self._plant_outputs(), strict=True):
+        for row, name in zip(C, names, strict=True):
             for k in range(A.shape[0]):
                 rows.append(row)
                 wanted.append(run.initial[f"{name}_{k}"])
@@ -196,21 +240,16 @@ class LinearModel(SimulatedModel):
         names = self._plant_outputs()
         if not (np.isfinite(A).all() and np.isfinite(B).all() and np.isfinite(C).all()):
             return {name: np.full(run.time_s.size, np.nan) for name in self.spec.outputs}
-        begin = self._begin_state(run, A, C)
-        Ad, B0, B1 = self.sampled(A, B, dt_s)
+        begin = self._begin_state(run, A, C, names)
         if self.spec.feedback is None:
+            Ad, B0, B1 = self.sampled(A, B, dt_s)
             u = np.vstack([run.inputs[name] for name in self.spec.inputs])
             return dict(zip(names, response(Ad, B0, B1, C, D, u, begin), strict=True))
         loop = self.spec.feedback
-        Ak, Bk, Ck, Dk = _realized(_values(loop.numerator, parameters), _values(loop.denominator, parameters))
-        Akd, Bk0, _ = (Ak, Bk, Bk) if self.spec.period_s is not None else sampled(Ak, Bk, dt_s, "zero")
-        fed = names.index(loop.output)
-        reference = run.inputs[loop.reference]
-        plant, controller = StateSpace(Ad, B0 + B1, C, D), StateSpace(Akd, Bk0, Ck, Dk)
-
-        def solve(changes: Array) -> tuple[Array, Array]:
-            """Outputs and the controller's command with `changes` (2, n) of the plant's input and the fed-back output."""
-            return closed_loop(plant, controller, fed, reference, changes, begin)
+        plant, controller = StateSpace(A, B, C, D), StateSpace(*self._controller(parameters))
+        at_first = np.concatenate((begin, self._begin_state(run, controller.A, controller.C, [COMMAND])))
+        fed, reference = names.index(loop.output), run.inputs[loop.reference]
+        solve = self._loop(plant, controller, fed, reference, at_first, dt_s)
 
         changes = np.zeros((2, run.time_s.size))
         y, command = solve(changes)
@@ -221,6 +260,34 @@ class LinearModel(SimulatedModel):
         if loop.actuation:
             found[loop.actuation] = command + changes[0]
         return found
+
+    def _loop(
+        self, plant: StateSpace, controller: StateSpace, fed: int, reference: Array, begin: Array, dt_s: float
+    ) -> Callable[[Array], tuple[Array, Array]]:
+        """Outputs and the controller's command of the loop, as a function of changes (2, n) of the plant's input and of the
+        output that is fed back. begin: states of the plant, then of the controller.
+        """
+        order = plant.A.shape[0]
+        if self.hold != "zero" and self.spec.period_s is None:
+            loop = continuous_loop(plant, controller, fed)
+            step, now, after = sampled(loop.A, loop.B, dt_s, "linear")
+            if self.hold == "held_reference":
+                now[:, 0], after[:, 0] = now[:, 0] + after[:, 0], 0.0
+
+            def together(changes: Array) -> tuple[Array, Array]:
+                u = np.vstack((reference, changes))
+                *y, command = response(step, now, after, loop.C, loop.D, u, begin)
+                return np.array(y), command
+
+            return together
+        if self.spec.period_s is None:
+            step, now, _ = sampled(controller.A, controller.B, dt_s, "zero")
+            controller = controller._replace(A=step, B=now)
+            step, now, _ = sampled(plant.A, plant.B, dt_s, "zero")
+            plant = plant._replace(A=step, B=now)
+        else:
+            self.sampled(plant.A, plant.B, dt_s)  # checks the period
+        return lambda changes: closed_loop(plant, controller, fed, reference, changes, begin[:order], begin[order:])
 
     def _caused(self, run: SimulatorRun, signals: tuple[Array, Array], fed: int) -> Array:
         """Changes (2, n) that the effects inside the loop make of its signals."""
@@ -246,13 +313,7 @@ class LinearModel(SimulatedModel):
             return super().motion(segment, next(p for p in self.ports if p.name == f"{loop.output}_reading"))
         if loop.actuation:
             return super().motion(segment, next(p for p in self.ports if p.name == f"{loop.actuation}_reading"))
-        y = super().motion(segment, next(p for p in self.ports if p.name == f"{loop.output}_reading"))
-        parameters = {**self.offs, **{p.name: p.grid[0] for p in self.parameters}}
-        Ak, Bk, Ck, Dk = _realized(_values(loop.numerator, parameters), _values(loop.denominator, parameters))
-        dt_s = segment.recording.dt_s
-        Akd, Bk0, Bk1 = (Ak, Bk, 0.0 * Bk) if self.spec.period_s is not None else sampled(Ak, Bk, dt_s, "zero")
-        error = segment.inputs[loop.reference] - y
-        return response(Akd, Bk0, Bk1, Ck, Dk, error[None, :], np.zeros(Ak.shape[0]))[0]
+        return self._expected_command(segment)[0]
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """Inside the loop, the residual of the output that is fed back."""
@@ -338,18 +399,19 @@ def response(A: Array, B0: Array, B1: Array, C: Array, D: Array, u: Array, begin
 
 @njit(cache=True)
 def closed_loop(
-    plant: StateSpace, controller: StateSpace, fed: int, reference: Array, changes: Array, begin: Array
+    plant: StateSpace, controller: StateSpace, fed: int, reference: Array, changes: Array, begin: Array, under_way: Array
 ) -> tuple[Array, Array]:
     """Outputs (outputs, n) and command (n,) of plant and controller, both sampled, the plant's input held between samples.
 
-    fed: row of the output that is fed back. changes: (2, n) of the plant's input and of that output, by effects.
+    fed: row of the output that is fed back. changes: (2, n) of the plant's input and of that output, by effects. begin,
+    under_way: states of the plant and of the controller at the first sample.
     A plant that answers at once (D not zero) answers the input of the sample before.
     """
     A, B, C, D = plant
     Ak, Bk, Ck, Dk = controller
     n = reference.size
     y, command = np.zeros((C.shape[0], n)), np.zeros(n)
-    x, z = begin.copy(), np.zeros(Ak.shape[0])
+    x, z = begin.copy(), under_way.copy()
     x_after, z_after = np.empty(x.size), np.empty(z.size)
     u, error = np.zeros(1), np.zeros(1)
     for k in range(n):
@@ -368,6 +430,28 @@ def closed_loop(
     return y, command
 
 
+def continuous_loop(plant: StateSpace, controller: StateSpace, fed: int) -> StateSpace:
+    """Plant and controller as one continuous model: of the reference, the change of the plant's input and that of the
+    output that is fed back (row `fed`); its outputs are those of the plant and the controller's command.
+    """
+    A, B, C, D = plant
+    Ak, Bk, Ck, Dk = controller
+    inputs = np.eye(3)[:, None, :]  # as rows (1, 3)
+    r, du, dy = inputs
+    answer = 1.0 / (1.0 + float(Dk[0, 0] * D[fed, 0]))  # a plant that answers at once
+    # u = command + du, command = Ck z + Dk e, e = r - C x - D u - dy
+    u_x, u_z = -answer * Dk @ C[fed : fed + 1], answer * Ck
+    u_in = answer * (Dk * (r - dy) + du)
+    e_x, e_z = -C[fed : fed + 1] - D[fed, 0] * u_x, -D[fed, 0] * u_z
+    e_in = r - dy - D[fed, 0] * u_in
+    return StateSpace(
+        np.block([[A + B @ u_x, B @ u_z], [Bk @ e_x, Ak + Bk @ e_z]]),
+        np.vstack((B @ u_in, Bk @ e_in)),
+        np.block([[C + D @ u_x, D @ u_z], [u_x, u_z]]),
+        np.vstack((D @ u_in, u_in - du)),
+    )
+
+
 def settled(caused: Any, begin: Array) -> Array:
     """Changes (2, n) that cause themselves, by fixed-point rounds with Anderson acceleration; NaN where they do not settle.
 
@@ -377,7 +461,7 @@ def settled(caused: Any, begin: Array) -> Array:
     images: list[Array] = [caused(begin).ravel()]
     for _ in range(MOST_ROUNDS):
         error = images[-1] - points[-1]
-        if not np.isfinite(error).all():
+        if not np.max(np.abs(error)) < DIVERGED * (1.0 + np.max(np.abs(images[0]))):
             break
         if np.max(np.abs(error)) <= SETTLED * max(float(np.max(np.abs(images[-1]))), 1e-300):
             return images[-1].reshape(begin.shape)

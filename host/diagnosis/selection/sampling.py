@@ -14,8 +14,6 @@ from host.diagnosis.selection.screening import screen
 from host.diagnosis.selection.search import fit_nominal, try_fit
 from host.diagnosis.selection.trial import Trial
 
-WORDS = {"zero": "is held", "linear": "runs straight", "band_limited": "runs smoothly (band-limited)"}
-
 
 def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates: Sequence[Candidate]) -> list[Finding]:
     """Let a model's input run between samples as its recordings say, and say so where the nominal model says otherwise.
@@ -50,7 +48,8 @@ def hold_between_samples(problem: Problem, others: Sequence[Problem], candidates
         return []
     columns = [problem.columns.get(name, name) for name in model.quiet_inputs]
     which = f"column {columns[0]}" if len(columns) == 1 else "each input"
-    says = f"Between its samples {which} {WORDS[chosen]}; the nominal model says that it {WORDS[stated]}. "
+    subject, words = model.hold_words
+    says = f"{subject or f'Between its samples {which}'} {words[chosen]}; the nominal model says that it {words[stated]}. "
     says += f'The diagnosis continues with this ({model.kind}.hold = "{chosen}").'
     return [Finding("hold", columns[0], says)]
 

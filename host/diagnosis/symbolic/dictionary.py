@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.estimation.evidence import compare
-from host.diagnosis.estimation.fit import Fit, Problem, Term, free, size_of
+from host.diagnosis.estimation.fit import RAN_AWAY, Fit, Problem, Term, free, size_of
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.model.effect import Candidate, Context, Effect, Parameter, Port, Scale
 from host.diagnosis.model.model import Segment
@@ -282,7 +282,7 @@ def _responses(problem: Problem, fit: Fit, target: Port, forms: list[Form]) -> l
             term = Term(equation_at(target, form), ())
             segment.equations[form.text] = values
             moved = problem.model.simulate(segment, nominal, [*active, (term.candidate, np.array([size]))])
-            whole[index] = np.nan_to_num((moved - base) / size)
+            whole[index] = _finite((moved - base) / size, problem)
         out.append(Response(table, whole=whole))
     return out
 
@@ -303,8 +303,16 @@ def _slopes(problem: Problem, fit: Fit, segment: Segment) -> Array:
         step = 1e-3 * (abs(value) if p.log else size_of(p, value))
         moved = fit.values.copy()
         moved[index] = value + step if value + step <= p.high else value - step
-        out.append(np.nan_to_num((problem.simulate(segment, fit.terms, moved) - base) / 1e-3))
+        out.append(_finite((problem.simulate(segment, fit.terms, moved) - base) / 1e-3, problem))
     return np.array(out) if out else np.zeros((0, *base.shape))
+
+
+def _finite(change: Array, problem: Problem) -> Array:
+    """A change of the outputs (outputs, n), zero where there are none; all of it is zero if the simulation ran away, as that
+    of a loop that saturates may.
+    """
+    change = np.nan_to_num(change)
+    return change if bool(np.all(np.abs(change) < RAN_AWAY * problem.scale[:, None])) else np.zeros_like(change)
 
 
 def _best(

@@ -10,9 +10,10 @@ from scipy import signal
 
 import seldinger as sd
 from host.diagnosis.effects import candidates
+from host.diagnosis.estimation.fit import FAR, answers_to_begin
 from host.diagnosis.model.effect import Array
 from host.diagnosis.model.expressions import names_in, value_of
-from host.diagnosis.model.model import Model
+from host.diagnosis.model.model import Begin, Model
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import prepare
@@ -155,7 +156,7 @@ def test_an_effect_inside_the_loop_is_solved_with_it() -> None:
     columns = loop_recorded(1, limit=0.6)
     model, problem = model_of(LOOP, columns)
     segment = problem.segments[0]
-    segment.begin.values = np.zeros(2)
+    segment.begin.values = np.zeros(3)
     clips = {c.key: c for c in candidates(model.ports, True)}
     sides = {"upper": 0.6, "lower": -0.6}
     limits = [(clips[f"saturation@slide_actuation({side})"], np.array([value])) for side, value in sides.items()]
@@ -166,7 +167,7 @@ def test_an_effect_inside_the_loop_is_solved_with_it() -> None:
 def test_the_loop_without_effects_is_the_recorded_one() -> None:
     columns = loop_recorded(2)
     model, problem = model_of(LOOP, columns)
-    problem.segments[0].begin.values = np.zeros(2)
+    problem.segments[0].begin.values = np.zeros(3)
     out = model.simulate(problem.segments[0], np.array([0.5, 3.0]), [])
     assert np.max(np.abs(out[0] - columns["y"])) < 6e-5
 
@@ -266,3 +267,89 @@ def test_a_force_inside_the_plant_is_no_noise(force: Any, verdict: str) -> None:
     found = sd.diagnose([oscillator(301, force), oscillator(302, force)], SECOND).as_dict()
     assert found["verdict"] == verdict
     assert verdict == "nothing_missing" or "kind axis" in found["next"]
+
+
+def run_loop(r: Array, y0: Array, steps: int) -> Array:
+    """A second-order plant under a controller with an integrator, both integrated in `steps` of a sample, from `y0`.
+
+    25 / (s^2 + 4 s + 25) under (s + 4) / s: three numbers begin each recording, one of them the controller's.
+    """
+    y, state, h = np.empty(r.size), y0.astype(float), DT_S / steps
+    for k in range(r.size):
+        y[k] = state[0]
+        for _ in range(steps):
+            error = r[k] - state[0]
+            command = error + 4.0 * state[2]
+            state = state + h * np.array([state[1], 25.0 * (command - state[0]) - 4.0 * state[1], error])
+    return y
+
+
+WITH_INTEGRATOR: dict[str, Any] = {
+    "name": "loop",
+    "kind": "linear",
+    "data": {"time": "t"},
+    "channels": {"r": {"column": "r", "unit": "m"}, "y": {"column": "y", "unit": "m"}},
+    "linear": {
+        "inputs": ["r"],
+        "outputs": ["y"],
+        "numerator": ["w**2"],
+        "denominator": [1.0, "2 * d * w", "w**2"],
+        "subsystem": "slide",
+        "feedback": {"reference": "r", "output": "y", "numerator": [1.0, 4.0], "denominator": [1.0, 0.0]},
+    },
+    "parameters": {"w": {"value": 4.5, "low": 0.5, "high": 50.0}, "d": {"value": 0.5, "low": 0.02, "high": 5.0}},
+}
+
+
+def cut_from_motion(seed: int) -> dict[str, Array]:
+    """The loop, exact for a held reference, recorded for 15 s from the middle of a motion, 1 mm noise."""
+    rng, r = np.random.default_rng(seed), tones(seed, 1900)
+    rates = np.array([[0.0, 1.0, 0.0], [-50.0, -4.0, 100.0], [-1.0, 0.0, 0.0]])
+    pushed = np.array([[0.0], [25.0], [1.0]])
+    step, by, *_ = signal.cont2discrete((rates, pushed, np.eye(3), np.zeros((3, 1))), DT_S)
+    y, state = np.empty(r.size), np.zeros(3)
+    for k, wanted in enumerate(r):
+        y[k], state = state[0], step @ state + by[:, 0] * wanted
+    y += 1e-3 * rng.standard_normal(y.size)
+    return {"t": DT_S * np.arange(1500), "r": r[400:], "y": y[400:]}
+
+
+@pytest.mark.slow
+def test_a_controller_begins_with_a_state_of_its_own_and_works_continuously() -> None:
+    """The integrator was begun at zero, and a loop that is integrated was simulated once a sample: a resonance, 0.92."""
+    content = sd.diagnose([cut_from_motion(seed) for seed in (1, 2)], WITH_INTEGRATOR).as_dict()
+    assert content["verdict"] == "nothing_missing"
+    found = content["fit"]["nominal_parameters"]
+    assert found["w"]["value"] == pytest.approx(5.0, rel=0.01) and found["d"]["value"] == pytest.approx(0.4, rel=0.02)
+
+
+@pytest.mark.parametrize(("reach", "expected"), [(10.0, -2.0), (0.5, -2.0), (0.0, 0.0)])
+def test_a_state_from_which_a_loop_runs_away_moves_less_or_not_at_all(reach: float, expected: float) -> None:
+    """Residuals of 1 - 2 x as far as `reach`, beyond it the loop runs away. That ended in a LinAlgError."""
+    begin = Begin(("x",), np.zeros(1), np.ones(1), np.zeros(1))
+
+    class Loop:
+        """A problem whose only state is x."""
+
+        def stacked(self, terms: Any, values: Any) -> Array:
+            """Return 3 residuals, cut where the simulation ran away."""
+            x = float(begin.values[0])
+            return np.full(3, 1.0 - 2.0 * x if abs(x) <= reach else FAR)
+
+    problem: Any = Loop()
+    ((index, column),) = answers_to_begin(problem, (), np.zeros(0), problem.stacked((), ()), begin)
+    assert index == 0 and np.allclose(-column, expected) and np.all(begin.values == 0.0)
+
+
+@pytest.mark.parametrize("hold", ["linear", "held_reference"])
+def test_a_continuous_loop_is_the_integrated_one(hold: str) -> None:
+    """Of a reference that is constant from the second sample on, straight and held are alike."""
+    r = np.full(400, 0.7)
+    y = run_loop(r, np.array([0.2, -0.3, 0.05]), 400)
+    section = {**WITH_INTEGRATOR["linear"], "hold": hold}
+    model, problem = model_of({**WITH_INTEGRATOR, "linear": section}, {"t": DT_S * np.arange(400), "r": r, "y": y})
+    segment = problem.segments[0]
+    rate = model.rate_of(segment)
+    segment.begin.values = np.array([0.2, -0.3 / rate, 4.0 * 0.05])
+    assert segment.begin.names == ("y_0", "y_1", "command_0")
+    assert np.max(np.abs(model.simulate(segment, np.array([5.0, 0.4]), [])[0] - y)) < 1e-3
