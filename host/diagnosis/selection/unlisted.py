@@ -46,7 +46,7 @@ class Remainder:
 
 def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
-    mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than what is left.
+    mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than that remaining error.
     """
     shares, weights = [], []
     noise_sd = _levels(problem, found.best, noise_sd)
