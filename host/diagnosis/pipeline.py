@@ -51,7 +51,7 @@ from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sa
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, concluded, fit_nominal, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
-from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -506,7 +506,7 @@ def _above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list
     """Sentences on outputs whose residual is larger than a noise that was never seen alone: it may be noise all the same."""
     findings = []
     for output, left, noise in zip(full.model.outputs, figures.after, full.noise, strict=True):
-        if noise.source in MEASURED or not left > rules.residual_over_noise * noise.sigma:
+        if noise.source.seen_alone or not left > rules.residual_over_noise * noise.sigma:
             continue
         column = full.columns.get(output.channel, output.channel)
         ratio = left / max(noise.sigma, 1e-300)

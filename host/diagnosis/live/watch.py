@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
-from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.estimation.noise import Noise, NoiseSource
 from host.diagnosis.live.charts import Charts, ChartSettings, Usual
 from host.diagnosis.live.local_field import LOCAL_FIELD
 from host.diagnosis.live.twin import FrameCollector, Twin, TwinFit
@@ -217,7 +217,7 @@ class Watch:
         segment.y[:POSE_ROWS] -= charts.usual.mean[:, None]
         scale = np.concatenate([charts.usual.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
         segment.weight = scale
-        problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
+        problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), NoiseSource.LEARNED) for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
         ranked = screen(problem, fit, self.candidate_effects, lambda what, part: self._rest())[: self.settings.suspects]
         squares = problem.stacked((), calibration.theta) ** 2

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import fftconvolve
 
-from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
+from host.diagnosis.estimation.noise import ORDER, Noise, NoiseSource, autoregression, estimate, quiescent
 from host.diagnosis.model.force_kernel import (
     COULOMB,
     DAMPING2,
@@ -173,9 +173,7 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     for kernel in (of_motion, of_force):
         lags += [kernel[k:] @ kernel[: kernel.size - k] for k in range(ORDER + 1)]
     lags[0] = lags[0] * (1.0 + 1e-9) or 1e-300  # neither has noise in an experiment that is only planned
-    return Noise(
-        max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), "spectra of motion and force above the motion's band"
-    )
+    return Noise(max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), NoiseSource.BALANCE)
 
 
 def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:

@@ -259,6 +259,10 @@ def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
 
 def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
     return [
-        (words(o.channel), quantity(n.sigma, o.unit), f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+        (
+            words(o.channel),
+            quantity(n.sigma, o.unit),
+            f"{n.source.value}, correlated over {n.correlation_samples:.1f} samples",
+        )
         for o, n in zip(result.model.outputs, result.full.noise, strict=True)
     ]

@@ -13,7 +13,6 @@ from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
-from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
 from host.diagnosis.selection.search import Found, Step, try_fit
@@ -23,8 +22,6 @@ from host.diagnosis.symbolic.equation_search import search_equation
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
-MEASURED = ("quiescent parts", REPEATS)  # sources of noise that was seen alone
-# several effects that pile up and still do not fit stand for something that is in no list
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     noise_sd = _levels(problem, found.best, noise_sd)
     return any(
         _power(problem, found.best.residuals, row)
-        > ((measured if noise.source in MEASURED else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
+        > ((measured if noise.source.seen_alone else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
         or (
             not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals], problem.rules))
         )  # no noise does that
@@ -82,7 +79,7 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
     """Noise of each output (outputs,): where it was guessed from a spectrum, and `fit` leaves coloured noise, that noise."""
     levels = noise_sd.copy()
     for row, noise in enumerate(problem.noise):
-        if noise.source not in MEASURED and _power(problem, fit.residuals, row) > levels[row] ** 2:
+        if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
             # What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
             known = [
                 [*(segment.inputs[name] for name in problem.model.quiet_inputs), segment.y[row] - r[row]]
@@ -136,6 +133,7 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
             problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
         ):
             return remainder_of(problem, found, noise_sd)
+    # Several effects that pile up and still do not fit stand for something that is in no list.
     return replace(remainder, doubtful=bool(crowd))
 
 
