@@ -86,7 +86,8 @@ class SelectionRules:
     input_jump_over_output: float = 2.0  # residual over what the output moves there: errors of timing or gain leave one
 
     # What a parameter costs: Akaike's one for the samples it was fitted to, one more for those held out.
-    parameter_penalty: float = 2.0
+    parameter_penalty: float = 2.0  # of a gain on the samples that were fitted, or on all
+    heldout_parameter_cost: float = 1.0  # of a gain on held-out samples, on which no parameter was fitted
 
     # Forward selection.
     heldout_log_likelihood: float = 6.0  # least gain on held-out samples: odds of 400

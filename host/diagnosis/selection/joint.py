@@ -202,9 +202,13 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> boo
     held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd, problem.rules)
     trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd, problem.rules)
     both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd, problem.rules)
-    shown = min(held.log_likelihood, trained.log_likelihood - more) >= problem.rules.heldout_log_likelihood + more
-    return held.share >= problem.rules.further_error_reduction and (
-        (shown and held.p_value <= problem.rules.significance) or _pooled(problem, held, both, more)
+    rules = problem.rules
+    shown = (
+        held.log_likelihood >= rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
+        and trained.log_likelihood >= rules.heldout_log_likelihood + rules.parameter_penalty * more
+    )
+    return held.share >= rules.further_error_reduction and (
+        (shown and held.p_value <= rules.significance) or _pooled(problem, held, both, more)
     )
 
 
@@ -219,7 +223,7 @@ def _passed(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> tuple[
     both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
-    shown = sure and held.log_likelihood > rules.heldout_log_likelihood + more
+    shown = sure and held.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
     if not (held.share > least and (shown or _pooled(problem, held, both, more))):
         return None
     return both.log_likelihood - rules.parameter_penalty * more, held

@@ -259,7 +259,8 @@ def refuted(heldout: Gain, rules: SelectionRules) -> bool:
 
 def _across(trial: Trial, crossed: Gain, more: int) -> bool:
     """Whether recordings that are predicted from one another call for it: no sample was fitted to what it judges."""
-    rules, gained = trial.rules, crossed.log_likelihood - more
+    rules = trial.rules
+    gained = crossed.log_likelihood - rules.heldout_parameter_cost * more
     agreed = gained > rules.pooled_log_likelihood and crossed.p_value < rules.weak_significance
     return crossed.share > _least(trial, crossed) and (agreed or gained > rules.decisive_log_likelihood)
 
@@ -267,7 +268,7 @@ def _across(trial: Trial, crossed: Gain, more: int) -> bool:
 def _alone(trial: Trial, more: int) -> bool:
     gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > rules.heldout_log_likelihood + more
+        gain.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
         and gain.p_value < rules.significance
         and gain.share > _least(trial, gain)
         and trial.trained.log_likelihood > rules.heldout_log_likelihood + rules.parameter_penalty * more

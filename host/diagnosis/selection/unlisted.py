@@ -228,7 +228,7 @@ def _earned(trial: Trial) -> bool:
     """
     gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > rules.heldout_log_likelihood + 1.0
+        gain.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost  # of its amplitude
         and trial.trained.log_likelihood > rules.equation_log_likelihood
         and gain.p_value < rules.equation_significance
         and gain.share > max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
