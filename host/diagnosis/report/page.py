@@ -214,26 +214,23 @@ def switches(result: Diagnosis) -> tuple[str, str]:
     return "\n".join(options), "\n\n".join(tables)
 
 
+def named(key: str) -> str:
+    """A candidate's key as text: its effect, form and place."""
+    return words(key.replace("@", " at ").replace("(", " ("))
+
+
 def candidates(result: Diagnosis) -> list[Row]:
     """What was fitted in full, step by step."""
     rows = []
     for count, step in enumerate(result.found.steps, start=1):
-        if step.move == "backward":
-            rows.append(
-                Row(
-                    str(count),
-                    f"{words(step.key)} removed again",
-                    short(step.gain.log_likelihood),
-                    short(step.gain.p_value),
-                    "",
-                    False,
-                )
-            )
+        if step.move.removes:
+            gain = ("", "") if step.gain is None else (short(step.gain.log_likelihood), short(step.gain.p_value))
+            rows.append(Row(str(count), f"{named(step.key)} {step.move.value}", *gain, "", False))
         for trial in step.trials[:6]:
             rows.append(
                 Row(
                     str(count),
-                    words(trial.candidate.key.replace("@", " at ").replace("(", " (")),
+                    named(trial.candidate.key),
                     short(trial.heldout.log_likelihood),
                     short(trial.heldout.p_value),
                     f"{100 * trial.heldout.share:.1f} %",

@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, Step, refined, unsure
+from host.diagnosis.selection.search import Found, SearchMove, Step, refined, unsure
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -98,7 +98,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
             set_starts(problem, begun)
             return standing
         found.best = other
-        found.steps.append(Step("swap", rival.key, ahead, step.trials))
+        found.steps.append(Step(SearchMove.SWAP, rival.key, ahead, step.trials))
         seen.append(other.names)
         standing = standings(problem, found, noise_sd)
     return standing
@@ -167,7 +167,7 @@ def without_improbable(
         found.best = before
         set_starts(problem, begun)
         return None
-    found.steps.append(Step("remove", weakest.candidate.key, weakest.gain, []))
+    found.steps.append(Step(SearchMove.IMPROBABLE, weakest.candidate.key, weakest.gain))
     return fewer, left
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -50,13 +51,35 @@ Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 
+class SearchMove(Enum):
+    """What one step of the search did with the effect of its key."""
+
+    FORWARD = "it entered"
+    UPGRADE = "it entered in the place of a simpler form"
+    JOINT = "it entered together with another one"
+    SWAP = "it took the place of another one"
+    REDUCE = "it took the place of a more general form"
+    EQUATION = "an equation entered"
+    EXCHANGE = "it stayed: no other one does better in its place"
+    REFIT = "the model before it was fitted again from the nominal parameters found with it"
+    STOP = "no effect earned its place"
+    BACKWARD = "removed again"
+    UNSURE = "removed: its interval contains zero"
+    IMPROBABLE = "removed: it is improbable next to the others"
+
+    @property
+    def removes(self) -> bool:
+        """Whether the effect left the model."""
+        return self in (SearchMove.BACKWARD, SearchMove.UNSURE, SearchMove.IMPROBABLE)
+
+
 @dataclass
 class Step:
-    """One move of the search, for the report."""
+    """One step of the search, for the report."""
 
-    move: str
+    move: SearchMove
     key: str
-    gain: Gain
+    gain: Gain | None = None  # none where no gain decided
     trials: list[Trial] = field(default_factory=list)
 
 
@@ -276,7 +299,7 @@ def drop_unsure(problem: Problem, found: Found) -> None:
     """
     while doubtful := unsure(problem, found.best):
         terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
-        found.steps.append(Step("remove", doubtful[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
+        found.steps.append(Step(SearchMove.UNSURE, doubtful[-1].candidate.key))
         found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
 
 
@@ -314,17 +337,17 @@ def _grow(
             (t for t in trials if good_enough(t, best) and weighty(t, earned) and not only_sampling(t, trials)), None
         )
         if winner is None:
-            steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
+            steps.append(Step(SearchMove.STOP, "", trials=trials))
             break
         better = _better_base(problem, best, winner) if refits < rules.most_refits else None
         if better is not None:  # the gain was that of a better minimum: judged again over that
             refits += 1
-            steps.append(Step("refit", winner.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+            steps.append(Step(SearchMove.REFIT, winner.candidate.key, trials=trials))
             best = better
             if not best.terms:
                 found.nominal = best
             continue
-        move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
+        move = SearchMove.UPGRADE if len(winner.fit.terms) <= len(best.terms) else SearchMove.FORWARD
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
         best = _parted(problem, _taken(problem, winner), candidate_effects)
@@ -333,7 +356,7 @@ def _grow(
             two, found.pairs = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart)
         if two is not None:
             best, gain = _joined(problem, two), two[1]
-            steps += [Step("joint", term.candidate.key, gain, trials) for term in best.terms]
+            steps += [Step(SearchMove.JOINT, term.candidate.key, gain, trials) for term in best.terms]
         if len(best.terms) > 1:
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
@@ -447,7 +470,7 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
         set_starts(problem, begun)
         return
     found.best = _parted(problem, _joined(problem, pair), candidate_effects)
-    found.steps += [Step("joint", term.candidate.key, pair[1], refused) for term in found.best.terms]
+    found.steps += [Step(SearchMove.JOINT, term.candidate.key, pair[1], refused) for term in found.best.terms]
     _grow(problem, found, candidate_effects, noise_sd, pair[1].log_likelihood, progress)
 
 
@@ -515,7 +538,7 @@ def _detour(
             + len(best.best.terms) * problem.rules.heldout_log_likelihood
         ):
             continue
-        other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
+        other = Found(found.nominal, base, [Step(SearchMove.FORWARD, trial.candidate.key, trial.heldout, first.trials)])
         _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
         if _ahead(problem, other, best, noise_sd):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
@@ -523,7 +546,7 @@ def _detour(
         pair = pair_first(problem, found.nominal, first.trials, noise_sd, _restart, progress)
         if pair is not None:
             base = _parted(problem, _joined(problem, pair), candidate_effects)
-            steps = [Step("joint", term.candidate.key, pair[1], first.trials) for term in base.terms]
+            steps = [Step(SearchMove.JOINT, term.candidate.key, pair[1], first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
             likelier = _ahead(problem, other, best, noise_sd)
             earned = compare(
@@ -570,7 +593,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
             ) and not at_bound(other):
-                steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
+                steps.append(Step(SearchMove.SWAP, new.candidate.key, ahead, step.trials if step else []))
                 return refined(problem, other)
     return best
 
@@ -621,7 +644,7 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd, problem.rules)
             more = found.best.fitted - other.fitted
             if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
-                found.steps.append(Step("reduce", key, ahead, [trial]))
+                found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
                 found.best = other
                 break
             set_starts(problem, begun)
@@ -671,7 +694,7 @@ def _in_place_of(
     ]
     rank(problem, trials, less)
     with_other_recordings(problem, less, trials, noise_sd)
-    found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+    found.steps.append(Step(SearchMove.EXCHANGE, term.candidate.key, trials=trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
@@ -684,7 +707,7 @@ def _in_place_of(
         > (problem.rules.heldout_log_likelihood if more >= 0 else -problem.rules.parameter_penalty)
         + problem.rules.parameter_penalty * more
     ):
-        found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
+        found.steps[-1] = Step(SearchMove.SWAP, winner.candidate.key, ahead, trials)
         found.best = _parted(problem, _taken(problem, winner), candidate_effects)
 
 
@@ -743,7 +766,7 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
             small = gain.share < rules.removal_tolerance * least
             if gone or few or small or held.log_likelihood < 0.0:
                 best, dropped = less, True
-                steps.append(Step("backward", term.candidate.key, gain))
+                steps.append(Step(SearchMove.BACKWARD, term.candidate.key, held))
                 break
             set_starts(problem, begun)
     return best

@@ -15,7 +15,7 @@ from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, mini
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.model.effect import Port
 from host.diagnosis.selection.screening import Screened, term_of, without
-from host.diagnosis.selection.search import Found, Step, try_fit
+from host.diagnosis.selection.search import Found, SearchMove, Step, try_fit
 from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
@@ -188,7 +188,7 @@ def _equation_instead(
     if there and _still_earned(problem, found.best, winner, there, noise_sd):
         return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
-    found.steps.append(Step("equation", winner.candidate.key, winner.heldout, trials))
+    found.steps.append(Step(SearchMove.EQUATION, winner.candidate.key, winner.heldout, trials))
     found.best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
     reweigh(problem, found.best)
     return True
