@@ -36,40 +36,67 @@ class Row(NamedTuple):
     taken: bool
 
 
-def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
-    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
-    environment = Environment(
+def _environment() -> Environment:
+    return Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+
+
+def write_data_report(name: str, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of a JSON `verdict` on recordings that nominal model `name` cannot be compared with: findings about the
+    data. Raises OSError where it cannot write `target`.
+    """
+    text = (
+        _environment()
+        .get_template("diagnosis_data.html.j2")
+        .render(
+            title="The recordings cannot be compared with the nominal model",
+            eyebrow=f"Diagnosis of {name}",
+            lead="A channel that the comparison needs cannot be used, so nothing was fitted.",
+            footer=f"{verdict['seconds']:.0f} s.",
+            findings=verdict["data_findings"],
+            next_step=verdict["next"],
+        )
+    )
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
     segment, _, row = shown(result)
     recordings = len(result.full.segments)
     samples = sum(p.n for p in result.full.segments)
-    text = environment.get_template("diagnosis.html.j2").render(
-        title=headline(result, verdict),
-        eyebrow=f"Diagnosis of {result.spec.name}",
-        lead=lead(result, verdict),
-        footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
-        lines=lines(result, verdict),
-        pictures=pictures(result),
-        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
-        nominal=_nominal(result),
-        candidates=candidates(result),
-        located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
-        scripts=[Path(path).name for path in verdict.get("scripts", ())],
-        on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
-        partly=remains(result).replace("its power", "the power of the mismatch"),
-        noises=_noises(result),
-        output=result.model.outputs[row].channel.replace("_", " "),
-        recording=segment.recording.name,
-        switches=switches(result),
-        heldout=[p.recording.name for p in result.full.segments if p.heldout.any()],
-        verdict=verdict["verdict"],
-        findings=verdict["data_findings"],
-        worse=verdict["worse"],
-        comparisons=comparisons(result, verdict),
-        probability_none=f"{verdict['probability_none']:.2f}",
-        next_step=verdict["next"],
-        rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
+    text = (
+        _environment()
+        .get_template("diagnosis.html.j2")
+        .render(
+            title=headline(result, verdict),
+            eyebrow=f"Diagnosis of {result.spec.name}",
+            lead=lead(result, verdict),
+            footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
+            lines=lines(result, verdict),
+            pictures=pictures(result),
+            effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
+            nominal=_nominal(result),
+            candidates=candidates(result),
+            located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
+            scripts=[Path(path).name for path in verdict.get("scripts", ())],
+            on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
+            partly=remains(result).replace("its power", "the power of the mismatch"),
+            noises=_noises(result),
+            output=result.model.outputs[row].channel.replace("_", " "),
+            recording=segment.recording.name,
+            switches=switches(result),
+            heldout=[p.recording.name for p in result.full.segments if p.heldout.any()],
+            verdict=verdict["verdict"],
+            findings=verdict["data_findings"],
+            worse=verdict["worse"],
+            comparisons=comparisons(result, verdict),
+            probability_none=f"{verdict['probability_none']:.2f}",
+            next_step=verdict["next"],
+            rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
+        )
     )
     target.write_text(text, encoding="utf-8")
     return target

@@ -40,30 +40,28 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         for row, output in enumerate(result.model.outputs)
         if np.isfinite(figures.before[row])
     }
-    return {
+    content = without_fit(result.findings, result.problem.rules, seconds)
+    content["fit"] |= {
+        "heldout": True,
+        "rmse_before": figures.before[primary],
+        "rmse_after": figures.after[primary],
+        "noise_floor": figures.noise_sd[primary],
+        "unit": result.model.outputs[primary].unit,
+        "per_channel": per_channel,
+        "per_recording": per_recording(result),
+        "nominal_parameters": nominal_parameters(result),
+        "whiteness_p_before": figures.white_before[primary],
+        "whiteness_p_after": figures.white_after[primary],
+    }
+    return content | {
         "verdict": result.verdict,
         "located": [_located(location, result) for location in result.located],
-        "data_findings": [finding_json(finding) for finding in result.findings],
         "probability_none": _none_stated(result),
         "probability_none_raw": probability_none(result),
-        "rules": result.problem.rules.as_dict(),
         "effects": effects(result),
-        "fit": {
-            "heldout": True,
-            "rmse_before": figures.before[primary],
-            "rmse_after": figures.after[primary],
-            "noise_floor": figures.noise_sd[primary],
-            "unit": result.model.outputs[primary].unit,
-            "per_channel": per_channel,
-            "per_recording": per_recording(result),
-            "nominal_parameters": nominal_parameters(result),
-            "whiteness_p_before": figures.white_before[primary],
-            "whiteness_p_after": figures.white_after[primary],
-        },
         "worse": worse(result),
         "next": next_step(result),
         "stopped_early": result.stopped_early,
-        "seconds": seconds,
     }
 
 
@@ -196,16 +194,30 @@ def words(effect_id: str) -> str:
 
 
 def without_fit(findings: list[Finding], rules: SelectionRules, seconds: float) -> dict[str, Any]:
-    """The verdict on recordings in which there is nothing to compare: findings about the data, no physics."""
-    nothing = dict.fromkeys(("rmse_before", "rmse_after", "noise_floor", "whiteness_p_before", "whiteness_p_after"))
+    """The verdict on recordings in which there is nothing to compare: findings about the data, no effects.
+
+    It has all keys of a verdict; `as_json` fills it.
+    """
     return {
         "verdict": "mismatch_not_identified",
         "located": [],
         "data_findings": [finding_json(finding) for finding in findings],
         "probability_none": 1.0,
+        "probability_none_raw": 1.0,
         "rules": rules.as_dict(),
         "effects": [],
-        "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
+        "fit": {
+            "heldout": False,
+            "rmse_before": None,
+            "rmse_after": None,
+            "noise_floor": None,
+            "unit": "",
+            "per_channel": {},
+            "per_recording": {},
+            "nominal_parameters": {},
+            "whiteness_p_before": None,
+            "whiteness_p_after": None,
+        },
         "worse": [],
         "next": "Correct the data first, then diagnose again: " + (findings[0].says if findings else ""),
         "stopped_early": False,
