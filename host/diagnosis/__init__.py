@@ -3,7 +3,8 @@
 Steps, each a room, arrows in this order: `model` (recordings, channels, data findings, operators) and `effects` (the
 vocabulary); `estimation` (fit, noise, evidence, intervals, rules); `models` (nominal models, one file a kind); `symbolic`
 (equations of recorded signals); `selection` (objective and decision rule are written there); `design` (experiments that
-separate models); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page).
+separate models); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page);
+`export` (the extended model as a file).
 """
 
 from __future__ import annotations

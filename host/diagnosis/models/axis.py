@@ -53,7 +53,8 @@ class AxisModel(Model):
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
     without a spring, small forces that were not recorded let the simulated axis run away from a recording. The force that
-    its measured motion needs is then compared with the input instead (`balance.py`), unless `compare` says "motion".
+    its measured motion needs is then compared with the input instead (`balance.py`), unless `compare` is "motion". A
+    diagnosis without `compare` tries "motion" first and keeps it if that explains the recordings down to their noise.
     """
 
     kind = "axis"

@@ -1,4 +1,6 @@
-"""A free mass is balanced, not simulated: its equation of motion in weak form, smooth test functions along the recording.
+"""The forces on a free mass: its equation of motion in weak form, with smooth test functions along the recording.
+
+They are compared if a simulation of the motion does not explain the recordings down to their noise.
 
     (phi * f)(t) = m (phi'' * x)(t) + c (phi' * x)(t) + k (phi * x)(t) - offset + (phi * other forces)(t)
 
