@@ -286,7 +286,7 @@ def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
     """RMS error before and after of every channel in every recording that was held out, by their names."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for segment, before, after in zip(
-        result.full.segments, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True
+        result.full.segments, result.full_rate.nominal.residuals, result.full_rate.best.residuals, strict=True
     ):
         if segment.heldout.any():
             found[segment.recording.name] = {

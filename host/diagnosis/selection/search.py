@@ -92,8 +92,6 @@ class Found:
     steps: list[Step]
     forms: list[Form] = field(default_factory=list)
     pairs: list[Fit] = field(default_factory=list)  # of two effects each, that do as well as the first one named
-    nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
-    best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 
     @property
     def last_trials(self) -> list[Trial]:
