@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, SearchMove, Step, refined, unsure
+from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, refined, unsure
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -42,12 +42,9 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
     """For every effect of the best structure: its gain over the structure without it, and its equals."""
     out = []
     for term in found.best.terms:
-        terms, values = without(found.best, problem, (term.candidate.key,))
         begun = get_starts(problem)
-        less = found.nominal
-        if terms:
-            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
-            set_starts(problem, begun)
+        less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal, begin_again=True)
+        set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd, problem.rules)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
         crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
@@ -61,7 +58,7 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
         alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
-        doubtful = terms and not term.candidate.effect.memories
+        doubtful = less.terms and not term.candidate.effect.memories
         share = _share(problem, found, less, noise_sd) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
@@ -159,8 +156,7 @@ def without_improbable(
         return None
     weakest = standing[min(doubtful)[1]]
     begun, before = get_starts(problem), found.best
-    terms, values = without(before, problem, (weakest.candidate.key,))
-    found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
+    found.best = fit_without(problem, before, (weakest.candidate.key,), rounds=10, begin_again=True)
     fewer = standings(problem, found, noise_sd)
     left = remainder_of(problem, found, noise_sd)
     if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least or unsure(problem, found.best):

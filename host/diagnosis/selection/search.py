@@ -29,7 +29,7 @@ from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.folds import unexcited, with_other_recordings
-from host.diagnosis.selection.joint import best_pair, pair_first, pair_instead
+from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
 from host.diagnosis.selection.trial import (
@@ -115,6 +115,28 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     if not problem.joint_states:
         start_again(problem, fit)
     return finish(problem, fit)
+
+
+def fit_without(
+    problem: Problem,
+    fit: Fit,
+    keys: tuple[str, ...],
+    *,
+    nominal: Fit | None = None,
+    rounds: int = 8,
+    tolerance: float = 1e-4,
+    begin_again: bool = False,
+) -> Fit:
+    """`fit` without the effects of these `keys`: what remains is fitted again from its values.
+
+    nominal: returned instead where no effect remains. rounds, tolerance: of `minimize`. begin_again: whether a model that is
+    a linear path is also given initial states of its own.
+    """
+    terms, values = without(fit, problem, keys)
+    if not terms and nominal is not None:
+        return nominal
+    less = minimize(problem, terms, values, rounds=rounds, tolerance=tolerance)
+    return finish(problem, begun_again(problem, less) if begin_again else less)
 
 
 def fit_nominal(problem: Problem) -> Fit:
@@ -353,8 +375,8 @@ def _grow(
         if len(best.terms) == 1:
             two, found.pairs = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart)
         if two is not None:
-            best, gain = _joined(problem, two), two[1]
-            steps += [Step(SearchMove.JOINT, term.candidate.key, gain, trials) for term in best.terms]
+            best = _joined(problem, two)
+            steps += [Step(SearchMove.JOINT, term.candidate.key, two.heldout, trials) for term in best.terms]
         if len(best.terms) > 1:
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
@@ -468,15 +490,14 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
         set_starts(problem, begun)
         return
     found.best = _parted(problem, _joined(problem, pair), candidate_effects)
-    found.steps += [Step(SearchMove.JOINT, term.candidate.key, pair[1], refused) for term in found.best.terms]
-    _grow(problem, found, candidate_effects, noise_sd, pair[1].log_likelihood, progress)
+    found.steps += [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, refused) for term in found.best.terms]
+    _grow(problem, found, candidate_effects, noise_sd, pair.heldout.log_likelihood, progress)
 
 
-def _joined(problem: Problem, pair: tuple[Fit, Gain, list[dict[str, float]]]) -> Fit:
+def _joined(problem: Problem, pair: PairFit) -> Fit:
     """The fit of a pair brought to its end, memories started and outputs weighed as it has them."""
-    fit, _, starts = pair
-    set_starts(problem, starts)
-    fit = refined(problem, fit)
+    set_starts(problem, pair.starts)
+    fit = refined(problem, pair.fit)
     reweigh(problem, fit)
     return fit
 
@@ -544,7 +565,7 @@ def _detour(
         pair = pair_first(problem, found.nominal, first.trials, noise_sd, _restart, progress)
         if pair is not None:
             base = _parted(problem, _joined(problem, pair), candidate_effects)
-            steps = [Step(SearchMove.JOINT, term.candidate.key, pair[1], first.trials) for term in base.terms]
+            steps = [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
             likelier = _ahead(problem, other, best, noise_sd)
             earned = compare(
@@ -631,9 +652,8 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             simple = trial.fit.terms[-1]
             own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
             alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
-            begun, key, less = get_starts(problem), simple.candidate.key, found.nominal
-            if rest:
-                less = finish(problem, minimize(problem, rest, values, rounds=8, tolerance=1e-4))
+            begun, key = get_starts(problem), simple.candidate.key
+            less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
             start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
             begin = np.concatenate((values, start))
             other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
@@ -676,8 +696,7 @@ def _in_place_of(
     problem: Problem, found: Found, term: Term, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
 ) -> None:
     known = _frequencies(found.best, term)
-    terms, values = without(found.best, problem, (term.candidate.key,))
-    less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+    less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
     ranked = [
         item
         for item in screen(problem, less, candidate_effects, progress, known)
@@ -750,9 +769,8 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
     while dropped and len(best.terms) > 1:
         dropped = False
         for term in best.terms:
-            terms, values = without(best, problem, (term.candidate.key,))
             begun = get_starts(problem)
-            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
+            less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
             gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd, problem.rules)
             held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd, problem.rules)
             least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)

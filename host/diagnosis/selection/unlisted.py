@@ -14,8 +14,8 @@ from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
 from host.diagnosis.model.effect import Port
-from host.diagnosis.selection.screening import Screened, term_of, without
-from host.diagnosis.selection.search import Found, SearchMove, Step, try_fit
+from host.diagnosis.selection.screening import Screened, term_of
+from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, try_fit
 from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
@@ -168,8 +168,7 @@ def _equation_instead(
     """
     progress("searching an equation", 0.0)
     there = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.name in (port.name, target.name))
-    terms, values = without(found.best, problem, there)
-    base = finish(problem, minimize(problem, terms, values, rounds=8)) if there else found.best
+    base = fit_without(problem, found.best, there, tolerance=1e-7) if there else found.best
     sized = [form for place in predict_residual(problem, base, noise_sd) if place.port is port for form in place.forms]
     trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
