@@ -107,7 +107,6 @@ class Diagnosis:
     figures: Figures
     verdict: str = "nothing_missing"
     remainder: Remainder = field(default_factory=lambda: Remainder(None, 0.0))
-    notes: list[str] = field(default_factory=list)
     designs: list[Design] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     stopped_early: bool = False
@@ -128,7 +127,7 @@ def inspected(spec: NominalSpec, sources: Sequence[Path | Table], rules: Selecti
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
     needed, optional = channels_of(spec)
-    data = inspect(spec, load(spec, tables, needed, optional, rules.data), optional, rules.data)
+    data = inspect(spec, load(spec, tables, needed, optional, rules.data), rules.data)
     if not data.recordings:
         raise NothingToCompare(data.findings)
     return data
@@ -648,7 +647,7 @@ def _contribution(full: Problem, found: Found, fits: FullRate, subsystem: str) -
     for neither.
     """
     if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
-        return mismatch_of(full, fits.nominal, fits.best)
+        return mismatch_of(fits.nominal, fits.best)
     here = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.subsystem == subsystem)
     terms, values = without(found.best, full, here)
     out = []

@@ -174,9 +174,7 @@ def coarse(
         findings.append(Finding("quantized", column, says))
 
 
-def counts(
-    recordings: list[Recording], names: list[str], columns: dict[str, str], units: dict[str, str], rules: DataRules
-) -> list[str]:
+def counts(recordings: list[Recording], names: list[str], units: dict[str, str], rules: DataRules) -> list[str]:
     """Channels that hold whole numbers only, many of them, though their unit is none of whole numbers."""
     found = []
     for name in names:

@@ -71,9 +71,9 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
         _environment()
         .get_template("diagnosis.html.j2")
         .render(
-            title=headline(result, verdict),
+            title=headline(verdict),
             eyebrow=f"Diagnosis of {result.spec.name}",
-            lead=lead(result, verdict),
+            lead=lead(verdict),
             footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
             lines=lines(result, verdict),
             pictures=pictures(result),
@@ -102,7 +102,7 @@ def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Pa
     return target
 
 
-def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
+def headline(verdict: dict[str, Any]) -> str:
     """Return the verdict in one sentence."""
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
     data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
@@ -121,7 +121,7 @@ def worse_words(verdict: dict[str, Any]) -> str:
     return f"the error of {words(first)} grew" + (f", and {more} more" if more else "")
 
 
-def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
+def lead(verdict: dict[str, Any]) -> str:
     """Return the sentence below the verdict."""
     fit = verdict["fit"]
     unit = fit["unit"]

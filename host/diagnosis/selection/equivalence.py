@@ -59,7 +59,7 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
         doubtful = less.terms and not term.candidate.effect.memories
-        share = _share(problem, found, less, noise_sd) if doubtful else np.inf
+        share = _share(found, less, noise_sd) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 
@@ -181,7 +181,7 @@ def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial)
     return refined(problem, finish(problem, minimize(problem, (*terms, term), begin, rounds=10, tolerance=1e-4)))
 
 
-def _share(problem: Problem, found: Found, less: Fit, noise_sd: Array) -> float:
+def _share(found: Found, less: Fit, noise_sd: Array) -> float:
     """Part of the nominal mismatch above noise that an effect removes from the model `less` without it, in the output where
     that is most.
     """

@@ -184,7 +184,7 @@ def _equation_instead(
         return False
     if _left(problem, found, winner.fit, noise_sd) > problem.rules.equation_residual_share:
         return False
-    if there and _still_earned(problem, found.best, winner, there, noise_sd):
+    if there and _still_earned(problem, found.best, winner, noise_sd):
         return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
     found.steps.append(Step(SearchMove.EQUATION, winner.candidate.key, winner.heldout, trials))
@@ -193,7 +193,7 @@ def _equation_instead(
     return True
 
 
-def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], noise_sd: Array) -> bool:
+def _still_earned(problem: Problem, best: Fit, winner: Trial, noise_sd: Array) -> bool:
     """Whether the effects that an equation would replace gain as much together with it as they must to enter: then they
     stay.
     """
