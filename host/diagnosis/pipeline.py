@@ -401,7 +401,7 @@ def _past_delay(
 ) -> _Searched | None:
     """The search with the delay of `late` among the nominal parameters; None if that names nothing better.
 
-    What is named may be no shape of the delay: its gain has to be that of a further effect, it is no linear effect at the
+    What is named may be no shape of the delay: its gain has to be that of a further effect, it is not a linear effect at the
     place of the delay, and the delay stays within the sample.
     """
     candidate, term, problem = late.candidate, late.fit.terms[-1], begun.problem
@@ -555,7 +555,7 @@ def candidate_ports(problem: Problem) -> tuple[Port, ...]:
 
 
 def _unexplained(full: Problem, fits: FullRate, subsystem: str) -> Location:
-    """Where the refitted nominal model fails, with no effect to blame."""
+    """Where the refitted nominal model fails, if no effect explains it."""
     residuals, rules = fits.nominal.residuals, full.rules
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))

@@ -59,7 +59,7 @@ class SelectionRules:
     # Jumps of a residual's level.
     jump_deviations: float = 8.0  # robust standard deviations, from which a difference of medians is more than noise
     jump_abrupt_share: float = 0.6  # of a jump that happens within few samples: a ramp has a seventh there
-    jumps_per_recording: int = 5  # a level that steps more often is no level
+    jumps_per_recording: int = 5  # at most: a sensor is not moved more often, so more of them have another cause
 
     # Evidence: gain of one model over another.
     evidence_independent_samples: float = 3.0  # of an output, below which it says nothing

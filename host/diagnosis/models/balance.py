@@ -182,7 +182,7 @@ def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:
     """Noise that a second mass or a branch that relaxes leaves in the balance, over that of the nominal law; 1 without them.
 
     The noise of a motion enters the balance mostly as m a. A spring of fitted frequency and damping pulls against it in just
-    that band, although the force has no such part: a smaller error of this kind is no evidence. linear: m, c, k, offset.
+    that band, although the force has no such part: a smaller error of this kind is not evidence. linear: m, c, k, offset.
     """
     if p[MASS2] <= 0.0 and p[MAXWELL_K] == 0.0:
         return 1.0
@@ -252,7 +252,7 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
 def _passed(applied: Array, recorded: Array, compared: npt.NDArray[np.bool_]) -> float:
     """Share of the recorded input that is applied: the median over parts of the recording of the ratio of their spreads.
 
-    One ratio for the whole recording is no measure. A limit that lets a single peak pass leaves no error anywhere else.
+    One ratio for the whole recording is not a measure. A limit that lets a single peak pass leaves no error anywhere else.
 
     applied, recorded: (n,), under the test function; compared: (n,).
     """

@@ -1,4 +1,4 @@
-"""The findings as the JSON object that the contract asks for, with one plain sentence for each effect."""
+"""The findings as one JSON object (docs/diagnosis.md, Fields of the verdict), with one plain sentence for each effect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  
 
 
 def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
-    """One JSON object exactly as the contract has it."""
+    """The JSON object of `seldinger diagnose --json`; docs/diagnosis.md explains its fields."""
     figures = result.figures
     primary = figures.primary
     per_channel = {
@@ -123,7 +123,7 @@ def _unexplained(result: Diagnosis) -> str:
     ):
         return (
             "Describe a mass on a spring or damper as kind axis and diagnose again: a linear model has candidates at its "
-            "inputs and readings alone, and a force inside it, as of friction or a hardening spring, is none of them."
+            "inputs and readings only, and not for a force inside it, such as friction or a hardening spring."
         )
     if result.verdict == "mismatch_not_identified" and result.model.simulates:
         return (
@@ -178,7 +178,7 @@ def placeless(result: Diagnosis) -> list[str]:
 def likelier(effect: dict[str, Any]) -> str:
     """State the alternative that is more probable than the named effect, with its probability; empty if there is none.
 
-    An effect keeps its name if an equation of recorded signals fits better in its place: a formula is no physics.
+    An effect keeps its name if an equation of recorded signals fits better in its place: an equation states no cause.
     """
     best = max(effect["alternatives"], key=lambda other: other["probability"], default=None)
     if best is None or best["probability"] <= effect["probability"]:
@@ -258,7 +258,7 @@ def probability_none(result: Diagnosis) -> float:
 
 
 def finding_json(finding: Finding) -> dict[str, str]:
-    """A finding about the data, as the contract has it."""
+    """One entry of `data_findings` (docs/diagnosis.md, Checks of the data)."""
     return {"id": finding.id, "channel": finding.channel, "says": finding.says}
 
 

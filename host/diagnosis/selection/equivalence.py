@@ -326,7 +326,7 @@ def _collapsed(problem: Problem, best: Fit, other: Fit) -> bool:
     """Whether `other`, which contains the best model, ended as that model: their outputs differ by less than chance.
 
     Its further parameters are then where they change nothing, such as a limit that is never reached. It says what the
-    best model says, so it is no other explanation.
+    best model says, so it is not another explanation.
     """
     lead = 0.0
     for segment, a, b in zip(problem.segments, best.residuals, other.residuals, strict=True):
