@@ -16,7 +16,7 @@ EXPLAINS_FOR_NS = 5_000_000_000
 # Devices that share nothing but the computer do not fall silent within this time by chance; a silence is noticed after 50 to
 # 150 ms, depending on the device.
 TOGETHER_NS = 300_000_000
-# The model process is none of them: without poses it has nothing to answer.
+# The model process is not one of them: without poses it has nothing to answer.
 _SILENCES = (("board_silent",), ("pose_stale", "pose_lost"), ("force_stale", "force_lost"))
 # ... or was noticed after at most this time: lateness and the board's counters are reported twice a second.
 NOTICED_WITHIN_NS = 600_000_000

@@ -32,7 +32,7 @@ DISTAL_TOLERANCE_M = 0.005
 
 
 class _Section(BaseModel):
-    # Strict: a text is no number, and 1 is not true. Lists of TOML become tuples.
+    # Strict: a text is not a number, and 1 is not true. Lists of TOML become tuples.
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 from numba import njit
 
-from protocol.serial_frames import AXIS_COUNT, FRAME_BY_NAME, OVERHEAD_BYTES, wire_bytes
+from protocol.serial_frames import AXIS_COUNT, FRAME_BY_NAME, wire_bytes
 
 SETPOINT_ID = FRAME_BY_NAME["SETPOINT"].id
-SETPOINT_BODY_BYTES = FRAME_BY_NAME["SETPOINT"].payload_bytes + OVERHEAD_BYTES
 SETPOINT_WIRE_BYTES = wire_bytes(FRAME_BY_NAME["SETPOINT"])
 BUFFER_BYTES = 64
 

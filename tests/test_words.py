@@ -39,6 +39,11 @@ REPLACED = {
     r"the play\b(?! operator)|play of": "backlash",
     r"nominal chain": "nominal model",
     r"mend(?:s|ed|ing)?": "correct, repair",
+    r"(?:the|command's) contract": "name the document or the command that prints it",
+    r"(?<!there )(?:is|are|was|were) no (?!longer|tip|answer|\w+er\b|more|less|better|worse)\w+": "is not a",
+    r"(?<!there )(?:is|are|was|were) none of|none of nature": "is not one of",
+    r"vouch\w*": "confirm, state",
+    r"to blame": "name the cause",
 }
 # Parts of names in code that are metaphors or replaced words.
 NAME_PARTS = set(
@@ -50,6 +55,7 @@ INSTEAD = list(REPLACED.values())
 
 def found_in(text: str) -> list[str]:
     """Each replaced word of `text` with what to say instead."""
+    text = re.sub(r"\s+", " ", text)  # two words may stand in two lines
     return [f'"{m.group()}": say {INSTEAD[int((m.lastgroup or "w0")[1:])]}' for m in PATTERN.finditer(text)]
 
 
@@ -111,4 +117,5 @@ def test_templates_use_the_glossary(template: Path) -> None:
 def test_replaced_words_are_found() -> None:
     assert found_in("The beat is foretold.") == ['"foretold": say predict, prediction']
     assert found_in("play operator, recorded, holds, displays, unheard-of") == ['"unheard": say received']
+    assert found_in("a step is no\n    noise; there is no noise; it is no longer one") == ['"is no noise": say is not a']
     assert found_in(prose_of("`beside`\n\n    seldinger beside\n\nsee [it](beside.md)")) == []

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from host.cli.contract_io import write_json
-from host.cli.options import Json, RigFile, writable_folder
+from host.cli.options import Json, writable_folder
 from host.cli.progress import Progress
 from protocol.errors import Description, InputError
 from protocol.rig_file import SIMULATED_RIG, load_rig
@@ -35,7 +35,9 @@ def diagnose(
     ] = None,
     quiet: Annotated[bool, typer.Option(help="Print no progress on standard error.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Compare a running rig with its twin and raise alarms.")] = False,
-    rig: RigFile = SIMULATED_RIG,
+    rig: Annotated[
+        Path | None, typer.Option(help="With --live: rig file (TOML); default: that of the simulated rig.")
+    ] = None,
     effect: Annotated[
         list[str] | None,
         typer.Option(help="Effect that is known to be active: id@subsystem:key=value,... as printed in a report."),
@@ -53,10 +55,21 @@ def diagnose(
 ) -> None:
     """Compare recordings with a simulation: where they disagree, which physics is missing, its parameters, the evidence."""
     if live:
-        if recordings:
-            raise InputError("recordings", recordings[0], "none with --live, which compares the running rig")
-        _watch(rig, json)
+        of_recordings = {
+            "recordings": recordings,
+            "--nominal": nominal,
+            "--out": out,
+            "--data": data,
+            "--without": without,
+            "--time-budget": time_budget,
+            "--effect": effect,
+            "--export": export,
+            "--trust": trust,
+        }
+        _diagnose_live(rig, json, of_recordings)
         return
+    if rig is not None:
+        raise InputError("--rig", str(rig), "this option with --live only: recordings are compared with --nominal")
     from host.diagnosis import diagnose as run
 
     if not nominal:
@@ -119,6 +132,19 @@ def _say_what_runs(nominal: str, trust: bool) -> None:
     if not trust:
         check_owner(path, *([code] if code is not None else []))
     print(f"seldinger diagnose: {path} runs {what} with your rights", file=sys.stderr)
+
+
+def _diagnose_live(rig: Path | None, json: bool, of_recordings: dict[str, Any]) -> None:
+    """Watch a running rig until it is stopped.
+
+    of_recordings: arguments by name that only a diagnosis of recordings reads. Raises InputError if one is given.
+    """
+    for name, value in of_recordings.items():
+        if value is None or value is False or value in ("", []):
+            continue
+        found = Description("this option") if value is True else str(value[0] if isinstance(value, list) else value)
+        raise InputError(name, found, "none with --live, which compares the running rig with its twin")
+    _watch(SIMULATED_RIG if rig is None else rig, json)
 
 
 def _watch(rig: Path, json: bool) -> None:

@@ -64,7 +64,7 @@ def prove(
         raise InputError("--finder", finder, "a command whose program can be run")
     folder = writable_folder("--out", resume or out or Path("runs") / f"prove_{seed}_{cases}{named}")
     if is_spent(seed):
-        print(f"seed {seed} was used during the development of the finder, so its figures are no proof", file=sys.stderr)
+        print(f"seed {seed} was used during the development of the finder, so its figures prove nothing", file=sys.stderr)
     with Progress() as bar:
         result = run(
             Settings(cases, seed, folder, processes, scheduler, command, limit_s, baselines, chosen, calibrate),

@@ -35,7 +35,7 @@ def quantity(key: str, text: str, unit: str) -> float:
     """Return the quantity in `text` in the SI unit `unit` ("m", "rad", "N" or "s").
 
     Raises:
-        InputError: named `key`; it is no number, or its unit is of another kind.
+        InputError: named `key`; it is not a number, or its unit is of another kind.
     """
     match = _NUMBER.fullmatch(text)
     known = [name for name, (si, _) in UNITS.items() if si == unit]

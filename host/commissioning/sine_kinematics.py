@@ -88,7 +88,7 @@ def fit_sines(x: Array, y: Array, terms_start: Array | None = None) -> SineCurve
     return SineCurve(best[1], 1.0 - 2.0 * best[0] / float(np.sum((y - y.mean()) ** 2)))
 
 
-def fit_sine_kinematics(sweep: KnobSweep, length_m: float, fold_knob_rad: float, thin: int = 600) -> SineKinematics:
+def fit_sine_kinematics(sweep: KnobSweep, fold_knob_rad: float, thin: int = 600) -> SineKinematics:
     """Curves 1 to 3 from one half of a knob sweep, at most `thin` points each. `fold_knob_rad`: where the tip is furthest
     off."""
     knob, lateral = np.abs(sweep.knob_rad), np.sign(sweep.knob_rad) * sweep.lateral_m

@@ -72,7 +72,6 @@ class KnobFit(NamedTuple):
     gains_per_m_rad: tuple[Estimate, Estimate]
     rest_curvature_per_m: Estimate
     delay_s: float
-    noise_per_m: float
     knob_rad: Array
     curvature_per_m: Array
 
@@ -198,7 +197,7 @@ def fit_knob(runs: Sequence[Run], sigma_per_m: float) -> KnobFit:
     e = [Estimate(float(value), float(width)) for value, width in zip(x, half, strict=True)]
     knob = given(x[7])
     places, curve = _monotone_curve(knob, output, x[:4], noise)
-    return KnobFit((e[0], e[1], e[2], e[3]), (e[4], e[5]), e[6], float(x[7]), noise, places, curve)
+    return KnobFit((e[0], e[1], e[2], e[3]), (e[4], e[5]), e[6], float(x[7]), places, curve)
 
 
 def _edges_by_eye(knob: Array, curvature: Array) -> Array:

@@ -3,7 +3,8 @@
 Steps, each a room, arrows in this order: `model` (recordings, channels, data findings, operators) and `effects` (the
 vocabulary); `estimation` (fit, noise, evidence, intervals, rules); `models` (nominal models, one file a kind); `symbolic`
 (equations of recorded signals); `selection` (objective and decision rule are written there); `design` (experiments that
-separate models); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page).
+separate models); `live` (a running rig); `pipeline` (one diagnosis from start to end); `report` (verdict and page);
+`export` (the extended model as a file).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ __all__ = ["Verdict", "diagnose"]
 class Verdict:
     """What a diagnosis found. `as_dict` has all of it, as `seldinger diagnose --json` prints it."""
 
-    def __init__(self, content: dict[str, Any], diagnosis: Diagnosis | None) -> None:
-        self._content, self.diagnosis = content, diagnosis
+    def __init__(self, name: str, content: dict[str, Any], diagnosis: Diagnosis | None) -> None:
+        self._name, self._content, self.diagnosis = name, content, diagnosis
         self.not_exported: list[str] = []  # what the file last exported cannot hold of the model, a sentence each
 
     @property
@@ -74,30 +75,29 @@ class Verdict:
         return Path(path)
 
     def write(self, folder: Path | str) -> Path:
-        """Write verdict.json and, if there was something to compare, report.html and the scripts of proposed experiments.
+        """Write verdict.json, report.html and, if there was something to compare, the scripts of proposed experiments.
 
         Parameters:
             folder: made if it does not exist.
 
         Returns:
-            The report's path, or that of verdict.json without one.
+            The report's path.
 
         Raises:
             OSError: the folder cannot be written.
         """
         import json
 
-        from host.diagnosis.report.page import write_report
+        from host.diagnosis.report.page import write_data_report, write_report
         from host.diagnosis.report.scripts import write_scripts
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         scripts = [] if self.diagnosis is None else write_scripts(self.diagnosis, folder)
         self._content["scripts"] = [str(path) for path in scripts]
-        written = folder / "verdict.json"
-        written.write_text(json.dumps(self.as_dict(), allow_nan=False) + "\n", encoding="utf-8")
+        (folder / "verdict.json").write_text(json.dumps(self.as_dict(), allow_nan=False) + "\n", encoding="utf-8")
         if self.diagnosis is None:
-            return written
+            return write_data_report(self._name, self._content, folder / "report.html")
         return write_report(self.diagnosis, self._content, folder / "report.html")
 
 
@@ -166,5 +166,5 @@ def diagnose(
     try:
         result = run(spec, sources, progress, frozenset(without), rules, time_budget_s)
     except NothingToCompare as nothing:
-        return Verdict(without_fit(nothing.findings, rules, time.monotonic() - began), None)
-    return Verdict(as_json(result, time.monotonic() - began), result)
+        return Verdict(spec.name, without_fit(nothing.findings, rules, time.monotonic() - began), None)
+    return Verdict(spec.name, as_json(result, time.monotonic() - began), result)

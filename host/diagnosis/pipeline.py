@@ -51,7 +51,7 @@ from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sa
 from host.diagnosis.selection.screening import without
 from host.diagnosis.selection.search import Found, concluded, fit_nominal, forward, search
 from host.diagnosis.selection.trial import Trial, within_sample
-from host.diagnosis.selection.unlisted import MEASURED, Remainder, explain_remainder, slow_outputs
+from host.diagnosis.selection.unlisted import Remainder, explain_remainder, slow_outputs
 from host.diagnosis.symbolic.dictionary import lay_out
 from protocol.errors import InputError
 
@@ -69,6 +69,14 @@ class Location:
     windows_s: dict[str, list[tuple[float, float]]]  # of every recording, in its file's own time
     condition: Condition | None
     residual_share: float
+
+
+@dataclass(frozen=True)
+class FullRate:
+    """The nominal and the best fit with their residuals on all samples of the recordings."""
+
+    nominal: Fit
+    best: Fit
 
 
 @dataclass
@@ -92,13 +100,13 @@ class Diagnosis:
     problem: Problem
     full: Problem
     found: Found
+    full_rate: FullRate
     standings: list[Standing]
     intervals: list[tuple[float, float]]
     located: list[Location]
     figures: Figures
     verdict: str = "nothing_missing"
     remainder: Remainder = field(default_factory=lambda: Remainder(None, 0.0))
-    notes: list[str] = field(default_factory=list)
     designs: list[Design] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     stopped_early: bool = False
@@ -119,7 +127,7 @@ def inspected(spec: NominalSpec, sources: Sequence[Path | Table], rules: Selecti
     tables = read_tables(spec, sources)
     spec._files = [table.path for table in tables if table.path is not None]
     needed, optional = channels_of(spec)
-    data = inspect(spec, load(spec, tables, needed, optional, rules.data), optional, rules.data)
+    data = inspect(spec, load(spec, tables, needed, optional, rules.data), rules.data)
     if not data.recordings:
         raise NothingToCompare(data.findings)
     return data
@@ -262,8 +270,9 @@ def _diagnosed(
     standing = with_unlisted_rival(standing, remainder)
     overall.part(0.85, 0.9)("intervals", 0.0)
     spans = intervals(problem, found.best)
-    located, figures = _locate(full, found, problem), _figures(full, found)
-    result = Diagnosis(spec, model, problem, full, found, standing, spans, located, figures)
+    fits = _fits_at_full_rate(full, found, problem)
+    located, figures = _locate(full, found, fits), _figures(full, fits)
+    result = Diagnosis(spec, model, problem, full, found, fits, standing, spans, located, figures)
     result.remainder = remainder
     result.findings = [
         *data.findings,
@@ -275,7 +284,7 @@ def _diagnosed(
         *model.findings(),
     ]
     if not found.best.terms and remainder.sure:
-        result.findings += _jumps(full, found)
+        result.findings += _jumps(full, fits)
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
     result.stopped_early = budget.spent()
     piled = remainder.doubtful and len(found.best.terms) > problem.rules.partial_effects
@@ -288,13 +297,13 @@ def _diagnosed(
         else "nothing_missing"
     )
     if not found.best.terms:
-        result.findings += _lines(full, found)
+        result.findings += _lines(full, fits)
     if result.verdict == "nothing_missing":
         slow = slow_outputs(problem, found.best, noise_sd)
         late = any(finding.id == "within_sample" for finding in done.findings)  # it explains what exceeds the noise
-        result.findings += _too_slow(full, found, slow) or ([] if late else _above_guess(full, figures, problem.rules))
+        result.findings += _too_slow(full, fits, slow) or ([] if late else _above_guess(full, figures, problem.rules))
     if not located and remainder.sure and remainder.predicted is not None:
-        result.located = [_unexplained(full, found, remainder.predicted.subsystem)]
+        result.located = [_unexplained(full, fits, remainder.predicted.subsystem)]
     overall.end()
     return result
 
@@ -392,7 +401,7 @@ def _past_delay(
 ) -> _Searched | None:
     """The search with the delay of `late` among the nominal parameters; None if that names nothing better.
 
-    What is named may be no shape of the delay: its gain has to be that of a further effect, it is no linear effect at the
+    What is named may be no shape of the delay: its gain has to be that of a further effect, it is not a linear effect at the
     place of the delay, and the delay stays within the sample.
     """
     candidate, term, problem = late.candidate, late.fit.terms[-1], begun.problem
@@ -450,7 +459,7 @@ def _repeated(full: Problem) -> list[Finding]:
     return findings
 
 
-def _lines(full: Problem, found: Found) -> list[Finding]:
+def _lines(full: Problem, fits: FullRate) -> list[Finding]:
     """Sentences on lines in the spectrum of the nominal residual that no effect explains."""
     if not full.segments[0].recording.timed:
         return []
@@ -462,7 +471,7 @@ def _lines(full: Problem, found: Found) -> list[Finding]:
         for segment in full.segments
     ]
     for row, output in enumerate(full.model.outputs):
-        residuals = [r[row] for r in found.nominal_full.residuals]
+        residuals = [r[row] for r in fits.nominal.residuals]
         simulated = [segment.y[row] - r for segment, r in zip(full.segments, residuals, strict=True)]
         known = [[*own, *distorted(said)] for own, said in zip(inputs, simulated, strict=True)]
         line = common_line(residuals, known, simulated, periods, full.rules.data)
@@ -489,11 +498,11 @@ def _fed_back(problem: Problem) -> list[Finding]:
     return [Finding("noise_fed_back", names[0], says)]
 
 
-def _too_slow(full: Problem, found: Found, rows: list[int]) -> list[Finding]:
+def _too_slow(full: Problem, fits: FullRate, rows: list[int]) -> list[Finding]:
     """Sentences on outputs whose residual wanders so slowly that it is noise or a mismatch, and data cannot tell which."""
     findings = []
     for row in rows:
-        output, residuals = full.model.outputs[row], [r[row] for r in found.best_full.residuals]
+        output, residuals = full.model.outputs[row], [r[row] for r in fits.best.residuals]
         column = full.columns.get(output.channel, output.channel)
         says = f"The residual of column {column}, {rms(residuals):.3g} {output.unit} RMS, has only "
         says += f"{independent_samples(residuals):.0f} independent samples. No structure is common to the recordings. "
@@ -506,7 +515,7 @@ def _above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list
     """Sentences on outputs whose residual is larger than a noise that was never seen alone: it may be noise all the same."""
     findings = []
     for output, left, noise in zip(full.model.outputs, figures.after, full.noise, strict=True):
-        if noise.source in MEASURED or not left > rules.residual_over_noise * noise.sigma:
+        if noise.source.seen_alone or not left > rules.residual_over_noise * noise.sigma:
             continue
         column = full.columns.get(output.channel, output.channel)
         ratio = left / max(noise.sigma, 1e-300)
@@ -517,11 +526,11 @@ def _above_guess(full: Problem, figures: Figures, rules: SelectionRules) -> list
     return findings
 
 
-def _jumps(full: Problem, found: Found) -> list[Finding]:
+def _jumps(full: Problem, fits: FullRate) -> list[Finding]:
     """Sentences on jumps of the nominal residual that no effect explains, such as those of a sensor that was moved."""
     findings = []
     for row, output in enumerate(full.model.outputs):
-        jumps = jumps_of([r[row] for r in found.nominal_full.residuals], full.rules)
+        jumps = jumps_of([r[row] for r in fits.nominal.residuals], full.rules)
         if not jumps:
             continue
         places = []
@@ -545,9 +554,9 @@ def candidate_ports(problem: Problem) -> tuple[Port, ...]:
     return tuple(replace(port, path=path) if port.name in path else port for port in problem.model.ports)
 
 
-def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
-    """Where the refitted nominal model fails, with no effect to blame."""
-    residuals, rules = found.nominal_full.residuals, full.rules
+def _unexplained(full: Problem, fits: FullRate, subsystem: str) -> Location:
+    """Where the refitted nominal model fails, if no effect explains it."""
+    residuals, rules = fits.nominal.residuals, full.rules
     rows = _rows_touched(full, residuals)
     top = max(rows, key=lambda row: _weight(full, residuals, row))
     spans = [
@@ -557,7 +566,7 @@ def _unexplained(full: Problem, found: Found, subsystem: str) -> Location:
     spans_s = _by_recording(full, spans)
     where = condition(full, residuals, top, max(1, sum(p.n for p in full.segments) // 20000))
     return Location(
-        subsystem, [full.model.outputs[row].channel for row in rows], spans_s, where, _share(full, found, spans, top)
+        subsystem, [full.model.outputs[row].channel for row in rows], spans_s, where, _share(full, fits, spans, top)
     )
 
 
@@ -574,10 +583,18 @@ def at_full_rate(full: Problem, fit: Fit, like: Problem) -> Fit:
     return again
 
 
-def _figures(full: Problem, found: Found) -> Figures:
+def _fits_at_full_rate(full: Problem, found: Found, coarse: Problem) -> FullRate:
+    """Both fits on the samples of `full`, whose segments then hold the equations, and the states of the best fit."""
+    nominal = at_full_rate(full, found.nominal, coarse)
+    for form in found.forms:
+        lay_out(full.segments, form)
+    return FullRate(nominal, at_full_rate(full, found.best, coarse))
+
+
+def _figures(full: Problem, fits: FullRate) -> Figures:
     rows = range(len(full.noise))
     before, after, white_b, white_a = (np.zeros(len(full.noise)) for _ in range(4))
-    nominal, best = found.nominal_full, found.best_full
+    nominal, best = fits.nominal, fits.best
     for row in rows:
         for store, fit in ((before, nominal), (after, best)):
             store[row] = rms([r[row][p.heldout] for r, p in zip(fit.residuals, full.segments, strict=True)])
@@ -603,14 +620,10 @@ def rms(parts: list[Array]) -> float:
     return float(np.sqrt(np.mean(together**2))) if together.size else float("nan")
 
 
-def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
-    found.nominal_full = at_full_rate(full, found.nominal, coarse)
-    for form in found.forms:
-        lay_out(full.segments, form)
-    found.best_full = at_full_rate(full, found.best, coarse)
+def _locate(full: Problem, found: Found, fits: FullRate) -> list[Location]:
     out: list[Location] = []
     for subsystem in dict.fromkeys(term.candidate.port.subsystem for term in found.best.terms):
-        alone = _contribution(full, found, subsystem)
+        alone = _contribution(full, found, fits, subsystem)
         rows = _rows_touched(full, alone)
         if not rows:
             continue
@@ -621,7 +634,7 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
             joined([span for row in strong for span in _windows(segment, m[row], full.rules)], full.rules)
             for segment, m in zip(full.segments, alone, strict=True)
         ]
-        share = _share(full, found, spans, top)
+        share = _share(full, fits, spans, top)
         where = condition(full, alone, top, max(1, sum(p.n for p in full.segments) // 20000))
         out.append(
             Location(subsystem, [full.model.outputs[row].channel for row in rows], _by_recording(full, spans), where, share)
@@ -629,16 +642,16 @@ def _locate(full: Problem, found: Found, coarse: Problem) -> list[Location]:
     return out
 
 
-def _contribution(full: Problem, found: Found, subsystem: str) -> list[Array]:
+def _contribution(full: Problem, found: Found, fits: FullRate, subsystem: str) -> list[Array]:
     """What the effects at `subsystem` add: best model against the best model with them at rest, nominal part refitted
     for neither.
     """
     if len({term.candidate.port.subsystem for term in found.best.terms}) == 1:
-        return mismatch_of(full, found.nominal_full, found.best_full)
+        return mismatch_of(fits.nominal, fits.best)
     here = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.subsystem == subsystem)
     terms, values = without(found.best, full, here)
     out = []
-    for segment, r in zip(full.segments, found.best_full.residuals, strict=True):
+    for segment, r in zip(full.segments, fits.best.residuals, strict=True):
         change = (segment.y - r) - full.simulate(segment, terms, values)
         out.append(change - np.nanmean(change, axis=1, keepdims=True))
     return out
@@ -672,10 +685,10 @@ def _windows(segment: Segment, change: Array, rules: SelectionRules) -> list[tup
     return windows(change, segment.recording.time_s, segment.recording.dt_s, rules)
 
 
-def _share(full: Problem, found: Found, spans: list[list[tuple[float, float]]], row: int) -> float:
+def _share(full: Problem, fits: FullRate, spans: list[list[tuple[float, float]]], row: int) -> float:
     """Part of the nominal model's residual energy above noise that falls into the windows."""
     held = total = 0.0
-    for segment, r, span in zip(full.segments, found.nominal_full.residuals, spans, strict=True):
+    for segment, r, span in zip(full.segments, fits.nominal.residuals, spans, strict=True):
         good = np.isfinite(r[row])
         above = np.where(good, r[row] ** 2 - full.noise[row].sigma ** 2, 0.0)
         total += float(above.sum())

@@ -104,7 +104,7 @@ def estimate_force(  # noqa: PLR0913 - keyword arguments of a public function, e
         `residual` (dimensionless), `chi_square`, `warnings`, `solutions_N` (k, 3), ...
         BatchEstimate for n samples: `force_N` (n, 3), `covariance_N2` (n, 3, 3), `converged` (n,), `residual` (n,).
         PlanarEstimate or RecordingEstimate for the planar model: `force_N` (2,) or (n, 2) in the base frame, ...
-        A pose that no force explains is no error: `converged` is False.
+        A pose that no force explains is not an error: `converged` is False.
 
     Raises:
         InputError: a value is not finite, out of its range or of a wrong shape, or a sensor is further from the sheath's
@@ -199,7 +199,7 @@ def _check_settings(sensors: object, prior: object, thorough: object, ordered: o
 
 
 def _check_sensors(distal_length_m: float, insertion_m: Any, sensors: Sequence[Any]) -> None:
-    """Raise InputError where the catheter cannot reach a sensor; what is no number is left to the estimator to name."""
+    """Raise InputError where the catheter cannot reach a sensor; what is not a number is left to the estimator to name."""
     for index, sensor in enumerate(sensors):
         number(f"sensors.{index}.offset_m", sensor[0], "an arc length in m")
         try:

@@ -1,4 +1,4 @@
-"""Requests of `seldinger estimate`: keys, ranges, sensors within reach, and the answer as the command's contract has it."""
+"""Requests of `seldinger estimate`: keys, ranges, sensors within reach, and the answer as JSON."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def estimate_request(
     """Estimate the force of a request.
 
     Returns:
-        The answer as the contract of `seldinger estimate` has it, and the picture where one is wanted.
+        The answer that `seldinger estimate --json` prints (docs/conventions.md, Residuals of the force estimation), and the
+        picture where one is wanted.
 
     Raises:
         InputError: a catheter without parameters of that model, or a sensor out of the catheter's reach.

@@ -76,7 +76,7 @@ class PlanarModel(ParametricModel):
         self, x: Array, arcs: Arcs, recording: RecordedShape, shape: sensitivities.PlanarShape, station: Array
     ) -> Array:
         n = arcs.length_m.size
-        length_by = self._length_by(arcs, recording)
+        length_by = self._length_by(arcs)
         q = length_by.shape[1]
         response, every = np.empty((n, n + q + 1)), np.empty((station.size, 2, n + q + 1))
         external = kernels.Load(float(recording.force_N[0]), float(recording.force_N[1]), NO_DRAG)
@@ -95,7 +95,7 @@ class PlanarModel(ParametricModel):
                 columns.append(every[:, :, n + q] * same)
         return np.stack(columns, axis=2)
 
-    def _length_by(self, arcs: Arcs, recording: RecordedShape) -> Array:
+    def _length_by(self, arcs: Arcs) -> Array:
         """d(arc lengths outside) / d(l2, l3, ...): a distal arc grows at the cost of the last one."""
         n, q = self.arc_count, self.arc_count - 2
         by = np.zeros((n, q))

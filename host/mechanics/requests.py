@@ -1,4 +1,4 @@
-"""Requests of `seldinger solve`: keys, ranges, the catheter they name, and the answer as the command's contract has it."""
+"""Requests of `seldinger solve`: keys, ranges, the catheter they name, and the answer as JSON."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def solve_request(request: PcarSolve | CosseratSolve, with_picture: bool) -> tup
     """Solve a request.
 
     Returns:
-        The answer as the contract of `seldinger solve` has it ("converged" false: with "reason" and "load_reached"), and the
-        picture where one is wanted and there is a solution.
+        The answer that `seldinger solve --json` prints (docs/conventions.md; "converged" false: with "reason" and
+        "load_reached"), and the picture where one is wanted and there is a solution.
 
     Raises:
         InputError: a catheter without parameters of that model, or an insertion that leaves no catheter outside.

@@ -45,7 +45,6 @@ class LoadedRod:
     quaternions_wxyz: Array  # (k + 1, 4)
     base_force_N: Array  # (3,): all loads together
     base_moment_Nm: Array  # (3,)
-    base_curvature_per_m: Array  # (3,)
     jacobian_force: Array  # (6, 3): tip position and turn by the tip force
     jacobian_actuation: Array  # (6, 3): by insertion (m), roll (rad), curvature (1/m), loads held
 
@@ -155,7 +154,6 @@ def solve_loads(
         nodes.Q[asked],
         carried,
         nodes.M[0].copy(),
-        curvature,
         by_force,
         by_actuation,
     )
@@ -173,7 +171,6 @@ def _unknown(status: int, reached: float, passes: int, steps: int, unstable: int
         unstable,
         nan(stations + 1, 3),
         nan(stations + 1, 4),
-        nan(3),
         nan(3),
         nan(3),
         nan(6, 3),

@@ -96,7 +96,7 @@ class RecordingFile:
             UNPACKED_PER_PACKED times the file's size where that is more.
 
     Raises:
-        InputError: The file cannot be read, is no recording, or unpacks to more than the limit.
+        InputError: The file cannot be read, is not a recording, or unpacks to more than the limit.
     """
 
     def __init__(self, path: str | Path, unpacked_limit_bytes: int | None = None) -> None:

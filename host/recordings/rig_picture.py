@@ -16,7 +16,7 @@ WAITING = 512
 LOG_LINES = 6
 # Kept for a page that is opened later: every third sample of the last half minute.
 KEPT, KEEP_EVERY = 1000, 3
-# An estimate older than this is no measure of the present force.
+# An estimate older than this is not a measure of the present force.
 ESTIMATE_LASTS_NS = 200_000_000
 # A pose this old is not drawn as where the sensor is.
 POSE_LASTS_NS = 500_000_000

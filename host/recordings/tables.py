@@ -18,7 +18,7 @@ class RecordingTables:
     """One recording, read completely; a damaged or cut-off file gives every message that is intact."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Read the MCAP file `path`. Raises InputError where it cannot be read or is no recording."""
+        """Read the MCAP file `path`. Raises InputError where it cannot be read or is not a recording."""
         if not isinstance(path, str | os.PathLike):
             raise InputError("path", str(path), "the name of an MCAP file")
         self._recording = RecordingFile(os.fspath(path))
@@ -93,7 +93,7 @@ def open_recording(path: str | os.PathLike[str]) -> RecordingTables:
         RecordingTables: `topics`, `table(topic)` as a DataFrame, `units(topic)`, `run`, `configuration`, `catheter`.
 
     Raises:
-        InputError: the file cannot be read or is no recording.
+        InputError: the file cannot be read or is not a recording.
 
     Source:
         Format: MCAP (mcap.dev), messages as JSON with the schemas of docs/topics.md.

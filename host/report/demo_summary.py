@@ -1,4 +1,4 @@
-"""How a demo went: the contract's JSON, from the recording, and a short table."""
+"""How a demo went: the JSON that `seldinger demo --json` prints, from the recording, and a short table."""
 
 from __future__ import annotations
 

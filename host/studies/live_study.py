@@ -147,7 +147,7 @@ def effect_of(task: Task) -> tuple[PlantedEffect, ...]:
     keys = next(keys for name, _, keys in CASES if name == task.planted)
     defaults = {p.name: p.default for p in describe(plain.id, plain.port)}
     values = {key: task.size * defaults[key] for key in keys if key in defaults}
-    if "ratio" in values:  # of the two directions: 1 is no effect
+    if "ratio" in values:  # of the two directions: 1 is not an effect
         values["ratio"] = 1.0 - task.size * (1.0 - defaults["ratio"])
     return (replace(plain, parameters=values, start_s=ON_S),)
 

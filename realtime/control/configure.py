@@ -22,7 +22,8 @@ HORIZON_S = 0.040
 # Squared acceleration (m2/s3) of the local model. With the first it follows a heart beat of 1 mm at 2 Hz. With the second
 # it stays at the mean, which is better than following when samples are few, noisy and late.
 FOLLOWING2, STANDING2 = 1e-3, 1e-7
-# A sample further than this many standard deviations from every model is rejected.
+# Standard deviations: a pose that is further from the last one than its speed allows by so many is rejected, and a sample of
+# the wall that is so far from every model.
 GATE_SIGMA = 5.0
 
 
@@ -143,7 +144,7 @@ def tick_parameters(rig: Rig, force_source: str = "sensor") -> np.ndarray:
         acceleration_noise_m_per_s2=control.acceleration_noise_m_per_s2,
         position_noise_m=rig.tracker.position_noise_m,
         max_speed_m_per_s=limits.max_tip_speed_m_per_s,
-        gate_sigma=5.0,
+        gate_sigma=GATE_SIGMA,
         workspace_min_m=limits.workspace_min_m,
         workspace_max_m=limits.workspace_max_m,
     )

@@ -30,7 +30,7 @@ def locate(params: Params, state: State, inputs: Inputs, tip_m: ReadFloats) -> N
     forward_m = (state.stage.position[0] - 0.5 * backlash.first_width(config)) * config.slope
     backlash.start(config, state.backlash, forward_m)
     joint[1] = backlash.distal_roll(config, state.stage.position[1])
-    joint[2] = wire_friction.start(params.wire, params.kinematics, state.wire, state.stage.position[2])
+    joint[2] = wire_friction.start(params.kinematics, state.wire, state.stage.position[2])
     joint[0] = forward_m + params.kinematics.insertion_at_home_m
     joint[0] = inverse_kinematics.apply_nearest(params.kinematics, tip_m, joint)[0]
     state.home_m = joint[0] - forward_m

@@ -57,7 +57,7 @@ def _take_side(state: WireState, curvature_per_m: float) -> None:
 
 
 @njit(cache=True)
-def start(config: WireParams, kinematics: KinematicsParams, state: WireState, knob_rad: float) -> float:
+def start(kinematics: KinematicsParams, state: WireState, knob_rad: float) -> float:
     """Start with the shaft where `knob_rad` (rad) brings it without friction. Return that knob angle."""
     curvature = curvature_of_knob(kinematics, knob_rad)
     _take_side(state, curvature)

@@ -97,7 +97,7 @@ def source_of(group: str, kind: str) -> Callable[[Any], DeviceSource[Any]]:
 class SourceThread(SensorThread, Generic[Sample]):
     """Opens a source, reads it, and opens it again after a loss. `kind` names it in events.
 
-    checked: returns a sample as it may be used, None for one to be dropped; raises TypeError for what is no sample.
+    checked: returns a sample as it may be used, None for one to be dropped; raises TypeError for what is not a sample.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class SourceThread(SensorThread, Generic[Sample]):
             source.close()
 
     def _read(self, source: DeviceSource[Sample]) -> tuple[int, list[Sample]]:
-        """Return how many samples the source gave, and those that may be used. Raises TypeError for what is no sample."""
+        """Return how many samples the source gave, and those that may be used. Raises TypeError for what is not a sample."""
         given: Any = source.read()
         if not isinstance(given, (list, tuple)):
             raise TypeError(f"read returned {type(given).__name__}, wanted a list of samples")

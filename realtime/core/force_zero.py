@@ -13,7 +13,7 @@ READINGS, LEAST_READINGS = 512, 250
 FRESH_NS = 100_000_000
 # Readings that vary by more than this many times the sensor's noise come from a tip that touches something that moves.
 QUIET_SIGMA, LEAST_QUIET_N = 5.0, 0.005
-# A load above this share of the range is no zero drift: something hangs on the sensor.
+# A load above this share of the range is not a zero drift: something hangs on the sensor.
 LARGEST_SHARE = 0.1
 
 Array = npt.NDArray[np.float64]

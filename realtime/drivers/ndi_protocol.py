@@ -26,7 +26,7 @@ ERROR_TEXTS = {
     0x06: "serial settings refused",
     0x07: "wrong number of parameters",
     0x08: "no such port handle",
-    0x09: "tracking priority is none of S, D, B",
+    0x09: "tracking priority is not S, D or B",
     0x0A: "no such LED",
     0x0B: "no such LED state",
     0x0C: "command not allowed in the present mode",

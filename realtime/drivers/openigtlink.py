@@ -68,7 +68,7 @@ class Received(NamedTuple):
 class IgtlReader:
     """Decodes bytes into TRANSFORM messages. Other messages are skipped; damaged ones are counted and skipped.
 
-    Raises ValueError in `feed` where the bytes are no OpenIGTLink: the connection cannot be used further.
+    Raises ValueError in `feed` where the bytes are not OpenIGTLink: the connection cannot be used further.
     """
 
     def __init__(self) -> None:

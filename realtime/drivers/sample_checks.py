@@ -9,7 +9,7 @@ import numpy as np
 from realtime.drivers.net_ft import ForceSample
 from realtime.drivers.pose_sample import PoseFlag, PoseSample
 
-# As of the Aurora: a quaternion this far from unit length, or a position beyond this, is no pose.
+# As of the Aurora: a quaternion this far from unit length, or a position beyond this, is not a pose.
 UNIT_TOLERANCE, MAX_DISTANCE_M = 0.02, 3.0
 
 
@@ -34,7 +34,7 @@ def checked_pose(sample: PoseSample) -> PoseSample:
 
 
 def checked_force(sample: ForceSample) -> ForceSample | None:
-    """Return `sample`, None if it is not finite. Raises TypeError if it is no ForceSample with (3,) force and torque."""
+    """Return `sample`, None if it is not finite. Raises TypeError if it is not a ForceSample with (3,) force and torque."""
     _check_kind(sample, ForceSample, {"force_N": 3, "torque_Nm": 3})
     return sample if np.all(np.isfinite(sample.force_N)) and np.all(np.isfinite(sample.torque_Nm)) else None
 

@@ -256,7 +256,7 @@ def _cyclictest_slice(
 
 
 def as_contract(result: LatencyResult) -> dict[str, object]:
-    """The figures of `result` under the names of the command's contract, all times in us."""
+    """The figures of `result` as `seldinger latency-check --json` prints them, all times in us."""
     cyclictest = result.cyclictest
     return {
         "hz": result.hz,

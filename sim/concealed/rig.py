@@ -32,7 +32,7 @@ CHANNELS = tuple(f"{tool}_{part}" for tool in ("tip", "shaft") for part in ("x",
 )
 STEPS_PER_UNIT = np.array([320000.0, 12800.0 / (2.0 * np.pi), 12800.0 / (2.0 * np.pi)])
 _TICK = np.array([0.02, 3.0, 3.0]) * FRAME_S  # fastest command change a frame
-# The concealed catheter is none of those that ship, so its geometry is its own.
+# The concealed catheter is not one of those that ship, so its geometry is its own.
 _DIAMETER_M, _WIRE_OFFSET_M = 0.00233, 0.0008
 _UNIT = np.array([1e-3, 0.1, 0.07])  # a middling correction of each axis
 Distortion = Callable[[Array, float], Array]  # (handle (3,), dt_s) -> what reaches the rig (3,)

@@ -548,6 +548,20 @@ CASES: list[Case] = [
     (("diagnose", "good.csv"), "--nominal"),
     (("diagnose", "good.csv", "folder/../good.csv", "--nominal", "nominal.toml"), "good.csv twice"),
     (("diagnose", "good.csv", "--live"), "--live"),
+    *(
+        (("diagnose", "--live", *words), f"{words[0]}: found")
+        for words in (
+            ("--nominal", "nominal.toml"),
+            ("--out", "folder"),
+            ("--data", "folder"),
+            ("--without", "backlash"),
+            ("--effect", "backlash@cable"),
+            ("--export", "model.py"),
+            ("--time-budget", "0"),
+            ("--trust",),
+        )
+    ),
+    (("diagnose", "good.csv", "--nominal", "nominal.toml", "--rig", "rig.toml"), "--rig"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--without", "backlsh"), "backlsh"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--time-budget", "nan"), "--time-budget"),
     (("diagnose", "good.csv", "--nominal", "nominal.toml", "--time-budget", "-1"), "--time-budget"),

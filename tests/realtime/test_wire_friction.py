@@ -46,7 +46,7 @@ def bent(handle_rad: np.ndarray) -> np.ndarray:
 
 def test_the_shaft_bends_as_requested_in_spite_of_friction(params: np.record) -> None:
     state = new(STATE)[0].wire
-    wire_friction.start(params.wire, params.kinematics, state, PATH_rad[0])
+    wire_friction.start(params.kinematics, state, PATH_rad[0])
     handle = np.zeros(len(PATH_rad))
     for i, angle in enumerate(PATH_rad):
         handle[i] = wire_friction.apply(params.wire, params.kinematics, state, angle)
@@ -60,7 +60,7 @@ def test_the_shaft_bends_as_requested_in_spite_of_friction(params: np.record) ->
 
 def test_the_bend_of_the_shaft_is_predicted(params: np.record) -> None:
     state = new(STATE)[0].wire
-    wire_friction.start(params.wire, params.kinematics, state, PATH_rad[0])
+    wire_friction.start(params.kinematics, state, PATH_rad[0])
     joint = np.array([wire_friction.follow(params.wire, params.kinematics, state, angle) for angle in PATH_rad])
     predicted = np.array([curvature_of_knob(params.kinematics, angle) for angle in joint])
     nominal = np.array([curvature_of_knob(params.kinematics, angle) for angle in PATH_rad])
@@ -71,7 +71,7 @@ def test_the_bend_of_the_shaft_is_predicted(params: np.record) -> None:
 def test_a_shaft_that_got_there_is_predicted_there(params: np.record) -> None:
     """Inverse and prediction agree on the edges of the band, in both directions."""
     state = new(STATE)[0].wire
-    wire_friction.start(params.wire, params.kinematics, state, PATH_rad[0])
+    wire_friction.start(params.kinematics, state, PATH_rad[0])
     errors = []
     for angle in PATH_rad:
         handle = wire_friction.apply(params.wire, params.kinematics, state, angle)
@@ -81,7 +81,7 @@ def test_a_shaft_that_got_there_is_predicted_there(params: np.record) -> None:
 
 def test_noise_does_not_send_the_knob_through_the_band(params: np.record) -> None:
     state, rng = new(STATE)[0].wire, np.random.default_rng(3)
-    wire_friction.start(params.wire, params.kinematics, state, 0.7)
+    wire_friction.start(params.kinematics, state, 0.7)
     handle = []
     for angle in 0.7 + 1e-3 * rng.standard_normal(300):
         handle.append(wire_friction.apply(params.wire, params.kinematics, state, angle))

@@ -10,7 +10,7 @@ from host.diagnosis.model.effect import Array, Context, Effect, Evidence, Parame
 from host.diagnosis.model.spectral_line import common_line, distorted, stands_out
 
 LEAST_PERIODS = 1.0  # in a recording: less of a sine cannot be separated from an offset, a ramp and a bend (Rayleigh)
-PERIODS = 2.0 / 3.0  # pitch against the span beyond which a bend is no period: crest and trough have to come back
+PERIODS = 2.0 / 3.0  # pitch against the span beyond which a bend is not a period: crest and trough have to come back
 # Pitch of an angle beyond which it is once a turn, which is whip: midway to twice a turn, as of a universal joint.
 LONGEST_ANGLE = float(np.sqrt(2.0) * np.pi)
 

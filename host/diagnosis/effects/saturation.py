@@ -51,7 +51,7 @@ def of_loop(s: Scale, form: str) -> tuple[Parameter, ...]:
     taus = spread(s.dt_s, max(0.3 * longest, 4.0 * s.dt_s), 4)
     return (
         Parameter("limit", f"{s.unit}/s", speeds, 0.02 * s.speed, 20.0 * s.speed, log=True),
-        # a tenth of a sample is no time constant: the limit of a speed alone, which is a form of its own right
+        # a tenth of a sample is not a time constant: the limit of a speed alone, which is a form of its own right
         Parameter("time_constant", "s", taus, 0.1 * s.dt_s, max(longest, 5.0 * s.dt_s), log=True, vanishes=True),
     )
 

@@ -1,4 +1,4 @@
-"""Whether a residual is coloured noise: its level alone is no evidence where noise was never seen alone.
+"""Whether a residual is coloured noise: its level alone is not evidence where noise was never seen alone.
 
 The quietest part of a spectrum bounds white noise only. Floor vibration, 1/f noise of a bridge or a sensor with a filter
 exceed it by any factor. Such noise is a stationary process with innovations that neither jump, nor repeat, nor depend on
@@ -193,7 +193,7 @@ def _caused(new: list[Array], inputs: Sequence[Sequence[Array]], rules: Selectio
     """Whether earlier features of the inputs say something of the innovations (F test of a regression).
 
     A controller sends noise into its own and later rows of an input, so the two are coherent without any mismatch. Earlier
-    inputs hold no later noise (Caines and Chan 1975), nor do steps of an input that are no noise, in whichever row.
+    inputs hold no later noise (Caines and Chan 1975), nor do steps of an input that are not noise, in whichever row.
     """
     from scipy.stats import f as fisher
 

@@ -45,7 +45,6 @@ class Fit:
     terms: tuple[Term, ...]
     values: Array
     residuals: list[Array] = field(default_factory=list)  # per segment (outputs, n): measured - simulated
-    jacobian: Array | None = None
     cost: float = np.inf
 
     @property
@@ -326,7 +325,6 @@ def minimize(
     r = raw if begins is None else begins.freed(raw)
     cost, w = robust(r)
     damping = 1e-3
-    J = np.zeros((r.size, 0))
     for _ in range(rounds if moving else 0):
         sizes = [size_of(p, v) for p, v in zip(parameters, values, strict=True)]
         J = jacobian(problem, terms, values, raw, sizes)
@@ -359,7 +357,7 @@ def minimize(
         damping = max(damping / 8.0, 1e-9)
         if gained < tolerance:
             break
-    return Fit(terms, values, jacobian=J, cost=cost)
+    return Fit(terms, values, cost=cost)
 
 
 def _solve(A: Array, g: Array, diagonal: Array, damping: float) -> Array:

@@ -64,6 +64,9 @@ def _scatter(r: Array) -> Array:
 
 
 def _shift(r: Array, side: int) -> Array:
-    """Median of `side` samples from each on less that of as many before it, from sample `side` on: an outlier is no jump."""
+    """Median of `side` samples from each on less that of as many before it, from sample `side` on.
+
+    An outlier is not a jump: it does not change these medians.
+    """
     medians = np.median(np.lib.stride_tricks.sliding_window_view(r, side), axis=1)
     return np.asarray(medians[side:] - medians[:-side])

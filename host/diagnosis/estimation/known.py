@@ -25,13 +25,8 @@ class Known(Model):
 
     def __init__(self, inner: Model, effects: list[EffectSpec], recordings: list[Recording]) -> None:
         self._inner = inner
-        self.kind, self.outputs, self.ports, self.quiet_inputs = inner.kind, inner.outputs, inner.ports, inner.quiet_inputs
-        self.screen_samples, self.scan_points = inner.screen_samples, inner.scan_points
-        self.fit_samples, self.coarsest_s = inner.fit_samples, inner.coarsest_s
-        self.travel, self.moves, self.unlisted_at = inner.travel, inner.moves, inner.unlisted_at
-        self.pointwise, self.either_sign = inner.pointwise, inner.either_sign
-        self.holds, self.hold, self.hold_stated = inner.holds, inner.hold, inner.hold_stated
-        self.hold_words = inner.hold_words
+        for name in Model.__annotations__:  # an attribute that is added to `Model` is one of every model
+            setattr(self, name, getattr(inner, name))
         segments = [inner.prepare(recording) for recording in recordings]
         self.active: list[tuple[Candidate, tuple[Parameter, ...]]] = []
         for spec in effects:
@@ -46,6 +41,20 @@ class Known(Model):
     def inner(self) -> Model:
         """The model without the known effects."""
         return self._inner
+
+    @property
+    def scripted(self) -> tuple[str, ...]:
+        """Channels that the script of an experiment sets, of the model without the known effects."""
+        return self._inner.scripted
+
+    @property
+    def on_rig(self) -> bool:
+        """Whether experiments of the model without the known effects run on a rig."""
+        return self._inner.on_rig
+
+    def excitations(self, problem: Any, best: Any) -> list[Any]:
+        """Call the model without the known effects."""
+        return self._inner.excitations(problem, best)
 
     def prepare(self, recording: Recording) -> Segment:
         """Call the model without the known effects."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,23 @@ from host.diagnosis.model.operators import fill, quantum
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 ORDER = 3
-REPEATS = "differences between repeats"
+
+
+class NoiseSource(Enum):
+    """What the noise of a channel was estimated from; the value is its name in a report."""
+
+    QUIESCENT = "quiescent parts"
+    REPEATS = "differences between repeats"
+    RESOLUTION = "resolution"  # at rest, or between repeats, the reading changes by less than one of its steps
+    CONSTANT = "constant readings"  # these do not change at all and have no steps: computed, or stuck
+    SPECTRUM = "quietest part of the spectrum (no quiescent part)"
+    BALANCE = "spectra of motion and force above the motion's band"
+    LEARNED = "while learning"  # of the live watch: the scatter of the residual before a change
+
+    @property
+    def seen_alone(self) -> bool:
+        """Whether samples of noise without any motion were recorded, so that the level is measured and not a guess."""
+        return self in (NoiseSource.QUIESCENT, NoiseSource.REPEATS, NoiseSource.RESOLUTION)
 
 
 @dataclass(frozen=True)
@@ -23,7 +40,7 @@ class Noise:
 
     sigma: float
     ar: Array
-    source: str
+    source: NoiseSource
 
     @property
     def correlation_samples(self) -> float:
@@ -146,13 +163,13 @@ def estimate(
         segments.append(segment - np.polynomial.polynomial.polyval(np.arange(segment.size), line))
     step = max((quantum(values) for values in outputs), default=0.0)
     noise_sd = step / np.sqrt(12.0)
-    source = "quiescent parts"
+    source = NoiseSource.QUIESCENT
     if sum(segment.size for segment in segments) < rules.rest_fewest_samples:
         differences = [(outputs[a][p] - outputs[b][q]) / np.sqrt(2.0) for a, p, b, q in repeats]
         segments = [
             d[part] - np.mean(d[part]) for d in differences for part in runs(np.isfinite(d), rules.input_repeat_samples)
         ]
-        source = REPEATS
+        source = NoiseSource.REPEATS
     if not segments:
         return _of_spectrum(outputs, noise_sd, rules)
     table = []
@@ -164,17 +181,23 @@ def estimate(
     sigma = float(np.sqrt(max(lags[0], 0.0)))
     # A slow plant is on its way while its input rests: what remains of a straight line is smooth and far above white noise.
     smooth = lags[1] > rules.under_way_correlation * lags[0]
-    if simulated and source != REPEATS and smooth and sigma > rules.under_way_over_noise * _high_frequency(outputs, rules):
+    if (
+        simulated
+        and source is NoiseSource.QUIESCENT
+        and smooth
+        and sigma > rules.under_way_over_noise * _high_frequency(outputs, rules)
+    ):
         return _of_spectrum(outputs, noise_sd, rules)
     if sigma <= noise_sd:
-        return Noise(max(noise_sd, 1e-300), np.zeros(0), "resolution")
+        source = NoiseSource.RESOLUTION if noise_sd > 0.0 else NoiseSource.CONSTANT
+        return Noise(max(noise_sd, 1e-300), np.zeros(0), source)
     return Noise(sigma, autoregression(lags), source)
 
 
 def _of_spectrum(outputs: list[Array], resolution: float, rules: SelectionRules) -> Noise:
     """Noise of which no sample was seen alone."""
     level = max(_high_frequency(outputs, rules), resolution, 1e-300)
-    return Noise(level, np.zeros(0), "quietest part of the spectrum (no quiescent part)")
+    return Noise(level, np.zeros(0), NoiseSource.SPECTRUM)
 
 
 def _settled(stretches: list[Array], rules: SelectionRules) -> list[Array]:

@@ -59,7 +59,7 @@ class SelectionRules:
     # Jumps of a residual's level.
     jump_deviations: float = 8.0  # robust standard deviations, from which a difference of medians is more than noise
     jump_abrupt_share: float = 0.6  # of a jump that happens within few samples: a ramp has a seventh there
-    jumps_per_recording: int = 5  # a level that steps more often is no level
+    jumps_per_recording: int = 5  # at most: a sensor is not moved more often, so more of them have another cause
 
     # Evidence: gain of one model over another.
     evidence_independent_samples: float = 3.0  # of an output, below which it says nothing
@@ -86,7 +86,8 @@ class SelectionRules:
     input_jump_over_output: float = 2.0  # residual over what the output moves there: errors of timing or gain leave one
 
     # What a parameter costs: Akaike's one for the samples it was fitted to, one more for those held out.
-    parameter_penalty: float = 2.0
+    parameter_penalty: float = 2.0  # of a gain on the samples that were fitted, or on all
+    heldout_parameter_cost: float = 1.0  # of a gain on held-out samples, on which no parameter was fitted
 
     # Forward selection.
     heldout_log_likelihood: float = 6.0  # least gain on held-out samples: odds of 400

@@ -34,7 +34,7 @@ ORDER = 3  # of the autoregression
 KINDS = 4  # charts for each output
 SURE = 2.0  # standard errors by which a learned level may be too small
 LEAST_INDEPENDENT = 30.0  # from fewer samples the level of a slow residual is not known: its innovations alone are judged
-FARTHEST = 4.0  # levels to which one sample counts: a wild reading is no mismatch
+FARTHEST = 4.0  # levels to which one sample counts: a wild reading is not a mismatch
 MEMORY = 1.5  # of the threshold: a chart rises no further, so that it comes down soon after the mismatch has gone
 
 

@@ -17,7 +17,7 @@ from host.diagnosis.model.effect import Port
 from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.rig_recording import knob_gain, rig_of
-from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS, RigSegment
+from host.diagnosis.models.rig import FORCE, HANDLES, KEYS, PARAMETERS, POSE_ROWS, RigSegment
 from host.recordings.recording import RecordingFile
 from protocol.catheter import Catheter, CosseratParameters
 from protocol.errors import InputError
@@ -25,7 +25,6 @@ from protocol.errors import InputError
 Array = npt.NDArray[np.float64]
 FREE = ("insertion_offset", "roll_slope", "roll_offset", "knob_gain", "knob_offset", "bending_stiffness")
 EI = [name for name, _, _ in PARAMETERS].index("bending_stiffness")
-POSE_ROWS = 12
 NUDGE_N = 1e-3
 
 
@@ -51,18 +50,18 @@ class RecordedRig(Twin):
                 wanted.append(replace(p, grid=(value,), low=-np.inf, high=np.inf))
         self.rigidity = self.parameters[EI].grid[0]
         self.parameters = tuple(wanted)
-        self.outputs = self.outputs[:POSE_ROWS]
+        self.outputs = self.outputs[POSE_ROWS]
         self.ports = tuple(port for port in self.ports if port.name != "contact")
 
     def prepare(self, recording: Recording) -> RigSegment:
         """As the twin does, the force as it was averaged about each frame; it is not an output."""
         segment = super().prepare(recording)
-        segment.y = segment.y[:POSE_ROWS]
+        segment.y = segment.y[POSE_ROWS]
         return segment
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Poses (12, n) of tip and shaft."""
-        return super().simulate(segment, theta, active)[:POSE_ROWS]
+        return super().simulate(segment, theta, active)[POSE_ROWS]
 
     def needs(self, segment: Segment, port: Port, theta: Array, residual: Array) -> Array:
         """As the nominal model has it; for the force sensor, the force along the wall's normal that the poses would need."""

@@ -16,7 +16,7 @@ from host.diagnosis.model.dataset import Recording
 from host.diagnosis.model.model import ActiveEffect, Segment
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
-from host.diagnosis.models.rig import FORCE, SHAFT, TIP, RigModel, RigSegment
+from host.diagnosis.models.rig import FORCE, FORCE_ROWS, HANDLES, POSE_ROWS, SHAFT, TIP, RigModel, RigSegment
 from host.diagnosis.models.rig_kernel import matrices, rotation_logs
 from host.mechanics.cosserat import CosseratSolution, solve_cosserat
 from protocol.catheter import Catheter, load_catheter
@@ -24,7 +24,6 @@ from protocol.rig_file import Rig
 from protocol.topics import ForceSensor, Message, Pose, Stage
 
 Array = npt.NDArray[np.float64]
-HANDLES = ("handle_insertion", "handle_roll", "handle_knob")
 COLUMNS = (*HANDLES, *TIP, *SHAFT, *FORCE)
 KEPT_STAGES, KEPT_FORCES = 4000, 4000
 FORCE_HALF_NS = 5_000_000  # forces this near a frame are averaged into its row
@@ -96,7 +95,7 @@ class Twin(RigModel):
             rest()
             segment = self.prepare(thinned(delayed(recording, float(z[4])), EVERY))
             self.correct(segment, moved)
-            r = (segment.y - self.simulate(segment, moved, []))[:12] / scale
+            r = (segment.y - self.simulate(segment, moved, []))[POSE_ROWS] / scale
             return np.clip(np.nan_to_num(r), -8.0, 8.0).ravel()
 
         z, steps = np.zeros(5), np.array([1e-4, 2e-3, 0.1, 0.02, 2e-3])
@@ -120,7 +119,7 @@ class Twin(RigModel):
         """Makes `simulate` of `segment` exact at `theta` (nominal parameters) without effects."""
         assert isinstance(segment, RigSegment)
         segment.exact = self._exact(segment, theta) - super().simulate(segment, theta, [])
-        segment.exact[12:] = 0.0
+        segment.exact[FORCE_ROWS] = 0.0
 
     def simulate(self, segment: Segment, theta: Array, active: list[ActiveEffect]) -> Array:
         """Outputs (15, n) of the nominal model, plus what the rod model adds where `correct` was called."""

@@ -13,18 +13,18 @@ import numpy.typing as npt
 
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import Fit, Problem, finish, minimize
-from host.diagnosis.estimation.noise import Noise
+from host.diagnosis.estimation.noise import Noise, NoiseSource
 from host.diagnosis.live.charts import Charts, ChartSettings, Usual
 from host.diagnosis.live.local_field import LOCAL_FIELD
 from host.diagnosis.live.twin import FrameCollector, Twin, TwinFit
 from host.diagnosis.model.effect import Candidate
 from host.diagnosis.model.model import Segment
+from host.diagnosis.models.rig import FORCE_ROWS, POSE_ROWS, POSES
 from host.diagnosis.selection.screening import screen
 from protocol.rig_file import Rig
 from protocol.topics import Alarm, ForceSensor, Message, Pose, RigState, Stage
 
 Array = npt.NDArray[np.float64]
-POSE_ROWS = 12
 SMALLEST_SHARE = 0.1  # of the mismatch that a cause has to explain to be named
 LEAST_PROBABILITY = 0.05  # of a cause that is listed as possible
 CALM, CALM_S = 0.5, 10.0  # a mismatch is over once the score has been below CALM for CALM_S: the next one is reported again
@@ -164,9 +164,9 @@ class Watch:
         assert self.calibration is not None
         segment = self.twin.prepare(self.calibration.applied(self.frames.recording(first)))
         self.twin.correct(segment, self.calibration.theta)
-        segment.y[POSE_ROWS:] = np.nan
+        segment.y[FORCE_ROWS] = np.nan
         expected = self.twin.simulate(segment, self.calibration.theta, [])
-        return segment, (segment.y - expected)[:POSE_ROWS]
+        return segment, (segment.y - expected)[POSE_ROWS]
 
     def _compare(self) -> Alarm | None:
         """New rows are added to the charts. A change is reported once, as soon as its cause can be sought."""
@@ -214,10 +214,10 @@ class Watch:
         """Causes that were fitted to the rows since the change, the likeliest first; none if no cause explains enough."""
         charts, calibration = self.charts, self.calibration
         assert charts is not None and calibration is not None
-        segment.y[:POSE_ROWS] -= charts.usual.mean[:, None]
-        scale = np.concatenate([charts.usual.rms, np.ones(len(self.twin.outputs) - POSE_ROWS)])
+        segment.y[POSE_ROWS] -= charts.usual.mean[:, None]
+        scale = np.concatenate([charts.usual.rms, np.ones(len(self.twin.outputs) - POSES)])
         segment.weight = scale
-        problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), "while learning") for s in scale], scale)
+        problem = Problem(self.twin, [segment], [Noise(float(s), np.zeros(0), NoiseSource.LEARNED) for s in scale], scale)
         fit = finish(problem, Fit((), calibration.theta))
         ranked = screen(problem, fit, self.candidate_effects, lambda what, part: self._rest())[: self.settings.suspects]
         squares = problem.stacked((), calibration.theta) ** 2

@@ -60,7 +60,6 @@ class Scale:
     duration_s: float
     timed: bool
     source_unit: str = ""
-    source_span: float = 1.0
     source_rms: float = 1.0
     motion_unit: str = ""  # force ports: unit of the motion
     motion_span: float = 1.0
@@ -80,7 +79,6 @@ class Context:
     start_rate: float = 0.0  # speed at the first sample beyond that of the motion: start of memory of second order
     starts: tuple[float, ...] = ()  # of an effect with `memories`: each of them, in this recording
     points: int = 1  # of the signal in one sample, where it is held between samples
-    _cache: dict[str, Array] = field(default_factory=dict)
 
     def moving(self, signal: Array) -> Array:
         """Direction of the last movement of `signal`."""

@@ -51,8 +51,8 @@ class Inspected:
     findings: list[Finding]
 
 
-def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str], rules: DataRules) -> Inspected:
-    """Look at the recordings of `spec` before any fit. `optional`: channels that may be absent."""
+def inspect(spec: NominalSpec, recordings: list[Recording], rules: DataRules) -> Inspected:
+    """Look at the recordings of `spec` before any fit."""
     data = _Inspection(spec, rules, recordings, {key: channel.column for key, channel in spec.channels.items()})
     paths = pairs_of(spec)
     vital = {name for path in paths for name in (path.input, path.output)}
@@ -164,7 +164,7 @@ class _Inspection:
         columns, units = self.columns, {key: channel.unit for key, channel in self.spec.channels.items()}
         self.recordings = without_outliers(self.recordings, names, columns, self.findings, self.rules)
         coarse(self.recordings, names, driven, columns, units, self.findings, self.rules)
-        for name in counts(self.recordings, names, columns, units, self.rules):
+        for name in counts(self.recordings, names, units, self.rules):
             says = f"Column {columns[name]} holds whole numbers only, called {units[name]}: these are probably counts. "
             says += f"State the value of one count (channels.{name}.scale)."
             self.find("unit", columns[name], says)

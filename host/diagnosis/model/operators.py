@@ -418,7 +418,8 @@ def smooth_derivatives(x: Array, dt_s: float, window: int, degree: int = 3) -> t
 def wander_at_rest(x: Array, smooth: Array, window: int, degree: int = 3) -> float:
     """Range of the noise that a local polynomial leaves in a motion `x` (n,) at rest; `smooth` (n,) is its result.
 
-    Movements below it are no movements. The noise is taken from the median difference of both, which steps do not change.
+    A movement below it cannot be separated from noise. The noise is taken from the median difference of both, which steps
+    do not change.
     """
     from scipy.signal import savgol_coeffs
 
@@ -465,7 +466,7 @@ def white_level(x: Array) -> float:
 
 
 def reading_noise(x: Array) -> float:
-    """`white_level` of a signal (n,) that may also be held and jump: steps are no noise, but fill its spectrum.
+    """`white_level` of a signal (n,) that may also be held and jump: steps are not noise, but fill its spectrum.
 
     Most second differences of such a signal are of noise alone. Those of a signal in fine steps may be zero, and its
     resolution counts as noise.
@@ -481,7 +482,7 @@ def quantum(values: Array) -> float:
 
     Steps of a twentieth of the range and more are a signal that switches between levels, no resolution. So are the steps of
     a motion of constant speed, such as a triangle wave: each is as long as the one before. A command that is held between
-    steps of any size has few levels too, but the steps between them are no multiples of the smallest.
+    steps of any size has few levels too, but the steps between them are not multiples of the smallest.
     """
     good = values[np.isfinite(values)]
     levels = np.unique(good)

@@ -36,7 +36,7 @@ class Pair:
     reads: str = "position"
     gain: float | None = None  # what the nominal model says of it
     related: bool = True
-    stated: bool = False  # whether the nominal model's file states the gain, so that it is no default
+    stated: bool = False  # whether the nominal model's file states the gain, so that it is not a default
     values: tuple[float, ...] = ()  # of the terms `law`, 0 where the nominal model's file does not state one
 
 

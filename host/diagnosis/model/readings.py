@@ -79,7 +79,7 @@ def lost(values: Array, rules: DataRules) -> Mask:
 def without_outliers(
     recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding], rules: DataRules
 ) -> list[Recording]:
-    """Recordings in which samples of the channels `names` that are no readings are missing; a finding says how many.
+    """Recordings in which samples of the channels `names` that are not readings are missing; a finding says how many.
 
     Single samples of a channel that holds still otherwise are left: those may be blows, and meant.
     """
@@ -174,10 +174,8 @@ def coarse(
         findings.append(Finding("quantized", column, says))
 
 
-def counts(
-    recordings: list[Recording], names: list[str], columns: dict[str, str], units: dict[str, str], rules: DataRules
-) -> list[str]:
-    """Channels that hold whole numbers only, many of them, though their unit is none of whole numbers."""
+def counts(recordings: list[Recording], names: list[str], units: dict[str, str], rules: DataRules) -> list[str]:
+    """Channels that hold whole numbers only, many of them, though their unit is not one of counts."""
     found = []
     for name in names:
         values = [r.channels[name][np.isfinite(r.channels[name])] for r in recordings if name in r.channels]

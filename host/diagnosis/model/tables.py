@@ -174,7 +174,7 @@ def _read_csv(path: Path, limit: int) -> Any:
 
 
 def _text_form(file: str, head: bytes) -> _TextForm:
-    """Find how the text table with the first bytes `head` is written. Raises InputError for what is no UTF-8 text.
+    """Find how the text table with the first bytes `head` is written. Raises InputError for bytes that are not UTF-8 text.
 
     A comma is the mark of the fraction only where semicolons or tabs separate the columns.
     """

@@ -53,7 +53,8 @@ class AxisModel(Model):
 
     With a controller in the nominal the loop is closed in simulation and the force is compared too. Without one, and
     without a spring, small forces that were not recorded let the simulated axis run away from a recording. The force that
-    its measured motion needs is then compared with the input instead (`balance.py`), unless `compare` says "motion".
+    its measured motion needs is then compared with the input instead (`balance.py`), unless `compare` is "motion". A
+    diagnosis without `compare` tries "motion" first and keeps it if that explains the recordings down to their noise.
     """
 
     kind = "axis"
@@ -253,7 +254,7 @@ class AxisModel(Model):
         drive = [effect for effect in active if effect[0].port.name == place]
         late = self.hold == "zero" and any(candidate.effect.shifts == "time" for candidate, _ in drive)
         finer = FINER * segment.substeps if late else 1  # a held input that is late by a part of a sample jumps within it
-        noise = segment.force_noise if drive else None  # what reads the force is no part of the drive: no effect smooths it
+        noise = segment.force_noise if drive else None  # the force sensor is not a part of the drive: no effect smooths it
         true = recorded if noise is None else recorded - noise
         force = apply_effects(np.repeat(true, finer) if late else true, drive, place, segment, None, finer=finer)
         if noise is not None:

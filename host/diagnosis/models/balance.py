@@ -1,4 +1,6 @@
-"""A free mass is balanced, not simulated: its equation of motion in weak form, smooth test functions along the recording.
+"""The forces on a free mass: its equation of motion in weak form, with smooth test functions along the recording.
+
+They are compared if a simulation of the motion does not explain the recordings down to their noise.
 
     (phi * f)(t) = m (phi'' * x)(t) + c (phi' * x)(t) + k (phi * x)(t) - offset + (phi * other forces)(t)
 
@@ -15,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import fftconvolve
 
-from host.diagnosis.estimation.noise import ORDER, Noise, autoregression, estimate, quiescent
+from host.diagnosis.estimation.noise import ORDER, Noise, NoiseSource, autoregression, estimate, quiescent
 from host.diagnosis.model.force_kernel import (
     COULOMB,
     DAMPING2,
@@ -173,16 +175,14 @@ def _noise(coefficients: Array, sigma_motion: float, sigma_force: float, kernels
     for kernel in (of_motion, of_force):
         lags += [kernel[k:] @ kernel[: kernel.size - k] for k in range(ORDER + 1)]
     lags[0] = lags[0] * (1.0 + 1e-9) or 1e-300  # neither has noise in an experiment that is only planned
-    return Noise(
-        max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), "spectra of motion and force above the motion's band"
-    )
+    return Noise(max(float(np.sqrt(lags[0])), 1e-300), autoregression(lags), NoiseSource.BALANCE)
 
 
 def quieted(balance: Balance, linear: Array, p: Array, dt_s: float) -> float:
     """Noise that a second mass or a branch that relaxes leaves in the balance, over that of the nominal law; 1 without them.
 
     The noise of a motion enters the balance mostly as m a. A spring of fitted frequency and damping pulls against it in just
-    that band, although the force has no such part: a smaller error of this kind is no evidence. linear: m, c, k, offset.
+    that band, although the force has no such part: a smaller error of this kind is not evidence. linear: m, c, k, offset.
     """
     if p[MASS2] <= 0.0 and p[MAXWELL_K] == 0.0:
         return 1.0
@@ -252,7 +252,7 @@ def error(balance: Balance, segment: Segment, motion: Motion, linear: Array, for
 def _passed(applied: Array, recorded: Array, compared: npt.NDArray[np.bool_]) -> float:
     """Share of the recorded input that is applied: the median over parts of the recording of the ratio of their spreads.
 
-    One ratio for the whole recording is no measure. A limit that lets a single peak pass leaves no error anywhere else.
+    One ratio for the whole recording is not a measure. A limit that lets a single peak pass leaves no error anywhere else.
 
     applied, recorded: (n,), under the test function; compared: (n,).
     """

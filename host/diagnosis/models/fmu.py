@@ -55,7 +55,7 @@ class FmuModel(SimulatedModel):
         return self.path.name
 
     def _reference(self, name: str, key: str, causalities: tuple[str, ...]) -> int:
-        """Value reference of variable `name`. Raises InputError where there is none of these causalities."""
+        """Value reference of variable `name`. Raises InputError if no variable has one of these causalities."""
         if name not in self.real:
             near = ", ".join(sorted(n for n, v in self.real.items() if not causalities or v.causality in causalities))
             raise InputError(f"fmu.{key}", name, f"a variable of {self.path.name}: {near or 'it has none of this kind'}")

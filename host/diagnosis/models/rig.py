@@ -36,6 +36,8 @@ HANDLES = {
 TIP = ("tip_x_m", "tip_y_m", "tip_z_m", "tip_qw", "tip_qx", "tip_qy", "tip_qz")
 SHAFT = tuple(name.replace("tip", "shaft") for name in TIP)
 FORCE = ("force_x_N", "force_y_N", "force_z_N")
+POSES = 12  # outputs of poses: place and turn of tip and shaft, three each; then those of the force
+POSE_ROWS, FORCE_ROWS = slice(0, POSES), slice(POSES, POSES + len(FORCE))
 PARAMETERS = (
     ("insertion_gain", "", 1.0),
     ("insertion_offset", "m", 0.0),
@@ -228,11 +230,11 @@ class RigModel(Model):
         following the parameters in the fit, so that force and stiffness cannot drift off together.
         """
         assert isinstance(segment, RigSegment)
-        recorded = segment.y[12:15]
+        recorded = segment.y[FORCE_ROWS]
         if not np.isfinite(recorded).any():
             segment.force = self._run(segment, theta, [])["force"]
             return
-        simulated = self.simulate(segment, theta, [])[12:15]
+        simulated = self.simulate(segment, theta, [])[FORCE_ROWS]
         sigmas = [by_steps(row, *s) for row, s in zip(recorded - simulated, segment.force_noise, strict=True)]
         beyond = np.vstack([calm(fill(row), *s, True) for row, s in zip(recorded - simulated, sigmas, strict=True)])
         segment.force = simulated + beyond
@@ -377,9 +379,9 @@ class RigModel(Model):
         """
         if port.name in AXES:
             S = self.sensitivity(segment, theta, port.name, [])
-            weight = segment.weights()[:12]
-            r = np.nan_to_num(residual[:12]) / weight
-            s = np.where(np.isfinite(residual[:12]), S[:12], 0.0) / weight
+            weight = segment.weights()[POSE_ROWS]
+            r = np.nan_to_num(residual[POSE_ROWS]) / weight
+            s = np.where(np.isfinite(residual[POSE_ROWS]), S[POSE_ROWS], 0.0) / weight
             return np.asarray(np.sum(s * r, axis=0) / (np.sum(s * s, axis=0) + 1e-12 * np.mean(s * s) + 1e-300))
         row = 14 if port.name in ("contact", "force_sensor") else 0
         return np.asarray(residual[row])

@@ -441,7 +441,7 @@ class SimulatedModel(Model):
         return self.kind
 
     def try_out(self, segments: list[Segment]) -> None:
-        """Simulate a recording twice. Raises InputError for outputs that are no numbers, differ, or do not move."""
+        """Simulate a recording twice. Raises InputError for outputs that are not numbers, differ, or do not move."""
         driven = [s for s in segments if any(np.ptp(s.inputs[name]) > 0.0 for name in self.section.inputs)]
         run, same = (self.run_of((driven or segments)[0], self.guess(segments), []) for _ in range(2))
         key = run.key  # before the run, which may change its arguments

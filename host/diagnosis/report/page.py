@@ -36,46 +36,73 @@ class Row(NamedTuple):
     taken: bool
 
 
-def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
-    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
-    environment = Environment(
+def _environment() -> Environment:
+    return Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    segment, _, row = shown(result)
-    recordings = len(result.full.segments)
-    samples = sum(p.n for p in result.full.segments)
-    text = environment.get_template("diagnosis.html.j2").render(
-        title=headline(result, verdict),
-        eyebrow=f"Diagnosis of {result.spec.name}",
-        lead=lead(result, verdict),
-        footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
-        lines=lines(result, verdict),
-        pictures=pictures(result),
-        effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
-        nominal=_nominal(result),
-        candidates=candidates(result),
-        located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
-        scripts=[Path(path).name for path in verdict.get("scripts", ())],
-        on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
-        partly=remains(result).replace("its power", "the power of the mismatch"),
-        noises=_noises(result),
-        output=result.model.outputs[row].channel.replace("_", " "),
-        recording=segment.recording.name,
-        switches=switches(result),
-        heldout=[p.recording.name for p in result.full.segments if p.heldout.any()],
-        verdict=verdict["verdict"],
-        findings=verdict["data_findings"],
-        worse=verdict["worse"],
-        comparisons=comparisons(result, verdict),
-        probability_none=f"{verdict['probability_none']:.2f}",
-        next_step=verdict["next"],
-        rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
+
+
+def write_data_report(name: str, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of a JSON `verdict` on recordings that nominal model `name` cannot be compared with: findings about the
+    data. Raises OSError where it cannot write `target`.
+    """
+    text = (
+        _environment()
+        .get_template("diagnosis_data.html.j2")
+        .render(
+            title="The recordings cannot be compared with the nominal model",
+            eyebrow=f"Diagnosis of {name}",
+            lead="A channel that the comparison needs cannot be used, so nothing was fitted.",
+            footer=f"{verdict['seconds']:.0f} s.",
+            findings=verdict["data_findings"],
+            next_step=verdict["next"],
+        )
     )
     target.write_text(text, encoding="utf-8")
     return target
 
 
-def headline(result: Diagnosis, verdict: dict[str, Any]) -> str:
+def write_report(result: Diagnosis, verdict: dict[str, Any], target: Path) -> Path:
+    """The report of `result`, with its JSON `verdict`, written to `target`. Raises OSError where it cannot write."""
+    segment, _, row = shown(result)
+    recordings = len(result.full.segments)
+    samples = sum(p.n for p in result.full.segments)
+    text = (
+        _environment()
+        .get_template("diagnosis.html.j2")
+        .render(
+            title=headline(verdict),
+            eyebrow=f"Diagnosis of {result.spec.name}",
+            lead=lead(verdict),
+            footer=f"{recordings} recording{'s' if recordings > 1 else ''}, {samples} samples, {verdict['seconds']:.0f} s.",
+            lines=lines(result, verdict),
+            pictures=pictures(result),
+            effects=[shown_effect(e, units_of(result)) for e in verdict["effects"]],
+            nominal=_nominal(result),
+            candidates=candidates(result),
+            located=[{**place, "times": times(place, timed=segment.recording.timed)} for place in verdict["located"]],
+            scripts=[Path(path).name for path in verdict.get("scripts", ())],
+            on_rig=any(str(path).endswith(".toml") for path in verdict.get("scripts", ())),
+            partly=remains(result).replace("its power", "the power of the mismatch"),
+            noises=_noises(result),
+            output=result.model.outputs[row].channel.replace("_", " "),
+            recording=segment.recording.name,
+            switches=switches(result),
+            heldout=[p.recording.name for p in result.full.segments if p.heldout.any()],
+            verdict=verdict["verdict"],
+            findings=verdict["data_findings"],
+            worse=verdict["worse"],
+            comparisons=comparisons(result, verdict),
+            probability_none=f"{verdict['probability_none']:.2f}",
+            next_step=verdict["next"],
+            rules=[(words(name), short(float(value))) for name, value in verdict["rules"].items()],
+        )
+    )
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def headline(verdict: dict[str, Any]) -> str:
     """Return the verdict in one sentence."""
     names = [f"{words(e['id'])} ({words(e['subsystem'])})" for e in verdict["effects"]]
     data = list(dict.fromkeys(finding["id"] for finding in verdict["data_findings"]))
@@ -94,7 +121,7 @@ def worse_words(verdict: dict[str, Any]) -> str:
     return f"the error of {words(first)} grew" + (f", and {more} more" if more else "")
 
 
-def lead(result: Diagnosis, verdict: dict[str, Any]) -> str:
+def lead(verdict: dict[str, Any]) -> str:
     """Return the sentence below the verdict."""
     fit = verdict["fit"]
     unit = fit["unit"]
@@ -214,26 +241,23 @@ def switches(result: Diagnosis) -> tuple[str, str]:
     return "\n".join(options), "\n\n".join(tables)
 
 
+def named(key: str) -> str:
+    """A candidate's key as text: its effect, form and place."""
+    return words(key.replace("@", " at ").replace("(", " ("))
+
+
 def candidates(result: Diagnosis) -> list[Row]:
     """What was fitted in full, step by step."""
     rows = []
     for count, step in enumerate(result.found.steps, start=1):
-        if step.move == "backward":
-            rows.append(
-                Row(
-                    str(count),
-                    f"{words(step.key)} removed again",
-                    short(step.gain.log_likelihood),
-                    short(step.gain.p_value),
-                    "",
-                    False,
-                )
-            )
+        if step.move.removes:
+            gain = ("", "") if step.gain is None else (short(step.gain.log_likelihood), short(step.gain.p_value))
+            rows.append(Row(str(count), f"{named(step.key)} {step.move.value}", *gain, "", False))
         for trial in step.trials[:6]:
             rows.append(
                 Row(
                     str(count),
-                    words(trial.candidate.key.replace("@", " at ").replace("(", " (")),
+                    named(trial.candidate.key),
                     short(trial.heldout.log_likelihood),
                     short(trial.heldout.p_value),
                     f"{100 * trial.heldout.share:.1f} %",
@@ -259,6 +283,10 @@ def _nominal(result: Diagnosis) -> list[tuple[str, str, str]]:
 
 def _noises(result: Diagnosis) -> list[tuple[str, str, str]]:
     return [
-        (words(o.channel), quantity(n.sigma, o.unit), f"{n.source}, correlated over {n.correlation_samples:.1f} samples")
+        (
+            words(o.channel),
+            quantity(n.sigma, o.unit),
+            f"{n.source.value}, correlated over {n.correlation_samples:.1f} samples",
+        )
         for o, n in zip(result.model.outputs, result.full.noise, strict=True)
     ]

@@ -46,7 +46,7 @@ def shown(result: Diagnosis) -> tuple[Segment, int, int]:
         mask = segment.heldout
         if not mask.any():
             return -1.0
-        change = result.found.nominal_full.residuals[index][row][mask] - result.found.best_full.residuals[index][row][mask]
+        change = result.full_rate.nominal.residuals[index][row][mask] - result.full_rate.best.residuals[index][row][mask]
         return float(np.nanmean(change**2)) if np.isfinite(change).any() else 0.0
 
     index = max(range(len(result.full.segments)), key=gain)
@@ -110,8 +110,8 @@ def over_time(result: Diagnosis) -> ReportFigure:
     t = segment.recording.time_s + segment.recording.begin_s
     size, unit = scaled(output.unit, float(np.nanmax(np.abs(segment.y[row]), initial=0.0)))
     y = segment.y[row] / size
-    nominal = y - result.found.nominal_full.residuals[index][row] / size
-    best = y - result.found.best_full.residuals[index][row] / size
+    nominal = y - result.full_rate.nominal.residuals[index][row] / size
+    best = y - result.full_rate.best.residuals[index][row] / size
     spans = joined(
         [span for place in result.located for span in place.windows_s[segment.recording.name]], result.problem.rules
     )
@@ -171,8 +171,8 @@ def loop(result: Diagnosis) -> ReportFigure | None:
     row = most_moved(result, index, port.subsystem)
     size, unit = scaled(result.model.outputs[row].unit, float(np.nanmax(np.abs(segment.y[row]), initial=0.0)))
     x = result.model.motion(segment, port)
-    left = result.found.nominal_full.residuals[index][row] / size
-    extra = left - result.found.best_full.residuals[index][row] / size
+    left = result.full_rate.nominal.residuals[index][row] / size
+    extra = left - result.full_rate.best.residuals[index][row] / size
     seen = [travel for travel in result.model.travel if np.array_equal(segment.inputs.get(travel[1], ()), x)]
     words, _, moved_unit = seen[0] if seen else (f"signal at {port.name.replace('_', ' ')}", "", "")
     moved_size, moved_unit = scaled(moved_unit, float(np.nanmax(np.abs(x), initial=0.0)))
@@ -205,8 +205,8 @@ def most_moved(result: Diagnosis, index: int, subsystem: str) -> int:
     rows = [row for row, output in enumerate(result.model.outputs) if output.channel in channels]
 
     def weight(row: int) -> float:
-        full = result.found
-        change = full.nominal_full.residuals[index][row] - full.best_full.residuals[index][row]
+        fits = result.full_rate
+        change = fits.nominal.residuals[index][row] - fits.best.residuals[index][row]
         good = change[np.isfinite(change)]
         return float(np.std(good)) / max(result.figures.noise_sd[row], 1e-300) if good.size else 0.0
 

@@ -1,4 +1,4 @@
-"""The findings as the JSON object that the contract asks for, with one plain sentence for each effect."""
+"""The findings as one JSON object (docs/diagnosis.md, Fields of the verdict), with one plain sentence for each effect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REMARKS = ("outliers", "quantized", "hold", "repeated", "session", *UNDECIDED)  
 
 
 def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
-    """One JSON object exactly as the contract has it."""
+    """The JSON object of `seldinger diagnose --json`; docs/diagnosis.md explains its fields."""
     figures = result.figures
     primary = figures.primary
     per_channel = {
@@ -40,30 +40,28 @@ def as_json(result: Diagnosis, seconds: float) -> dict[str, Any]:
         for row, output in enumerate(result.model.outputs)
         if np.isfinite(figures.before[row])
     }
-    return {
+    content = without_fit(result.findings, result.problem.rules, seconds)
+    content["fit"] |= {
+        "heldout": True,
+        "rmse_before": figures.before[primary],
+        "rmse_after": figures.after[primary],
+        "noise_floor": figures.noise_sd[primary],
+        "unit": result.model.outputs[primary].unit,
+        "per_channel": per_channel,
+        "per_recording": per_recording(result),
+        "nominal_parameters": nominal_parameters(result),
+        "whiteness_p_before": figures.white_before[primary],
+        "whiteness_p_after": figures.white_after[primary],
+    }
+    return content | {
         "verdict": result.verdict,
         "located": [_located(location, result) for location in result.located],
-        "data_findings": [finding_json(finding) for finding in result.findings],
         "probability_none": _none_stated(result),
         "probability_none_raw": probability_none(result),
-        "rules": result.problem.rules.as_dict(),
         "effects": effects(result),
-        "fit": {
-            "heldout": True,
-            "rmse_before": figures.before[primary],
-            "rmse_after": figures.after[primary],
-            "noise_floor": figures.noise_sd[primary],
-            "unit": result.model.outputs[primary].unit,
-            "per_channel": per_channel,
-            "per_recording": per_recording(result),
-            "nominal_parameters": nominal_parameters(result),
-            "whiteness_p_before": figures.white_before[primary],
-            "whiteness_p_after": figures.white_after[primary],
-        },
         "worse": worse(result),
         "next": next_step(result),
         "stopped_early": result.stopped_early,
-        "seconds": seconds,
     }
 
 
@@ -125,7 +123,7 @@ def _unexplained(result: Diagnosis) -> str:
     ):
         return (
             "Describe a mass on a spring or damper as kind axis and diagnose again: a linear model has candidates at its "
-            "inputs and readings alone, and a force inside it, as of friction or a hardening spring, is none of them."
+            "inputs and readings only, and not for a force inside it, such as friction or a hardening spring."
         )
     if result.verdict == "mismatch_not_identified" and result.model.simulates:
         return (
@@ -180,7 +178,7 @@ def placeless(result: Diagnosis) -> list[str]:
 def likelier(effect: dict[str, Any]) -> str:
     """State the alternative that is more probable than the named effect, with its probability; empty if there is none.
 
-    An effect keeps its name if an equation of recorded signals fits better in its place: a formula is no physics.
+    An effect keeps its name if an equation of recorded signals fits better in its place: an equation states no cause.
     """
     best = max(effect["alternatives"], key=lambda other: other["probability"], default=None)
     if best is None or best["probability"] <= effect["probability"]:
@@ -196,16 +194,30 @@ def words(effect_id: str) -> str:
 
 
 def without_fit(findings: list[Finding], rules: SelectionRules, seconds: float) -> dict[str, Any]:
-    """The verdict on recordings in which there is nothing to compare: findings about the data, no physics."""
-    nothing = dict.fromkeys(("rmse_before", "rmse_after", "noise_floor", "whiteness_p_before", "whiteness_p_after"))
+    """The verdict on recordings in which there is nothing to compare: findings about the data, no effects.
+
+    It has all keys of a verdict; `as_json` fills it.
+    """
     return {
         "verdict": "mismatch_not_identified",
         "located": [],
         "data_findings": [finding_json(finding) for finding in findings],
         "probability_none": 1.0,
+        "probability_none_raw": 1.0,
         "rules": rules.as_dict(),
         "effects": [],
-        "fit": {"heldout": False, **nothing, "unit": "", "per_channel": {}},
+        "fit": {
+            "heldout": False,
+            "rmse_before": None,
+            "rmse_after": None,
+            "noise_floor": None,
+            "unit": "",
+            "per_channel": {},
+            "per_recording": {},
+            "nominal_parameters": {},
+            "whiteness_p_before": None,
+            "whiteness_p_after": None,
+        },
         "worse": [],
         "next": "Correct the data first, then diagnose again: " + (findings[0].says if findings else ""),
         "stopped_early": False,
@@ -246,7 +258,7 @@ def probability_none(result: Diagnosis) -> float:
 
 
 def finding_json(finding: Finding) -> dict[str, str]:
-    """A finding about the data, as the contract has it."""
+    """One entry of `data_findings` (docs/diagnosis.md, Checks of the data)."""
     return {"id": finding.id, "channel": finding.channel, "says": finding.says}
 
 
@@ -274,7 +286,7 @@ def per_recording(result: Diagnosis) -> dict[str, dict[str, dict[str, float]]]:
     """RMS error before and after of every channel in every recording that was held out, by their names."""
     found: dict[str, dict[str, dict[str, float]]] = {}
     for segment, before, after in zip(
-        result.full.segments, result.found.nominal_full.residuals, result.found.best_full.residuals, strict=True
+        result.full.segments, result.full_rate.nominal.residuals, result.full_rate.best.residuals, strict=True
     ):
         if segment.heldout.any():
             found[segment.recording.name] = {

@@ -1,4 +1,4 @@
-"""Nominal parameters that differ from recording to recording: what was changed between sessions is no law of the model."""
+"""Nominal parameters that differ from recording to recording, because something was changed between the sessions."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from host.diagnosis.model.effect import Candidate
 from host.diagnosis.selection.folds import unexcited
 from host.diagnosis.selection.posterior import Posterior, ahead_of_rival, coarse, posterior
 from host.diagnosis.selection.screening import replaced_by, term_of, without
-from host.diagnosis.selection.search import Found, Step, refined, unsure
+from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, refined, unsure
 from host.diagnosis.selection.trial import Trial, at_bound, related
 from host.diagnosis.selection.unlisted import Remainder, equations_for, remainder_of
 from host.diagnosis.symbolic.dictionary import equation_at
@@ -42,12 +42,9 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
     """For every effect of the best structure: its gain over the structure without it, and its equals."""
     out = []
     for term in found.best.terms:
-        terms, values = without(found.best, problem, (term.candidate.key,))
         begun = get_starts(problem)
-        less = found.nominal
-        if terms:
-            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
-            set_starts(problem, begun)
+        less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal, begin_again=True)
+        set_starts(problem, begun)
         gain = compare(problem.segments, "heldout", less.residuals, found.best.residuals, noise_sd, problem.rules)
         both = compare(problem.segments, "both", less.residuals, found.best.residuals, noise_sd, problem.rules)
         crossed = unexcited(problem, less, found.best, term.fitted, noise_sd, gain)
@@ -61,8 +58,8 @@ def standings(problem: Problem, found: Found, noise_sd: Array) -> list[Standing]
         differences = tuple((rival, min(d, least) if rival in alike else d) for rival, d in (*rivals, *said, *paired))
         alone = _rests_on(problem, less, found.best, noise_sd, term.fitted)
         # No inexact formula of another effect leaves a line that no motion has.
-        doubtful = terms and not term.candidate.effect.memories
-        share = _share(problem, found, less, noise_sd) if doubtful else np.inf
+        doubtful = less.terms and not term.candidate.effect.memories
+        share = _share(found, less, noise_sd) if doubtful else np.inf
         out.append(Standing(term.candidate, gain, both, alike, differences, term.fitted, share, alone, crossed is not None))
     return out
 
@@ -98,7 +95,7 @@ def most_probable(problem: Problem, found: Found, noise_sd: Array) -> list[Stand
             set_starts(problem, begun)
             return standing
         found.best = other
-        found.steps.append(Step("swap", rival.key, ahead, step.trials))
+        found.steps.append(Step(SearchMove.SWAP, rival.key, ahead, step.trials))
         seen.append(other.names)
         standing = standings(problem, found, noise_sd)
     return standing
@@ -159,15 +156,14 @@ def without_improbable(
         return None
     weakest = standing[min(doubtful)[1]]
     begun, before = get_starts(problem), found.best
-    terms, values = without(before, problem, (weakest.candidate.key,))
-    found.best = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=10, tolerance=1e-4)))
+    found.best = fit_without(problem, before, (weakest.candidate.key,), rounds=10, begin_again=True)
     fewer = standings(problem, found, noise_sd)
     left = remainder_of(problem, found, noise_sd)
     if max(probability_of(one, left.share, problem.rules).raw for one in fewer) < least or unsure(problem, found.best):
         found.best = before
         set_starts(problem, begun)
         return None
-    found.steps.append(Step("remove", weakest.candidate.key, weakest.gain, []))
+    found.steps.append(Step(SearchMove.IMPROBABLE, weakest.candidate.key, weakest.gain))
     return fewer, left
 
 
@@ -185,7 +181,7 @@ def _with_rival(problem: Problem, best: Fit, candidate: Candidate, trial: Trial)
     return refined(problem, finish(problem, minimize(problem, (*terms, term), begin, rounds=10, tolerance=1e-4)))
 
 
-def _share(problem: Problem, found: Found, less: Fit, noise_sd: Array) -> float:
+def _share(found: Found, less: Fit, noise_sd: Array) -> float:
     """Part of the nominal mismatch above noise that an effect removes from the model `less` without it, in the output where
     that is most.
     """
@@ -330,7 +326,7 @@ def _collapsed(problem: Problem, best: Fit, other: Fit) -> bool:
     """Whether `other`, which contains the best model, ended as that model: their outputs differ by less than chance.
 
     Its further parameters are then where they change nothing, such as a limit that is never reached. It says what the
-    best model says, so it is no other explanation.
+    best model says, so it is not another explanation.
     """
     lead = 0.0
     for segment, a, b in zip(problem.segments, best.residuals, other.residuals, strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +21,24 @@ Restart = Callable[[Problem, Fit, Candidate], Fit]
 FitNext = Callable[[Fit, list[dict[str, float]]], list[Trial]]
 
 
+@dataclass(frozen=True)
+class PairFit:
+    """Two effects that pass together: their fit, and the starts of memory that it was found with."""
+
+    fit: Fit
+    score: float  # likelihood on all samples, less the cost of the parameters
+    heldout: Gain
+    starts: list[dict[str, float]]
+
+
 def best_pair(
     problem: Problem, nominal: Fit, trials: list[Trial], fit_next: FitNext, noise_sd: Array, progress: Progress
-) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
+) -> PairFit | None:
     """The likeliest pair of refused effects of which each earns its place together with the other; None if there is none.
 
     The effects of a pair are among those fitted alone; or the second is one that shows only past the first.
 
     trials: effects fitted alone over `nominal`, all refused. fit_next: the best further effects over the fit of a trial.
-    Returns the pair's fit, its gain on held-out samples and the starts of memory that it was found with.
     """
     rules = problem.rules
     singles = _singles(trials, rules.joint_singles)
@@ -44,9 +54,9 @@ def best_pair(
         starts = [{**y, **x} for x, y in zip(a.starts, b.starts, strict=True)]
         set_starts(problem, starts)
         fit = _fitted(problem, nominal, a, b)
-        passed = _passed(problem, nominal, fit, noise_sd)
+        passed = _passed(problem, nominal, fit, starts, noise_sd)
         if passed is not None and all(_earned_over(problem, fit, alone.fit, noise_sd) for alone in (a, b)):
-            found.append((*passed, fit, starts))
+            found.append(passed)
     for trial in _unlike(singles)[: rules.joint_first]:
         if problem.budget.spent():
             break
@@ -59,26 +69,23 @@ def best_pair(
             seconds += [t for t in fit_next(other, top.starts) if len(t.fit.terms) == 2]
         for second in seconds:
             set_starts(problem, second.starts)
-            fit, passed = second.fit, _passed(problem, nominal, second.fit, noise_sd)
+            fit, passed = second.fit, _passed(problem, nominal, second.fit, second.starts, noise_sd)
             if passed is not None and all(
                 _earned_over(problem, fit, _alone(problem, nominal, fit, which), noise_sd) for which in (0, 1)
             ):
-                found.append((*passed, fit, second.starts))
-    if not found:
-        return None
-    _, held, fit, starts = max(found, key=lambda item: item[0])
-    return fit, held, starts
+                found.append(passed)
+    return max(found, key=lambda pair: pair.score, default=None)
 
 
 def pair_instead(
     problem: Problem, nominal: Fit, one: Fit, trials: list[Trial], noise_sd: Array, restart: Restart
-) -> tuple[tuple[Fit, Gain, list[dict[str, float]]] | None, list[Fit]]:
+) -> tuple[PairFit | None, list[Fit]]:
     """Two effects in the place of the one in `one`, whose formula joins effects of unlike kinds; None if they do no better.
     Then the pairs that do as well: no data tell them from it.
 
     A loop with a dead band both rests after a reversal and is late. It outdoes play or a delay alone where both are there,
     and hides them: past it, neither earns much. Pairs of an effect that it contains and any unlike one at its port have to
-    be likelier than it is. The arguments and what is returned are those of `best_pair`; restart: fits again
+    be likelier than it is. The arguments are those of `best_pair`; restart: fits again
     with the memory of a candidate started, in each recording, where that recording fits best.
     """
     rules, term = problem.rules, one.terms[0]
@@ -96,8 +103,7 @@ def pair_instead(
     begun, found, equal = get_starts(problem), [], []
     for a, b in tried[: rules.split_fits]:
         fit = _fitted_anew(problem, nominal, a, b, restart)
-        starts = get_starts(problem)
-        passed = _passed(problem, nominal, fit, noise_sd)
+        passed = _passed(problem, nominal, fit, get_starts(problem), noise_sd)
         ahead = compare(problem.segments, "both", one.residuals, fit.residuals, noise_sd, problem.rules)
         more = fit.fitted - one.fitted
         lead = ahead.log_likelihood - rules.parameter_penalty * max(more, 0)
@@ -106,23 +112,21 @@ def pair_instead(
         if all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
             equal.append(fit)
             if lead > rules.heldout_log_likelihood:
-                found.append((*passed, fit, starts))
+                found.append(passed)
     set_starts(problem, begun)
-    if not found:
-        return None, equal
-    _, held, fit, starts = max(found, key=lambda item: item[0])
-    return (fit, held, starts), []
+    best = max(found, key=lambda pair: pair.score, default=None)
+    return best, equal if best is None else []
 
 
 def pair_first(
     problem: Problem, nominal: Fit, trials: list[Trial], noise_sd: Array, restart: Restart, progress: Progress
-) -> tuple[Fit, Gain, list[dict[str, float]]] | None:
+) -> PairFit | None:
     """The likeliest pair of unlike effects that were tried in the first step, one of them at a place along a loaded link;
     None if no pair passes.
 
     A gap behind friction is seen only together with it: another effect can be the best single one, and what is found past it
     hides the pair. Pairs of two places along the link are fitted first: the scores of single effects say little of them.
-    The arguments and what is returned are those of `pair_instead`.
+    The arguments are those of `pair_instead`.
     """
     tried = [
         (a, b)
@@ -138,14 +142,11 @@ def pair_first(
             break
         progress(f"fitting {a.candidate.key} and {b.candidate.key}", count / len(tried))
         fit = _fitted_anew(problem, nominal, a, b, restart)
-        passed = _passed(problem, nominal, fit, noise_sd)
+        passed = _passed(problem, nominal, fit, get_starts(problem), noise_sd)
         if passed is not None and all(_earned_over(problem, fit, t.fit, noise_sd) for t in (a, b)):
-            found.append((*passed, fit, get_starts(problem)))
+            found.append(passed)
     set_starts(problem, begun)
-    if not found:
-        return None
-    _, held, fit, starts = max(found, key=lambda item: item[0])
-    return fit, held, starts
+    return max(found, key=lambda pair: pair.score, default=None)
 
 
 def _singles(trials: list[Trial], most: int) -> list[Trial]:
@@ -202,9 +203,13 @@ def _earned_over(problem: Problem, fit: Fit, alone: Fit, noise_sd: Array) -> boo
     held = compare(problem.segments, "heldout", alone.residuals, fit.residuals, noise_sd, problem.rules)
     trained = compare(problem.segments, "fit", alone.residuals, fit.residuals, noise_sd, problem.rules)
     both = compare(problem.segments, "both", alone.residuals, fit.residuals, noise_sd, problem.rules)
-    shown = min(held.log_likelihood, trained.log_likelihood - more) >= problem.rules.heldout_log_likelihood + more
-    return held.share >= problem.rules.further_error_reduction and (
-        (shown and held.p_value <= problem.rules.significance) or _pooled(problem, held, both, more)
+    rules = problem.rules
+    shown = (
+        held.log_likelihood >= rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
+        and trained.log_likelihood >= rules.heldout_log_likelihood + rules.parameter_penalty * more
+    )
+    return held.share >= rules.further_error_reduction and (
+        (shown and held.p_value <= rules.significance) or _pooled(problem, held, both, more)
     )
 
 
@@ -212,14 +217,14 @@ def _pooled(problem: Problem, held: Gain, both: Gain, more: int) -> bool:
     return problem.apart and sure_together(problem.rules, held, both, more)
 
 
-def _passed(problem: Problem, nominal: Fit, fit: Fit, noise_sd: Array) -> tuple[float, Gain] | None:
-    """Score of a pair and its gain on held-out samples; None if it does not pass what a single effect has to."""
+def _passed(problem: Problem, nominal: Fit, fit: Fit, starts: list[dict[str, float]], noise_sd: Array) -> PairFit | None:
+    """The pair that was fitted with `starts`; None if it does not pass what a single effect has to."""
     rules, more = problem.rules, fit.fitted - nominal.fitted
     held = compare(problem.segments, "heldout", nominal.residuals, fit.residuals, noise_sd, problem.rules)
     both = compare(problem.segments, "both", nominal.residuals, fit.residuals, noise_sd, problem.rules)
     least = max(rules.least_error_reduction, rules.least_excess_reduction * held.excess)
     sure = held.p_value < rules.significance or both.log_likelihood > rules.decisive_log_likelihood
-    shown = sure and held.log_likelihood > rules.heldout_log_likelihood + more
+    shown = sure and held.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
     if not (held.share > least and (shown or _pooled(problem, held, both, more))):
         return None
-    return both.log_likelihood - rules.parameter_penalty * more, held
+    return PairFit(fit, both.log_likelihood - rules.parameter_penalty * more, held, starts)

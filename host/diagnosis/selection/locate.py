@@ -20,11 +20,9 @@ SHIFTS = 60  # circular ones, by which a condition is compared with chance
 
 @dataclass(frozen=True)
 class Condition:
-    """Words, share of the mismatch's energy under it, share of samples under it, p-value by circular shifts."""
+    """When a mismatch is large, in words, and the p-value by circular shifts."""
 
     says: str
-    energy_share: float
-    sample_share: float
     p_value: float
 
 
@@ -68,7 +66,7 @@ def inside(spans: list[tuple[float, float]], time_s: Array) -> Mask:
     return mask
 
 
-def mismatch_of(problem: Problem, nominal: Fit, best: Fit) -> list[Array]:
+def mismatch_of(nominal: Fit, best: Fit) -> list[Array]:
     """Return extended minus refitted nominal model per segment (outputs, n); the nominal residual without effects."""
     if not best.terms:
         return nominal.residuals
@@ -124,7 +122,7 @@ def condition(problem: Problem, mismatch: list[Array], row: int, stride: int = 1
                 by_chance = np.array([float(np.roll(together, s)[mask].sum()) / total for s in shifts])
                 z = (held - by_chance.mean()) / (by_chance.std() + 1e-12)
                 p = max(float(np.mean(by_chance >= held)), float(np.exp(-0.5 * z * z)) if z > 0 else 1.0)
-                found.append((held - part, Condition(_words(name, side, limit, problem), held, part, p)))
+                found.append((held - part, Condition(_words(name, side, limit, problem), p)))
     return _discover(found, rules.condition_false_discovery)
 
 

@@ -29,8 +29,9 @@ noise is known. w(none) is the same likelihood ratio against a model that would 
 w(other): an effect that removes the `share` of the mismatch may stand for what the inexact formula of another one leaves, up
 to `exact_share`; its prior is scale-free. It counts as none of these at the place of the small effect.
 
-What is stated is calibrated: slope and shift of the log-odds, frozen in `SelectionRules`, fitted on suites apart from those
-that judge (host.studies.proof.calibrate). The probabilities before that are kept as raw.
+Stated probabilities are calibrated by beta calibration (`calibrated`). Its a, b and c, for effects, for none of them and for
+verdicts without an effect, are fields of `SelectionRules`, fitted on suites apart from those that judge
+(host.studies.proof.calibrate). The probabilities before that are kept as raw.
 """
 
 from __future__ import annotations

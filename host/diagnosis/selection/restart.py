@@ -10,7 +10,7 @@ from host.diagnosis.selection.screening import Screened, enough, term_of
 
 
 def hidden(problem: Problem, nominal: Fit, candidate_effects: list[Candidate]) -> list[Screened]:
-    """Candidates that the refitted nominal model cannot vouch for, each with nominal parameters of its own to start from.
+    """Candidates that change the nominal parameters so much that each needs start values of its own for them.
 
     A model with `restarts` says which parameters are worth a try; those that leave the least with the effect are
     kept.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,7 @@ from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.effect import Candidate, rate_key
 from host.diagnosis.model.model import Segment
 from host.diagnosis.selection.folds import unexcited, with_other_recordings
-from host.diagnosis.selection.joint import best_pair, pair_first, pair_instead
+from host.diagnosis.selection.joint import PairFit, best_pair, pair_first, pair_instead
 from host.diagnosis.selection.restart import hidden
 from host.diagnosis.selection.screening import Screened, above_noise, enough, screen, term_of, without
 from host.diagnosis.selection.trial import (
@@ -50,13 +51,35 @@ Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 
+class SearchMove(Enum):
+    """What one step of the search did with the effect of its key."""
+
+    FORWARD = "it entered"
+    UPGRADE = "it entered in the place of a simpler form"
+    JOINT = "it entered together with another one"
+    SWAP = "it took the place of another one"
+    REDUCE = "it took the place of a more general form"
+    EQUATION = "an equation entered"
+    EXCHANGE = "it stayed: no other one does better in its place"
+    REFIT = "the model before it was fitted again from the nominal parameters found with it"
+    STOP = "no effect earned its place"
+    BACKWARD = "removed again"
+    UNSURE = "removed: its interval contains zero"
+    IMPROBABLE = "removed: it is improbable next to the others"
+
+    @property
+    def removes(self) -> bool:
+        """Whether the effect left the model."""
+        return self in (SearchMove.BACKWARD, SearchMove.UNSURE, SearchMove.IMPROBABLE)
+
+
 @dataclass
 class Step:
-    """One move of the search, for the report."""
+    """One step of the search, for the report."""
 
-    move: str
+    move: SearchMove
     key: str
-    gain: Gain
+    gain: Gain | None = None  # none where no gain decided
     trials: list[Trial] = field(default_factory=list)
 
 
@@ -69,8 +92,6 @@ class Found:
     steps: list[Step]
     forms: list[Form] = field(default_factory=list)
     pairs: list[Fit] = field(default_factory=list)  # of two effects each, that do as well as the first one named
-    nominal_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
-    best_full: Fit = field(default_factory=lambda: Fit((), np.zeros(0)))
 
     @property
     def last_trials(self) -> list[Trial]:
@@ -94,6 +115,28 @@ def refined(problem: Problem, fit: Fit) -> Fit:
     if not problem.joint_states:
         start_again(problem, fit)
     return finish(problem, fit)
+
+
+def fit_without(
+    problem: Problem,
+    fit: Fit,
+    keys: tuple[str, ...],
+    *,
+    nominal: Fit | None = None,
+    rounds: int = 8,
+    tolerance: float = 1e-4,
+    begin_again: bool = False,
+) -> Fit:
+    """`fit` without the effects of these `keys`: what remains is fitted again from its values.
+
+    nominal: returned instead where no effect remains. rounds, tolerance: of `minimize`. begin_again: whether a model that is
+    a linear path is also given initial states of its own.
+    """
+    terms, values = without(fit, problem, keys)
+    if not terms and nominal is not None:
+        return nominal
+    less = minimize(problem, terms, values, rounds=rounds, tolerance=tolerance)
+    return finish(problem, begun_again(problem, less) if begin_again else less)
 
 
 def fit_nominal(problem: Problem) -> Fit:
@@ -276,7 +319,7 @@ def drop_unsure(problem: Problem, found: Found) -> None:
     """
     while doubtful := unsure(problem, found.best):
         terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
-        found.steps.append(Step("remove", doubtful[-1].candidate.key, Gain(0.0, 1.0, 0.0)))
+        found.steps.append(Step(SearchMove.UNSURE, doubtful[-1].candidate.key))
         found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
 
 
@@ -314,17 +357,17 @@ def _grow(
             (t for t in trials if good_enough(t, best) and weighty(t, earned) and not only_sampling(t, trials)), None
         )
         if winner is None:
-            steps.append(Step("stop", "", Gain(0.0, 1.0, 0.0), trials))
+            steps.append(Step(SearchMove.STOP, "", trials=trials))
             break
         better = _better_base(problem, best, winner) if refits < rules.most_refits else None
         if better is not None:  # the gain was that of a better minimum: judged again over that
             refits += 1
-            steps.append(Step("refit", winner.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+            steps.append(Step(SearchMove.REFIT, winner.candidate.key, trials=trials))
             best = better
             if not best.terms:
                 found.nominal = best
             continue
-        move = "upgrade" if len(winner.fit.terms) <= len(best.terms) else "forward"
+        move = SearchMove.UPGRADE if len(winner.fit.terms) <= len(best.terms) else SearchMove.FORWARD
         steps.append(Step(move, winner.candidate.key, winner.heldout, trials))
         earned += winner.both.log_likelihood
         best = _parted(problem, _taken(problem, winner), candidate_effects)
@@ -332,8 +375,8 @@ def _grow(
         if len(best.terms) == 1:
             two, found.pairs = pair_instead(problem, found.nominal, best, trials, noise_sd, _restart)
         if two is not None:
-            best, gain = _joined(problem, two), two[1]
-            steps += [Step("joint", term.candidate.key, gain, trials) for term in best.terms]
+            best = _joined(problem, two)
+            steps += [Step(SearchMove.JOINT, term.candidate.key, two.heldout, trials) for term in best.terms]
         if len(best.terms) > 1:
             best = _swap(problem, best, noise_sd, steps)
         best = _prune(problem, best, noise_sd, steps)
@@ -447,15 +490,14 @@ def _join(problem: Problem, found: Found, candidate_effects: list[Candidate], no
         set_starts(problem, begun)
         return
     found.best = _parted(problem, _joined(problem, pair), candidate_effects)
-    found.steps += [Step("joint", term.candidate.key, pair[1], refused) for term in found.best.terms]
-    _grow(problem, found, candidate_effects, noise_sd, pair[1].log_likelihood, progress)
+    found.steps += [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, refused) for term in found.best.terms]
+    _grow(problem, found, candidate_effects, noise_sd, pair.heldout.log_likelihood, progress)
 
 
-def _joined(problem: Problem, pair: tuple[Fit, Gain, list[dict[str, float]]]) -> Fit:
+def _joined(problem: Problem, pair: PairFit) -> Fit:
     """The fit of a pair brought to its end, memories started and outputs weighed as it has them."""
-    fit, _, starts = pair
-    set_starts(problem, starts)
-    fit = refined(problem, fit)
+    set_starts(problem, pair.starts)
+    fit = refined(problem, pair.fit)
     reweigh(problem, fit)
     return fit
 
@@ -515,7 +557,7 @@ def _detour(
             + len(best.best.terms) * problem.rules.heldout_log_likelihood
         ):
             continue
-        other = Found(found.nominal, base, [Step("forward", trial.candidate.key, trial.heldout, first.trials)])
+        other = Found(found.nominal, base, [Step(SearchMove.FORWARD, trial.candidate.key, trial.heldout, first.trials)])
         _grow(problem, other, candidate_effects, noise_sd, trial.both.log_likelihood, progress)
         if _ahead(problem, other, best, noise_sd):
             best, begun, scale = other, get_starts(problem), problem.scale.copy()
@@ -523,7 +565,7 @@ def _detour(
         pair = pair_first(problem, found.nominal, first.trials, noise_sd, _restart, progress)
         if pair is not None:
             base = _parted(problem, _joined(problem, pair), candidate_effects)
-            steps = [Step("joint", term.candidate.key, pair[1], first.trials) for term in base.terms]
+            steps = [Step(SearchMove.JOINT, term.candidate.key, pair.heldout, first.trials) for term in base.terms]
             other = Found(found.nominal, base, steps)
             likelier = _ahead(problem, other, best, noise_sd)
             earned = compare(
@@ -570,7 +612,7 @@ def _swap(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> Fi
             if ahead.log_likelihood > problem.rules.heldout_log_likelihood + problem.rules.parameter_penalty * max(
                 more, 0
             ) and not at_bound(other):
-                steps.append(Step("swap", new.candidate.key, ahead, step.trials if step else []))
+                steps.append(Step(SearchMove.SWAP, new.candidate.key, ahead, step.trials if step else []))
                 return refined(problem, other)
     return best
 
@@ -610,9 +652,8 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             simple = trial.fit.terms[-1]
             own = {p.name: float(value) for p, value in zip(term.parameters, found.best.values_of(term), strict=True)}
             alone = zip(simple.parameters, trial.fit.values_of(simple), strict=True)
-            begun, key, less = get_starts(problem), simple.candidate.key, found.nominal
-            if rest:
-                less = finish(problem, minimize(problem, rest, values, rounds=8, tolerance=1e-4))
+            begun, key = get_starts(problem), simple.candidate.key
+            less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
             start = np.array([min(max(own.get(p.name, float(value)), p.low), p.high) for p, value in alone])
             begin = np.concatenate((values, start))
             other = minimize(problem, (*rest, simple), begin, rounds=problem.rules.further_iterations, tolerance=1e-4)
@@ -621,7 +662,7 @@ def _reduce(problem: Problem, found: Found, noise_sd: Array) -> None:
             ahead = compare(problem.segments, "both", other.residuals, found.best.residuals, noise_sd, problem.rules)
             more = found.best.fitted - other.fitted
             if ahead.log_likelihood < richer_gain(earned, more, problem.rules) and not at_bound(other):
-                found.steps.append(Step("reduce", key, ahead, [trial]))
+                found.steps.append(Step(SearchMove.REDUCE, key, ahead, [trial]))
                 found.best = other
                 break
             set_starts(problem, begun)
@@ -655,8 +696,7 @@ def _in_place_of(
     problem: Problem, found: Found, term: Term, candidate_effects: list[Candidate], noise_sd: Array, progress: Progress
 ) -> None:
     known = _frequencies(found.best, term)
-    terms, values = without(found.best, problem, (term.candidate.key,))
-    less = finish(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)) if terms else found.nominal
+    less = fit_without(problem, found.best, (term.candidate.key,), nominal=found.nominal)
     ranked = [
         item
         for item in screen(problem, less, candidate_effects, progress, known)
@@ -671,7 +711,7 @@ def _in_place_of(
     ]
     rank(problem, trials, less)
     with_other_recordings(problem, less, trials, noise_sd)
-    found.steps.append(Step("exchange", term.candidate.key, Gain(0.0, 1.0, 0.0), trials))
+    found.steps.append(Step(SearchMove.EXCHANGE, term.candidate.key, trials=trials))
     winner = next((trial for trial in trials if good_enough(trial, less)), None)
     if winner is None or winner.candidate.key == term.candidate.key:
         return
@@ -684,7 +724,7 @@ def _in_place_of(
         > (problem.rules.heldout_log_likelihood if more >= 0 else -problem.rules.parameter_penalty)
         + problem.rules.parameter_penalty * more
     ):
-        found.steps[-1] = Step("swap", winner.candidate.key, ahead, trials)
+        found.steps[-1] = Step(SearchMove.SWAP, winner.candidate.key, ahead, trials)
         found.best = _parted(problem, _taken(problem, winner), candidate_effects)
 
 
@@ -729,9 +769,8 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
     while dropped and len(best.terms) > 1:
         dropped = False
         for term in best.terms:
-            terms, values = without(best, problem, (term.candidate.key,))
             begun = get_starts(problem)
-            less = finish(problem, begun_again(problem, minimize(problem, terms, values, rounds=8, tolerance=1e-4)))
+            less = fit_without(problem, best, (term.candidate.key,), begin_again=True)
             gain = compare(problem.segments, "both", less.residuals, best.residuals, noise_sd, problem.rules)
             held = compare(problem.segments, "heldout", less.residuals, best.residuals, noise_sd, problem.rules)
             least = max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)
@@ -743,7 +782,7 @@ def _prune(problem: Problem, best: Fit, noise_sd: Array, steps: list[Step]) -> F
             small = gain.share < rules.removal_tolerance * least
             if gone or few or small or held.log_likelihood < 0.0:
                 best, dropped = less, True
-                steps.append(Step("backward", term.candidate.key, gain))
+                steps.append(Step(SearchMove.BACKWARD, term.candidate.key, held))
                 break
             set_starts(problem, begun)
     return best

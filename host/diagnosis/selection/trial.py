@@ -35,7 +35,7 @@ class Trial:
 
 
 def at_bound(fit: Fit) -> bool:
-    """Whether the last term ended at a bound that is none of nature's: its shape is then not what it stands for."""
+    """Whether the last term ended at a bound that is not a natural one: its shape is then not what it stands for."""
     return bound_by(fit, fit.terms[-1])
 
 
@@ -49,7 +49,7 @@ def bound_by(fit: Fit, term: Term) -> bool:
 
 
 def _reached(p: Parameter, value: float, natural: bool) -> bool:
-    """Whether `value` is at a bound of `p` that is none of nature's. natural: whether the effect's bounds are."""
+    """Whether `value` is at a bound of `p` that is not a natural one. natural: whether the effect's bounds are."""
     if p.high <= p.low:
         return False
     low = np.isfinite(p.low) and p.low != 0.0 and value <= p.low * (1.001 if p.low > 0 else 0.999)
@@ -171,7 +171,7 @@ def _zeros(fit: Fit) -> int:
 
 def of_sampling(trial: Trial) -> bool:
     """Whether a delay or lag of an axis' input, all of a drifting one, may be how the input was held between samples or
-    recorded, which is no physics: it is within a sample, and no time between those that this could take.
+    recorded, which is not physics: it is within a sample, and no time between those that this could take.
 
     An input that is held where it should run straight is half a sample late, one that is recorded after its sample a whole
     one, and an integrator of a few steps in a sample a small part of one. A delay d that gains the log-likelihood L over
@@ -259,7 +259,8 @@ def refuted(heldout: Gain, rules: SelectionRules) -> bool:
 
 def _across(trial: Trial, crossed: Gain, more: int) -> bool:
     """Whether recordings that are predicted from one another call for it: no sample was fitted to what it judges."""
-    rules, gained = trial.rules, crossed.log_likelihood - more
+    rules = trial.rules
+    gained = crossed.log_likelihood - rules.heldout_parameter_cost * more
     agreed = gained > rules.pooled_log_likelihood and crossed.p_value < rules.weak_significance
     return crossed.share > _least(trial, crossed) and (agreed or gained > rules.decisive_log_likelihood)
 
@@ -267,7 +268,7 @@ def _across(trial: Trial, crossed: Gain, more: int) -> bool:
 def _alone(trial: Trial, more: int) -> bool:
     gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > rules.heldout_log_likelihood + more
+        gain.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost * more
         and gain.p_value < rules.significance
         and gain.share > _least(trial, gain)
         and trial.trained.log_likelihood > rules.heldout_log_likelihood + rules.parameter_penalty * more

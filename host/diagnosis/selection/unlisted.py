@@ -13,18 +13,15 @@ from host.diagnosis.estimation.coloured import only_coloured, too_slow
 from host.diagnosis.estimation.evidence import compare
 from host.diagnosis.estimation.fit import Fit, Problem, finish, get_starts, minimize, reweigh, set_starts
 from host.diagnosis.estimation.jumps import jumps_of
-from host.diagnosis.estimation.noise import REPEATS
 from host.diagnosis.model.effect import Port
-from host.diagnosis.selection.screening import Screened, term_of, without
-from host.diagnosis.selection.search import Found, Step, try_fit
+from host.diagnosis.selection.screening import Screened, term_of
+from host.diagnosis.selection.search import Found, SearchMove, Step, fit_without, try_fit
 from host.diagnosis.selection.trial import Trial, rank, within_sample
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at, fallen, lay_out, predict_residual
 from host.diagnosis.symbolic.equation_search import search_equation
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str, float], None]
-MEASURED = ("quiescent parts", REPEATS)  # sources of noise that was seen alone
-# several effects that pile up and still do not fit stand for something that is in no list
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class Remainder:
 
 def remaining_share(problem: Problem, found: Found, noise_sd: Array) -> float:
     """Share of the nominal model's held-out error above noise that the best model leaves, in the output where it
-    mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than what is left.
+    mattered most; noise may be larger than its estimate by `noise_uncertainty`, and is no larger than that remaining error.
     """
     shares, weights = [], []
     noise_sd = _levels(problem, found.best, noise_sd)
@@ -70,7 +67,7 @@ def _above_noise(problem: Problem, found: Found, noise_sd: Array) -> bool:
     noise_sd = _levels(problem, found.best, noise_sd)
     return any(
         _power(problem, found.best.residuals, row)
-        > ((measured if noise.source in MEASURED else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
+        > ((measured if noise.source.seen_alone else problem.rules.residual_over_guessed_noise) * noise_sd[row]) ** 2
         or (
             not found.best.terms and bool(jumps_of([r[row] for r in found.best.residuals], problem.rules))
         )  # no noise does that
@@ -82,7 +79,7 @@ def _levels(problem: Problem, fit: Fit, noise_sd: Array) -> Array:
     """Noise of each output (outputs,): where it was guessed from a spectrum, and `fit` leaves coloured noise, that noise."""
     levels = noise_sd.copy()
     for row, noise in enumerate(problem.noise):
-        if noise.source not in MEASURED and _power(problem, fit.residuals, row) > levels[row] ** 2:
+        if not noise.source.seen_alone and _power(problem, fit.residuals, row) > levels[row] ** 2:
             # What a plant does to a force inside it follows its own motion, of which no form of an input says enough.
             known = [
                 [*(segment.inputs[name] for name in problem.model.quiet_inputs), segment.y[row] - r[row]]
@@ -136,6 +133,7 @@ def explain_remainder(problem: Problem, found: Found, noise_sd: Array, progress:
             problem, found, noise_sd, *pairs[place], progress, evolve=number == 0
         ):
             return remainder_of(problem, found, noise_sd)
+    # Several effects that pile up and still do not fit stand for something that is in no list.
     return replace(remainder, doubtful=bool(crowd))
 
 
@@ -170,8 +168,7 @@ def _equation_instead(
     """
     progress("searching an equation", 0.0)
     there = tuple(term.candidate.key for term in found.best.terms if term.candidate.port.name in (port.name, target.name))
-    terms, values = without(found.best, problem, there)
-    base = finish(problem, minimize(problem, terms, values, rounds=8)) if there else found.best
+    base = fit_without(problem, found.best, there, tolerance=1e-7) if there else found.best
     sized = [form for place in predict_residual(problem, base, noise_sd) if place.port is port for form in place.forms]
     trials = [_tried(problem, base, noise_sd, target, form, size) for form, size in sized]
     forms = [form for form, _ in sized]
@@ -187,16 +184,16 @@ def _equation_instead(
         return False
     if _left(problem, found, winner.fit, noise_sd) > problem.rules.equation_residual_share:
         return False
-    if there and _still_earned(problem, found.best, winner, there, noise_sd):
+    if there and _still_earned(problem, found.best, winner, noise_sd):
         return False
     found.forms += [form for form in forms if form.text == winner.candidate.effect.equation]
-    found.steps.append(Step("equation", winner.candidate.key, winner.heldout, trials))
+    found.steps.append(Step(SearchMove.EQUATION, winner.candidate.key, winner.heldout, trials))
     found.best = finish(problem, minimize(problem, winner.fit.terms, winner.fit.values))
     reweigh(problem, found.best)
     return True
 
 
-def _still_earned(problem: Problem, best: Fit, winner: Trial, there: tuple[str, ...], noise_sd: Array) -> bool:
+def _still_earned(problem: Problem, best: Fit, winner: Trial, noise_sd: Array) -> bool:
     """Whether the effects that an equation would replace gain as much together with it as they must to enter: then they
     stay.
     """
@@ -230,7 +227,7 @@ def _earned(trial: Trial) -> bool:
     """
     gain, rules = trial.heldout, trial.rules
     return (
-        gain.log_likelihood > rules.heldout_log_likelihood + 1.0
+        gain.log_likelihood > rules.heldout_log_likelihood + rules.heldout_parameter_cost  # of its amplitude
         and trial.trained.log_likelihood > rules.equation_log_likelihood
         and gain.p_value < rules.equation_significance
         and gain.share > max(rules.least_error_reduction, rules.least_excess_reduction * gain.excess)

@@ -392,7 +392,7 @@ def _alarm_is_right(outcome: dict[str, Any]) -> bool:
 
 
 def by_fault(results: list[RunResult]) -> list[dict[str, Any]]:
-    """A row per fault and phase, as the command's contract has it, with the actions and violations."""
+    """A row per fault and phase, as the command prints it, with the actions and violations."""
     rows = []
     for fault in FAULTS:
         for phase in PHASES:

@@ -62,10 +62,10 @@ def _left(result: Diagnosis, verdict: dict[str, Any], before: Axes, after: Axes)
     unit, sigma = result.model.outputs[row].unit, result.full.noise[row].sigma
     scale, unit = (1e3, f"m{unit}") if unit in ("m", "rad", "N") else (1.0, unit)
     pairs = (
-        (before, result.found.nominal_full, FAULT, "the refitted nominal model"),
-        (after, result.found.best_full, MEASURED, "the model with what was found"),
+        (before, result.full_rate.nominal, FAULT, "the refitted nominal model"),
+        (after, result.full_rate.best, MEASURED, "the model with what was found"),
     )
-    limit = 1.05 * scale * float(np.nanmax(np.abs(result.found.nominal_full.residuals[index][row])))
+    limit = 1.05 * scale * float(np.nanmax(np.abs(result.full_rate.nominal.residuals[index][row])))
     for axes, fit, colour, name in pairs:
         axes.plot(
             *thinned(segment.recording.time_s, scale * fit.residuals[index][row]),

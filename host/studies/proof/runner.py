@@ -67,8 +67,9 @@ def is_spent(seed: int) -> bool:
 
 
 def prove(settings: Settings, progress: Progress, announce: Callable[[str], None]) -> dict[str, Any]:
-    """The contract's object. `announce` gets the labels' sha256 before the finder runs. Raises InputError, RuntimeError.
+    """The JSON object that `seldinger prove --json` prints (docs/proof.md). Raises InputError, RuntimeError.
 
+    `announce` gets the labels' sha256 before the finder runs.
     With several worlds all seals are announced before the first verdict, and `worlds` holds each one's table.
     """
     _claim(settings)

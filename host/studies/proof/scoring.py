@@ -59,7 +59,7 @@ def judge(
 
     Args:
         label: the sealed truth.
-        verdict: as the contract has it.
+        verdict: as `seldinger diagnose --json` prints it (docs/diagnosis.md, Fields of the verdict).
         heldout: columns of the held-out recording, for equations; without them no form is right.
         calibrate: what turns a verdict's probabilities into those that count.
     """

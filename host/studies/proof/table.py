@@ -1,4 +1,4 @@
-"""The proof's table: figures of all cases under the contract's names, and as rows of text."""
+"""The proof's table (docs/proof.md): figures of all cases by name, and as rows of text."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ Table = dict[str, float | int | None]
 
 
 def tabulate(facts: Sequence[Facts]) -> Table:
-    """The contract's table. A share is None where no case has a say in it."""
+    """The figures that `seldinger prove --json` prints as `table`. A share is None where no case has a say in it."""
 
     def share(which: Callable[[Facts], bool], of: Callable[[Facts], bool | None]) -> float | None:
         return mean([float(bool(of(f))) for f in facts if which(f) and of(f) is not None])

@@ -96,7 +96,7 @@ def _curves(found: Characterization) -> list[Section]:
     held = KnobSweep(*(column[sweep.number == HELD_OUT] for column in sweep))
     curve, held_curve = _knob_curve(train), _knob_curve(held)
     fold_rad = float(np.interp(FOLD_BEND / length, curve[1], curve[0]))
-    sines = fit_sine_kinematics(train, length, fold_rad)
+    sines = fit_sine_kinematics(train, fold_rad)
     errors = compare(held, held_curve, length, sines, curve)
     across, along = _curve_pictures(train, sines, curve, length, fold_rad)
     squares = f"R² {sines.past_fold.r_square:.3f}, {sines.below_fold.r_square:.3f}, {sines.along.r_square:.3f}"

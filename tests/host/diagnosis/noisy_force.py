@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from host.diagnosis.model.nominal import read_nominal
+from host.diagnosis.models.rig import FORCE_ROWS
 from host.diagnosis.pipeline import Diagnosis, diagnose
 from sim.concealed import suite as concealed
 from sim.concealed import system as concealed_system
@@ -25,7 +26,7 @@ def rig(seed: int, index: int) -> ConcealedCase:
 def write(drawn: ConcealedCase, force_noise_N: float, folder: Path) -> list[Path]:
     """Its recordings with a force sensor as noisy as told, and nominal.toml, in `folder`."""
     sigma = drawn.system.sigma.copy()
-    sigma[12:15] = force_noise_N
+    sigma[FORCE_ROWS] = force_noise_N
     system = replace(drawn.system, sigma=sigma)
     recorded = system.noisy(drawn.session, drawn.plan.stream(3))
     calibrated = system.calibrate(recorded, (0, 1), system.case.nominal, every=6)

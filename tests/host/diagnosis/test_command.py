@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from host.cli.diagnose import diagnose
+from host.diagnosis import diagnose as find
 from protocol.errors import InputError
 from tests.host.diagnosis import planted
 
@@ -76,6 +79,25 @@ def test_json_is_what_the_contract_says(made: tuple[dict, str]) -> None:
     assert set(place) >= {"subsystem", "channels", "windows_s", "condition", "residual_share"}
     assert verdict["fit"]["rmse_after"] < verdict["fit"]["rmse_before"]
     assert all(len(p["ci95"]) == 2 and p["ci95"][0] <= p["value"] <= p["ci95"][1] for p in effect["parameters"].values())
+
+
+def test_recordings_without_information_get_the_same_keys_and_a_report(made: tuple[dict, str], tmp_path: Path) -> None:
+    verdict, _ = made
+    t = np.arange(600) * 0.01
+    nominal = {
+        "name": "gear",
+        "kind": "transmission",
+        "data": {"time": "t"},
+        "channels": {"motor": {"column": "m", "unit": "rad"}, "tip": {"column": "y", "unit": "rad"}},
+        "link": [{"subsystem": "gear", "input": "motor", "output": "tip"}],
+    }
+    nothing = find([{"t": t, "m": np.sin(t), "y": np.full(t.size, 3.0)}], nominal)
+    page = nothing.write(tmp_path).read_text(encoding="utf-8")
+    found = json.loads((tmp_path / "verdict.json").read_text())
+    assert nothing.diagnosis is None and found["data_findings"]
+    assert set(found) == set(verdict) and set(found["fit"]) == set(verdict["fit"])
+    assert "Diagnosis of gear" in page and all(finding["says"] in unescape(page) for finding in found["data_findings"])
+    assert unescape(page).count(found["next"]) == 1
 
 
 def test_report_needs_nothing_from_outside(made: tuple[dict, str]) -> None:

@@ -130,9 +130,7 @@ def test_infinite_values_are_missing_and_said(tmp_path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
     (one,) = read(tmp_path, [path])
     assert np.isnan(one.channels["motor"][1]) and one.infinite == ("motor",)
-    findings = [
-        finding.says for finding in inspect(spec(tmp_path), [one], set(), DataRules()).findings if finding.id == "missing"
-    ]
+    findings = [finding.says for finding in inspect(spec(tmp_path), [one], DataRules()).findings if finding.id == "missing"]
     assert findings == ["Column a holds infinite values. They count as missing."]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from host.diagnosis import diagnose
 from host.diagnosis.selection import search
+from host.diagnosis.selection.search import SearchMove
 from tests.host.proof import everyday as make
 
 
@@ -24,7 +25,7 @@ def test_a_pair_is_found_where_every_single_effect_is_refused(monkeypatch: pytes
     monkeypatch.setattr(search, "good_enough", lambda trial, base: bool(base.terms) and found(trial, base))
     verdict = diagnose([_play_and_delay(1), _play_and_delay(2)], make.gear_nominal())
     assert {effect["id"] for effect in verdict.effects} == {"backlash", "latency"}
-    assert [step.move for step in verdict.diagnosis.found.steps][:1] == ["stop"]
+    assert [step.move for step in verdict.diagnosis.found.steps][:1] == [SearchMove.STOP]
 
 
 def test_no_pair_is_tried_where_nothing_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from host.diagnosis import diagnose
 from host.diagnosis.effects import candidates
 from host.diagnosis.estimation.fit import minimize
 from host.diagnosis.estimation.jumps import jumps_of
-from host.diagnosis.estimation.noise import estimate
+from host.diagnosis.estimation.noise import NoiseSource, estimate
 from host.diagnosis.estimation.rules import RULES
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
@@ -114,9 +114,9 @@ def test_a_slow_plant_is_on_its_way_while_its_input_rests() -> None:
     slow = lfilter([0.02], [1.0, -0.98], held)
     still = [np.tile(np.arange(40) >= 5, n // 40)]
     sure = estimate([slow + 2e-4 * rng.standard_normal(n)], still, simulated=True)
-    assert "quiescent" not in sure.source.split(" (")[0] and sure.sigma == pytest.approx(2e-4, rel=0.3)
+    assert sure.source is NoiseSource.SPECTRUM and sure.sigma == pytest.approx(2e-4, rel=0.3)
     wander = 2e-4 * lfilter([1.0], [1.0, -0.6], rng.standard_normal(n))
-    assert estimate([wander], still, simulated=True).source == "quiescent parts"
+    assert estimate([wander], still, simulated=True).source is NoiseSource.QUIESCENT
 
 
 def test_an_amplitude_whose_interval_contains_zero_is_dropped() -> None:

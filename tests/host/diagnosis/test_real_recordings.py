@@ -51,7 +51,7 @@ def test_silverbox_spring() -> None:
     assert verdict["effects"][0]["id"] == "nonlinear_stiffness"
     left = {
         p.recording.name: float(np.sqrt(np.nanmean(r[0][p.heldout] ** 2)))
-        for p, r in zip(result.full.segments, result.found.best_full.residuals, strict=True)
+        for p, r in zip(result.full.segments, result.full_rate.best.residuals, strict=True)
         if p.heldout.any()
     }
     assert left["multisine_10"] < 0.363e-3 and left["arrow"] < 0.523e-3

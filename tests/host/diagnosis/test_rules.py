@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from host.diagnosis import diagnose
+from host.diagnosis.estimation.noise import NoiseSource
 from host.diagnosis.estimation.rules import RULES, SelectionRules
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.nominal import nominal_of
@@ -75,9 +76,9 @@ def test_noise_is_estimated_by_the_rules_that_are_given() -> None:
     still = gear(3)
     still["m"][:200] = still["m"][200]
     sources = [Table("r", {**still, "y": still["m"] + 1e-3 * np.random.default_rng(4).normal(size=600)})]
-    for rules, source in ((RULES, "quiescent parts"), (RULES.changed(rest_shortest_samples=500), "quietest part")):
+    for rules, source in ((RULES, NoiseSource.QUIESCENT), (RULES.changed(rest_shortest_samples=500), NoiseSource.SPECTRUM)):
         _, problem, full = prepare(nominal_of(GEAR), sources, rules)
-        assert problem.noise[0].source.startswith(source) and problem.rules is full.rules is rules
+        assert problem.noise[0].source is source and problem.rules is full.rules is rules
 
 
 @pytest.mark.parametrize("constant", [False, True])

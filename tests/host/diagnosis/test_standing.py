@@ -23,7 +23,7 @@ from host.diagnosis.selection import equivalence
 from host.diagnosis.selection.equivalence import Standing, _rests_on, with_unlisted_rival, without_improbable
 from host.diagnosis.selection.posterior import ahead_of_rival, calibrated, posterior
 from host.diagnosis.selection.screening import Screened, term_of
-from host.diagnosis.selection.search import Found, Step, _varied, fit_nominal
+from host.diagnosis.selection.search import Found, SearchMove, Step, _varied, fit_nominal
 from host.diagnosis.selection.trial import Trial, good_enough, only_sampling, weighty
 from host.diagnosis.selection.unlisted import Remainder
 from host.diagnosis.symbolic.dictionary import Form, PredictedPart, equation_at
@@ -162,7 +162,7 @@ def test_a_rival_with_few_parameters_has_to_outdo_the_form_with_few_parameters()
     smooth, plain = tried("coulomb_friction", "smooth", 148.0), tried("coulomb_friction", "", 135.0)
     bristles, drag = tried("coulomb_friction", "bristles", 127.0), tried("viscous_friction", "quadratic", 86.0)
     assert plain.fit.fitted < smooth.fit.fitted == bristles.fit.fitted
-    found = Found(Fit((), np.zeros(0)), smooth.fit, [Step("forward", "", NOTHING, [smooth, bristles, plain, drag])])
+    found = Found(Fit((), np.zeros(0)), smooth.fit, [Step(SearchMove.FORWARD, "", NOTHING, [smooth, bristles, plain, drag])])
     assert equivalence._rivals(found, smooth.candidate, RULES) == [plain, drag]
 
 

@@ -39,14 +39,25 @@ def test_noise_comes_from_the_quiescent_parts() -> None:
     y = motion + ar1(rng, t.size, 0.7, 0.02)
     still = noise.quiescent([motion], 0.01, True)
     found = noise.estimate([y], [still])
-    assert found.source == "quiescent parts" and found.sigma == pytest.approx(0.02, rel=0.15)
+    assert found.source is noise.NoiseSource.QUIESCENT and found.sigma == pytest.approx(0.02, rel=0.15)
     assert found.correlation_samples == pytest.approx((1 + 0.7) / (1 - 0.7), rel=0.35)
 
 
 def test_noise_without_rest_says_so() -> None:
     y = np.sin(np.arange(4000) / 30.0) + 0.01 * np.random.default_rng(0).normal(size=4000)
     found = noise.estimate([y], [np.zeros(4000, dtype=bool)])
-    assert "no quiescent part" in found.source and found.sigma == pytest.approx(0.01, rel=0.35)
+    assert found.source is noise.NoiseSource.SPECTRUM and found.sigma == pytest.approx(0.01, rel=0.35)
+
+
+@pytest.mark.parametrize(("step", "source"), [(0.01, noise.NoiseSource.RESOLUTION), (0.0, noise.NoiseSource.CONSTANT)])
+def test_noise_below_one_step_was_seen_alone(step: float, source: noise.NoiseSource) -> None:
+    """A reading that rests within one of its steps bounds the noise; one without steps that never changes does not."""
+    t = np.arange(6000)
+    motion = np.where((t // 1000) % 2 == 0, 0.0, np.sin(t / 20.0)) + 0.0
+    y = np.round(motion / step) * step if step else motion
+    found = noise.estimate([y], [noise.quiescent([motion], 0.01, True)])
+    assert found.source is source and found.source.seen_alone is (step > 0.0)
+    assert found.sigma == pytest.approx(step / np.sqrt(12.0), abs=1e-9)
 
 
 def test_whitened_noise_is_white() -> None:
@@ -167,7 +178,7 @@ def test_noise_is_what_does_not_repeat() -> None:
     repeats = noise.repeated([[x], [np.roll(x, 37)]], RULES)
     assert {(a, b) for a, _, b, _ in repeats} == {(0, 0), (1, 1), (0, 1)}
     found = noise.estimate(outputs, nowhere, noise.repeated([[x], [x]], RULES))
-    assert found.source == noise.REPEATS and found.sigma == pytest.approx(0.02, rel=0.05)
+    assert found.source is noise.NoiseSource.REPEATS and found.sigma == pytest.approx(0.02, rel=0.05)
     alone = noise.estimate(outputs, nowhere).sigma
     assert alone == pytest.approx(0.02, rel=0.15)  # the spectrum takes the jumps for noise, the middling difference does not
     assert noise.repeated([[x], [rng.standard_normal(t.size)]], RULES)[0][2] == 0
