@@ -66,6 +66,8 @@ class DataRules:
     clipped_share: float = 0.01  # at the largest reading, from which it is a limit
     clipped_run_samples: int = 5  # in a row at the limit
     clipped_overrun: float = 0.01  # share of the input's span by which it moves on
+    level_samples: int = 3  # of one value in a row, from which an input is held at a level
+    samples_between_levels: float = 1.0  # on average, up to which an input jumps: a resampled step may have one in between
     tone_power_share: float = 0.995  # of an input's power in one spectral line, from which it is one sinusoid
     tone_frequency_ratio: float = 1.1  # of the sinusoids of all recordings, below which they are one frequency
     reversal_share: float = 0.05  # of its span by which an input goes back that reverses

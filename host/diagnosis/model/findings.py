@@ -35,7 +35,7 @@ from host.diagnosis.model.pairs import (
     regression_by_spectra,
     typical,
 )
-from host.diagnosis.model.readings import Finding, coarse, counts, resolution, without_outliers
+from host.diagnosis.model.readings import Finding, coarse, counts, held_levels, resolution, without_outliers
 
 Array = npt.NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str], 
         if not data.recordings:
             return Inspected([], data.findings)
     for path in paths:
-        data.saturated(path)
+        data.saturated(path, driven)
     for path in paths:
         data.excitation(path)
     return Inspected(data.recordings, list(dict.fromkeys(data.findings)))
@@ -363,14 +363,19 @@ class _Inspection:
                 ]
                 return
 
-    def saturated(self, path: Pair) -> None:
-        """Find readings that stay at their largest or smallest value while their input continues to move."""
+    def saturated(self, path: Pair, driven: set[str]) -> None:
+        """Find readings that stay at their largest or smallest value while their input continues to move.
+
+        An input that is made of levels is meant to stay at them, and one that is zero rests. driven: outputs.
+        """
         both = [(path.output, path.input), (path.input, path.output)]
         for name, driver in both if path.law else both[:1]:
             fine = [r for r in self.recordings if resolution(r.channels[name], self.rules, switched=False) <= 0.0]
+            fine = [r for r in fine if name in driven or not held_levels(r.channels[name], self.rules)]
             lines = [(fill(r.channels[name]), fill(r.channels[driver])) for r in fine]
             for side, word in ((1.0, "largest"), (-1.0, "smallest")):
-                share = max((_clipped(y, x, side, self.rules) for y, x in lines), default=0.0)
+                limited = [(y, x) for y, x in lines if name in driven or np.max(side * y) != 0.0]
+                share = max((_clipped(y, x, side, self.rules) for y, x in limited), default=0.0)
                 if share > self.rules.clipped_share:
                     says = f"Column {self.columns[name]} stays at its {word} reading for {share:.1%} of a recording while "
                     says += f"{self.columns[driver]} moves on: it is limited there."

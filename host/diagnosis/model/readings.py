@@ -129,6 +129,19 @@ def resolution(values: Array, rules: DataRules, switched: bool) -> float:
     return smallest if bool(even.all()) and not constant_speed(values, smallest) else 0.0
 
 
+def held_levels(values: Array, rules: DataRules) -> bool:
+    """Whether a channel (n,) is held at levels and jumps from one to the next: a step, pulses, a staircase, a PRBS.
+
+    A motion that a limit clips runs through many values between two limits.
+    """
+    good = values[np.isfinite(values)]
+    lasts = np.diff(np.flatnonzero(np.concatenate(([True], np.diff(good) != 0.0, [True]))))
+    held = lasts >= rules.level_samples
+    between = int(np.sum(lasts[~held]))
+    jumps = int(np.count_nonzero(held)) - 1
+    return bool(np.unique(good).size == 2 or between <= rules.samples_between_levels * jumps)
+
+
 def repeated(values: Array, rules: DataRules) -> Places | None:
     """Sample (n,) whose reading each sample of `values` (n,) repeats, where a sensor is read more seldom than it is logged.
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import nominal_of
@@ -19,6 +21,34 @@ GEAR: dict[str, Any] = {
     "channels": {"motor": {"column": "m", "unit": "rad"}, "jaw": {"column": "y", "unit": "rad"}},
     "link": [{"input": "motor", "output": "jaw"}],
 }
+
+
+AXIS: dict[str, Any] = {
+    "name": "stage",
+    "kind": "axis",
+    "data": {"time": "t"},
+    "channels": {"force": {"column": "f", "unit": "N"}, "place": {"column": "y", "unit": "m"}},
+    "axis": {"input": "force", "output": "place", "terms": ["mass", "damping", "stiffness"], "hold": "zero"},
+    "parameters": {"mass": 1.1, "damping": 3.5, "stiffness": 140.0},
+}
+
+
+def stage(force: Callable[[np.ndarray], np.ndarray], noise_m: float = 1e-4) -> dict[str, np.ndarray]:
+    """A mass of 1.2 kg on 150 N/m and 3 N s/m under a held force (N) of time, for 20 s at 100 Hz."""
+    t, rng = np.arange(2000) * 0.01, np.random.default_rng(301)
+    f = force(t)
+    step = expm(np.array([[0.0, 1.0, 0.0], [-150.0 / 1.2, -3.0 / 1.2, 1.0 / 1.2], [0.0, 0.0, 0.0]]) * 0.01)[:2]
+    state, y = np.zeros(2), np.zeros(t.size)
+    for k in range(t.size):
+        y[k] = state[0]
+        state = step @ np.array([*state, f[k]])
+    return {"t": t, "f": f, "y": y + noise_m * rng.standard_normal(t.size)}
+
+
+def tones(t: np.ndarray) -> np.ndarray:
+    """Four tones (N) that never repeat a value."""
+    parts = zip((0.3, 0.9, 1.6, 2.6), (3.0, 2.0, 3.0, 2.0), (0.4, 2.1, 5.0, 1.2), strict=True)
+    return sum(a * np.sin(2.0 * np.pi * f * t + phase) for f, a, phase in parts)
 
 
 def motion(n: int = 600) -> dict[str, np.ndarray]:
@@ -38,6 +68,30 @@ def test_a_reading_that_is_limited_on_either_side_is_stated(gain: float, low: fl
     columns["y"] = np.clip(gain * columns["y"], low, high)
     limits = [finding.says for finding in said(columns) if finding.id == "saturated"]
     assert len(limits) == 1 and f"its {word} reading" in limits[0]
+
+
+LEVELS = np.random.default_rng(910).uniform(-5.0, 5.0, 60)
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        lambda t: np.where(t > 2.0, 4.0, 0.0),
+        lambda t: np.where(t % 2.0 < 0.8, 4.0, 1.0),
+        lambda t: np.sign(LEVELS)[(t / 0.35).astype(int)] * 5.0,
+        lambda t: np.sign(np.random.default_rng(1).standard_normal(t.size)) * 5.0,
+        lambda t: LEVELS[(t / 0.5).astype(int)],
+        lambda t: np.convolve(LEVELS[(t / 0.5).astype(int)], [0.5, 0.5])[: t.size],
+        lambda t: 4.0 * np.where(t % 2.0 < 0.8, np.sin(np.pi * (t % 2.0) / 0.8), 0.0),
+    ],
+    ids=["step", "pulses", "prbs", "white prbs", "staircase", "resampled staircase", "half sines"],
+)
+def test_an_input_that_is_held_at_levels_is_not_limited_there(force: Callable[[np.ndarray], np.ndarray]) -> None:
+    assert "saturated" not in {finding.id for finding in said(stage(force), AXIS)}
+
+
+def test_an_input_that_is_clipped_is_stated() -> None:
+    assert "saturated" in {finding.id for finding in said(stage(lambda t: np.clip(tones(t), -4.0, 4.0)), AXIS)}
 
 
 def test_a_short_channel_of_noise_is_no_sinusoid() -> None:
