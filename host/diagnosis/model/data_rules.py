@@ -35,6 +35,18 @@ class DataRules:
     repeated_regular_share: float = 0.9  # of its readings that last equally long, from which it repeats them
     repeated_fine_steps: float = 4.0  # smallest changes in the usual one; with less, a coarse reading stays the same
 
+    # Frozen channels: one value again and again while another channel moves on.
+    frozen_samples: int = 20  # of one value in a row, from which a channel that repeats hardly any may be frozen
+    frozen_repeats: float = 0.05  # of its other samples that repeat the one before, up to which it repeats hardly any
+    frozen_share: float = 0.8  # of a recording in such runs, up to which the other samples show how the channel is read
+    frozen_noise: float = 1e-5  # over size, above which noise is none of rounding: six digits or single precision
+    frozen_alternation: float = 0.65  # of high differences that change sign: 0.81 do for white noise, few for a motion
+    frozen_jump_ratio: float = 3.0  # of the change at an end of a run to those that nine in ten samples do not exceed
+    frozen_stop_ratio: float = 0.5  # of the speed next to a run to the usual one, from which a motion stops at once
+    frozen_driver_share: float = 0.1  # of its span by which another channel moves on
+    frozen_error_ratio: float = 4.0  # of the nominal residual in a run to that elsewhere, without the run (RMS)
+    frozen_unexplained: float = 0.03  # of an output's variance that this residual is at least: motion that goes on as driven
+
     # Copies: a channel that was computed from another one.
     copy_residual: float = 1e-7  # over span, below which a channel is a copy of another
     copy_noise: float = 1e-6  # noise over span, from which two channels cannot be alike by chance

@@ -110,7 +110,7 @@ def load(
             _cut(whole, segment.name, segment.rows[0], segment.rows[1], lead=spec.data.lead_rows) for segment in cuts
         ] or [whole]
     parts = [part for segment in segments for part in _at_gaps(segment, rules)]
-    return _split(_named_apart(parts), spec.data.heldout)
+    return _split(named_apart(parts), spec.data.heldout)
 
 
 def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
@@ -120,12 +120,14 @@ def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
     Time runs on. Parts of fewer than `least_rows` are left out, unless there is no other.
     """
     seen = np.any([np.isfinite(values) for values in segment.channels.values()], axis=0)
-    rows = np.flatnonzero(seen)
-    if rows.size == 0:
-        return [segment]
+    between = np.diff(np.flatnonzero(seen))
+    return parted(segment, seen, rules) if np.any(between > rules.gap_samples) else [segment]
+
+
+def parted(segment: Recording, known: Mask, rules: DataRules) -> list[Recording]:
+    """The recording between its first and last `known` (n,) sample, cut where more than `gap_samples` are not known."""
+    rows = np.flatnonzero(known)
     ends = np.flatnonzero(np.diff(rows) > rules.gap_samples)
-    if ends.size == 0:
-        return [segment]
     firsts, lasts = [rows[0], *rows[ends + 1]], [*rows[ends], rows[-1]]
     parts = []
     for first, last in zip(firsts, lasts, strict=True):
@@ -138,13 +140,15 @@ def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
     return parts or [segment]
 
 
-def _named_apart(segments: list[Recording]) -> list[Recording]:
+def named_apart(segments: list[Recording]) -> list[Recording]:
     """Recordings of one name get a number: two stay two."""
-    count: dict[str, int] = {}
+    taken: set[str] = set()
     out = []
     for segment in segments:
-        count[segment.name] = count.get(segment.name, 0) + 1
-        out.append(segment if count[segment.name] == 1 else replace(segment, name=f"{segment.name} ({count[segment.name]})"))
+        names = (segment.name if k == 1 else f"{segment.name} ({k})" for k in itertools.count(1))
+        name = next(name for name in names if name not in taken)
+        taken.add(name)
+        out.append(segment if name == segment.name else replace(segment, name=name))
     return out
 
 

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.data_rules import DataRules
-from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.dataset import Recording, named_apart
+from host.diagnosis.model.frozen import frozen_finding, frozen_readings, without_runs
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
 from host.diagnosis.model.pairs import (
@@ -25,6 +26,7 @@ from host.diagnosis.model.pairs import (
     as_stated,
     centred,
     copy_of,
+    driven_of,
     elsewhere,
     explained_by_gain,
     explained_by_law,
@@ -60,6 +62,7 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str], 
     if not data.recordings:
         return Inspected([], data.findings)
     data.stamps()
+    data.frozen(driven_of(spec))
     driven = {path.input if path.law and spec.impedance is not None else path.output for path in paths}
     data.alone(sorted(vital), driven)
     data.exchanged_outputs([path for path in paths if not path.law])
@@ -158,6 +161,22 @@ class _Inspection:
             says += "milliseconds or microseconds, every rate and time constant below is in that unit, not in seconds: set "
             says += "data.time_scale (0.001 for milliseconds)."
             self.find("unit", column, says)
+
+    def frozen(self, driven: set[str]) -> None:
+        """Leave out readings of outputs that are frozen whatever moves them. driven: outputs.
+
+        What follows the last reading is left out, too: it can be compared with nothing.
+        """
+        units = {key: channel.unit for key, channel in self.spec.channels.items()}
+        kept: list[Recording] = []
+        for recording in self.recordings:
+            found = frozen_readings(recording, driven, self.rules)
+            for name, mover in {run.name: mover for run, mover in found}.items():
+                runs = [run for run, _ in found if run.name == name]
+                names = self.columns.get(name, name), self.columns.get(mover, mover)
+                self.findings.append(frozen_finding(recording, runs, names[0], units.get(name, ""), names[1]))
+            kept += without_runs(recording, [run for run, _ in found], driven, self.rules)
+        self.recordings = named_apart(kept)
 
     def alone(self, names: list[str], driven: set[str]) -> None:
         """Each of the channels `names` by itself: outliers, coarse steps, and whole numbers where a unit says otherwise."""

@@ -58,6 +58,14 @@ def pairs_of(spec: NominalSpec) -> list[Pair]:
     return found
 
 
+def driven_of(spec: NominalSpec) -> set[str]:
+    """Channels that the nominal model predicts, where its sections name them (not those of a rig)."""
+    found = {link.output for link in spec.link}
+    for section in (spec.axis, spec.impedance):
+        found |= {section.output} if section is not None else set()
+    return found | set(spec.simulator.outputs if spec.simulator is not None else ())
+
+
 def _stated(spec: NominalSpec, law: Sequence[str]) -> tuple[float, ...]:
     return tuple(spec.start(term, 0.0)[0] if term in spec.parameters else 0.0 for term in law)
 

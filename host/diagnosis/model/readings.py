@@ -19,7 +19,7 @@ Places = npt.NDArray[np.int64]
 @dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped,
-    saturated, outliers, quantized, repeated, session, hold or jump; `channel`: the column's name in the recordings.
+    saturated, outliers, frozen, quantized, repeated, session, hold or jump; `channel`: the column's name in the recordings.
     """
 
     id: str
