@@ -37,9 +37,11 @@ from host.diagnosis.model.pairs import (
     regression_by_spectra,
     typical,
 )
-from host.diagnosis.model.readings import Finding, coarse, counts, held_levels, resolution, without_outliers
+from host.diagnosis.model.readings import Finding, coarse, counts, held_levels, outliers, resolution, without_outliers
+from host.diagnosis.model.spikes import NEAR, around, unanswered
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 FACTORS = {1e3: "1000 (milli)", 1e-3: "1/1000 (milli)", 1e6: "10^6 (micro)", 1e-6: "10^-6 (micro)"}
 FACTORS |= {180.0 / np.pi: "57.3 (degrees and radians)", np.pi / 180.0: "1/57.3 (degrees and radians)"}
@@ -64,7 +66,7 @@ def inspect(spec: NominalSpec, recordings: list[Recording], optional: set[str], 
     data.stamps()
     data.frozen(driven_of(spec))
     driven = {path.input if path.law and spec.impedance is not None else path.output for path in paths}
-    data.alone(sorted(vital), driven)
+    data.alone(sorted(vital), driven, paths)
     data.exchanged_outputs([path for path in paths if not path.law])
     for path in paths:
         data.compared(path)
@@ -178,10 +180,26 @@ class _Inspection:
             kept += without_runs(recording, [run for run, _ in found], driven, self.rules)
         self.recordings = named_apart(kept)
 
-    def alone(self, names: list[str], driven: set[str]) -> None:
+    def outliers(self, recording: Recording, names: list[str], driven: set[str], paths: list[Pair]) -> dict[str, Mask]:
+        """Samples (n,) of each channel that are no readings. A spike of an input that its output answers is one, as is the
+        answer.
+        """
+        bad = {name: outliers(recording.channels[name], self.rules) for name in names if name in recording.channels}
+        for path in paths:
+            pair = (path.input, path.output)
+            for name, output in (pair, pair[::-1]):
+                if name in driven or output not in driven or not {name, output} <= bad.keys() or not bad[name].any():
+                    continue
+                answer = unanswered(recording, path, name, bad[name], bad[output], self.rules)
+                bad[output] = bad[output] & ~around(bad[name] & ~answer, NEAR)
+                bad[name] = answer
+        return bad
+
+    def alone(self, names: list[str], driven: set[str], paths: list[Pair]) -> None:
         """Each of the channels `names` by itself: outliers, coarse steps, and whole numbers where a unit says otherwise."""
         columns, units = self.columns, {key: channel.unit for key, channel in self.spec.channels.items()}
-        self.recordings = without_outliers(self.recordings, names, columns, self.findings, self.rules)
+        bad = [self.outliers(recording, names, driven, paths) for recording in self.recordings]
+        self.recordings = without_outliers(self.recordings, bad, columns, self.findings)
         coarse(self.recordings, names, driven, columns, units, self.findings, self.rules)
         for name in counts(self.recordings, names, columns, units, self.rules):
             says = f"Column {columns[name]} holds whole numbers only, called {units[name]}: these are probably counts. "

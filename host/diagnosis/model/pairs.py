@@ -211,6 +211,20 @@ def regression(recording: Recording, path: Pair, exchanged: bool = False) -> Law
     return LawFit(found[:-1], rms[:-1], explained)
 
 
+def sides_of_law(recording: Recording, path: Pair, window: int) -> tuple[Array, Array]:
+    """Terms (k + 1, n) of which a pair's law or gain makes a signal (n,), and that signal, filtered alike.
+
+    The terms end with ones. window: samples over which a law is smoothed.
+    """
+    x, y = fill(recording.channels[path.input]), fill(recording.channels[path.output])
+    if not path.law:
+        return np.array([x, np.ones_like(x)]), y
+    if path.reads == "acceleration":
+        terms, force = _by_spectra(recording, path)
+        return np.vstack([terms, np.ones_like(force)]), force
+    return _terms(path, y, recording.dt_s, window), smooth_derivatives(x, recording.dt_s, window)[0]
+
+
 def _terms(path: Pair, motion: Array, dt: float, window: int) -> Array:
     """Rows (k + 1, n) that the coefficients of the law multiply, by derivatives smoothed over `window`, and ones."""
     x, v, a = smooth_derivatives(motion, dt, window)
@@ -233,6 +247,11 @@ def regression_by_spectra(recording: Recording, path: Pair) -> LawFit:
 
     An integral of a reading with an offset drifts. All terms and the force lose the same slow part.
     """
+    return _least_squares(*_by_spectra(recording, path))
+
+
+def _by_spectra(recording: Recording, path: Pair) -> tuple[Array, Array]:
+    """Terms (k, n) and force (n,) of the law of a recorded acceleration, without what is slow."""
     rows = np.vstack([fill(recording.channels[name]) for name in (path.output, path.input)])
     n = rows.shape[1]
     window = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
@@ -243,7 +262,7 @@ def regression_by_spectra(recording: Recording, path: Pair) -> LawFit:
     a, force = np.where(kept, spectra, 0.0)
     table = {"mass": a, "damping": a / (1j * turn), "stiffness": -a / turn**2}
     terms = np.array([np.fft.irfft(table[term], n) for term in path.law])
-    return _least_squares(terms, np.fft.irfft(force, n))
+    return terms, np.fft.irfft(force, n)
 
 
 def explained_by_law(fits: list[LawFit]) -> float:

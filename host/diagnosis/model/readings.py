@@ -76,34 +76,40 @@ def lost(values: Array, rules: DataRules) -> Mask:
     return found & np.isfinite(values) if ordinary else np.zeros(line.size, dtype=bool)
 
 
-def without_outliers(
-    recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding], rules: DataRules
-) -> list[Recording]:
-    """Recordings in which samples of the channels `names` that are no readings are missing; a finding says how many.
+def outliers(values: Array, rules: DataRules) -> Mask:
+    """Samples (n,) of a channel that are no readings: those that stand alone, and codes for a lost reading.
 
     Single samples of a channel that holds still otherwise are left: those may be blows, and meant.
     """
-    for name in names:
+    if np.count_nonzero(np.isfinite(values)) < rules.outlier_fewest_samples:
+        return np.zeros(values.size, dtype=bool)
+    noise = scatter(values)
+    bad = wild(values, noise, rules)
+    if float(np.nanstd(np.where(bad, np.nan, values))) <= rules.motion_over_noise * noise:
+        bad = np.zeros(values.size, dtype=bool)
+    return bad | lost(values, rules)
+
+
+def without_outliers(
+    recordings: list[Recording], bad: list[dict[str, Mask]], columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """Recordings in which the `bad` samples (n,) of each channel are missing; a finding says how many.
+
+    bad: of each recording, by channel.
+    """
+    for name in dict.fromkeys(name for of_one in bad for name in of_one):
         count = total = 0
         first = ""
         cleaned = []
-        for recording in recordings:
-            values = recording.channels.get(name)
-            if values is None or np.count_nonzero(np.isfinite(values)) < rules.outlier_fewest_samples:
-                cleaned.append(recording)
-                continue
-            noise = scatter(values)
-            bad = wild(values, noise, rules)
-            rest = np.where(bad, np.nan, values)
-            if float(np.nanstd(rest)) <= rules.motion_over_noise * noise:
-                bad = np.zeros(values.size, dtype=bool)
-            bad |= lost(values, rules)
-            if bad.any():
-                where = recording.begin_s + float(recording.time_s[int(np.argmax(bad))])
-                unit = "s" if recording.timed else "samples"
-                first = first or f"first at {where:.4g} {unit} of {recording.name}"
-                recording = replace(recording, channels={**recording.channels, name: np.where(bad, np.nan, values)})
-            count, total = count + int(bad.sum()), total + values.size
+        for recording, of_one in zip(recordings, bad, strict=True):
+            if name in of_one:
+                values, mask = recording.channels[name], of_one[name]
+                count, total = count + int(mask.sum()), total + values.size
+                if mask.any():
+                    where = recording.begin_s + float(recording.time_s[int(np.argmax(mask))])
+                    unit = "s" if recording.timed else "samples"
+                    first = first or f"first at {where:.4g} {unit} of {recording.name}"
+                    recording = replace(recording, channels={**recording.channels, name: np.where(mask, np.nan, values)})
             cleaned.append(recording)
         recordings = cleaned
         if count:
@@ -138,8 +144,7 @@ def held_levels(values: Array, rules: DataRules) -> bool:
     lasts = np.diff(np.flatnonzero(np.concatenate(([True], np.diff(good) != 0.0, [True]))))
     held = lasts >= rules.level_samples
     between = int(np.sum(lasts[~held]))
-    jumps = int(np.count_nonzero(held)) - 1
-    return bool(np.unique(good).size == 2 or between <= rules.samples_between_levels * jumps)
+    return bool(np.unique(good).size == 2 or between <= rules.samples_between_levels * np.count_nonzero(held))
 
 
 def repeated(values: Array, rules: DataRules) -> Places | None:

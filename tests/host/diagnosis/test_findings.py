@@ -12,7 +12,8 @@ from scipy.linalg import expm
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected
+from host.diagnosis.pipeline import inspected, prepare
+from host.diagnosis.selection.search import fit_nominal
 
 GEAR: dict[str, Any] = {
     "name": "gear",
@@ -92,6 +93,53 @@ def test_an_input_that_is_held_at_levels_is_not_limited_there(force: Callable[[n
 
 def test_an_input_that_is_clipped_is_stated() -> None:
     assert "saturated" in {finding.id for finding in said(stage(lambda t: np.clip(tones(t), -4.0, 4.0)), AXIS)}
+
+
+SPIKES = np.random.default_rng(7).choice(np.arange(50, 1950), 12, replace=False)
+
+
+def spiked(values: np.ndarray, size: float) -> np.ndarray:
+    spikes = np.zeros(values.size)
+    spikes[SPIKES] = size * np.where(SPIKES % 2, 1.0, -1.0)
+    return values + spikes
+
+
+@pytest.mark.parametrize("answered", [True, False])
+@pytest.mark.parametrize("noise_m", [1e-5, 1e-3])
+def test_a_spike_of_an_input_is_an_outlier_where_the_output_does_not_answer(answered: bool, noise_m: float) -> None:
+    columns = stage(lambda t: spiked(tones(t), 100.0 if answered else 0.0), noise_m)
+    columns["f"] = spiked(tones(columns["t"]), 100.0)
+    texts = [finding.says for finding in said(columns, AXIS) if finding.id == "outliers"]
+    assert [text[:8] for text in texts] == ([] if answered else ["24 of 40"])  # in two recordings
+
+
+@pytest.mark.parametrize("late", [0, 2])
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_gear_answers_a_spike_by_its_gain(answered: bool, late: int) -> None:
+    """A mechanism that is late by two samples answers as well."""
+    columns = motion(2000)
+    columns["m"], smooth = spiked(columns["m"], 3.0), columns["m"]
+    y = np.roll(columns["m"] if answered else smooth, late)
+    columns["y"] = 1.2 * y + 1e-3 * np.random.default_rng(3).standard_normal(y.size)
+    assert [f.channel for f in said(columns) if f.id == "outliers"] == ([] if answered else ["m"])
+
+
+def test_derivative_kicks_of_a_controller_move_the_mass() -> None:
+    """All set-point steps were cut off the force, the first at the first sample: the mass was 6.3 kg instead of 1.5."""
+    rng, dt = np.random.default_rng(120), 0.005
+    step = expm(np.array([[0.0, 1.0, 0.0], [-40.0 / 1.5, -5.0 / 1.5, 1.0 / 1.5], [0.0, 0.0, 0.0]]) * dt)[:2]
+    goal = np.repeat(rng.uniform(-0.02, 0.02, 10), 160)
+    f, y, state, total, before = np.zeros(goal.size), np.zeros(goal.size), np.zeros(2), 0.0, 0.0
+    for k in range(goal.size):
+        y[k] = state[0] + 2e-5 * rng.standard_normal()
+        error = goal[k] - y[k]
+        total += error * dt
+        f[k] = 400.0 * error + 800.0 * total + 12.0 * (error - before) / dt
+        before, state = error, step @ np.array([*state, f[k]])
+    columns = {"t": np.arange(goal.size) * dt, "f": f, "y": y}
+    assert not [finding for finding in said(columns, AXIS) if finding.id == "outliers"]
+    _, problem, _ = prepare(nominal_of(AXIS), [Table("a", columns)])
+    assert fit_nominal(problem).values == pytest.approx([1.5, 5.0, 40.0], rel=0.005)
 
 
 def test_a_short_channel_of_noise_is_no_sinusoid() -> None:
