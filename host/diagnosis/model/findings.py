@@ -239,6 +239,8 @@ class _Inspection:
         input_column, output_column = self.columns[path.input], self.columns[path.output]
         copied = copy_of(self.recordings, path.input, path.output, self.rules)
         if copied is not None:
+            units = {self.spec.channels[name].unit for name in (path.input, path.output)}
+            copied = replace(copied, unlike=bool(path.law) or len(units) > 1)
             self.find("alias", output_column, copied.sentence(output_column, input_column, self.recordings[0]))
             if copied.whole:
                 self.recordings = []

@@ -106,7 +106,8 @@ def _left(x: Array, y: Array) -> float:
 class Copied:
     """A channel that is another one, scaled and shifted, up to `tolerance`.
 
-    noisy: with the noise of that one, so that it was not measured.
+    noisy: with the noise of that one, so that it was not measured. unlike: the two are quantities of different kinds, such
+    as a force and a place, which no plant makes equal.
     """
 
     gain: float
@@ -114,21 +115,29 @@ class Copied:
     lag: float  # samples
     noisy: bool
     tolerance: float
+    unlike: bool = False
 
     @property
     def whole(self) -> bool:
         """Return whether the channel has no information beyond the other."""
-        return self.noisy or (self.lag == 0.0 and abs(self.gain - 1.0) < self.tolerance and self.offset == 0.0)
+        return self.noisy or (self.same and (self.lag == 0.0 or self.unlike))
+
+    @property
+    def same(self) -> bool:
+        """Return whether the channel has the values of the other, perhaps later."""
+        return abs(self.gain - 1.0) < self.tolerance and self.offset == 0.0
 
     def sentence(self, copy: str, original: str, recording: Recording) -> str:
         """Return the sentence of the finding."""
-        if self.gain == 1.0 and self.offset == 0.0:
+        if self.same:
             says = f"Column {copy} is column {original} in every sample"
         else:
             says = f"Column {copy} is column {original} times {self.gain:.4g}"
         if self.lag:
             late = f"{self.lag * recording.dt_s:.4g} s" if recording.timed else f"{self.lag:.4g} samples"
             says += f", {late} later"
+        if self.whole and not self.noisy:
+            return says + ", exactly: it was copied, not measured. There is nothing to compare."
         if self.whole:
             return says + ", noise included: it was computed from it, not measured. There is nothing to compare."
         return says + ", exactly and without any noise: was it measured, or computed from it?"
@@ -177,6 +186,7 @@ def _copied(recording: Recording, a: str, b: str, rules: DataRules) -> Copied | 
         whole = float(q / gain) + lag
         near_whole = abs(whole - round(whole)) < 1e-4
         noisy = white_level(x) >= rules.copy_noise * float(np.ptp(x))
+        offset = 0.0 if abs(offset) < most_left * float(np.ptp(y)) else offset
         return Copied(gain, float(offset), round(whole) if near_whole else whole, noisy, most_left)
     return None
 

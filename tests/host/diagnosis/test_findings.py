@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from host.diagnosis.model.findings import Finding
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
-from host.diagnosis.pipeline import inspected, prepare
+from host.diagnosis.pipeline import NothingToCompare, inspected, prepare
 from host.diagnosis.selection.search import fit_nominal
 
 GEAR: dict[str, Any] = {
@@ -93,6 +93,18 @@ def test_an_input_that_is_held_at_levels_is_not_limited_there(force: Callable[[n
 
 def test_an_input_that_is_clipped_is_stated() -> None:
     assert "saturated" in {finding.id for finding in said(stage(lambda t: np.clip(tones(t), -4.0, 4.0)), AXIS)}
+
+
+@pytest.mark.parametrize(("nominal", "refused"), [(AXIS, True), (GEAR, False)])
+def test_a_place_is_no_late_copy_of_a_force(nominal: dict[str, Any], refused: bool) -> None:
+    """A delay was named (0.92). Behind a gear of one unit it may be a simulated one, and is only stated."""
+    columns = stage(tones)
+    columns["m"], columns["y"] = columns["f"], np.r_[np.full(5, columns["f"][0]), columns["f"][:-5]]
+    if refused:
+        with pytest.raises(NothingToCompare, match="0.05 s later, exactly: it was copied, not measured"):
+            said(columns, nominal)
+    else:
+        assert [finding.id for finding in said(columns, nominal)] == ["alias"]
 
 
 SPIKES = np.random.default_rng(7).choice(np.arange(50, 1950), 12, replace=False)
