@@ -21,6 +21,8 @@ from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+# Names of columns that hold times, if their values increase: t, time_s, Time (s), stamp, timestamp_ms, ...
+TIME = re.compile(r"(t|time|stamp|timestamp|seconds)(?![a-z0-9])", re.IGNORECASE)
 BLOCKS_OF_A_LONE_RECORDING = 10
 # Of an even grid: points for each row, and points in all, above which its gaps are cut short.
 MOST_EMPTY, LARGEST_GRID = 10, 1_000_000
@@ -164,6 +166,9 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
     for key, channel in needed.items():
         if channel.column in columns:
             channels[key] = channel.sign * channel.scale * columns[channel.column] + channel.offset
+        elif channel.column in table.unread:
+            found = f"column {channel.column} of {name} with {table.unread[channel.column]}"
+            raise InputError(f"channels.{key}.column", found, "real numbers")
         elif key not in optional:
             raise InputError(f"channels.{key}.column", channel.column, f"a column of {name}: {', '.join(sorted(columns))}")
     n = max(values.size for values in channels.values())
@@ -174,7 +179,7 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
         raise InputError("recording", f"{n} rows in {name}", f"at least {rules.least_rows} rows")
     infinite = tuple(key for key, values in channels.items() if np.isinf(values).any())
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
-    time_s, timed = _time_line(spec, name, columns, n)
+    time_s, timed = _time_line(spec, table, n)
     dt_s = float(np.median(np.diff(time_s)))
     if dt_s <= 0.0:
         raise InputError("data.time", f"more than half of the stamps of {name} repeat", "seconds that increase")
@@ -186,7 +191,8 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
     return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter, infinite=infinite)
 
 
-def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:
+def _time_line(spec: NominalSpec, table: Table, n: int) -> tuple[Array, bool]:
+    name, columns = table.name, table.columns
     if spec.data.time is not None:
         if spec.data.time not in columns:
             raise InputError(
@@ -198,6 +204,11 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
         return time_s, True
     if spec.data.rate_Hz is not None:
         return np.arange(n) / spec.data.rate_Hz, True
+    channels = {channel.column for channel in spec.channels.values()}
+    for column, values in columns.items():
+        if column not in channels and TIME.match(column) and values.size == n > 1 and bool(np.all(np.diff(values) > 0.0)):
+            found = f"nothing, although column {column} of {name} seems to hold times"
+            raise InputError("data.time", found, f'the column with seconds or dates, as time = "{column}", or rate_Hz')
     return np.arange(n, dtype=np.float64), False
 
 

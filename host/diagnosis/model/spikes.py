@@ -18,7 +18,7 @@ from host.diagnosis.model.pairs import Pair, sides_of_law
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-NEAR = 3  # samples about a spike in which an answer is looked for, beside the length of the law's smoothing
+NEAR = 3  # samples about a spike in which an answer is looked for, in addition to the law's smoothing
 
 
 def around(spikes: Mask, reach: int) -> Mask:

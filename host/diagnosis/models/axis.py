@@ -26,6 +26,7 @@ from host.diagnosis.model.model import (
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import calm, fill, reading_noise, smooth_derivatives, wander_at_rest
 from host.diagnosis.models import balance
+from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 READ = ("position", "velocity", "acceleration")
@@ -94,6 +95,10 @@ class AxisModel(Model):
         parameters = []
         for term in self.spec.terms:
             value, free = spec.start(term, defaults[term][0])
+            if (term == "mass" and value == 0.0) or (term != "offset" and value < 0.0):
+                least = "a value above 0" if term == "mass" else "0 or a value above it"
+                wanted = f"{least}; leave {term} out of axis.terms if the axis has none"
+                raise InputError(f"parameters.{term}", value, wanted)
             low, high = (value, value) if not free else (-np.inf, np.inf) if term == "offset" else (1e-12, 1e12)
             parameters.append(Parameter(term, defaults[term][1], (value,), low, high, log=term != "offset" and free))
         self.given = [term for term in self.spec.terms if term in spec.parameters]
