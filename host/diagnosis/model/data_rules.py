@@ -16,7 +16,8 @@ class DataRules:
     constant_span: float = 1e-9  # span over size below which a channel is constant
     uneven_period_share: float = 0.2  # largest deviation of a period from the median one that counts as even
     sampling_period_ratio: float = 1.05  # of recordings, from which they are sampled at different rates
-    slow_period_s: float = 1.0  # sampling period from which the time column is probably not in seconds
+    slow_period_s: float = 1.0  # sampling period from which the time column may not be in seconds,
+    slow_period_ratio: float = 1.0  # and of a plant's slowest stated time constant to it, below which it probably is not
 
     # Samples that stand alone, and codes for a lost reading.
     outlier_noise_deviations: float = 12.0  # from the median of the neighbours,

@@ -37,8 +37,18 @@ from host.diagnosis.model.pairs import (
     regression_by_spectra,
     typical,
 )
-from host.diagnosis.model.readings import Finding, coarse, counts, held_levels, outliers, resolution, without_outliers
+from host.diagnosis.model.readings import (
+    MECHANICAL,
+    Finding,
+    coarse,
+    counts,
+    held_levels,
+    outliers,
+    resolution,
+    without_outliers,
+)
 from host.diagnosis.model.spikes import NEAR, around, unanswered
+from host.diagnosis.model.time_constants import slowest_s
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -158,11 +168,24 @@ class _Inspection:
         if periods and max(periods) > rules.sampling_period_ratio * min(periods):
             says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."
             self.find("clock", "time", says)
-        if column is not None and periods and min(periods) >= rules.slow_period_s:
+        if column is not None and periods and self.too_slow(timed, min(periods)):
             says = f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples. If it is in "
             says += "milliseconds or microseconds, every rate and time constant below is in that unit, not in seconds: set "
             says += "data.time_scale (0.001 for milliseconds)."
             self.find("unit", column, says)
+
+    def too_slow(self, timed: list[Recording], period_s: float) -> bool:
+        """Whether stamps are probably no seconds: the plant is faster by what is stated, or whole numbers stamp a mechanism.
+
+        A thermal plant that is sampled once a second is not remarkable.
+        """
+        if period_s < self.rules.slow_period_s or self.spec.data.time_scale != 1.0:
+            return False
+        stated_s = slowest_s(self.spec)
+        if stated_s is not None:
+            return stated_s < self.rules.slow_period_ratio * period_s
+        whole = all(np.all(r.time_s + r.begin_s == np.round(r.time_s + r.begin_s)) for r in timed)
+        return whole and all(channel.unit in MECHANICAL for channel in self.spec.channels.values())
 
     def frozen(self, driven: set[str]) -> None:
         """Leave out readings of outputs that are frozen whatever moves them. driven: outputs.

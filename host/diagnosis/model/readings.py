@@ -14,6 +14,7 @@ from host.diagnosis.model.operators import constant_speed, fill, quantum
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Places = npt.NDArray[np.int64]
+MECHANICAL = ("rad", "m", "m/s", "m/s2", "N", "N m")  # units of motions and forces, which are no whole numbers
 
 
 @dataclass(frozen=True)
@@ -201,10 +202,6 @@ def counts(
         values = [r.channels[name][np.isfinite(r.channels[name])] for r in recordings if name in r.channels]
         together = np.concatenate(values) if values else np.zeros(0)
         whole = together.size > 0 and bool(np.all(together == np.round(together)))
-        if (
-            whole
-            and np.unique(together).size > rules.switched_levels
-            and units.get(name, "") in ("rad", "m", "m/s", "m/s2", "N", "N m")
-        ):
+        if whole and np.unique(together).size > rules.switched_levels and units.get(name, "") in MECHANICAL:
             found.append(name)
     return found

@@ -246,7 +246,7 @@ def test_a_column_of_times_that_the_nominal_model_does_not_name_is_bad_input() -
     untimed = nominal_of({key: value for key, value in STAGE.items() if key != "data"})
     x = np.random.default_rng(1).standard_normal((2, 200))
     for name in ("t", "Time (s)", "time_s", "stamp"):
-        with pytest.raises(InputError, match="data.time: found .*although column"):
+        with pytest.raises(InputError, match=r"data\.time: found .*although column"):
             inspected(untimed, [Table("r", {name: np.arange(200) * 0.01, "f": x[0], "y": x[1]})])
     for name, values in (("temperature", np.arange(200.0)), ("t", x[0]), ("index", np.arange(200.0))):
         assert not inspected(untimed, [Table("r", {name: values, "f": x[0], "y": x[1]})]).recordings[0].timed

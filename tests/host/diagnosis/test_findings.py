@@ -107,6 +107,40 @@ def test_a_place_is_no_late_copy_of_a_force(nominal: dict[str, Any], refused: bo
         assert [finding.id for finding in said(columns, nominal)] == ["alias"]
 
 
+def slowly(period: float, nominal: dict[str, Any]) -> set[str]:
+    """Findings in a recording whose stamps grow by `period`."""
+    columns = motion() | {"t": period * np.arange(600)}
+    return {finding.id for finding in said(columns, nominal)}
+
+
+HEATER: dict[str, Any] = {
+    "name": "heater",
+    "kind": "linear",
+    "data": {"time": "t"},
+    "channels": {"power": {"column": "m", "unit": "W"}, "rise": {"column": "y", "unit": "K"}},
+    "linear": {"inputs": ["power"], "outputs": ["rise"], "numerator": ["K"], "denominator": ["tau", 1.0]},
+}
+STATES = {"inputs": ["power"], "outputs": ["rise"], "A": [["-1/tau"]], "B": [[1.0]], "C": [["K/tau"]]}
+
+
+@pytest.mark.parametrize(
+    ("period", "nominal", "stated"),
+    [
+        (1.0, HEATER | {"parameters": {"tau": 70.0, "K": 2.5}}, False),
+        (1.0, HEATER | {"parameters": {"tau": 0.07, "K": 2.5}}, True),
+        (10.0, HEATER | {"parameters": {"tau": 70.0, "K": 2.5}}, False),
+        (10.0, HEATER | {"parameters": {"tau": 0.07, "K": 2.5}, "linear": STATES}, True),
+        (10.0, GEAR, True),
+        (1.003, GEAR, False),
+        (10.0, GEAR | {"link": [GEAR["link"][0] | {"lag_order": 1}], "parameters": {"time_constant_1": 40.0}}, False),
+        (10.0, GEAR | {"data": {"time": "t", "time_scale": 1.0001}}, False),
+        (0.02, GEAR, False),
+    ],
+)
+def test_slow_sampling_is_remarkable_for_a_fast_plant_alone(period: float, nominal: dict[str, Any], stated: bool) -> None:
+    assert ("unit" in slowly(period, nominal)) is stated
+
+
 SPIKES = np.random.default_rng(7).choice(np.arange(50, 1950), 12, replace=False)
 
 
