@@ -30,6 +30,7 @@ from host.diagnosis.model.effect import Candidate, Port
 from host.diagnosis.model.findings import Finding, Inspected, inspect
 from host.diagnosis.model.model import Model, Segment
 from host.diagnosis.model.nominal import EffectSpec, NominalSpec
+from host.diagnosis.model.pairs import driven_of
 from host.diagnosis.model.progress import Overall
 from host.diagnosis.model.spectral_line import common_line, distorted
 from host.diagnosis.model.tables import Table
@@ -45,6 +46,7 @@ from host.diagnosis.selection.equivalence import (
     with_unlisted_rival,
     without_improbable,
 )
+from host.diagnosis.selection.frozen_inputs import without_frozen
 from host.diagnosis.selection.locate import Condition, condition, inside, joined, mismatch_of, windows
 from host.diagnosis.selection.readings_apart import readings_apart
 from host.diagnosis.selection.sampling import hold_between_samples, late_by_a_sample
@@ -283,6 +285,7 @@ def _diagnosed(
         *uncertain(problem, found.best, spans),
         *model.findings(),
     ]
+    result.findings.sort(key=lambda finding: finding.id != "frozen")  # it is to be corrected before anything else
     if not found.best.terms and remainder.sure:
         result.findings += _jumps(full, fits)
     result.designs = [] if budget.spent() else design(problem, found, standing, overall.part(0.9, 1.0))
@@ -333,6 +336,9 @@ def _searched(
     recordings, apart = readings_apart(problem, data.recordings)
     if apart:
         model, problem, full = problems(spec, recordings, rules)
+    recordings, frozen = _without_frozen(spec, problem, recordings)
+    if frozen:
+        model, problem, full = problems(spec, recordings, rules)
     recordings, lone = _without_lone_samples(problem, full, recordings)
     if lone:
         model, problem, full = problems(spec, recordings, rules)
@@ -353,7 +359,7 @@ def _searched(
     if to_noise and not at_white_noise(problem, found.best if late is None else late.fit):
         return None
     found = concluded(problem, found, candidate_effects, progress)
-    begun = _Searched(model, problem, full, found, [*apart, *lone, *held])
+    begun = _Searched(model, problem, full, found, [*apart, *frozen, *lone, *held])
     return _past_sampling(spec, begun, recordings, candidate_effects, overall.part(later, high))
 
 
@@ -427,6 +433,21 @@ def _past_delay(
     if ahead < -max(rules.heldout_log_likelihood, rules.refinement_tolerance * earned):
         return None
     return _Searched(model, again, full, found, [*begun.findings, *late_by_a_sample(again, late, past=True)])
+
+
+def _without_frozen(
+    spec: NominalSpec, problem: Problem, recordings: list[Recording]
+) -> tuple[list[Recording], list[Finding]]:
+    """Recordings without the runs in which a channel is frozen, and what was found. Those of a rig are not looked at."""
+
+    def fitted(parts: list[Recording]) -> Fit:
+        _, own, full = problems(spec, parts, problem.rules)
+        return at_full_rate(full, fit_nominal(own), own)
+
+    if spec.kind == "rig":
+        return recordings, []
+    outputs = [output.channel for output in problem.model.outputs]
+    return without_frozen(recordings, driven_of(spec), outputs, problem.columns, fitted, problem.rules.data)
 
 
 def _without_lone_samples(

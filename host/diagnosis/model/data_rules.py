@@ -16,13 +16,16 @@ class DataRules:
     constant_span: float = 1e-9  # span over size below which a channel is constant
     uneven_period_share: float = 0.2  # largest deviation of a period from the median one that counts as even
     sampling_period_ratio: float = 1.05  # of recordings, from which they are sampled at different rates
-    slow_period_s: float = 1.0  # sampling period from which the time column is probably not in seconds
+    slow_period_s: float = 1.0  # sampling period from which the time column may not be in seconds,
+    slow_period_ratio: float = 1.0  # and of a plant's slowest stated time constant to it, below which it probably is not
 
     # Samples that stand alone, and codes for a lost reading.
     outlier_noise_deviations: float = 12.0  # from the median of the neighbours,
     outlier_local_spreads: float = 8.0  # and deviations of these, from which a sample stands alone,
     outlier_resolution_steps: float = 2.5  # and steps of the resolution
     outlier_fewest_samples: int = 50  # measured ones of a channel
+    spike_error_share: float = 0.3  # of what a law leaves about a spike of an input, below which it holds without the spike:
+    # an answer that is late by some samples leaves half
     motion_over_noise: float = 5.0  # of the other samples, from which a channel carries a motion and no single blows
     lost_jump_ratio: float = 4.0  # of the jump to a code over the changes that nine in ten do not exceed
     lost_code_returns: int = 3  # to the same value, from which that is a code for a lost reading
@@ -34,6 +37,18 @@ class DataRules:
     repeated_fewest_readings: int = 20  # of a channel that repeats them, below which nothing is stated
     repeated_regular_share: float = 0.9  # of its readings that last equally long, from which it repeats them
     repeated_fine_steps: float = 4.0  # smallest changes in the usual one; with less, a coarse reading stays the same
+
+    # Frozen channels: one value again and again while another channel moves on.
+    frozen_samples: int = 20  # of one value in a row, from which a channel that repeats hardly any may be frozen
+    frozen_repeats: float = 0.05  # of its other samples that repeat the one before, up to which it repeats hardly any
+    frozen_share: float = 0.8  # of a recording in such runs, up to which the other samples show how the channel is read
+    frozen_noise: float = 1e-5  # over size, above which noise is none of rounding: six digits or single precision
+    frozen_alternation: float = 0.65  # of high differences that change sign: 0.81 do for white noise, few for a motion
+    frozen_jump_ratio: float = 3.0  # of the change at an end of a run to those that nine in ten samples do not exceed
+    frozen_stop_ratio: float = 0.5  # of the speed next to a run to the usual one, from which a motion stops at once
+    frozen_driver_share: float = 0.1  # of its span by which another channel moves on
+    frozen_error_ratio: float = 4.0  # of the nominal residual in a run to that elsewhere, without the run (RMS)
+    frozen_unexplained: float = 0.03  # of an output's variance that this residual is at least: motion that goes on as driven
 
     # Copies: a channel that was computed from another one.
     copy_residual: float = 1e-7  # over span, below which a channel is a copy of another
@@ -66,6 +81,8 @@ class DataRules:
     clipped_share: float = 0.01  # at the largest reading, from which it is a limit
     clipped_run_samples: int = 5  # in a row at the limit
     clipped_overrun: float = 0.01  # share of the input's span by which it moves on
+    level_samples: int = 3  # of one value in a row, from which an input is held at a level
+    samples_between_levels: float = 1.0  # on average, up to which an input jumps: a resampled step may have one in between
     tone_power_share: float = 0.995  # of an input's power in one spectral line, from which it is one sinusoid
     tone_frequency_ratio: float = 1.1  # of the sinusoids of all recordings, below which they are one frequency
     reversal_share: float = 0.05  # of its span by which an input goes back that reverses

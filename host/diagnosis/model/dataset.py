@@ -21,6 +21,8 @@ from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+# Names of columns that hold times, if their values increase: t, time_s, Time (s), stamp, timestamp_ms, ...
+TIME = re.compile(r"(t|time|stamp|timestamp|seconds)(?![a-z0-9])", re.IGNORECASE)
 BLOCKS_OF_A_LONE_RECORDING = 10
 # Of an even grid: points for each row, and points in all, above which its gaps are cut short.
 MOST_EMPTY, LARGEST_GRID = 10, 1_000_000
@@ -110,7 +112,7 @@ def load(
             _cut(whole, segment.name, segment.rows[0], segment.rows[1], lead=spec.data.lead_rows) for segment in cuts
         ] or [whole]
     parts = [part for segment in segments for part in _at_gaps(segment, rules)]
-    return _split(_named_apart(parts), spec.data.heldout)
+    return _split(named_apart(parts), spec.data.heldout)
 
 
 def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
@@ -120,12 +122,14 @@ def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
     Time runs on. Parts of fewer than `least_rows` are left out, unless there is no other.
     """
     seen = np.any([np.isfinite(values) for values in segment.channels.values()], axis=0)
-    rows = np.flatnonzero(seen)
-    if rows.size == 0:
-        return [segment]
+    between = np.diff(np.flatnonzero(seen))
+    return parted(segment, seen, rules) if np.any(between > rules.gap_samples) else [segment]
+
+
+def parted(segment: Recording, known: Mask, rules: DataRules) -> list[Recording]:
+    """The recording between its first and last `known` (n,) sample, cut where more than `gap_samples` are not known."""
+    rows = np.flatnonzero(known)
     ends = np.flatnonzero(np.diff(rows) > rules.gap_samples)
-    if ends.size == 0:
-        return [segment]
     firsts, lasts = [rows[0], *rows[ends + 1]], [*rows[ends], rows[-1]]
     parts = []
     for first, last in zip(firsts, lasts, strict=True):
@@ -138,13 +142,15 @@ def _at_gaps(segment: Recording, rules: DataRules) -> list[Recording]:
     return parts or [segment]
 
 
-def _named_apart(segments: list[Recording]) -> list[Recording]:
+def named_apart(segments: list[Recording]) -> list[Recording]:
     """Recordings of one name get a number: two stay two."""
-    count: dict[str, int] = {}
+    taken: set[str] = set()
     out = []
     for segment in segments:
-        count[segment.name] = count.get(segment.name, 0) + 1
-        out.append(segment if count[segment.name] == 1 else replace(segment, name=f"{segment.name} ({count[segment.name]})"))
+        names = (segment.name if k == 1 else f"{segment.name} ({k})" for k in itertools.count(1))
+        name = next(name for name in names if name not in taken)
+        taken.add(name)
+        out.append(segment if name == segment.name else replace(segment, name=name))
     return out
 
 
@@ -160,6 +166,9 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
     for key, channel in needed.items():
         if channel.column in columns:
             channels[key] = channel.sign * channel.scale * columns[channel.column] + channel.offset
+        elif channel.column in table.unread:
+            found = f"column {channel.column} of {name} with {table.unread[channel.column]}"
+            raise InputError(f"channels.{key}.column", found, "real numbers")
         elif key not in optional:
             raise InputError(f"channels.{key}.column", channel.column, f"a column of {name}: {', '.join(sorted(columns))}")
     n = max(values.size for values in channels.values())
@@ -170,7 +179,7 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
         raise InputError("recording", f"{n} rows in {name}", f"at least {rules.least_rows} rows")
     infinite = tuple(key for key, values in channels.items() if np.isinf(values).any())
     channels = {key: np.where(np.isfinite(values), values, np.nan) for key, values in channels.items()}
-    time_s, timed = _time_line(spec, name, columns, n)
+    time_s, timed = _time_line(spec, table, n)
     dt_s = float(np.median(np.diff(time_s)))
     if dt_s <= 0.0:
         raise InputError("data.time", f"more than half of the stamps of {name} repeat", "seconds that increase")
@@ -182,7 +191,8 @@ def _one(spec: NominalSpec, table: Table, needed: dict[str, ChannelSpec], option
     return Recording(name, time_s, dt_s, timed, channels, nothing, nothing, units, jitter=jitter, infinite=infinite)
 
 
-def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) -> tuple[Array, bool]:
+def _time_line(spec: NominalSpec, table: Table, n: int) -> tuple[Array, bool]:
+    name, columns = table.name, table.columns
     if spec.data.time is not None:
         if spec.data.time not in columns:
             raise InputError(
@@ -194,6 +204,11 @@ def _time_line(spec: NominalSpec, name: str, columns: dict[str, Array], n: int) 
         return time_s, True
     if spec.data.rate_Hz is not None:
         return np.arange(n) / spec.data.rate_Hz, True
+    channels = {channel.column for channel in spec.channels.values()}
+    for column, values in columns.items():
+        if column not in channels and TIME.match(column) and values.size == n > 1 and bool(np.all(np.diff(values) > 0.0)):
+            found = f"nothing, although column {column} of {name} seems to hold times"
+            raise InputError("data.time", found, f'the column with seconds or dates, as time = "{column}", or rate_Hz')
     return np.arange(n, dtype=np.float64), False
 
 

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from host.diagnosis.model.data_rules import DataRules
-from host.diagnosis.model.dataset import Recording
+from host.diagnosis.model.dataset import Recording, named_apart
+from host.diagnosis.model.frozen import frozen_finding, frozen_readings, without_runs
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import fill
 from host.diagnosis.model.pairs import (
@@ -25,6 +26,7 @@ from host.diagnosis.model.pairs import (
     as_stated,
     centred,
     copy_of,
+    driven_of,
     elsewhere,
     explained_by_gain,
     explained_by_law,
@@ -35,9 +37,21 @@ from host.diagnosis.model.pairs import (
     regression_by_spectra,
     typical,
 )
-from host.diagnosis.model.readings import Finding, coarse, counts, resolution, without_outliers
+from host.diagnosis.model.readings import (
+    MECHANICAL,
+    Finding,
+    coarse,
+    counts,
+    held_levels,
+    outliers,
+    resolution,
+    without_outliers,
+)
+from host.diagnosis.model.spikes import NEAR, around, unanswered
+from host.diagnosis.model.time_constants import slowest_s
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 FACTORS = {1e3: "1000 (milli)", 1e-3: "1/1000 (milli)", 1e6: "10^6 (micro)", 1e-6: "10^-6 (micro)"}
 FACTORS |= {180.0 / np.pi: "57.3 (degrees and radians)", np.pi / 180.0: "1/57.3 (degrees and radians)"}
@@ -60,15 +74,16 @@ def inspect(spec: NominalSpec, recordings: list[Recording], rules: DataRules) ->
     if not data.recordings:
         return Inspected([], data.findings)
     data.stamps()
+    data.frozen(driven_of(spec))
     driven = {path.input if path.law and spec.impedance is not None else path.output for path in paths}
-    data.alone(sorted(vital), driven)
+    data.alone(sorted(vital), driven, paths)
     data.exchanged_outputs([path for path in paths if not path.law])
     for path in paths:
         data.compared(path)
         if not data.recordings:
             return Inspected([], data.findings)
     for path in paths:
-        data.saturated(path)
+        data.saturated(path, driven)
     for path in paths:
         data.excitation(path)
     return Inspected(data.recordings, list(dict.fromkeys(data.findings)))
@@ -153,16 +168,61 @@ class _Inspection:
         if periods and max(periods) > rules.sampling_period_ratio * min(periods):
             says = f"Recordings are sampled at different rates, every {min(periods):.4g} to {max(periods):.4g} s."
             self.find("clock", "time", says)
-        if column is not None and periods and min(periods) >= rules.slow_period_s:
+        if column is not None and periods and self.too_slow(timed, min(periods)):
             says = f"Column {column}, taken for seconds, grows by {min(periods):.4g} between samples. If it is in "
             says += "milliseconds or microseconds, every rate and time constant below is in that unit, not in seconds: set "
             says += "data.time_scale (0.001 for milliseconds)."
             self.find("unit", column, says)
 
-    def alone(self, names: list[str], driven: set[str]) -> None:
+    def too_slow(self, timed: list[Recording], period_s: float) -> bool:
+        """Whether stamps are probably no seconds: the plant is faster by what is stated, or whole numbers stamp a mechanism.
+
+        A thermal plant that is sampled once a second is not remarkable.
+        """
+        if period_s < self.rules.slow_period_s or self.spec.data.time_scale != 1.0:
+            return False
+        stated_s = slowest_s(self.spec)
+        if stated_s is not None:
+            return stated_s < self.rules.slow_period_ratio * period_s
+        whole = all(np.all(r.time_s + r.begin_s == np.round(r.time_s + r.begin_s)) for r in timed)
+        return whole and all(channel.unit in MECHANICAL for channel in self.spec.channels.values())
+
+    def frozen(self, driven: set[str]) -> None:
+        """Leave out readings of outputs that are frozen whatever moves them. driven: outputs.
+
+        What follows the last reading is left out, too: it can be compared with nothing.
+        """
+        units = {key: channel.unit for key, channel in self.spec.channels.items()}
+        kept: list[Recording] = []
+        for recording in self.recordings:
+            found = frozen_readings(recording, driven, self.rules)
+            for name, mover in {run.name: mover for run, mover in found}.items():
+                runs = [run for run, _ in found if run.name == name]
+                names = self.columns.get(name, name), self.columns.get(mover, mover)
+                self.findings.append(frozen_finding(recording, runs, names[0], units.get(name, ""), names[1]))
+            kept += without_runs(recording, [run for run, _ in found], driven, self.rules)
+        self.recordings = named_apart(kept)
+
+    def outliers(self, recording: Recording, names: list[str], driven: set[str], paths: list[Pair]) -> dict[str, Mask]:
+        """Samples (n,) of each channel that are no readings. A spike of an input that its output answers is one, as is the
+        answer.
+        """
+        bad = {name: outliers(recording.channels[name], self.rules) for name in names if name in recording.channels}
+        for path in paths:
+            pair = (path.input, path.output)
+            for name, output in (pair, pair[::-1]):
+                if name in driven or output not in driven or not {name, output} <= bad.keys() or not bad[name].any():
+                    continue
+                answer = unanswered(recording, path, name, bad[name], bad[output], self.rules)
+                bad[output] = bad[output] & ~around(bad[name] & ~answer, NEAR)
+                bad[name] = answer
+        return bad
+
+    def alone(self, names: list[str], driven: set[str], paths: list[Pair]) -> None:
         """Each of the channels `names` by itself: outliers, coarse steps, and whole numbers where a unit says otherwise."""
         columns, units = self.columns, {key: channel.unit for key, channel in self.spec.channels.items()}
-        self.recordings = without_outliers(self.recordings, names, columns, self.findings, self.rules)
+        bad = [self.outliers(recording, names, driven, paths) for recording in self.recordings]
+        self.recordings = without_outliers(self.recordings, bad, columns, self.findings)
         coarse(self.recordings, names, driven, columns, units, self.findings, self.rules)
         for name in counts(self.recordings, names, units, self.rules):
             says = f"Column {columns[name]} holds whole numbers only, called {units[name]}: these are probably counts. "
@@ -202,6 +262,8 @@ class _Inspection:
         input_column, output_column = self.columns[path.input], self.columns[path.output]
         copied = copy_of(self.recordings, path.input, path.output, self.rules)
         if copied is not None:
+            units = {self.spec.channels[name].unit for name in (path.input, path.output)}
+            copied = replace(copied, unlike=bool(path.law) or len(units) > 1)
             self.find("alias", output_column, copied.sentence(output_column, input_column, self.recordings[0]))
             if copied.whole:
                 self.recordings = []
@@ -363,14 +425,19 @@ class _Inspection:
                 ]
                 return
 
-    def saturated(self, path: Pair) -> None:
-        """Find readings that stay at their largest or smallest value while their input continues to move."""
+    def saturated(self, path: Pair, driven: set[str]) -> None:
+        """Find readings that stay at their largest or smallest value while their input continues to move.
+
+        An input that is made of levels is meant to stay at them, and one that is zero rests. driven: outputs.
+        """
         both = [(path.output, path.input), (path.input, path.output)]
         for name, driver in both if path.law else both[:1]:
             fine = [r for r in self.recordings if resolution(r.channels[name], self.rules, switched=False) <= 0.0]
+            fine = [r for r in fine if name in driven or not held_levels(r.channels[name], self.rules)]
             lines = [(fill(r.channels[name]), fill(r.channels[driver])) for r in fine]
             for side, word in ((1.0, "largest"), (-1.0, "smallest")):
-                share = max((_clipped(y, x, side, self.rules) for y, x in lines), default=0.0)
+                limited = [(y, x) for y, x in lines if name in driven or np.max(side * y) != 0.0]
+                share = max((_clipped(y, x, side, self.rules) for y, x in limited), default=0.0)
                 if share > self.rules.clipped_share:
                     says = f"Column {self.columns[name]} stays at its {word} reading for {share:.1%} of a recording while "
                     says += f"{self.columns[driver]} moves on: it is limited there."

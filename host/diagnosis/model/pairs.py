@@ -58,6 +58,14 @@ def pairs_of(spec: NominalSpec) -> list[Pair]:
     return found
 
 
+def driven_of(spec: NominalSpec) -> set[str]:
+    """Channels that the nominal model predicts, where its sections name them (not those of a rig)."""
+    found = {link.output for link in spec.link}
+    for section in (spec.axis, spec.impedance):
+        found |= {section.output} if section is not None else set()
+    return found | set(spec.simulator.outputs if spec.simulator is not None else ())
+
+
 def _stated(spec: NominalSpec, law: Sequence[str]) -> tuple[float, ...]:
     return tuple(spec.start(term, 0.0)[0] if term in spec.parameters else 0.0 for term in law)
 
@@ -98,7 +106,8 @@ def _left(x: Array, y: Array) -> float:
 class Copied:
     """A channel that is another one, scaled and shifted, up to `tolerance`.
 
-    noisy: with the noise of that one, so that it was not measured.
+    noisy: with the noise of that one, so that it was not measured. unlike: the two are quantities of different kinds, such
+    as a force and a place, which no plant makes equal.
     """
 
     gain: float
@@ -106,21 +115,29 @@ class Copied:
     lag: float  # samples
     noisy: bool
     tolerance: float
+    unlike: bool = False
 
     @property
     def whole(self) -> bool:
         """Return whether the channel has no information beyond the other."""
-        return self.noisy or (self.lag == 0.0 and abs(self.gain - 1.0) < self.tolerance and self.offset == 0.0)
+        return self.noisy or (self.same and (self.lag == 0.0 or self.unlike))
+
+    @property
+    def same(self) -> bool:
+        """Return whether the channel has the values of the other, perhaps later."""
+        return abs(self.gain - 1.0) < self.tolerance and self.offset == 0.0
 
     def sentence(self, copy: str, original: str, recording: Recording) -> str:
         """Return the sentence of the finding."""
-        if self.gain == 1.0 and self.offset == 0.0:
+        if self.same:
             says = f"Column {copy} is column {original} in every sample"
         else:
             says = f"Column {copy} is column {original} times {self.gain:.4g}"
         if self.lag:
             late = f"{self.lag * recording.dt_s:.4g} s" if recording.timed else f"{self.lag:.4g} samples"
             says += f", {late} later"
+        if self.whole and not self.noisy:
+            return says + ", exactly: it was copied, not measured. There is nothing to compare."
         if self.whole:
             return says + ", noise included: it was computed from it, not measured. There is nothing to compare."
         return says + ", exactly and without any noise: was it measured, or computed from it?"
@@ -169,6 +186,7 @@ def _copied(recording: Recording, a: str, b: str, rules: DataRules) -> Copied | 
         whole = float(q / gain) + lag
         near_whole = abs(whole - round(whole)) < 1e-4
         noisy = white_level(x) >= rules.copy_noise * float(np.ptp(x))
+        offset = 0.0 if abs(offset) < most_left * float(np.ptp(y)) else offset
         return Copied(gain, float(offset), round(whole) if near_whole else whole, noisy, most_left)
     return None
 
@@ -203,6 +221,20 @@ def regression(recording: Recording, path: Pair, exchanged: bool = False) -> Law
     return LawFit(found[:-1], rms[:-1], explained)
 
 
+def sides_of_law(recording: Recording, path: Pair, window: int) -> tuple[Array, Array]:
+    """Terms (k + 1, n) of which a pair's law or gain makes a signal (n,), and that signal, filtered alike.
+
+    The terms end with ones. window: samples over which a law is smoothed.
+    """
+    x, y = fill(recording.channels[path.input]), fill(recording.channels[path.output])
+    if not path.law:
+        return np.array([x, np.ones_like(x)]), y
+    if path.reads == "acceleration":
+        terms, force = _by_spectra(recording, path)
+        return np.vstack([terms, np.ones_like(force)]), force
+    return _terms(path, y, recording.dt_s, window), smooth_derivatives(x, recording.dt_s, window)[0]
+
+
 def _terms(path: Pair, motion: Array, dt: float, window: int) -> Array:
     """Rows (k + 1, n) that the coefficients of the law multiply, by derivatives smoothed over `window`, and ones."""
     x, v, a = smooth_derivatives(motion, dt, window)
@@ -225,6 +257,11 @@ def regression_by_spectra(recording: Recording, path: Pair) -> LawFit:
 
     An integral of a reading with an offset drifts. All terms and the force lose the same slow part.
     """
+    return _least_squares(*_by_spectra(recording, path))
+
+
+def _by_spectra(recording: Recording, path: Pair) -> tuple[Array, Array]:
+    """Terms (k, n) and force (n,) of the law of a recorded acceleration, without what is slow."""
     rows = np.vstack([fill(recording.channels[name]) for name in (path.output, path.input)])
     n = rows.shape[1]
     window = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
@@ -235,7 +272,7 @@ def regression_by_spectra(recording: Recording, path: Pair) -> LawFit:
     a, force = np.where(kept, spectra, 0.0)
     table = {"mass": a, "damping": a / (1j * turn), "stiffness": -a / turn**2}
     terms = np.array([np.fft.irfft(table[term], n) for term in path.law])
-    return _least_squares(terms, np.fft.irfft(force, n))
+    return terms, np.fft.irfft(force, n)
 
 
 def explained_by_law(fits: list[LawFit]) -> float:

@@ -14,12 +14,13 @@ from host.diagnosis.model.operators import constant_speed, fill, quantum
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Places = npt.NDArray[np.int64]
+MECHANICAL = ("rad", "m", "m/s", "m/s2", "N", "N m")  # units of motions and forces, which are no whole numbers
 
 
 @dataclass(frozen=True)
 class Finding:
     """One thing that is wrong with the data. `id`: sign, unit, alias, constant, missing, clock, excitation, swapped,
-    saturated, outliers, quantized, repeated, session, hold or jump; `channel`: the column's name in the recordings.
+    saturated, outliers, frozen, quantized, repeated, session, hold or jump; `channel`: the column's name in the recordings.
     """
 
     id: str
@@ -76,34 +77,40 @@ def lost(values: Array, rules: DataRules) -> Mask:
     return found & np.isfinite(values) if ordinary else np.zeros(line.size, dtype=bool)
 
 
-def without_outliers(
-    recordings: list[Recording], names: list[str], columns: dict[str, str], findings: list[Finding], rules: DataRules
-) -> list[Recording]:
-    """Recordings in which samples of the channels `names` that are not readings are missing; a finding says how many.
+def outliers(values: Array, rules: DataRules) -> Mask:
+    """Samples (n,) of a channel that are not readings: those that stand alone, and codes for a lost reading.
 
     Single samples of a channel that holds still otherwise are left: those may be blows, and meant.
     """
-    for name in names:
+    if np.count_nonzero(np.isfinite(values)) < rules.outlier_fewest_samples:
+        return np.zeros(values.size, dtype=bool)
+    noise = scatter(values)
+    bad = wild(values, noise, rules)
+    if float(np.nanstd(np.where(bad, np.nan, values))) <= rules.motion_over_noise * noise:
+        bad = np.zeros(values.size, dtype=bool)
+    return bad | lost(values, rules)
+
+
+def without_outliers(
+    recordings: list[Recording], bad: list[dict[str, Mask]], columns: dict[str, str], findings: list[Finding]
+) -> list[Recording]:
+    """Recordings in which the `bad` samples (n,) of each channel are missing; a finding says how many.
+
+    bad: of each recording, by channel.
+    """
+    for name in dict.fromkeys(name for of_one in bad for name in of_one):
         count = total = 0
         first = ""
         cleaned = []
-        for recording in recordings:
-            values = recording.channels.get(name)
-            if values is None or np.count_nonzero(np.isfinite(values)) < rules.outlier_fewest_samples:
-                cleaned.append(recording)
-                continue
-            noise = scatter(values)
-            bad = wild(values, noise, rules)
-            rest = np.where(bad, np.nan, values)
-            if float(np.nanstd(rest)) <= rules.motion_over_noise * noise:
-                bad = np.zeros(values.size, dtype=bool)
-            bad |= lost(values, rules)
-            if bad.any():
-                where = recording.begin_s + float(recording.time_s[int(np.argmax(bad))])
-                unit = "s" if recording.timed else "samples"
-                first = first or f"first at {where:.4g} {unit} of {recording.name}"
-                recording = replace(recording, channels={**recording.channels, name: np.where(bad, np.nan, values)})
-            count, total = count + int(bad.sum()), total + values.size
+        for recording, of_one in zip(recordings, bad, strict=True):
+            if name in of_one:
+                values, mask = recording.channels[name], of_one[name]
+                count, total = count + int(mask.sum()), total + values.size
+                if mask.any():
+                    where = recording.begin_s + float(recording.time_s[int(np.argmax(mask))])
+                    unit = "s" if recording.timed else "samples"
+                    first = first or f"first at {where:.4g} {unit} of {recording.name}"
+                    recording = replace(recording, channels={**recording.channels, name: np.where(mask, np.nan, values)})
             cleaned.append(recording)
         recordings = cleaned
         if count:
@@ -127,6 +134,18 @@ def resolution(values: Array, rules: DataRules, switched: bool) -> float:
     smallest = float(np.min(steps))
     even = np.abs(steps / smallest - np.round(steps / smallest)) < 1e-3
     return smallest if bool(even.all()) and not constant_speed(values, smallest) else 0.0
+
+
+def held_levels(values: Array, rules: DataRules) -> bool:
+    """Whether a channel (n,) is held at levels and jumps from one to the next: a step, pulses, a staircase, a PRBS.
+
+    A motion that a limit clips runs through many values between two limits.
+    """
+    good = values[np.isfinite(values)]
+    lasts = np.diff(np.flatnonzero(np.concatenate(([True], np.diff(good) != 0.0, [True]))))
+    held = lasts >= rules.level_samples
+    between = int(np.sum(lasts[~held]))
+    return bool(np.unique(good).size == 2 or between <= rules.samples_between_levels * np.count_nonzero(held))
 
 
 def repeated(values: Array, rules: DataRules) -> Places | None:
@@ -181,10 +200,6 @@ def counts(recordings: list[Recording], names: list[str], units: dict[str, str],
         values = [r.channels[name][np.isfinite(r.channels[name])] for r in recordings if name in r.channels]
         together = np.concatenate(values) if values else np.zeros(0)
         whole = together.size > 0 and bool(np.all(together == np.round(together)))
-        if (
-            whole
-            and np.unique(together).size > rules.switched_levels
-            and units.get(name, "") in ("rad", "m", "m/s", "m/s2", "N", "N m")
-        ):
+        if whole and np.unique(together).size > rules.switched_levels and units.get(name, "") in MECHANICAL:
             found.append(name)
     return found

@@ -8,7 +8,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,15 @@ _MAT_COMPRESSED, _MAT_HEAD_BYTES = 15, 128
 
 @dataclass(frozen=True)
 class Table:
-    """One recording as it was given: columns by name, each (n,), and the file that it was read from, if any."""
+    """One recording as it was given: columns by name, each (n,), and the file that it was read from, if any.
+
+    unread: columns that hold no real numbers -> what they hold.
+    """
 
     name: str
     columns: dict[str, Array]
     path: Path | None = None
+    unread: dict[str, str] = field(default_factory=dict)
 
 
 def table_of(source: Any, number: int) -> Table | Path:
@@ -50,6 +54,7 @@ def table_of(source: Any, number: int) -> Table | Path:
     if not isinstance(source, Mapping) and not (hasattr(source, "columns") and hasattr(source, "__getitem__")):
         raise InputError("recordings", type(source).__name__, "paths, dictionaries of arrays or DataFrames")
     columns: dict[str, Array] = {}
+    unread: dict[str, str] = {}
     signals: dict[Any, Any] = dict(source) if isinstance(source, Mapping) else {key: source[key] for key in source.columns}
     index = None if isinstance(source, Mapping) else getattr(source, "index", None)
     if index is not None and index.name is not None:  # a DataFrame with its time as index
@@ -60,13 +65,14 @@ def table_of(source: Any, number: int) -> Table | Path:
         except (TypeError, ValueError):
             values = None
         if values is None:  # words: not a signal
+            unread[str(key)] = f"an array of type {np.asarray(signals[key]).dtype}"
             continue
         if values.ndim != 1:
             raise InputError(f"{name}, {key}", f"shape {values.shape}", "one-dimensional arrays (n,)")
         columns[str(key)] = values
     if not columns:
         raise InputError(name, "no numeric column", "at least one numeric column")
-    return Table(name, columns)
+    return Table(name, columns, unread=unread)
 
 
 def _numbers_of(given: Any) -> Array | None:
@@ -372,9 +378,9 @@ def _read_mcap(path: Path, limit: int) -> dict[str, Array]:
         stamps = np.array([row[0] for row in rows])
         nearest = np.clip(np.round(np.interp(grid, stamps, np.arange(stamps.size))).astype(int), 0, stamps.size - 1)
         close = np.abs(stamps[nearest] - grid) <= 0.5 * spacing + 1e-9
-        for field in {key for _, row in rows for key in row}:
-            values = np.array([row.get(field, np.nan) for _, row in rows])
-            columns[f"{topic}.{field}"] = np.where(close, values[nearest], np.nan)
+        for key in {key for _, row in rows for key in row}:
+            values = np.array([row.get(key, np.nan) for _, row in rows])
+            columns[f"{topic}.{key}"] = np.where(close, values[nearest], np.nan)
     return columns
 
 

@@ -6,9 +6,28 @@ from host.diagnosis.model.model import Model
 from host.diagnosis.model.nominal import ChannelSpec, NominalSpec
 from protocol.errors import InputError
 
+LAW = ("mass", "damping", "stiffness", "offset")  # whose names an axis and an impedance know, also where `terms` has fewer
+
 
 def build(spec: NominalSpec) -> Model:
-    """The nominal model of `spec`; the rig that recordings describe themselves is `live.recorded_rig`."""
+    """The nominal model of `spec`; the rig that recordings describe themselves is `live.recorded_rig`.
+
+    Raises:
+        InputError: a section that is not usable, or a parameter that the model does not have.
+    """
+    model = _built(spec)
+    if spec.simulator is None:  # a simulator looks up the names itself
+        from host.diagnosis.models.rig import KEYS
+
+        own = [KEYS.get(p.name, p.name) if spec.kind == "rig" else p.name for p in model.parameters]
+        accepted = dict.fromkeys([*own, *(LAW if spec.kind in ("axis", "impedance") else ())])
+        for name in spec.parameters:
+            if name not in accepted:
+                raise InputError(f"parameters.{name}", f"no parameter of kind {spec.kind}", "one of " + ", ".join(accepted))
+    return model
+
+
+def _built(spec: NominalSpec) -> Model:
     if spec.kind == "transmission":
         from host.diagnosis.models.transmission import TransmissionModel
 

@@ -26,12 +26,14 @@ from host.diagnosis.model.model import (
 from host.diagnosis.model.nominal import NominalSpec
 from host.diagnosis.model.operators import calm, fill, reading_noise, smooth_derivatives, wander_at_rest
 from host.diagnosis.models import balance
+from protocol.errors import InputError
 
 Array = npt.NDArray[np.float64]
 READ = ("position", "velocity", "acceleration")
 SMOOTHING_S = 0.02
 UNSEEN_S = 0.05  # least scale of an initial position or speed that is not read
 UNKNOWN = np.array([0.01, 0.05])  # of the range of position and speed, that an input before the recording can have made
+KICK = 100.0  # changes of the usual size that an input makes in one sample, from which it changes the first speed at once
 FINER = 8  # points in each sub-step at which a held input is computed that an effect delays
 
 
@@ -94,6 +96,10 @@ class AxisModel(Model):
         parameters = []
         for term in self.spec.terms:
             value, free = spec.start(term, defaults[term][0])
+            if (term == "mass" and value == 0.0) or (term != "offset" and value < 0.0):
+                least = "a value above 0" if term == "mass" else "0 or a value above it"
+                wanted = f"{least}; leave {term} out of axis.terms if the axis has none"
+                raise InputError(f"parameters.{term}", value, wanted)
             low, high = (value, value) if not free else (-np.inf, np.inf) if term == "offset" else (1e-12, 1e12)
             parameters.append(Parameter(term, defaults[term][1], (value,), low, high, log=term != "offset" and free))
         self.given = [term for term in self.spec.terms if term in spec.parameters]
@@ -138,6 +144,9 @@ class AxisModel(Model):
             )
         elif spec.compare == "motion":  # a delay puts the unknown input before the recording into its first moments
             spread = np.maximum(spread, UNKNOWN * np.array([np.ptp(x), np.ptp(v)]))
+        kick = np.abs(np.diff(segment.inputs[spec.input][: window + 1]))
+        if spec.reads == "position" and np.max(kick) > KICK * np.median(np.abs(np.diff(segment.inputs[spec.input]))):
+            spread[1] = max(spread[1], abs(v[0]))  # the window reads the speed behind the kick, not that before it
         segment.begin = Begin(("position", "speed"), np.array(begin), spread, np.array(begin), again)
         segment.x, segment.v, segment.substeps = x, v, self._substeps(segment)
         along = motion if spec.reads == "position" else place

@@ -92,13 +92,20 @@ class LinearModel(SimulatedModel):
         at_rest = A - np.eye(A.shape[0]) if self.spec.period_s is not None else A
         return A.size > 0 and bool(np.linalg.matrix_rank(at_rest) < A.shape[0])
 
-    def _check(self, spec: NominalSpec) -> None:
-        section = self.spec
+    def _check_names(self, spec: NominalSpec) -> set[str]:
+        """Return the names in the coefficients, each of which has to be a parameter."""
         known = {*spec.parameters, *(offer.parameter for offer in spec.offer)}
-        for key, coefficients in _coefficients(section):
+        used: set[str] = set()
+        for key, coefficients in _coefficients(self.spec):
             for text in coefficients:
+                used |= names_in(text, key)
                 for name in sorted(names_in(text, key) - known):
                     raise InputError(key, name, "a parameter under [parameters]")
+        return used
+
+    def _check(self, spec: NominalSpec) -> None:
+        used = self._check_names(spec)
+        section = self.spec
         outputs = len(section.outputs)
         if section.feedback is not None:
             loop = section.feedback
@@ -123,6 +130,9 @@ class LinearModel(SimulatedModel):
                     )
         elif outputs != 1:
             raise InputError("linear.outputs", section.outputs, "one output of a transfer function, and the actuation")
+        unused = next((name for name in spec.parameters if name not in used), None)
+        if unused is not None:
+            raise InputError(f"parameters.{unused}", "in no coefficient", "one of " + ", ".join(sorted(used)))
 
     def matrices(self, parameters: Mapping[str, float]) -> tuple[Array, Array, Array, Array]:
         """A, B, C and D of the plant for these parameters."""

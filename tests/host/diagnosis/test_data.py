@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import pytest
 from host.diagnosis.model.data_rules import DataRules
 from host.diagnosis.model.dataset import Recording, find_files, load, read_tables, thin
 from host.diagnosis.model.findings import inspect
-from host.diagnosis.model.nominal import NominalSpec, read_nominal
+from host.diagnosis.model.nominal import NominalSpec, nominal_of, read_nominal
 from host.diagnosis.model.tables import Table, read_table, table_of
-from host.diagnosis.models import channels_of
+from host.diagnosis.models import build, channels_of
+from host.diagnosis.pipeline import inspected
 from protocol.errors import InputError
 
 TOML = """
@@ -196,3 +198,53 @@ def test_no_files_is_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delenv("SELDINGER_DATA", raising=False)
     with pytest.raises(InputError, match="recording"):
         find_files(spec(tmp_path), [], None)
+
+
+STAGE: dict[str, Any] = {
+    "name": "stage",
+    "kind": "axis",
+    "data": {"time": "t"},
+    "channels": {"force": {"column": "f", "unit": "N"}, "place": {"column": "y", "unit": "m"}},
+    "axis": {"input": "force", "output": "place", "terms": ["mass", "damping", "stiffness"]},
+    "parameters": {"mass": 1.1, "damping": 3.5, "stiffness": 140.0},
+}
+PLANT = {
+    **STAGE,
+    "kind": "linear",
+    "linear": {"inputs": ["force"], "outputs": ["place"], "numerator": ["K"], "denominator": ["tau", 1.0]},
+}
+
+
+@pytest.mark.parametrize(
+    ("nominal", "parameters", "wanted"),
+    [
+        (STAGE, {"mass": 0.0}, "parameters.mass: found 0.0, wanted a value above 0; leave mass out of axis.terms"),
+        (STAGE, {"damping": -1.0}, "parameters.damping: found -1.0, wanted 0 or a value above it"),
+        (STAGE, {"masss": 1.0}, "parameters.masss: found .*, wanted one of mass, damping, stiffness, offset"),
+        (PLANT, {"K": 1.0, "tau": 2.0, "taw": 2.0}, "parameters.taw: found .*, wanted one of K, tau"),
+    ],
+)
+def test_a_parameter_that_the_model_cannot_have_is_bad_input(
+    nominal: dict[str, Any], parameters: dict[str, float], wanted: str
+) -> None:
+    with pytest.raises(InputError, match=wanted):
+        build(nominal_of({**nominal, "parameters": parameters}))
+
+
+@pytest.mark.parametrize("values", [np.full(200, "1.5"), np.full(200, 1j), np.array([None, "a"] * 100)])
+def test_a_column_that_holds_no_real_numbers_is_named(values: np.ndarray) -> None:
+    table = table_of({"t": np.arange(200.0), "f": np.arange(200.0), "y": values}, 0)
+    assert isinstance(table, Table)
+    with pytest.raises(InputError, match=f"channels.place.column: found .*column y of recording 1 .*{values.dtype}"):
+        inspected(nominal_of(STAGE), [table])
+
+
+def test_a_column_of_times_that_the_nominal_model_does_not_name_is_bad_input() -> None:
+    """Without times the mass would be in newtons, metres and samples: 12000 kg for 1.2 kg read every 0.01 s."""
+    untimed = nominal_of({key: value for key, value in STAGE.items() if key != "data"})
+    x = np.random.default_rng(1).standard_normal((2, 200))
+    for name in ("t", "Time (s)", "time_s", "stamp"):
+        with pytest.raises(InputError, match=r"data\.time: found .*although column"):
+            inspected(untimed, [Table("r", {name: np.arange(200) * 0.01, "f": x[0], "y": x[1]})])
+    for name, values in (("temperature", np.arange(200.0)), ("t", x[0]), ("index", np.arange(200.0))):
+        assert not inspected(untimed, [Table("r", {name: values, "f": x[0], "y": x[1]})]).recordings[0].timed
