@@ -298,7 +298,7 @@ def _grow(
     while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
         ranked = screen(problem, best, candidate_effects, progress)
         trials: list[Trial] = []
-        promising = _promising(problem, best, ranked)
+        promising = worth_fitting(problem, best, ranked)
         if not best.terms:
             promising += hidden(problem, best, candidate_effects)
         for count, item in enumerate(promising):
@@ -368,7 +368,7 @@ def settled(problem: Problem, fit: Fit) -> Fit:
     return fit
 
 
-def _promising(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
+def worth_fitting(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
     """Candidates to fit: those that promise enough, and the first few wherever the residual is above noise.
 
     A promise counts independent samples by what one projection leaves. In a recording of seconds a slow residual has few
