@@ -134,7 +134,7 @@ class Effect:
     """One effect at one kind of port.
 
     `port`: motion (a kinematic signal), turn (an angle), load (one that deflects the output), deflection (what it does),
-    force (a force balance), timing, limit, drift and mix (a scalar reading),
+    force (a force balance), timing, clock, limit, drift and mix (a scalar reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
     `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "other"
     (another channel). `order`: place among the effects of one port, small first. `side`: motion ports only, before or after
