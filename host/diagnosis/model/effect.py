@@ -34,6 +34,7 @@ class Parameter:
     vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
     shape: bool = False  # its upper bound is a limit of the form, even where the effect's bounds are natural
     dead_time: bool = False  # the output's first so many seconds come from what was before the recording
+    event: bool = False  # the instant of a single event: only samples around it show it, no finer than their period
     follows: str = ""  # nominal parameter whose sign it has: a branch of a spring counts as the spring does
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
