@@ -38,6 +38,7 @@ from host.diagnosis.models import build, channels_of
 from host.diagnosis.selection.apart_from_model import outliers_of_residual
 from host.diagnosis.selection.between_recordings import unlike_recordings
 from host.diagnosis.selection.down_to_noise import at_white_noise, ran_away
+from host.diagnosis.selection.early import early_outputs
 from host.diagnosis.selection.equivalence import (
     Standing,
     most_probable,
@@ -244,10 +245,10 @@ def _diagnosed(
 ) -> Diagnosis:
     overall = Overall(progress)
     overall.part(0.0, 0.02)("reading recordings", 0.0)
-    data, done = inspected(spec, sources, rules), None
+    data, done = clocks_put_right(spec, inspected(spec, sources, rules), left_out, rules), None
     axis = spec.axis
     if axis is not None and axis.runs_away and axis.compare is None:
-        by_motion = spec.model_copy(update={"axis": axis.model_copy(update={"compare": "motion"})})
+        by_motion = _by_motion(spec)
         done = _searched(by_motion, data, left_out, rules, _third(budget), overall, (0.02, 0.3), to_noise=True)
         if done is not None:
             spec = by_motion
@@ -311,6 +312,38 @@ def _diagnosed(
     return result
 
 
+def _by_motion(spec: NominalSpec) -> NominalSpec:
+    """`spec` with an axis that is compared by its motion."""
+    return (
+        spec if spec.axis is None else spec.model_copy(update={"axis": spec.axis.model_copy(update={"compare": "motion"})})
+    )
+
+
+def clocks_put_right(spec: NominalSpec, data: Inspected, left_out: frozenset[str], rules: SelectionRules) -> Inspected:
+    """`data` with outputs that precede their inputs shifted back, and what was found.
+
+    An impedance differentiates its input, for which it needs later samples. Its law was compared before (`inspect`).
+    """
+    axis = spec.axis
+    if spec.impedance is not None or spec.recorded_rig or spec.kind == "rig":
+        return data
+    if axis is not None and axis.runs_away and axis.compare == "force":
+        return data
+    model, problem, _ = problems(spec if axis is None else _by_motion(spec), data.recordings, rules)
+    model.try_out(problem.segments)
+    effects = _candidates(problem, left_out)
+    recordings, findings = early_outputs(problem, data.recordings, effects)
+    return Inspected(recordings, [*data.findings, *findings])
+
+
+def _candidates(problem: Problem, left_out: frozenset[str]) -> list[Candidate]:
+    """Candidate effects of a problem, whose initial states are fitted together with the parameters on a linear path."""
+    ports = candidate_ports(problem)
+    problem.joint_states = any(port.path for port in ports)
+    found = candidates(ports, problem.segments[0].recording.timed, problem.model.taken | left_out)
+    return [candidate for candidate in found if candidate.effect.id not in left_out]
+
+
 def _third(budget: Budget) -> Budget:
     return replace(budget, seconds=None if budget.seconds is None else budget.seconds / 3.0)
 
@@ -343,10 +376,7 @@ def _searched(
     if lone:
         model, problem, full = problems(spec, recordings, rules)
     problem.budget = budget
-    ports = candidate_ports(problem)
-    problem.joint_states = any(port.path for port in ports)
-    candidate_effects = candidates(ports, problem.segments[0].recording.timed, model.taken | left_out)
-    candidate_effects = [c for c in candidate_effects if c.effect.id not in left_out]
+    candidate_effects = _candidates(problem, left_out)
     held = hold_between_samples(problem, [full] if full is not problem else [], candidate_effects)
     cost = model.announce(problem.segments, model.guess(problem.segments))
     if cost:

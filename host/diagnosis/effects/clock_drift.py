@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+from scipy.interpolate import CubicSpline
+
 from host.diagnosis.effects.latency import rows
 from host.diagnosis.model.effect import Array, Context, Effect, Parameter, Scale, in_form
 from host.diagnosis.model.operators import shift
+
+SMOOTH = 0.5  # of the largest change from sample to sample, below which no change of it is a step or noise
 
 
 def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
@@ -19,8 +24,12 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
 
 
 def apply(signal: Array, c: Context, p: Array, form: str) -> Array:
-    """Delay the signal (n,) by p[0] t, or by p[0] (t - p[1])."""
-    return shift(signal, c.dt_s, p[0] * (c.time_s - p[1] if form == "set" else c.time_s))
+    """Delay the signal (n,) by p[0] t, or by p[0] (t - p[1]); on a spline where it runs smoothly, which a line flattens."""
+    late = p[0] * (c.time_s - p[1] if form == "set" else c.time_s)
+    steps = np.diff(signal)
+    if np.max(np.abs(np.diff(steps)), initial=0.0) >= SMOOTH * np.max(np.abs(steps), initial=0.0):
+        return shift(signal, c.dt_s, late)
+    return np.asarray(CubicSpline(c.time_s, signal)(np.clip(c.time_s - late, c.time_s[0], c.time_s[-1])))
 
 
 def apply_pose(run: dict, c: Context, p: Array, form: str) -> dict:
@@ -35,10 +44,8 @@ def apply_force(signal: Array, c: Context, p: Array, form: str) -> Array:
 
 SAYS = "One clock runs faster: the delay grows by {rate}."
 _DRIFTS = tuple(
-    Effect(
-        "clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate", invariant=True
-    )
-    for port in ("motion", "timing")
+    Effect("clock_drift", port, 62, parameters, SAYS, "y(t) = x(t - rate*t)", apply, timed=True, shifts="rate")
+    for port in ("motion", "timing", "clock")
 )
 _SET = "One clock runs faster: the delay grows by {rate}; both agree at {agree}."
 EFFECTS = (

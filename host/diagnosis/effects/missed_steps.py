@@ -22,7 +22,9 @@ def parameters(s: Scale, form: str) -> tuple[Parameter, ...]:
         instants = tuple(np.linspace(0.02, 0.98, 49) * s.duration_s)
         edge = EDGE * s.duration_s
         found.append(Parameter(f"jump{number}", s.unit, (s.need,), linear=True))
-        found.append(Parameter(f"instant{number}", "s", instants, edge, s.duration_s - edge, step=0.005 * s.duration_s))
+        found.append(
+            Parameter(f"instant{number}", "s", instants, edge, s.duration_s - edge, step=0.005 * s.duration_s, event=True)
+        )
     return tuple(found)
 
 

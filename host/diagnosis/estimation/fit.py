@@ -82,6 +82,7 @@ class Problem:
     joint_states: bool = False  # whether parameters and initial states are fitted together: the model is a linear path
     noise_fed: bool = False  # the residual is mostly noise that a controller fed back (`find_feedback`)
     waits_s: float = 0.0  # time from the first sample on that is left out at least, while a dead time is fitted
+    ends_s: float = 0.0  # and before the last one, while the drift of a clock is
 
     @property
     def apart(self) -> bool:
@@ -129,6 +130,15 @@ class Problem:
         late = math.ceil(late_s / segment.recording.dt_s - 1e-9) + segment.spread  # a test function reaches so far back
         return min(late, segment.n // 2) if late_s > 0.0 else 0
 
+    def early_s(self, terms: tuple[Term, ...], values: Array) -> float:
+        """Time (s) by which clocks that run faster are ahead at the end of a recording, at most."""
+        return max((_ahead_s(segment, terms, values) for segment in self.segments if segment.fit.any()), default=0.0)
+
+    def ends(self, segment: Segment, terms: tuple[Term, ...], values: Array) -> int:
+        """Last samples (number) that a clock which runs faster makes of what came after the recording."""
+        early_s = max(_ahead_s(segment, terms, values), self.ends_s)
+        return min(math.ceil(early_s / segment.recording.dt_s - 1e-9), segment.n // 2) if early_s > 0.0 else 0
+
     def left(self, segment: Segment, terms: tuple[Term, ...], values: Array, out: Array | None = None) -> Array:
         """Measured minus simulated (outputs, n), NaN where nothing was measured or nothing can be predicted.
 
@@ -136,6 +146,7 @@ class Problem:
         """
         r = segment.y - (self.simulate(segment, terms, values) if out is None else out)
         r[:, : self.unseen(segment, terms, values)] = np.nan
+        r[:, segment.n - self.ends(segment, terms, values) :] = np.nan
         return np.asarray(r)
 
     def residuals(self, terms: tuple[Term, ...], values: Array, which: str = "fit") -> list[Array]:
@@ -160,6 +171,8 @@ class Problem:
             r = (segment.y - out) / self.scale[:, None]
             first = self.unseen(segment, terms, values)
             r[:, :first] = np.where(np.isfinite(segment.y[:, :first]), unseen, np.nan)
+            last = segment.n - self.ends(segment, terms, values)
+            r[:, last:] = np.where(np.isfinite(segment.y[:, last:]), unseen, np.nan)
             rows.append(np.clip(np.nan_to_num(r[:, segment.fit], nan=0.0, posinf=FAR, neginf=-FAR), -FAR, FAR).ravel())
         return np.concatenate(rows)
 
@@ -167,7 +180,19 @@ class Problem:
         """Share of the samples to fit that can be predicted: the others are behind a dead time at a recording's begin."""
         used = [segment for segment in self.segments if segment.fit.any()]
         hidden = sum(int(segment.fit[: self.unseen(segment, terms, values)].sum()) for segment in used)
+        hidden += sum(int(segment.fit[segment.n - self.ends(segment, terms, values) :].sum()) for segment in used)
         return 1.0 - hidden / max(sum(int(segment.fit.sum()) for segment in used), 1)
+
+
+def _ahead_s(segment: Segment, terms: tuple[Term, ...], values: Array) -> float:
+    """Time (s) by which clocks that run faster, by `values`, are ahead at the end of `segment`."""
+    last_s, ahead_s, first = float(segment.recording.time_s[-1]), 0.0, len(values)
+    for term in reversed(terms):
+        first -= len(term.parameters)
+        if term.candidate.effect.shifts == "rate":
+            rate, agree_s = float(values[first]), float(values[first + 1]) if len(term.parameters) > 1 else 0.0
+            ahead_s = max(ahead_s, -rate * (last_s - agree_s))
+    return ahead_s
 
 
 def free(parameters: list[Parameter]) -> list[int]:
@@ -303,18 +328,22 @@ def minimize(
 ) -> Fit:
     """Values that minimize the Huber cost of the weighted simulation error, from `start`.
 
-    A dead time hides the first samples. How many is held while it is fitted: the cost would jump with each of them.
+    A dead time hides the first samples, a clock that runs faster the last ones. How many is held while they are fitted: the
+    cost would jump with each of them.
     states: whether initial states follow the values tried; they are not changed, the caller estimates them again.
     """
-    if problem.waits_s == 0.0 and any(p.dead_time for term in terms for p in term.parameters):
+    late = any(p.dead_time for term in terms for p in term.parameters)
+    drifts = any(term.candidate.effect.shifts == "rate" for term in terms)
+    if problem.waits_s == 0.0 == problem.ends_s and (late or drifts):
+        dt_s = problem.segments[0].recording.dt_s
         for _ in range(3):
-            late_s = problem.late_s(terms, start)
-            waits_s = WAIT * late_s + 3.0 * problem.segments[0].recording.dt_s
-            held = replace(problem, waits_s=waits_s)
+            waits_s = WAIT * problem.late_s(terms, start) + 3.0 * dt_s if late else 0.0
+            ends_s = WAIT * problem.early_s(terms, start) + 3.0 * dt_s if drifts else 0.0
+            held = replace(problem, waits_s=waits_s, ends_s=ends_s)
             fit = minimize(held, terms, start, rounds, tolerance, states)
             fit.cost /= max(held.seen_share(terms, start), 1e-3)  # that a longer dead time gains nothing by hiding samples
             start = fit.values
-            if problem.late_s(terms, start) <= waits_s:
+            if problem.late_s(terms, start) <= waits_s + 1e-12 and problem.early_s(terms, start) <= ends_s + 1e-12:
                 break
         return fit
     parameters, nominal = problem.parameters(terms), len(problem.model.parameters)

@@ -49,6 +49,8 @@ def intervals(problem: Problem, fit: Fit, level: float = 0.95) -> list[tuple[flo
     out = [(float(v), float(v)) for v in fit.values]
     for place, index in enumerate(free(parameters)):
         p, value, half = parameters[index], float(fit.values[index]), float(widths[place])
+        if p.event:  # between two samples nothing shows it
+            half = max(half, 0.5 * problem.segments[0].recording.dt_s / sizes[index])
         if p.log:
             half = min(half, 20.0)
             low, high = value * np.exp(-half), value * np.exp(half)

@@ -75,7 +75,7 @@ class DataRules:
     # Clocks: an output that comes before its input.
     clock_lead_samples: int = 2  # by which it may not
     clock_residual_ratio: float = 0.5  # of the variance or RMS that is left with a shift to that without or a later one
-    clock_over_noise: float = 1.5  # times the noise of a force, up to which a law with a shift leaves nothing but noise
+    clock_over_noise: float = 1.5  # times the noise, up to which a law or model with a shift leaves nothing but noise
 
     # Limits of a reading, and excitation.
     clipped_share: float = 0.01  # at the largest reading, from which it is a limit

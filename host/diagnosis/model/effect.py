@@ -34,6 +34,7 @@ class Parameter:
     vanishes: bool = False  # its lower bound is as good as zero: no sign that another form is wanted
     shape: bool = False  # its upper bound is a limit of the form, even where the effect's bounds are natural
     dead_time: bool = False  # the output's first so many seconds come from what was before the recording
+    event: bool = False  # the instant of a single event: only samples around it show it, no finer than their period
     follows: str = ""  # nominal parameter whose sign it has: a branch of a spring counts as the spring does
     spectral: bool = False  # a frequency in Hz: tried where the residual's spectrum has its lines
 
@@ -132,7 +133,7 @@ class Effect:
     """One effect at one kind of port.
 
     `port`: motion (a kinematic signal), turn (an angle), load (one that deflects the output), deflection (what it does),
-    force (a force balance), timing, limit, drift and mix (a scalar reading),
+    force (a force balance), timing, clock, limit, drift and mix (a scalar reading),
     or one of the rig's own ports. A `Port` is of one or several of these kinds, joined by `+`.
     `source`: the further signal that it depends on: "load" (a force), "drag" (a force or bend that presses), "other"
     (another channel). `order`: place among the effects of one port, small first. `side`: motion ports only, before or after

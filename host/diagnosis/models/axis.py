@@ -85,7 +85,7 @@ class AxisModel(Model):
                 (self.spec.output,),
                 held=True,
             ),
-            Port(f"{name}_reading", "drift+limit", name, (self.spec.output,)),
+            Port(f"{name}_reading", "drift+limit+clock", name, (self.spec.output,)),
         )
         defaults = {
             "mass": (1.0, f"{force} s2/{place}"),

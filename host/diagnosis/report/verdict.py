@@ -394,9 +394,30 @@ def elsewhere(result: Diagnosis, candidate: Candidate) -> str:
     """Return a sentence that names the places at which the effect would act alike, if there are others; else empty."""
     active = [term.candidate for term in result.found.best.terms]
     places = [port.replace("_", " ") for port in candidate.port.path]
+    if candidate.effect.shifts == "rate" and len(places) > 1:
+        return _other_clock(result, candidate)
     if not candidate.effect.invariant or len(places) < 2 or not all(other.effect.invariant for other in active):
         return ""
     return f" These data cannot tell whether it acts at {' or at '.join(places)}: the model between them is linear."
+
+
+def _other_clock(result: Diagnosis, candidate: Candidate) -> str:
+    """A sentence on another place of a linear path at which a drift explains as much, with other nominal rates; else empty.
+
+    A plant whose input comes faster by a factor answers as one does whose reading comes faster, if its masses are divided
+    by the square of that factor and its dampings by the factor.
+    """
+    trials = [t for step in result.found.steps for t in step.trials if t.candidate.effect.id == candidate.effect.id]
+    own = next((t for t in trials if t.candidate.key == candidate.key), None)
+    others = [t for t in trials if t.candidate.port.name in candidate.port.path and t.candidate.form == candidate.form]
+    for other in (t for t in others if t.candidate.port.name != candidate.port.name):
+        if own is None or abs(own.score - other.score) > result.problem.rules.equal_log_likelihood:
+            continue
+        pairs = zip(result.model.parameters, own.fit.values, other.fit.values, strict=False)
+        values = [f"{p.name} {value:.4g} {p.unit}".strip() for p, mine, value in pairs if not np.isclose(mine, value, 1e-3)]
+        at = other.candidate.port.name.replace("_", " ")
+        return f" A drift at {at} explains as much" + (f", with {', '.join(values)}." if values else ".")
+    return ""
 
 
 def at_bound(p: Parameter, value: float) -> bool:

@@ -24,6 +24,7 @@ from host.diagnosis.estimation.fit import (
     set_starts,
 )
 from host.diagnosis.estimation.initial_state import STATE_STEPS, begun_again, fit_with_states, start_again
+from host.diagnosis.estimation.instants import placed
 from host.diagnosis.estimation.rules import SelectionRules
 from host.diagnosis.estimation.uncertainty import intervals
 from host.diagnosis.model.effect import Candidate, rate_key
@@ -114,7 +115,7 @@ def refined(problem: Problem, fit: Fit) -> Fit:
         fit = minimize(problem, fit.terms, fit.values, states=not problem.joint_states)
     if not problem.joint_states:
         start_again(problem, fit)
-    return finish(problem, fit)
+    return placed(problem, finish(problem, fit))
 
 
 def fit_without(
@@ -187,7 +188,7 @@ def try_fit(problem: Problem, base: Fit, item: Screened, noise_sd: Array) -> Tri
     if alone:
         start_again(problem, fit)  # also of held-out recordings: the state of the model so far is not this one's
     fit = finish(problem, fit)
-    fit = _restart(problem, fit, fit.terms[-1].candidate)
+    fit = placed(problem, _restart(problem, fit, fit.terms[-1].candidate))
     after = get_starts(problem)
     set_starts(problem, begun)
     heldout = compare(problem.segments, "heldout", base.residuals, fit.residuals, noise_sd, problem.rules)
@@ -307,6 +308,7 @@ def concluded(problem: Problem, found: Found, candidate_effects: list[Candidate]
         _reduce(problem, found, noise_sd)
     if found.best.terms:
         found.best = refined(problem, found.best)
+    _drop_unsure_events(problem, found, candidate_effects)
     drop_unsure(problem, found)
     return found
 
@@ -321,6 +323,41 @@ def drop_unsure(problem: Problem, found: Found) -> None:
         terms, values = without(found.best, problem, (doubtful[-1].candidate.key,))
         found.steps.append(Step(SearchMove.UNSURE, doubtful[-1].candidate.key))
         found.best = refined(problem, minimize(problem, terms, values)) if terms else fit_nominal(problem)
+
+
+def _drop_unsure_events(problem: Problem, found: Found, candidate_effects: list[Candidate]) -> None:
+    """Takes events whose size has an interval that contains zero out of an effect of several, one after the other."""
+    for _ in range(problem.rules.most_effects):
+        fit, spans = found.best, intervals(problem, found.best) if found.best.terms else []
+        for term in fit.terms:
+            first, events = fit.first_of(term), _events(term)
+            sizes = [k - 1 for k in events if len(events) > 1 and spans[first + k - 1][0] <= 0.0 <= spans[first + k - 1][1]]
+            fewer = _with_events(problem, fit, term, candidate_effects, len(events) - 1) if sizes else None
+            if fewer is not None:
+                smallest = min(sizes, key=lambda k: abs(fit.values[first + k]))
+                values = np.delete(fit.values, [first + smallest, first + smallest + 1])
+                terms = tuple(fewer if other is term else other for other in fit.terms)
+                found.steps.append(Step("remove", term.candidate.key, Gain(0.0, 1.0, 0.0)))
+                found.best = refined(problem, minimize(problem, terms, values))
+                break
+        else:
+            return
+
+
+def _events(term: Term) -> list[int]:
+    """Places of the instants among the parameters of a term; the size of each event is before its instant."""
+    return [k for k, p in enumerate(term.parameters) if p.event]
+
+
+def _with_events(problem: Problem, fit: Fit, term: Term, candidate_effects: list[Candidate], count: int) -> Term | None:
+    """The effect of `term` at its port in the form that has `count` events; None where it has no such form."""
+    own = term.candidate
+    for candidate in candidate_effects:
+        if (candidate.effect.id, candidate.port.name, candidate.source) == (own.effect.id, own.port.name, own.source):
+            other = term_of(problem, candidate, fit)
+            if len(_events(other)) == count:
+                return other
+    return None
 
 
 def unsure(problem: Problem, fit: Fit) -> list[Term]:
@@ -341,7 +378,7 @@ def _grow(
     while len(best.terms) < rules.most_effects and len(steps) < rules.most_steps and not problem.budget.spent():
         ranked = screen(problem, best, candidate_effects, progress)
         trials: list[Trial] = []
-        promising = _promising(problem, best, ranked)
+        promising = worth_fitting(problem, best, ranked)
         if not best.terms:
             promising += hidden(problem, best, candidate_effects)
         for count, item in enumerate(promising):
@@ -411,7 +448,7 @@ def settled(problem: Problem, fit: Fit) -> Fit:
     return fit
 
 
-def _promising(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
+def worth_fitting(problem: Problem, best: Fit, ranked: list[Screened]) -> list[Screened]:
     """Candidates to fit: those that promise enough, and the first few wherever the residual is above noise.
 
     A promise counts independent samples by what one projection leaves. In a recording of seconds a slow residual has few

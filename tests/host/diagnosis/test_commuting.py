@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import seldinger as sd
-from host.diagnosis.effects import candidates
-from host.diagnosis.estimation.fit import Fit, Term, finish, minimize
-from host.diagnosis.model.effect import Candidate
+from host.diagnosis.effects import candidates, library
+from host.diagnosis.estimation.fit import Fit, Term, finish, minimize, size_of
+from host.diagnosis.model.effect import Candidate, Context, Effect, Scale
 from host.diagnosis.model.nominal import nominal_of
 from host.diagnosis.model.tables import Table
 from host.diagnosis.pipeline import candidate_ports, prepare
@@ -140,3 +140,59 @@ def test_places_in_two_subsystems_share_the_probability() -> None:
     names = {f"{found['id']}@{found['subsystem']}", *found["indistinguishable_from"]}
     assert {"latency@amplifier", "latency@encoder"} <= names and found["probability_raw"] < 0.5
     assert "Record a signal between u and y reading" in verdict.as_dict()["next"]
+
+
+def test_effects_that_commute_do_not_depend_on_the_instant() -> None:
+    """A signal that comes half a second later is changed alike, half a second later, but for what the beginning leaves."""
+    t, late = 0.01 * np.arange(4000), 50
+    scale = Scale("rad", 2.0, -1.0, 1.0, 3.0, 1e-3, 0.1, 0.01, 40.0, True)
+    signal = np.sin(2.0 * t) + 0.5 * np.sin(5.0 * t + 1.0)
+
+    def answer(effect: Effect, form: str, x: Array) -> Array:
+        values = [
+            p.grid[len(p.grid) // 2] if p.grid and not p.linear else size_of(p, 0.0) for p in effect.parameters(scale, form)
+        ]
+        context = Context(t[: x.size], 0.01, x, 1e-3)
+        assert effect.apply is not None
+        return np.asarray(effect.apply(x, context, np.array(values), form))
+
+    checked = set()
+    for effect in library():
+        if effect.invariant and effect.apply is not None and not effect.memories and effect.port in PORTS:
+            for form in (form for form in effect.forms if effect.parameters(scale, form)):
+                moved = answer(effect, form, signal)[late + 3000 :] - answer(effect, form, signal[late:])[3000:]
+                assert np.max(np.abs(moved)) < 0.02, (effect.id, form)
+                checked.add(effect.id)
+    assert not any(effect.invariant for effect in library() if effect.id == "clock_drift")
+    assert {"latency", "rate_lag", "resonance", "creep_relaxation", "viscous_friction"} <= checked
+
+
+PORTS = ("motion", "timing", "mode", "drift", "scale")
+SLIDE: dict[str, Any] = {
+    "name": "slide",
+    "kind": "axis",
+    "data": {"time": "t"},
+    "channels": {"f": {"column": "f", "unit": "N"}, "y": {"column": "y", "unit": "m"}},
+    "axis": {"subsystem": "slide", "input": "f", "output": "y", "terms": ["mass", "damping", "stiffness"], "hold": "linear"},
+    "parameters": {"mass": 1.1, "damping": 3.5, "stiffness": 140.0},
+}
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_drifting_clock_has_a_place_where_the_masses_are_known(held: bool) -> None:
+    """The reading comes faster. With free rates, an input that comes faster does the same: mass and damping change."""
+    rng, t, faster = np.random.default_rng(68), np.arange(0.0, 20.0, 0.01), 1.005
+    w, size, phase = 2.0 * np.pi * np.array([0.3, 0.9, 1.6, 2.6]), np.array([3.0, 2.0, 3.0, 2.0]), rng.uniform(0.0, 6.28, 4)
+    y = (size / (150.0 - 1.2 * w**2 + 3.0j * w) * np.exp(1j * (np.outer(faster * t, w) + phase))).sum(axis=1).imag
+    f = (size * np.sin(np.outer(t, w) + phase)).sum(axis=1)
+    known = {"mass": 1.2, "damping": 3.0, "stiffness": 150.0}
+    parameters = {key: {"value": value, "free": False} for key, value in known.items()} if held else SLIDE["parameters"]
+    recording = {"t": t, "f": f, "y": y + 1e-4 * rng.standard_normal(t.size)}
+    (found,) = sd.diagnose([recording], {**SLIDE, "parameters": parameters}).as_dict()["effects"]
+    assert found["id"] == "clock_drift"
+    assert found["parameters"]["rate_s_per_s"]["value"] == pytest.approx(1.0 - faster, rel=0.05 if held else 0.01)
+    if held:
+        assert found["port"] == "slide_reading" and "explains as much" not in found["says"]
+    else:
+        assert "explains as much, with mass 1." in found["says"]
+    assert "cannot tell whether" not in found["says"]
