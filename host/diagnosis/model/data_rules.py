@@ -42,7 +42,7 @@ class DataRules:
     frozen_samples: int = 20  # of one value in a row, from which a channel that repeats hardly any may be frozen
     frozen_repeats: float = 0.05  # of its other samples that repeat the one before, up to which it repeats hardly any
     frozen_share: float = 0.8  # of a recording in such runs, up to which the other samples show how the channel is read
-    frozen_noise: float = 1e-5  # over size, above which noise is none of rounding: six digits or single precision
+    frozen_noise: float = 1e-5  # over size, above which noise is more than rounding to six digits or to single precision
     frozen_alternation: float = 0.65  # of high differences that change sign: 0.81 do for white noise, few for a motion
     frozen_jump_ratio: float = 3.0  # of the change at an end of a run to those that nine in ten samples do not exceed
     frozen_stop_ratio: float = 0.5  # of the speed next to a run to the usual one, from which a motion stops at once

@@ -204,7 +204,7 @@ class _Inspection:
         self.recordings = named_apart(kept)
 
     def outliers(self, recording: Recording, names: list[str], driven: set[str], paths: list[Pair]) -> dict[str, Mask]:
-        """Samples (n,) of each channel that are no readings. A spike of an input that its output answers is one, as is the
+        """Samples (n,) of each channel that are not readings. A spike of an input that its output answers is one, as is the
         answer.
         """
         bad = {name: outliers(recording.channels[name], self.rules) for name in names if name in recording.channels}

@@ -14,7 +14,7 @@ from host.diagnosis.model.operators import constant_speed, fill, quantum
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Places = npt.NDArray[np.int64]
-MECHANICAL = ("rad", "m", "m/s", "m/s2", "N", "N m")  # units of motions and forces, which are no whole numbers
+MECHANICAL = ("rad", "m", "m/s", "m/s2", "N", "N m")  # units of motions and forces, which are not whole numbers
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Samples of an input that stand alone: a spike that the output answers, such as a derivative kick, is no outlier.
+"""Samples of an input that stand alone: a spike that the output answers, such as a derivative kick, is not an outlier.
 
 The law of the pair is fitted past all spikes, once. A spike is left out if the law holds much better without it than with
 it. Where both hold alike, because the motion is too noisy to show an answer, it stays.

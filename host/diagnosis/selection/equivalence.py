@@ -239,7 +239,7 @@ def _better_said(
     for trial in equations_for(problem, less, candidate.port, noise_sd):
         behind = compare(problem.segments, "both", found.best.residuals, trial.fit.residuals, noise_sd, problem.rules)
         if behind.log_likelihood > problem.rules.equal_log_likelihood:
-            # its form was chosen among hundreds: it is no simpler than an effect with more parameters
+            # its form was chosen among hundreds: it is not simpler than an effect with more parameters
             more = max(trial.fit.fitted - found.best.fitted, 0)
             return ((trial.candidate, -coarse(behind, more, earned, problem.rules)),)
     return ()
